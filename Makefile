@@ -17,7 +17,7 @@ run: $(READY)
 # Two processes on two cores: with threads of their own as well they would wait for each other. A file's tests share what
 # they build, so a process takes whole files. pip left no bytecode: without this, where the shell forbids writing it, each
 # process that a test starts compiles torch's.
-PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --max-worker-restart=0
+PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --max-worker-restart=0 --durations=20
 
 # Lint, types, and the tests without which nobody would trust a package; the examples are among them.
 test: $(READY_DEV)

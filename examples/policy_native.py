@@ -12,7 +12,8 @@ def play(folder: str, steps: int) -> list[np.ndarray]:
     """Joint targets of every control step, from home and the objects' nominal places."""
     session = onnxruntime.InferenceSession(f"{folder}/policy.onnx")
     facts = {k: json.loads(v) for k, v in session.get_modelmeta().custom_metadata_map.items()}
-    assert facts["action"]["kind"] == "absolute joint targets"
+    modes = {term["params"].get("mode") for term in facts["action"]["terms"].values()}
+    assert modes == {"absolute"}, "actions that are no joint targets"
     model = mujoco.MjModel.from_binary_path(f"{folder}/model.mjb")
     data = mujoco.MjData(model)
     robot, execute = facts["robot"], facts["action"]["execute"]

@@ -18,14 +18,10 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
-from mjstack.report.gl import BeforeMujoco
-
 if TYPE_CHECKING:
     from mjstack.config import Config, load_config
     from mjstack.envs import Env, make_env
     from mjstack.errors import MjstackError
-
-sys.meta_path.insert(0, BeforeMujoco())
 
 __all__ = ["Config", "Env", "MjstackError", "load_config", "make_env"]
 __version__ = "0.1.0"

@@ -12,21 +12,25 @@ import shutil
 import sys
 import traceback
 from argparse import Namespace
-from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
-from hydra._internal.hydra import Hydra
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, OmegaConf
 
 import mjstack
-from mjstack.config.explain import own_overrides, parse
+from mjstack.cli_sweep import (
+    check_jobs,
+    choose_launcher,
+    claim_sweep,
+    expand,
+    hydra_path,
+    print_sweep,
+)
+from mjstack.config.explain import own_overrides
 from mjstack.config.help import help_text, key_help
 from mjstack.config.load import compose, extended_search_path, to_config
 from mjstack.config.session import (
@@ -34,24 +38,21 @@ from mjstack.config.session import (
     hydra_session,
     lacking_folders,
     list_items,
-    quoted,
     search_path,
     search_path_args,
 )
 from mjstack.errors import (
-    CompositionError,
-    ConfigError,
     MjstackError,
     RankError,
     UnknownName,
     describe_error,
     suggest,
 )
-from mjstack.files import check_unused, claim_folder, write_atomic
+from mjstack.files import claim_folder, write_atomic
 from mjstack.interrupt import EXIT_CODE, begin_job
 from mjstack.process import is_rank
 from mjstack.report.record import Report, Status
-from mjstack.report.table import Console, Table
+from mjstack.report.table import Console
 from mjstack.report.write import read_report
 
 if TYPE_CHECKING:
@@ -84,13 +85,13 @@ def run(args: list[str]) -> int:
     except BrokenPipeError:
         # The reader may not want all of it, such as ``| head``. Python writes once more at its end.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return max((result.exit_code for result in _results), default=0)
+        return _status()
     except (Exception, SystemExit) as error:
         if os.environ.get("MJSTACK_DEBUG"):
             traceback.print_exception(error)
         problem = describe_error(error, "MJSTACK_DEBUG=1 shows the traceback")
         who = f"rank {os.environ['RANK']}: " if int(os.environ.get("RANK", 0)) else ""
-        if not (isinstance(error, RankError) and error.told):
+        if not (isinstance(error, RankError) and error.printed):
             errors.print(f"mjstack: {who}{problem}")
         return 1 if _results or _assisting else MjstackError.exit_code
 
@@ -99,15 +100,15 @@ def _dispatch(flags: Namespace, overrides: list[str]) -> int:
     """Do what the flags ask for, on the current search path."""
     with hydra_session() as hydra:
         if flags.help:
-            _print_help(hydra, overrides)
+            _print_help(overrides)
         elif flags.hydra_help:
             hydra.hydra_help(CONFIG_NAME, args_parser=get_args_parser(), args=flags)
         elif flags.info is not None:
-            compose(hydra, overrides)
+            compose(overrides)
             hydra.show_info(flags.info, CONFIG_NAME, overrides)
         elif flags.shell_completion:
             if not " ".join(overrides).startswith(("install=", "query=", "uninstall=")):
-                raise CompositionError("-sc: expected install=SHELL or uninstall=SHELL alone.")
+                raise MjstackError("-sc: expected install=SHELL or uninstall=SHELL alone.")
             hydra.shell_completion(CONFIG_NAME, overrides)
         elif flags.cfg:
             _show(hydra, flags, overrides)
@@ -118,27 +119,27 @@ def _dispatch(flags: Namespace, overrides: list[str]) -> int:
     return 0
 
 
-def _show(hydra: Hydra, flags: Namespace, overrides: list[str]) -> None:
+def _show(hydra: Any, flags: Namespace, overrides: list[str]) -> None:
     """Check the values of a configuration and print it."""
     if flags.multirun:
-        raise CompositionError("--cfg shows one configuration, and -m makes several. Leave -m out.")
-    cfg = compose(hydra, overrides)
+        raise MjstackError("--cfg shows one configuration, and -m makes several. Leave -m out.")
+    cfg = compose(overrides)
     to_config(cfg)
     if flags.package and OmegaConf.select(cfg, flags.package) is None:
         raise UnknownName("package", flags.package, [key for key, _ in list_items(cfg)])
     hydra.show_cfg(CONFIG_NAME, overrides, flags.cfg, flags.package, flags.resolve)
 
 
-def _run_one(hydra: Hydra, overrides: list[str]) -> int:
+def _run_one(hydra: Any, overrides: list[str]) -> int:
     """Compose, check and run one job, perhaps as one of several ranks."""
     if not is_rank():
-        cfg, checked = _compose_one(hydra, overrides)
+        cfg, checked = _compose_one(overrides)
         from mjstack.distributed import launch  # they load torch
         from mjstack.jobs import check_share, count_devices
 
-        if (count := count_devices(checked.context.cfg)) > 1:
+        if (count := count_devices(checked.stage.cfg)) > 1:
             _check_spreads(checked)
-            check_share(checked.context.cfg, count)
+            check_share(checked.stage.cfg, count)
             return launch([*overrides, *search_path_args()], count)
         return _run_checked(hydra, cfg, checked, overrides)
     from mjstack.distributed import joined
@@ -147,9 +148,9 @@ def _run_one(hydra: Hydra, overrides: list[str]) -> int:
     with joined() as ranks:
         problem = ""
         try:
-            cfg, checked = ranks.alike(lambda: _compose_one(hydra, overrides))
+            cfg, checked = ranks.alike(lambda: _compose_one(overrides))
             ranks.alike(lambda: _check_spreads(checked))
-            ranks.alike(lambda: check_ranks(checked.context))
+            ranks.alike(lambda: check_ranks(checked.stage))
             return _run_checked(hydra, cfg, checked, overrides)
         except RankError:
             raise
@@ -160,28 +161,28 @@ def _run_one(hydra: Hydra, overrides: list[str]) -> int:
             ranks.end(problem)
 
 
-def _compose_one(hydra: Hydra, overrides: list[str]) -> tuple[DictConfig, "CheckedJob"]:
-    cfg = compose(hydra, overrides)
+def _compose_one(overrides: list[str]) -> tuple[DictConfig, "CheckedJob"]:
+    cfg = compose(overrides)
     if cfg.hydra.mode is RunMode.MULTIRUN:
-        raise CompositionError("hydra.mode=MULTIRUN: expected RUN without -m. Replace it by -m.")
+        raise MjstackError("hydra.mode=MULTIRUN: expected RUN without -m. Replace it by -m.")
     return cfg, _check(cfg, overrides)
 
 
 def _check_spreads(checked: "CheckedJob") -> None:
     if not checked.spreads:
-        raise CompositionError(
+        raise MjstackError(
             "torchrun, devices: expected a job whose worlds ranks share: gates, train, collect, or"
             " replay of world=failing. Run this job in one process."
         )
 
 
-def _run_checked(hydra: Hydra, cfg: DictConfig, checked: "CheckedJob", overrides: list[str]) -> int:
+def _run_checked(hydra: Any, cfg: DictConfig, checked: "CheckedJob", overrides: list[str]) -> int:
     """Run a job in its folder; of several ranks the first one makes it, and alone writes."""
-    ranks = checked.context.ranks
-    given = _is_set("hydra.run.dir", overrides)
-    resumed = None if given else checked.folder
-    folder = resumed or _hydra_path(cfg, "run.dir")
-    own = "" if given else checked.own
+    ranks = checked.stage.ranks
+    chosen = any(override.lstrip("+").startswith("hydra.run.dir=") for override in overrides)
+    resumed = None if chosen else checked.folder
+    folder = resumed or hydra_path(cfg, "run.dir")
+    marker = "" if chosen else checked.marker
     begin_job()
     if not ranks.writes:
         global _assisting
@@ -189,94 +190,56 @@ def _run_checked(hydra: Hydra, cfg: DictConfig, checked: "CheckedJob", overrides
         checked.assist(ranks.from_first(lambda: folder))
         return 0
     with ExitStack() as stack:
-        claim = claim_folder(folder, checked.resumes, own, numbered=not (given or resumed))
+        claim = claim_folder(folder, checked.resumes, marker, numbered=not (chosen or resumed))
         claimed = ranks.from_first(lambda: stack.enter_context(claim))
         cfg.hydra.run.dir = str(claimed)
         hydra.run(CONFIG_NAME, run_job, overrides)
-    return max(result.exit_code for result in _results)
+    return _status()
 
 
-def _sweep(hydra: Hydra, overrides: list[str]) -> int:
-    """Compose and check every job of a sweep, then run them."""
+def _status() -> int:
+    """The exit status of the jobs that ran."""
+    return max((result.exit_code for result in _results), default=0)
+
+
+def _sweep(hydra: Any, overrides: list[str]) -> int:
+    """Compose and check every job of a sweep, then run those that are left."""
     if is_rank():
-        raise CompositionError("torchrun: expected one job, and -m makes several. Leave one out.")
-    jobs = _expand(overrides)
-    refused = CompositionError(
-        "hydra.sweeper.params: expected none. Give the values on the command line, as in"
-        " -m nworld=1,2."
-    )
-    if jobs and any("hydra.sweeper.params" in override for override in overrides):
-        raise refused
+        raise MjstackError("torchrun: expected one job, and -m makes several. Leave one out.")
+    if any("hydra.sweeper.params" in override for override in overrides):
+        raise MjstackError(
+            "hydra.sweeper.params: expected none. Give the values on the command line, as in"
+            " -m nworld=1,2."
+        )
     overrides = [*overrides, "hydra.mode=MULTIRUN"]
-    master = compose(hydra, overrides, RunMode.MULTIRUN)
-    if jobs and OmegaConf.select(master, "hydra.sweeper.params"):
-        raise refused
-    folder = _hydra_path(master, "sweep.dir")
-    numbers = _check_jobs(hydra, master, folder, jobs)
+    master = compose(overrides, RunMode.MULTIRUN)
+    choose_launcher(master)
+    known = check_jobs(master, expand(master, overrides), _check)
     begin_job()
-    given = _is_set("hydra.sweep.dir", overrides)
-    claim = claim_folder(folder, numbered=not given, key="hydra.sweep.dir")
-    if "GpuLauncher" in str(OmegaConf.select(master, "hydra.launcher._target_")):
-        from mjstack.jobs.sweep import SweepJob, find_slots, shared_sweep
+    from mjstack.jobs.sweep_folder import list_jobs
+    from mjstack.jobs.sweep_table import sweep_config
 
-        find_slots(OmegaConf.select(master, "hydra.launcher.jobs"))
-        known = [SweepJob(number, one, tuple(jobs[number])) for one, number in numbers.items()]
-        claim = shared_sweep(folder, known) if given else claim
-    with claim as claimed:
-        if claimed != folder:
-            master.hydra.sweep.dir = str(claimed)
-            master.hydra.overrides.hydra.append(f"hydra.sweep.dir={quoted(claimed)}")  # of its jobs
+    sweep = sweep_config(master)
+    reports: dict[int, Report] = {}
+    with claim_sweep(master, known) as claimed:
         try:
             returned = hydra.multirun(CONFIG_NAME, run_job, overrides)
             batches = returned if isinstance(returned, list) else []
-            # A launcher's own processes return theirs.
-            _results[:] = _results or [job.return_value for batch in batches for job in batch]
+            _results[:] = [job.return_value for batch in batches for job in batch]
+            reports = dict(enumerate(_results))
         finally:
-            if _results:
-                _print_sweep(claimed, len(jobs))
-    return max(result.exit_code for result in _results)
+            if reports or any(job.report() for job in list_jobs(claimed)):
+                print_sweep(claimed, sweep, reports)
+    return _status()
 
 
-def _check_jobs(
-    hydra: Hydra, master: DictConfig, folder: Path, jobs: Sequence[list[str]]
-) -> dict[Path, int]:
-    """Compose and check every job, and return their numbers by their folders.
-
-    Jobs of a sweeper other than Hydra's basic one are not known before; each is checked as it runs.
-    """
-    numbers: dict[Path, int] = {}
-    for number, job in enumerate(jobs):
-        cfg = compose(hydra, job, sweep=master)
-        if cfg.devices is not None:
-            raise ConfigError(
-                "devices",
-                cfg.devices,
-                "null with -m",
-                "Leave it out: with hydra/launcher=gpus each job has one GPU, and"
-                " hydra.launcher.jobs is how many run at once",
-            )
-        _check(cfg, job)
-        with open_dict(cfg):
-            cfg.hydra.job.num = number
-            cfg.hydra.job.id = str(number)
-        one = Path(os.path.normpath(folder / _hydra_path(cfg, "sweep.subdir")))
-        if not one.is_relative_to(folder):
-            check_unused(one, key="hydra.sweep.subdir")
-        if numbers.setdefault(one, number) != number:
-            raise CompositionError(
-                f"hydra.sweep.subdir: jobs {numbers[one]} and {number} would both write into {one},"
-                " expected a folder for each job. Leave it out, or let it name what differs."
-            )
-    return numbers
-
-
-def _print_help(hydra: Hydra, args: list[str]) -> None:
+def _print_help(args: list[str]) -> None:
     """Print the help, or the keys below the ones among the arguments, as the overrides have
     them.
     """
     width = min(max(shutil.get_terminal_size((120, 24)).columns, 60), 120)
     keys = [arg for arg in args if "=" not in arg and not arg.startswith("~")]
-    cfg = to_config(compose(hydra, [arg for arg in args if arg not in keys]))
+    cfg = to_config(compose([arg for arg in args if arg not in keys]))
     texts = [key_help(cfg, key, width) for key in keys] or [help_text(cfg, width)]
     print("\n".join(texts), flush=True)
 
@@ -286,21 +249,28 @@ def run_job(cfg: DictConfig) -> Report:
     nothing has been checked yet.
     """
     logging.raiseExceptions = False  # a full disk would print a traceback for each line of run.log
-    own = HydraConfig.get()
-    overrides = list(own.overrides.task)
-    with search_path(lacking_folders(own.runtime.config_sources)):
-        folder = Path(own.runtime.output_dir)
-        if own.mode is RunMode.MULTIRUN and cfg.job.name == "gates":
-            # A cluster may have started the job before.
-            earlier = read_report(folder)
-            if earlier is not None and earlier.status is Status.interrupted:
-                cfg.resume = str(folder)
-                _checked.clear()
-                _save_config(cfg, folder)  # Hydra has just put one with interpolations there
+    settings = HydraConfig.get()
+    overrides = list(settings.overrides.task)
+    with search_path(lacking_folders(settings.runtime.config_sources)):
+        folder = Path(settings.runtime.output_dir)
+        sweeps = settings.mode is RunMode.MULTIRUN
+        earlier = read_report(folder, overrides) if sweeps else None  # of a call before this one
+        if earlier is not None and earlier.status is not Status.interrupted:
+            _save_config(cfg, folder)  # Hydra has just put one with interpolations there
+            return earlier
+        if earlier is not None and cfg.job.name == "gates":
+            cfg.resume = str(folder)
+            _checked.clear()
+            _save_config(cfg, folder)
         checked = _checked.pop(tuple(overrides), None) or _check(cfg, overrides)
-        with suppress(OSError):  # the job says so
+        with suppress(OSError):  # the job's error
             _save_config(cfg, folder)
         result = checked.run(folder, overrides)
+        if sweeps:
+            from mjstack.jobs.sweep_table import sweep_config, update_summary
+
+            report = {settings.job.num: result}
+            update_summary(Path(settings.sweep.dir), sweep_config(cfg), report)
     _results.append(result)
     if result.status is Status.interrupted:
         raise KeyboardInterrupt
@@ -317,69 +287,25 @@ def _check(cfg: DictConfig, overrides: list[str]) -> "CheckedJob":
     # It loads torch and Warp, for which a misspelt key need not wait.
     from mjstack.jobs import check_job
 
-    own = own_overrides(overrides)
-    checked = check_job(to_config(cfg), own)
-    _checked[tuple(own)] = checked
+    keys = own_overrides(overrides)
+    checked = check_job(to_config(cfg), keys)
+    _checked[tuple(keys)] = checked
     return checked
 
 
 def _parse(args: list[str]) -> Namespace:
-    """Hydra's reading of the flags, or a `CompositionError`."""
+    """Hydra's reading of the flags, or a `MjstackError`."""
 
     def refuse(message: str) -> NoReturn:
-        raise CompositionError(message)
+        raise MjstackError(message)
 
-    parser = get_args_parser()
+    parser = get_args_parser()  # Hydra has no public one
     parser.error = refuse  # type: ignore[method-assign]
     known = set(parser._option_string_actions) - _OTHER_CONFIG
     for arg in args:
         if arg.startswith("-") and arg.partition("=")[0] not in known:
-            raise CompositionError(
+            raise MjstackError(
                 f"flag '{arg}' does not exist. {suggest(arg, known)} Keys are set without dashes:"
                 " nworld=64."
             )
     return parser.parse_intermixed_args(args)
-
-
-def _expand(overrides: Sequence[str]) -> list[list[str]]:
-    """The jobs of a sweep as Hydra's basic sweeper makes them; none for another sweeper."""
-    if any(o.startswith("hydra/sweeper=") and o != "hydra/sweeper=basic" for o in overrides):
-        return []
-    parsed = [parse(override) for override in own_overrides(overrides)]
-    try:
-        batches = BasicSweeper.split_arguments(parsed, max_batch_size=None)
-    except HydraException as error:  # a glob
-        raise CompositionError(f"{' '.join(overrides)}: expected a list of values.") from error
-    jobs = [list(job) for batch in batches for job in batch]
-    if not jobs:
-        raise CompositionError(f"{' '.join(overrides)}: has no jobs, expected at least one value.")
-    return jobs
-
-
-def _is_set(key: str, overrides: Sequence[str]) -> bool:
-    return any(override.lstrip("+").startswith(f"{key}=") for override in overrides)
-
-
-def _hydra_path(cfg: DictConfig, key: str) -> Path:
-    """A path below ``hydra``, as Hydra will find it."""
-    HydraConfig.instance().set_config(cfg)  # for what is interpolated
-    OmegaConf.set_readonly(cfg.hydra, None)
-    return Path(str(OmegaConf.select(cfg, f"hydra.{key}", throw_on_missing=True)))
-
-
-def _print_sweep(folder: Path, count: int) -> None:
-    """One row per job that has begun, also written beside the jobs as summary.md."""
-    names = dict.fromkeys(gate.name for result in _results for gate in result.gates)
-    columns = ["job", "overrides", *names, "status"]
-    rows = [
-        {gate.name: f"{gate.status}: {gate.reason}" for gate in result.gates}
-        | {"job": str(job), "overrides": " ".join(result.overrides), "status": result.status}
-        for job, result in enumerate(_results)
-    ]
-    jobs = max(count, len(rows))
-    title = f"sweep of {jobs} job{'s' if jobs > 1 else ''}"
-    table = Table.of({name: name for name in columns}, rows, title)
-    Console().print(table.to_console())
-    if len(rows) > 1:
-        write_atomic(folder / "summary.md", "\n".join(table.to_markdown()) + "\n")
-        Console(soft_wrap=True).print(f"summary: {folder}/summary.md")

@@ -28,6 +28,7 @@ _JOIN = timedelta(minutes=5)  # until all ranks must have joined
 _WORK = timedelta(days=30)  # a rank may wait for another one's whole gate
 _GRACE = 10.0  # s, in which a rank that has gone leaves its reason
 _KEY = "mjstack"
+_KILLED = " was killed"
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,18 +93,21 @@ class Ranks:
         """
         if self.size == 1:
             return [value]
-        found: list[Any] = [None] * self.size
+        values: list[Any] = [None] * self.size
         try:
-            dist.all_gather_object(found, value)
+            dist.all_gather_object(values, value)
         except RuntimeError as error:
-            raise self._gone(self._wait_for_lost(), error) from error
-        return found
+            until = time.monotonic() + _GRACE
+            while not (lost := self.lost()) and time.monotonic() < until:
+                time.sleep(0.1)
+            raise self._gone(lost, error) from error
+        return values
 
     def alike(self, work: Callable[[], T]) -> T:
         """The result of work that every rank does for itself, as `in_all`."""
-        kept: list[T] = []
-        self.in_all(lambda: kept.append(work()))
-        return kept[0]
+        results: list[T] = []
+        self.in_all(lambda: results.append(work()))
+        return results[0]
 
     def from_first(self, work: Callable[[], T]) -> T:
         """The result of work that rank 0 alone does, in every rank.
@@ -111,8 +115,8 @@ class Ranks:
         Raises:
             RankError: It failed there, in the other ranks.
         """
-        mine: Callable[[], Any] = work if self.writes else lambda: None
-        return self.in_all(mine)[0]
+        first: Callable[[], Any] = work if self.writes else lambda: None
+        return self.in_all(first)[0]
 
     def in_all(self, work: Callable[[], T]) -> list[T]:
         """The results of work that every rank does, by rank. If it fails in one, it fails in all.
@@ -123,20 +127,20 @@ class Ranks:
         if self.size == 1:
             return [work()]
         result: Any = None
-        own = text = None
+        failure = text = None
         try:
             result = work()
         except (Exception, SystemExit) as error:
-            own = error
+            failure = error
             text = describe_error(error, "MJSTACK_DEBUG=1 shows the traceback")
-        found = self.gather((text, result))
-        failed = [rank for rank, (problem, _) in enumerate(found) if problem is not None]
+        problems, results = zip(*self.gather((text, result)), strict=True)
+        failed = [rank for rank, problem in enumerate(problems) if problem is not None]
         if not failed:
-            return [each for _, each in found]
-        if own is not None and self.writes:
-            raise own
+            return list(results)
+        if failure is not None and self.writes:
+            raise failure
         who = "" if 0 in failed else f"rank {failed[0]} of {self.size}: "
-        raise RankError(f"{who}{found[failed[0]][0]}", told=not self.writes) from own
+        raise RankError(f"{who}{problems[failed[0]]}", printed=not self.writes) from failure
 
     def cause(self, error: BaseException) -> BaseException:
         """The error behind one that has ended this rank's work: torchrun stops the others where one
@@ -150,54 +154,41 @@ class Ranks:
 
     def end(self, problem: str = "") -> None:
         """Leave word for the other ranks of how this one ended."""
-        if _store is not None:
-            with suppress(Exception):  # the rank that has the store may be gone
-                _store.set(f"{_KEY}/ended/{self.rank}", problem)
+        with suppress(Exception):  # the rank that has the store may be gone
+            _store.set(f"{_KEY}/ended/{self.rank}", problem)
 
     def lost(self) -> str:
         """Why another rank has gone before its work was done; empty if none is known to be."""
-        if _store is None:
-            return ""
-        for rank in range(self.size):
-            with suppress(Exception):
-                if rank == self.rank or not _store.check([f"{_KEY}/place/{rank}"]):
-                    continue
-                if process := self._killed(rank):
-                    return f"rank {rank} of {self.size} ({process}) was killed"
-                ended = f"{_KEY}/ended/{rank}"
-                if _store.check([ended]) and (problem := _store.get(ended).decode()):
-                    host = _store.get(f"{_KEY}/place/{rank}").decode().split()[0]
-                    return f"rank {rank} of {self.size} ({host}) failed: {problem}"
+        return next(filter(None, map(self._loss_of, range(self.size))), "")
+
+    def _loss_of(self, rank: int) -> str:
+        """Why a rank has gone before its work was done; empty if it is not known to be."""
+        place = f"{_KEY}/place/{rank}"
+        ended = f"{_KEY}/ended/{rank}"
+        with suppress(Exception):  # there is no store, or the rank that has it may be gone
+            if rank != self.rank and _store.check([place]):
+                host, pid = _store.get(place).decode().split()
+                # A rank that concludes says so before its process ends.
+                dead = host == socket.gethostname() and not _alive(int(pid))
+                who = f"rank {rank} of {self.size} ({host}"
+                if not _store.check([ended]):
+                    return f"{who}, process {pid}){_KILLED}" if dead else ""
+                if problem := _store.get(ended).decode():
+                    return f"{who}) failed: {problem}"
         return ""
 
-    def _killed(self, rank: int) -> str:
-        """Host and process of a rank of this machine that has ended without a word."""
-        host, pid = _store.get(f"{_KEY}/place/{rank}").decode().split()
-        # A rank that concludes says so before its process ends.
-        dead = host == socket.gethostname() and not _alive(int(pid))
-        silent = dead and not _store.check([f"{_KEY}/ended/{rank}"])
-        return f"{host}, process {pid}" if silent else ""
-
     def _gone(self, lost: str, error: BaseException) -> RankError:
-        """The error of a rank that has gone: the lowest one that was not killed tells the user.
+        """The error of a rank that has gone: the lowest one that was not killed prints it.
 
         Args:
             lost: Why it has gone; empty if that is not known.
             error: The error in which this rank has seen it.
         """
-        told = False
-        with suppress(Exception):  # the rank that has the store may be gone
-            told = bool(lost) and not all(self._killed(rank) for rank in range(self.rank))
+        lower = map(self._loss_of, range(self.rank))
+        printed = bool(lost) and not all(loss.endswith(_KILLED) for loss in lower)
         return RankError(
-            lost or f"another rank has gone ({first_line(error)})", told=told, gone=True
+            lost or f"another rank has gone ({first_line(error)})", printed=printed, gone=True
         )
-
-    def _wait_for_lost(self) -> str:
-        """Why ranks cannot talk any more, if that is known in time."""
-        until = time.monotonic() + _GRACE
-        while not (found := self.lost()) and time.monotonic() < until:
-            time.sleep(0.1)
-        return found
 
 
 _current = Ranks()
@@ -213,7 +204,7 @@ def _alive(pid: int) -> bool:
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
     except OSError:
-        return not Path("/proc/self/stat").exists()  # a system that does not tell
+        return not Path("/proc/self/stat").exists()  # a system without it
     return state not in "ZX"
 
 

@@ -81,12 +81,8 @@ class ConfigError(KeyedError):
     """A value in the configuration cannot be used."""
 
     def __init__(self, key: str, value: object, expected: str, fix: str = "") -> None:
-        shown = json.dumps(value) if value is None or isinstance(value, bool) else value
-        super().__init__(key, f"={shown}: expected {expected}", fix)
-
-
-class CompositionError(MjstackError):
-    """Overrides do not fit the configuration files."""
+        text = json.dumps(value) if value is None or isinstance(value, bool) else value
+        super().__init__(key, f"={text}: expected {expected}", fix)
 
 
 class UnknownName(MjstackError):
@@ -96,42 +92,26 @@ class UnknownName(MjstackError):
         super().__init__(f"{what} '{name}' does not exist. {suggest(name, available)}")
 
 
-class SourceError(MjstackError):
-    """A robot description that cannot be fetched, found or read."""
-
-
 class DeviceError(MjstackError):
     """A compute device that was asked for and is not there."""
-
-
-class RunError(MjstackError):
-    """The folder of an earlier run that cannot be read, or has not what is asked for."""
-
-
-class PolicyError(MjstackError):
-    """A policy's folder that cannot be read, or that was trained for something else."""
 
 
 class RankError(MjstackError):
     """Another process of the job has failed or gone.
 
     Attributes:
-        told: Whether another rank tells the user.
+        printed: Whether another rank prints it.
         gone: Whether it cannot be waited for any more.
     """
 
-    def __init__(self, problem: str, *, told: bool = False, gone: bool = False) -> None:
+    def __init__(self, problem: str, *, printed: bool = False, gone: bool = False) -> None:
         super().__init__(problem)
-        self.told = told
+        self.printed = printed
         self.gone = gone
 
 
 class FolderError(MjstackError):
-    """A folder that has another run, or that another process is writing."""
-
-
-class UnsupportedModel(MjstackError):
-    """A backend does not implement a feature of the model."""
+    """The folder of a run, a policy or a dataset that cannot be read, written or gone on with."""
 
 
 class TermError(KeyedError):
@@ -142,13 +122,7 @@ class TermError(KeyedError):
 
 
 class ParameterError(ConfigError):
-    """A value that a term cannot use, by the parameter's name; its manager raises a `ConfigError`
-    of the whole key.
-    """
-
-    def __init__(self, key: str, value: object, expected: str, fix: str = "") -> None:
-        super().__init__(key, value, expected, fix)
-        self.facts = (value, expected, fix)
+    """A value that a term cannot use, by the parameter's name; its manager names the whole key."""
 
 
 class FaultError(MjstackError):
@@ -176,40 +150,11 @@ class Unreachable(MjstackError):
         )
 
 
-class RebindError(MjstackError):
-    """A view of a simulation, such as ``sim.qpos``, was assigned to instead of written into."""
-
-    def __init__(self, view: str) -> None:
-        super().__init__(
-            f"{view} is a view of the simulation's memory and cannot be rebound: write {view}[:] ="
-            " ... instead."
-        )
-
-
 class ArgumentError(MjstackError):
     """An argument of a function cannot be used."""
 
-    def __init__(self, name: str, found: object, expected: str, fix: str = "") -> None:
-        super().__init__(f"{name}: found {found}, expected {expected}", fix)
-
-
-class DatasetError(MjstackError):
-    """A dataset of demonstrations that cannot be opened or read, or an episode that does not fit
-    into it.
-    """
-
-
-class UnwrittenError(MjstackError):
-    """A dataset that could not be written any further, such as on a full disk, and the number of
-    episodes that were committed before.
-    """
-
-    def __init__(self, folder: str, error: OSError, kept: int) -> None:
-        super().__init__(
-            f"{folder}: cannot be written ({error.strerror or error}): {kept} committed episodes"
-            " are kept, those added since are not. Make room or correct it, and do the same again:"
-            " it goes on after the last one kept."
-        )
+    def __init__(self, name: str, value: object, expected: str, fix: str = "") -> None:
+        super().__init__(f"{name}: found {value}, expected {expected}", fix)
 
 
 class MissingExtra(MjstackError):
@@ -254,6 +199,6 @@ def name_worlds(
     worlds: Sequence[int | str], nworld: int, limit: int = 8, what: str = "worlds"
 ) -> str:
     """Say how many worlds and name the first ones: ``17 of 4096 worlds (first: 3, 41, 96)``."""
-    shown = ", ".join(str(w) for w in worlds[:limit])
+    first = ", ".join(str(w) for w in worlds[:limit])
     label = "first: " if len(worlds) > limit else ""
-    return f"{len(worlds)} of {nworld} {what} ({label}{shown})"
+    return f"{len(worlds)} of {nworld} {what} ({label}{first})"

@@ -21,13 +21,12 @@ _KEY = "hydra.run.dir (job=collect, job=train: job.folder)"
 
 
 @contextmanager
-def reading(path: Path, kind: type[MjstackError], fix: str) -> Iterator[None]:
+def reading(path: Path, fix: str) -> Iterator[None]:
     """Raise one line for a file that is missing or damaged: one of a run's folder, which may be a
     stranger's, can hold anything.
 
     Args:
         path: The file that is read inside.
-        kind: Class of the error.
         fix: What to do about it, a sentence without its full stop.
 
     Raises:
@@ -38,9 +37,11 @@ def reading(path: Path, kind: type[MjstackError], fix: str) -> Iterator[None]:
     except MjstackError:
         raise
     except Exception as error:
-        reason = getattr(error, "strerror", None)
-        reason = reason or f"{type(error).__name__}: {first_line(error)}"
-        raise kind(f"{path}: cannot be read ({reason}), expected it as written", fix) from error
+        text = f"{type(error).__name__}: {first_line(error)}"
+        reason = getattr(error, "strerror", None) or text
+        raise FolderError(
+            f"{path}: cannot be read ({reason}), expected it as written", fix
+        ) from error
 
 
 def write_atomic(path: Path, content: str | bytes) -> None:
@@ -85,7 +86,7 @@ def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
 def claim_folder(
     folder: Path,
     job: str = "",
-    own: str = "",
+    marker: str = "",
     *,
     numbered: bool = False,
     key: str = _KEY,
@@ -96,7 +97,7 @@ def claim_folder(
     Args:
         folder: The folder.
         job: As of `check_unused`.
-        own: As of `check_unused`.
+        marker: As of `check_unused`.
         numbered: Where the folder is there, make another: its name and ``-2``, ``-3``, ...
         key: As of `check_unused`.
 
@@ -108,32 +109,29 @@ def claim_folder(
     """
     name = folder.name
     handle = None
-    before = None
     made: list[Path] = []
     try:
         for number in itertools.count(2):
             missing = [path for path in (folder, *folder.parents) if not path.exists()]
             try:
-                folder.mkdir(parents=True)
+                folder.mkdir(parents=True, exist_ok=not numbered)
                 made = missing
                 break
             except FileExistsError:
-                if not numbered and folder.is_dir():
-                    break
                 if not numbered:
                     raise
             folder = folder.with_name(f"{name}-{number}")
         handle = lock_folder(folder)
-        check_unused(folder, job, own, key)
         before = {*folder.iterdir()}
+        check_unused(folder, job, marker, key)
         yield folder
     except BaseException as error:
-        with suppress(OSError):  # something stays
-            new = {*folder.iterdir()} - before if before is not None else set()
-            if all(path.name == ".hydra" or path.suffix == ".log" for path in new):  # Hydra's
-                for path in new:
-                    (shutil.rmtree if path.name == ".hydra" else os.remove)(path)
-            if handle is not None:  # else it is another process's
+        if handle is not None:  # else it is another process's
+            with suppress(OSError):  # something stays
+                new = {*folder.iterdir()} - before
+                if all(path.name == ".hydra" or path.suffix == ".log" for path in new):  # Hydra's
+                    for path in new:
+                        (shutil.rmtree if path.name == ".hydra" else os.remove)(path)
                 for path in made:
                     path.rmdir()
         if not isinstance(error, OSError):
@@ -147,7 +145,7 @@ def claim_folder(
             os.close(handle)
 
 
-def check_unused(folder: Path, job: str = "", own: str = "", key: str = _KEY) -> None:
+def check_unused(folder: Path, job: str = "", marker: str = "", key: str = _KEY) -> None:
     """Check that no run has begun in a folder, or one that a job goes on with.
 
     Before a run begins there are only logs and Hydra's files, perhaps half-written.
@@ -155,7 +153,7 @@ def check_unused(folder: Path, job: str = "", own: str = "", key: str = _KEY) ->
     Args:
         folder: The folder, which need not be there.
         job: As report.json names a job that goes on with the run; empty if none may.
-        own: A file by which the job knows its folder even without the report.
+        marker: A file by which the job knows its folder even without the report.
         key: Configuration key that names another folder.
 
     Raises:
@@ -171,7 +169,7 @@ def check_unused(folder: Path, job: str = "", own: str = "", key: str = _KEY) ->
             )
     names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
     used = sorted(name for name in names if name != ".hydra" and not name.endswith(".log"))
-    if not used or own in names:
+    if not used or marker in names:
         return
     with suppress(OSError, ValueError, KeyError, TypeError):
         if job and json.loads((folder / "report.json").read_text())["resumes"] == job:
@@ -182,8 +180,9 @@ def check_unused(folder: Path, job: str = "", own: str = "", key: str = _KEY) ->
     )
 
 
-def lock_folder(folder: Path) -> int:
-    """A descriptor that keeps other writers out until it is closed, also by the end of the process.
+def lock_folder(folder: Path, *, shared: bool = False) -> int:
+    """A descriptor that keeps other writers out until it is closed, also by the end of the process;
+    or, if it is shared, those that would have the folder alone.
 
     Raises:
         FolderError: Another writer has the folder.
@@ -191,7 +190,7 @@ def lock_folder(folder: Path) -> int:
     """
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(handle, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError as error:
         os.close(handle)
         raise FolderError(

@@ -70,8 +70,8 @@ def quat_z_row(quat: torch.Tensor) -> torch.Tensor:
 def _z_row_constants(device: torch.device, dtype: torch.dtype) -> tuple[torch.Tensor, ...]:
     """The constants of `quat_z_row`, copied once: a captured step may not copy from the host."""
     with torch.inference_mode(False):
-        columns = (each.to(device) for each in (_Z_ROW_LEFT, _Z_ROW_RIGHT))
-        return (*columns, *(each.to(device, dtype) for each in (_Z_ROW_SIGNS, _Z_ROW_ADDED)))
+        columns = (part.to(device) for part in (_Z_ROW_LEFT, _Z_ROW_RIGHT))
+        return (*columns, *(part.to(device, dtype) for part in (_Z_ROW_SIGNS, _Z_ROW_ADDED)))
 
 
 def quat_to_matrix(quat: torch.Tensor) -> torch.Tensor:
@@ -136,10 +136,10 @@ def not_finite(*parts: torch.Tensor) -> torch.Tensor:
     """
     if not parts[0].is_cuda and all_finite(*parts):
         return torch.zeros(len(parts[0]), dtype=torch.bool, device=parts[0].device)
-    # 0 times a number that is not finite is NaN, which a sum keeps. It takes fewer kernels than to
-    # ask each number.
-    first, *others = ((part * 0.0).sum(1) for part in parts)
-    return sum(others, first) != 0.0
+    # 0 times a number that is not finite is NaN, which a sum keeps. It takes fewer kernels than a
+    # test of each number.
+    first, *more = ((part * 0.0).sum(1) for part in parts)
+    return sum(more, first) != 0.0
 
 
 def all_finite(*parts: torch.Tensor) -> bool:

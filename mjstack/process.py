@@ -1,9 +1,19 @@
-"""Processes of one command: those that it starts, and those that it is one of."""
+"""Processes of one command: those that it is one of, and those that it starts, follows and ends."""
 
 import os
+import signal
+import subprocess
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
+from typing import IO
+
+from mjstack.interrupt import check_interrupt
+
+POLL = 0.1  # s, between two looks at processes
+_GRACE = 30.0  # s, in which an interrupted process must have ended
 
 # The working folder is not imported from (-P), only the folder that has this mjstack. On Linux the
 # process ends with the one that started it (PR_SET_PDEATHSIG), which a second Ctrl-C ends at once.
@@ -22,3 +32,72 @@ def is_rank() -> bool:
 def own_command(args: Sequence[str]) -> list[str]:
     """The command that runs this mjstack with some arguments, in a process of its own."""
     return [sys.executable, "-P", "-c", _START, *args]
+
+
+class Child(subprocess.Popen[bytes]):
+    """This mjstack in a process of its own, which outlives the call that starts it."""
+
+    def __init__(
+        self,
+        args: Sequence[str],
+        log: IO[bytes],
+        *,
+        env: Mapping[str, str] | None = None,
+        cores: Collection[int] = (),
+        folder: Path | None = None,
+    ) -> None:
+        """Start it.
+
+        Args:
+            args: Arguments of the command.
+            log: Gets its output.
+            env: Environment variables, besides those of this process.
+            cores: The cores that it may use; all if empty.
+            folder: Its working folder; by default that of this process.
+        """
+        self._began = time.monotonic()
+        super().__init__(
+            own_command(args),
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            env=os.environ | dict(env or {}),
+            cwd=folder,
+            start_new_session=True,  # Ctrl-C of the terminal comes through this process
+        )
+        if cores:
+            with suppress(OSError):  # it may have ended
+                os.sched_setaffinity(self.pid, cores)
+
+    @property
+    def seconds(self) -> float:
+        """Time since it started."""
+        return time.monotonic() - self._began
+
+    def follow(self) -> int:
+        """Wait until it ends, and return its exit status. It is stopped if this is left earlier.
+
+        Raises:
+            KeyboardInterrupt: The command was interrupted.
+        """
+        try:
+            while (code := self.poll()) is None:
+                check_interrupt()
+                time.sleep(POLL)
+            return code
+        finally:
+            stop_all([self])
+
+
+def stop_all(children: Collection[Child]) -> None:
+    """Interrupt processes, wait for them, and kill those that go on for too long."""
+    for child in children:
+        with suppress(OSError):
+            child.send_signal(signal.SIGINT)
+    until = time.monotonic() + _GRACE
+    for child in children:
+        try:
+            child.wait(max(0.0, until - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            child.kill()
+            child.wait()

@@ -48,40 +48,39 @@ def philox(counter: np.ndarray, key: tuple[int, int]) -> np.ndarray:
 
 
 def uniform(
-    *,
     seed: int,
+    stream: int,
     world: torch.Tensor,
     episode: torch.Tensor,
-    step: torch.Tensor,
-    stream: int,
+    step: torch.Tensor | None,
     size: int,
 ) -> torch.Tensor:
     """Uniform numbers in [-1, 1).
 
     Args:
         seed: The run's seed, a non-negative integer; its low 32 bits are used.
+        stream: Number of the consumer, so that two consumers never share a draw.
         world: World indices, shape ``(n,)``, int64.
         episode: Episode of each world, shape ``(n,)``, int64.
-        step: Step within the episode, shape ``(n,)``, int64.
-        stream: Number of the consumer, so that two consumers never share a draw.
+        step: Step within the episode, shape ``(n,)``, int64; 0 if None.
         size: How many numbers each world gets.
 
     Returns:
         Shape ``(n, size)``, float32.
     """
     blocks = -(-size // 4)
-    counter = np.empty((4, world.shape[0], blocks), dtype=np.uint64)
+    counter = np.zeros((4, world.shape[0], blocks), dtype=np.uint64)
     for word, numbers in zip(counter, (world, episode, step), strict=False):
-        word[:] = (numbers.cpu().numpy() & _MASK)[:, None]
+        if numbers is not None:
+            word[:] = (numbers.cpu().numpy() & _MASK)[:, None]
     counter[3] = np.arange(blocks)
     words = philox(counter.reshape(4, -1), (seed & _MASK, stream & _MASK))
     # 24 bits fill a float32 mantissa exactly, so that no rounding can reach 1.
     words >>= np.uint64(8)
-    drawn = np.empty((world.shape[0], blocks, 4), dtype=np.float32)
-    drawn[:] = np.moveaxis(words.reshape(counter.shape), 0, -1)
-    drawn *= np.float32(2.0 / (1 << 24))
-    drawn -= np.float32(1.0)
-    return torch.from_numpy(drawn.reshape(-1, 4 * blocks)[:, :size]).to(world.device)
+    out = np.moveaxis(words.reshape(counter.shape), 0, -1).astype(np.float32, order="C")
+    out *= np.float32(2.0 / (1 << 24))
+    out -= np.float32(1.0)
+    return torch.from_numpy(out.reshape(-1, 4 * blocks)[:, :size]).to(world.device)
 
 
 def check_seed(seed: int, *, masked: bool) -> int:

@@ -11,10 +11,8 @@ iterations with so many worlds on each GPU, and ``sweep`` runs eight batches of 
 import argparse
 import json
 import statistics
-import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +20,11 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from mjstack.files import write_atomic  # noqa: E402
-from mjstack.process import own_command  # noqa: E402
+from mjstack.process import Child  # noqa: E402
+from mjstack.report.markdown import to_markdown  # noqa: E402
 from mjstack.report.picture import figure  # noqa: E402
-from mjstack.report.table import Console, Table, to_document  # noqa: E402
+from mjstack.report.sections import Section  # noqa: E402
+from mjstack.report.table import Console, Table  # noqa: E402
 
 SPEEDS = {
     "physics": "physics.world_steps_per_s.median",
@@ -56,13 +56,14 @@ def measure(what: str, worlds: int, gpus: int, args: argparse.Namespace) -> Run:
         elif what in ("weak", "strong"):
             command += ["gates=[batch,throughput]", "gate.throughput.native_baseline=false"]
             command += [f"hydra.run.dir={folder}"]
-        began = time.perf_counter()
-        done = subprocess.run(own_command(command), capture_output=True, text=True, cwd=place)
-        run: Run = {"seconds": time.perf_counter() - began, "status": done.returncode}
+        with (Path(place) / "output.log").open("wb") as output:
+            child = Child(command, output, folder=Path(place))
+            run: Run = {"status": child.follow(), "seconds": child.seconds}
         try:
             run |= read(what, folder, gpus, run["seconds"])
         except (OSError, KeyError, ValueError, IndexError) as error:
-            run["error"] = f"{error!r}: {(done.stderr or done.stdout).strip()[-400:]}"
+            text = (Path(place) / "output.log").read_text(errors="replace")
+            run["error"] = f"{error!r}: {text.strip()[-400:]}"
         return run
 
 
@@ -79,43 +80,43 @@ def read(what: str, folder: Path, gpus: int, seconds: float) -> dict[str, float]
     metrics = {gate["name"]: gate["metrics"] for gate in gates if gate["status"] != "skip"}
     batch = metrics["batch"]
     speed = metrics.get("throughput_cuda") or metrics["throughput"]
-    found = {"succeeded": batch["succeeded"], "episodes": batch["episodes"]}
+    figures = {"succeeded": batch["succeeded"], "episodes": batch["episodes"]}
     if "world_steps_per_s" in batch:  # void where worlds failed
-        found["batch"] = batch["world_steps_per_s"]
+        figures["batch"] = batch["world_steps_per_s"]
     for name, key in SPEEDS.items():
         key = f"all_ranks.{key}" if gpus > 1 else key
         if key in speed:
-            found[name] = speed[key]
-    return found
+            figures[name] = speed[key]
+    return figures
 
 
 def rows_of(runs: list[Run]) -> list[dict[str, Any]]:
     """A row for each measurement and figure: N GPUs over one, by neighbouring runs."""
     rows = []
     for what, worlds in dict.fromkeys((run["what"], run["worlds"]) for run in runs):
-        mine = [run for run in runs if (run["what"], run["worlds"]) == (what, worlds)]
-        for gpus in sorted({run["gpus"] for run in mine} - {1}):
-            names = dict.fromkeys(name for run in mine for name in run if name in FIGURES)
+        group = [run for run in runs if (run["what"], run["worlds"]) == (what, worlds)]
+        for gpus in sorted({run["gpus"] for run in group} - {1}):
+            names = dict.fromkeys(name for run in group for name in run if name in FIGURES)
             for name in names:
                 pairs = [
-                    (one[name], many[name])
-                    for one in mine
-                    for many in mine
-                    if (one["gpus"], many["gpus"]) == (1, gpus)
-                    and one["round"] == many["round"]
-                    and name in one
-                    and name in many
+                    (single[name], several[name])
+                    for single in group
+                    for several in group
+                    if (single["gpus"], several["gpus"]) == (1, gpus)
+                    and single["round"] == several["round"]
+                    and name in single
+                    and name in several
                 ]
                 if pairs:
-                    ratios = sorted(many / one for one, many in pairs)
+                    ratios = sorted(large / small for small, large in pairs)
                     rows.append(
                         {
                             "what": what,
                             "worlds": worlds,
                             "gpus": gpus,
                             "figure": name,
-                            "one": statistics.median(one for one, _ in pairs),
-                            "many": statistics.median(many for _, many in pairs),
+                            "one": statistics.median(small for small, _ in pairs),
+                            "many": statistics.median(large for _, large in pairs),
                             "ratio": statistics.median(ratios),
                             "range": f"{ratios[0]:.3f} to {ratios[-1]:.3f}",
                             "rounds": len(pairs),
@@ -149,8 +150,9 @@ def write(folder: Path, runs: list[Run]) -> None:
             axes.axvline(1.0, color="0.3", linewidth=1.0)
             axes.set(xlabel="ratio over the number of GPUs (1: perfect)")
             axes.grid(alpha=0.3, axis="x")
-        pictures = ["many.png"]
-    write_atomic(folder / "many.md", to_document("N GPUs over one", [table], pictures=pictures))
+        pictures = [folder / "many.png"]
+    section = Section(title="N GPUs over one", parts=[table, *pictures], level=1)
+    write_atomic(folder / "many.md", to_markdown([section]))
 
 
 def main() -> None:

@@ -4,13 +4,15 @@ checker or for alterations.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 from box_checker import BLUE, RED, BoxOutcome, BoxRecording, check_box_world
 from check_cases import STOPPED_EARLY, limits
@@ -19,10 +21,9 @@ from environments import StubViews, at_double_speed
 
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
-from mjstack.episodes.context import RunContext
 from mjstack.episodes.failures import FailureMonitor
-from mjstack.episodes.rollout import Episode, Observer, Reset
-from mjstack.sim import Simulation
+from mjstack.episodes.rollout import Episode, Observer, play_episode
+from mjstack.episodes.stage import Stage
 from mjstack.tasks.check import CheckResult, make_check
 
 NAMES = ("red", "blue")
@@ -34,60 +35,53 @@ Disturb = Callable[[Env, str], None]
 class Recorder(Observer):
     """Keeps every world's state and phase at every step end."""
 
-    def __init__(
-        self, context: RunContext, observers: Sequence[Observer], disturb: Disturb | None
-    ) -> None:
-        self.context = context
-        self._observers = observers
+    def __init__(self, names: list[str], disturb: Disturb | None) -> None:
+        self._names = names
         self._disturb = disturb
-        self._names = [phase.name for phase in context.planner.phases]
         self._rows: dict[str, list[np.ndarray]] = {name: [] for name in (*STATE, "phase")}
 
     def start(self, env: Env, driver: Driver) -> None:
-        self._env = env
+        super().start(env, driver)
         self._driver = driver
 
     def after_step(self, step: int) -> None:
         for name in STATE:
-            self._rows[name].append(getattr(self._env.sim, name).double().cpu().numpy().copy())
+            self._rows[name].append(getattr(self.env.sim, name).double().cpu().numpy().copy())
         phase = self._driver.phase.cpu().numpy().copy()
         self._rows["phase"].append(phase)
         if self._disturb is not None:
-            self._disturb(self._env, self._names[phase[-1]])
+            self._disturb(self.env, self._names[phase[-1]])
 
-    def recording(self, sim: Simulation, episode: Episode) -> SimpleNamespace:
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Rows of all steps, and what a world ends with."""
+        sim = self.env.sim
         sim.kinematics()
-        ends = {
-            name: getattr(sim, name).cpu().numpy().copy()
-            for name in ("xpos", "xquat", "step_count", "overflow")
+        ends = ("xpos", "xquat", "step_count", "overflow")
+        return {name: np.stack(rows, 1) for name, rows in self._rows.items()} | {
+            name: getattr(sim, name).cpu().numpy().copy() for name in ends
         }
-        rows = {name: np.stack(kept, 1) for name, kept in self._rows.items()}
-        return SimpleNamespace(
-            context=self.context,
-            episode=episode,
-            result=episode.result,
-            watch=next((o for o in self._observers if isinstance(o, FailureMonitor)), None),
-            **rows,
-            **ends,
-        )
 
 
-@dataclass(eq=False)
-class RecordingContext(RunContext):
-    """A gate context that records the episodes that it plays; so does one that a gate derives from
-    it.
-    """
-
-    disturb: Disturb | None = None
-    recordings: list[SimpleNamespace] = field(default_factory=list)
+@contextmanager
+def recording(stage: Stage, disturb: Disturb | None = None) -> Iterator[list[SimpleNamespace]]:
+    """Recordings of the episodes that the stage, or one that a gate derives from it, plays."""
+    recordings: list[SimpleNamespace] = []
+    names = [phase.name for phase in stage.planner.phases]
 
     def play(
-        self, sim: Simulation, reset: Reset, observers: Sequence[Observer] = (), **kwargs: Any
+        env: Env, driver: Driver, observers: Sequence[Observer] = (), **kwargs: Any
     ) -> Episode:
-        recorder = Recorder(self, observers, self.disturb)
-        episode = super().play(sim, reset, [*observers, recorder], **kwargs)
-        self.recordings.append(recorder.recording(sim, episode))
+        recorder = Recorder(names, disturb)
+        episode = play_episode(env, driver, [*observers, recorder], **kwargs)
+        watch = next((o for o in observers if isinstance(o, FailureMonitor)), None)
+        views = {"episode": episode, "result": episode.result, "watch": watch}
+        recordings.append(SimpleNamespace(stage=stage, **views, **recorder.arrays()))
         return episode
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in ("stage", "batches"):
+            patch.setattr(f"mjstack.episodes.{module}.play_episode", play)
+        yield recordings
 
 
 def _overrides(robot: str) -> list[str]:
@@ -97,20 +91,13 @@ def _overrides(robot: str) -> list[str]:
 
 
 @cache
-def base_context(robot: str) -> RunContext:
-    return RunContext(cfg=load_config(_overrides(robot)))
+def base_stage(robot: str) -> Stage:
+    return Stage(load_config(_overrides(robot)))
 
 
-def recording_context(
-    robot: str, *overrides: str, disturb: Disturb | None = None
-) -> RecordingContext:
-    """For overrides that change neither scene nor plan: both are shared by the robot's contexts."""
-    base = base_context(robot)
-    return RecordingContext(
-        cfg=load_config([*_overrides(robot), *overrides]),
-        stage=base.stage,
-        disturb=disturb,
-    )
+def faster_stage(robot: str, *overrides: str) -> Stage:
+    """For overrides that change neither scene nor plan: both are shared by the robot's stages."""
+    return Stage(load_config([*_overrides(robot), *overrides]), base_stage(robot).assets)
 
 
 def put_cube(env: Env, cube: int, place: list[float] | np.ndarray) -> None:
@@ -127,7 +114,7 @@ def put_cube(env: Env, cube: int, place: list[float] | np.ndarray) -> None:
 class World:
     """A recorded world, to be checked or altered."""
 
-    context: RunContext
+    stage: Stage
     phase: np.ndarray
     qpos: np.ndarray
     qvel: np.ndarray
@@ -140,61 +127,57 @@ class World:
     @classmethod
     def of(cls, rec: SimpleNamespace, k: int = 0) -> World:
         arrays = {n: getattr(rec, n)[k].copy() for n in (*STATE, "phase", "xpos", "xquat")}
-        return cls(
-            context=rec.context,
-            step_count=int(rec.step_count[k]),
-            overflow=int(rec.overflow[k]),
-            **arrays,
-        )
+        counts = {name: int(getattr(rec, name)[k]) for name in ("step_count", "overflow")}
+        return cls(stage=rec.stage, **counts, **arrays)
 
     @property
     def t(self) -> Any:
         """Thresholds."""
-        return limits(self.context.cfg)
+        return limits(self.stage.cfg)
 
     def steps(self, *names: str) -> np.ndarray:
         """Numbers of the steps of some phases."""
-        numbers = [i for i, p in enumerate(self.context.planner.phases) if p.name in names]
+        numbers = [i for i, p in enumerate(self.stage.planner.phases) if p.name in names]
         return np.flatnonzero(np.isin(self.phase, numbers))
 
     @property
     def order(self) -> list[str]:
         """Names of the phases in the order in which they were gone through."""
         first = np.flatnonzero(np.diff(self.phase, prepend=-1))
-        return [self.context.planner.phases[number].name for number in self.phase[first]]
+        return [self.stage.planner.phases[number].name for number in self.phase[first]]
 
     def pose(self, cube: int) -> np.ndarray:
         """A view of a cube's pose, shape ``(steps, 7)``."""
-        at = self.context.index.object_qpos[cube]
+        at = self.stage.index.object_qpos[cube]
         return self.qpos[:, at : at + 7]
 
     def velocity(self, cube: int) -> np.ndarray:
         """A view of its velocity, shape ``(steps, 6)``."""
-        at = self.context.index.object_qvel[cube]
+        at = self.stage.index.object_qvel[cube]
         return self.qvel[:, at : at + 6]
 
     def jaw(self, cube: int, jaw: int) -> np.ndarray:
         """A view of a jaw's force on it, shape ``(steps, 3)``."""
-        at = self.context.index.jaw_force[NAMES[cube]][jaw]
+        at = self.stage.index.jaw_force[NAMES[cube]][jaw]
         return self.sensordata[:, at : at + 3]
 
     def support(self, cube: int, number: int = 0) -> np.ndarray:
         """A view of the world's force on it, or of the other cube's, shape ``(steps, 3)``."""
-        at = self.context.index.support_force[NAMES[cube]][number]
+        at = self.stage.index.support_force[NAMES[cube]][number]
         return self.sensordata[:, at : at + 3]
 
     @property
     def gripper(self) -> np.ndarray:
         """A view of the gripper's first joint, shape ``(steps,)``."""
-        index = self.context.index
+        index = self.stage.index
         return self.qpos[:, index.robot_qpos[index.n_arm]]
 
     @property
     def recording(self) -> BoxRecording:
-        index = self.context.index
+        index = self.stage.index
         cubes = (RED, BLUE)
-        names = np.array([p.name for p in self.context.planner.phases])
-        ours = [c for a in index.object_qpos for c in range(a, a + 7)]
+        names = np.array([p.name for p in self.stage.planner.phases])
+        poses = [c for a in index.object_qpos for c in range(a, a + 7)]
         return BoxRecording(
             phase=names[self.phase],
             pose=np.stack([self.pose(c) for c in cubes], 1),
@@ -208,19 +191,19 @@ class World:
             xquat=self.xquat,
             step_count=self.step_count,
             overflow=bool(self.overflow & ~STOPPED_EARLY),
-            finite_elsewhere=bool(np.isfinite(np.delete(self.qpos, ours, axis=1)).all()),
+            finite_elsewhere=bool(np.isfinite(np.delete(self.qpos, poses, axis=1)).all()),
         )
 
     @property
     def outcome(self) -> BoxOutcome:
         """The verdict of the plain checker."""
-        return check_box_world(self.recording, self.context.cfg, self.context.model)
+        return check_box_world(self.recording, self.stage.cfg, self.stage.model)
 
     @property
     def outcome_without_phases(self) -> BoxOutcome:
         """The same of a driver without phases."""
         recording = replace(self.recording, phase=None)
-        return check_box_world(recording, self.context.cfg, self.context.model)
+        return check_box_world(recording, self.stage.cfg, self.stage.model)
 
 
 def feed(
@@ -229,36 +212,28 @@ def feed(
     """Plays recordings of one robot, equally long and with the same phases, through the check, as
     of a driver with phases or without.
     """
-    context = worlds[0].context
-    phases = context.planner.phases
+    stage = worlds[0].stage
+    phases = stage.planner.phases
     stacked = {name: np.stack([getattr(w, name) for w in worlds]) for name in (*STATE, "phase")}
-    ends = {
-        name: torch.tensor(np.stack([getattr(w, name) for w in worlds]), dtype=dtype)
-        for name in ("xpos", "xquat")
-    }
+    cpu = torch.device("cpu")
     sim = StubViews(
-        model=context.model,
-        device=torch.device("cpu"),
+        model=stage.model,
+        device=cpu,
         step_count=torch.tensor([w.step_count for w in worlds]),
         overflow=torch.tensor([w.overflow for w in worlds], dtype=torch.int32),
         kinematics=lambda: None,
-        **ends,
+        xpos=torch.tensor(np.stack([w.xpos for w in worlds]), dtype=dtype),
+        xquat=torch.tensor(np.stack([w.xquat for w in worlds]), dtype=dtype),
     )
-    env = SimpleNamespace(
-        sim=sim,
-        cfg=context.cfg,
-        index=context.index,
-        nworld=len(worlds),
-        device=torch.device("cpu"),
-        given_places={},
-    )
+    views = {"sim": sim, "cfg": stage.cfg, "index": stage.index}
+    env = SimpleNamespace(**views, nworld=len(worlds), device=cpu, given_places={})
 
     def take(step: int) -> None:
         for name in STATE:
             setattr(sim, name, torch.tensor(stacked[name][:, step], dtype=dtype))
 
     take(0)
-    check = make_check(context.cfg)
+    check = make_check(stage.cfg)
     check.start(env, phases[-1].stop, phases if phased else ())
     for step in range(stacked["phase"].shape[1]):
         take(step)

@@ -5,10 +5,11 @@ in a copy of it, as Hydra sets them. A composition takes half a second.
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any
 
+import pytest
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -19,13 +20,14 @@ from mjstack.config.load import compose, to_config
 from mjstack.config.schema import Config
 from mjstack.config.session import hydra_session, list_choices, without_hydra
 from mjstack.envs import Env, build_env
+from mjstack.errors import MjstackError
 from mjstack.tasks.check import make_check
 
 
 @cache
 def _choices(groups: tuple[str, ...]) -> DictConfig:
-    with hydra_session() as hydra:
-        return without_hydra(compose(hydra, groups))
+    with hydra_session():
+        return without_hydra(compose(groups))
 
 
 @cache
@@ -46,9 +48,8 @@ def _composed(overrides: tuple[str, ...]) -> Config:
 
 def load_config(overrides: Sequence[str] = ()) -> Config:
     """A copy of the result of `mjstack.load_config`."""
-    return copy.deepcopy(
-        _composed(tuple(o for o in overrides if o not in ("robot=so101", "task=stack")))
-    )
+    default = ("robot=so101", "task=stack")
+    return copy.deepcopy(_composed(tuple(o for o in overrides if o not in default)))
 
 
 def make_env(
@@ -59,10 +60,20 @@ def make_env(
     device: str | None = None,
 ) -> Env:
     """The result of `mjstack.make_env`."""
-    given = {"nworld": nworld, "seed": seed, "sim.device": device}
-    return build_env(
-        load_config([*overrides, *(f"{k}={v}" for k, v in given.items() if v is not None)])
-    )
+    arguments = {"nworld": nworld, "seed": seed, "sim.device": device}
+    values = [f"{key}={value}" for key, value in arguments.items() if value is not None]
+    return build_env(load_config([*overrides, *values]))
+
+
+def refusal(check: Callable[[], object], *words: str) -> str:
+    """The line in which something is refused before anything is written; it has some words."""
+    with pytest.raises(MjstackError) as caught:
+        check()
+    assert caught.value.exit_code == 2
+    message = str(caught.value)
+    assert "\n" not in message
+    assert [word for word in words if word not in message] == [], message
+    return message
 
 
 def put(cfg: Config, *overrides: str) -> Config:

@@ -9,14 +9,14 @@ import os
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import torch
 from compositions import load_config
+from environments import Keep
 
 from mjstack.config.schema import Backend, Config
-from mjstack.episodes.context import RunContext
-from mjstack.episodes.rollout import Hook
+from mjstack.episodes.run import Run
+from mjstack.episodes.stage import Stage
 from mjstack.sim import Simulation, make_simulation
 
 ROBOTS = ("so101", "rebot")
@@ -37,39 +37,37 @@ def _outside_the_checkout(tmp_path_factory: pytest.TempPathFactory) -> Iterator[
 
 
 @pytest.fixture(scope="session")
-def stage() -> Callable[..., RunContext]:
+def get_stage() -> Callable[..., Stage]:
     """Configuration, model, index and planner of a robot under some overrides, each made once in
     the session.
     """
-    made: dict[tuple[str, ...], RunContext] = {}
+    made: dict[tuple[str, ...], Stage] = {}
 
-    def get(robot: str, *overrides: str) -> RunContext:
+    def get(robot: str, *overrides: str) -> Stage:
         key = (f"robot={robot}", *overrides)
         if key not in made:
-            made[key] = RunContext(cfg=load_config(key))
+            made[key] = Stage(load_config(key))
         return made[key]
 
     return get
 
 
 @pytest.fixture(scope="session")
-def new_context(stage: Callable[..., RunContext]) -> Callable[..., RunContext]:
-    """A gate context of its own for some overrides that change neither scene nor, but for its
+def new_run(get_stage: Callable[..., Stage]) -> Callable[..., Run]:
+    """A run of its own for some overrides that change neither scene nor, but for its
     phases, plan: both are shared.
     """
 
-    def make(*overrides: str, robot: str = "so101") -> RunContext:
-        shared = stage(
-            robot,
-            *(override for override in overrides if override.startswith("controller.phases.")),
-        )
-        return RunContext(load_config([f"robot={robot}", *overrides]), shared.stage)
+    def make(*overrides: str, robot: str = "so101") -> Run:
+        phases = [text for text in overrides if text.startswith("controller.phases.")]
+        shared = get_stage(robot, *phases)
+        return Run(Stage(load_config([f"robot={robot}", *overrides]), shared.assets))
 
     return make
 
 
 @pytest.fixture(scope="session")
-def make_sim(stage: Callable[[str], RunContext]) -> Callable[..., Simulation]:
+def make_sim(get_stage: Callable[[str], Stage]) -> Callable[..., Simulation]:
     """Simulations by (backend, nworld, overrides), reset and shared by all tests: MJWarp's are slow
     to build.
     """
@@ -81,9 +79,8 @@ def make_sim(stage: Callable[[str], RunContext]) -> Callable[..., Simulation]:
             cfg = load_config([f"robot={robot}", *overrides])
             kind = Backend.native if backend == "native" else Backend.mjwarp
             device = "cuda:0" if backend == "mjwarp-cuda" else "cpu"
-            made[key] = make_simulation(
-                stage(robot).model, cfg, nworld, backend=kind, device=device
-            )
+            model = get_stage(robot).model
+            made[key] = make_simulation(model, cfg, nworld, backend=kind, device=device)
         made[key].reset()
         return made[key]
 
@@ -92,7 +89,7 @@ def make_sim(stage: Callable[[str], RunContext]) -> Callable[..., Simulation]:
 
 @pytest.fixture(scope="session")
 def recorded(
-    stage: Callable[[str], RunContext], make_sim: Callable[..., Simulation]
+    get_stage: Callable[[str], Stage], make_sim: Callable[..., Simulation]
 ) -> Callable[[str], SimpleNamespace]:
     """A native episode of four jittered worlds per robot: cube poses and velocities at every step
     end, and the result.
@@ -101,42 +98,11 @@ def recorded(
 
     def get(robot: str) -> SimpleNamespace:
         if robot not in made:
-            context = stage(robot)
+            stage = get_stage(robot)
             sim = make_sim("native", 4, robot=robot)
-            pose = []
-            velocity = []
-            force = []
-            gripper = []
-
-            def keep(_: int, sim: Simulation) -> None:
-                pose.append(
-                    np.stack(
-                        [sim.qpos[:, a : a + 7].numpy().copy() for a in context.index.object_qpos],
-                        1,
-                    )
-                )
-                velocity.append(
-                    np.stack(
-                        [sim.qvel[:, a : a + 6].numpy().copy() for a in context.index.object_qvel],
-                        1,
-                    )
-                )
-                force.append(sim.sensordata.numpy().copy())
-                fingers = context.index.robot_qpos[context.index.n_arm :]
-                gripper.append(sim.qpos[:, fingers].numpy().copy())
-
-            episode = context.play(sim, context.cfg.reset, [Hook(keep)])
-            made[robot] = SimpleNamespace(
-                pose=np.stack(pose, 1),
-                velocity=np.stack(velocity, 1),
-                force=np.stack(force, 1),
-                gripper=np.stack(gripper, 1),
-                jaw_force=context.index.jaw_force,
-                result=episode.result,
-                step_count=sim.step_count.numpy().copy(),
-                cfg=context.cfg,
-                phases=context.planner.phases,
-            )
+            keep = Keep()
+            episode = stage.play(sim, stage.cfg.reset, [keep])
+            made[robot] = keep.recording(stage, episode)
         return made[robot]
 
     return get
@@ -167,6 +133,17 @@ def backend(request: pytest.FixtureRequest) -> str:
     there is one.
     """
     return request.param
+
+
+@pytest.fixture
+def error_line(capsys: pytest.CaptureFixture[str]) -> Callable[[], str]:
+    """The line that a command has written to standard error, and no other."""
+
+    def read() -> str:
+        (line,) = capsys.readouterr().err.splitlines()
+        return line
+
+    return read
 
 
 @pytest.fixture(scope="session")

@@ -4,23 +4,34 @@ time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from functools import cache
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mujoco
+import numpy as np
+import pytest
 import torch
 from comparison import assert_same_run
 from compositions import load_config
+from numpy.typing import ArrayLike
 
 from mjstack.config.schema import Backend, Config
+from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
+from mjstack.episodes.rollout import Episode, Observer
+from mjstack.episodes.stage import Stage
 from mjstack.managers import required_fields
 from mjstack.scene import SceneIndex, build_model
 from mjstack.sim import Simulation, make_simulation
 from mjstack.sim.sizes import resolve_env_sizes
 
+if TYPE_CHECKING:
+    from mjstack.sim.mjwarp import MjwarpSimulation
+
+CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+DEVICES = ["cpu", pytest.param("cuda:0", marks=[pytest.mark.gpu, CUDA])]
 TASKS = ("stack", "reach")
 STATE = ("qpos", "qvel", "act", "ctrl")
 POSES = ("xpos", "xquat", "site_xpos", "geom_xpos")
@@ -90,6 +101,28 @@ def new_sim(backend: str, nworld: int, robot: str = "so101") -> Simulation:
     )
 
 
+def fused_sim(
+    cfg: Config,
+    nworld: int,
+    device: str = "cpu",
+    *,
+    fields: Sequence[str] = (),
+    edit: Callable[[mujoco.MjModel], None] | None = None,
+) -> MjwarpSimulation:
+    """A simulation on MJWarp with room for random actions, of a model that is edited before."""
+    from mjstack.sim.mjwarp import MjwarpSimulation  # loads Warp
+
+    model = build_model(cfg)
+    if edit is not None:
+        edit(model)
+    sizes = resolve_env_sizes(cfg)
+    sim = make_simulation(
+        model, cfg, nworld, backend=Backend.mjwarp, device=device, sizes=sizes, fields=fields
+    )
+    assert isinstance(sim, MjwarpSimulation)
+    return sim
+
+
 _shared = cache(new_sim)
 
 
@@ -110,6 +143,20 @@ def on_new_sim(backend: str, nworld: int, cfg: Config) -> Env:
     return Env(sim, SceneIndex(sim.model, cfg.robot, cfg.scene), cfg)
 
 
+def quats(yaw: np.ndarray) -> np.ndarray:
+    """Rotations about z [rad], as a starts file has them, shape ``(..., 4)``."""
+    zero = np.zeros_like(yaw)
+    return np.stack((np.cos(0.5 * yaw), zero, zero, np.sin(0.5 * yaw)), axis=-1)
+
+
+def stack_starts(red: ArrayLike, blue: ArrayLike, **others: ArrayLike) -> dict[str, np.ndarray]:
+    """The arrays of a starts file with both cubes, from x, y [m] and yaw [rad] of every world."""
+    starts = {name: np.asarray(values) for name, values in others.items()}
+    for name, rows in (("red", np.array(red)), ("blue", np.array(blue))):
+        starts |= {f"{name}_xy": rows[:, :2], f"{name}_quat": quats(rows[:, 2])}
+    return starts
+
+
 def actions(env: Env, steps: int, seed: int = 0) -> list[torch.Tensor]:
     """Random actions between the bounds; world k's are the same in any environment that starts with
     world 0.
@@ -119,9 +166,7 @@ def actions(env: Env, steps: int, seed: int = 0) -> list[torch.Tensor]:
     rows = []
     for world in env.world.tolist():
         generator = torch.Generator().manual_seed(1000 * seed + world)
-        rows.append(
-            torch.rand((steps, env.action_manager.action_dim), generator=generator, dtype=low.dtype)
-        )
+        rows.append(torch.rand((steps, len(low)), generator=generator, dtype=low.dtype))
     draw = low + (high - low) * torch.stack(rows, dim=1)
     return list(draw.to(env.device))
 
@@ -140,9 +185,8 @@ def returned(step: tuple[Any, ...]) -> dict[str, torch.Tensor]:
     out = {f"obs.{name}": value for name, value in obs.items()}
     if len(step) == 5:
         out |= dict(zip(("reward", "terminated", "truncated"), step[1:4], strict=True))
-        out |= {f"final.{name}": value for name, value in extras["final_obs"].items()} | {
-            "success": extras["success"]
-        }
+        out |= {f"final.{name}": value for name, value in extras["final_obs"].items()}
+        out["success"] = extras["success"]
     return out
 
 
@@ -167,22 +211,11 @@ def play(env: Env, moves: list[torch.Tensor], before: Callable[[int], None] | No
         if before is not None:
             before(t)
         row = returned(env.step(move))
-        row |= {
-            name: getattr(env.sim, name).clone() for name in (*STATE, "site_xpos", "sensordata")
-        }
-        trace.append(
-            row | {"episode": env.episode.clone(), "episode_step": env.episode_step.clone()}
-        )
+        views = (*STATE, "site_xpos", "sensordata")
+        row |= {name: getattr(env.sim, name).clone() for name in views}
+        row |= {name: getattr(env, name).clone() for name in ("episode", "episode_step")}
+        trace.append(row)
     return trace
-
-
-def pairs(
-    a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]
-) -> Iterator[tuple[str, torch.Tensor, torch.Tensor]]:
-    """Values of the same name; both have the same names."""
-    assert a.keys() == b.keys()
-    for name in a:
-        yield name, a[name], b[name]
 
 
 def assert_rows(
@@ -194,11 +227,12 @@ def assert_rows(
     where: str = "",
 ) -> None:
     """Rows of one are the other rows of the other."""
-    for name, x, y in pairs(a, b):
+    assert a.keys() == b.keys()
+    for name, x in a.items():
         try:
-            assert_same_run(x[rows], y[other], backend)
+            assert_same_run(x[rows], b[name][other], backend)
         except AssertionError as error:
-            raise AssertionError(f"{where} {name}: {x[rows]} is not {y[other]}") from error
+            raise AssertionError(f"{where} {name}: {x[rows]} is not {b[name][other]}") from error
 
 
 def assert_traces(a: Trace, b: Trace, rows: Any, other: Any, backend: str) -> None:
@@ -208,9 +242,41 @@ def assert_traces(a: Trace, b: Trace, rows: Any, other: Any, backend: str) -> No
         assert_rows(x, y, rows, other, backend, f"step {t}:")
 
 
+class Keep(Observer):
+    """Keeps actions and states at every step end."""
+
+    def start(self, env: Env, driver: Driver) -> None:
+        super().start(env, driver)
+        self.actions: list[torch.Tensor] = []
+        self._states: dict[str, list[torch.Tensor]] = {"qpos": [], "qvel": [], "sensordata": []}
+
+    def after_step(self, step: int) -> None:
+        self.actions.append(self.env.action_manager.action.clone())
+        for name, rows in self._states.items():
+            rows.append(getattr(self.env.sim, name).clone())
+
+    def recording(self, stage: Stage, episode: Episode) -> SimpleNamespace:
+        """Cube poses and velocities, forces and the gripper at every step end, each ``(nworld,
+        steps, ...)``, and the result.
+        """
+        index = stage.index
+        qpos, qvel, force = (torch.stack(rows, 1).numpy() for rows in self._states.values())
+        return SimpleNamespace(
+            pose=np.stack([qpos[..., a : a + 7] for a in index.object_qpos], axis=2),
+            velocity=np.stack([qvel[..., a : a + 6] for a in index.object_qvel], axis=2),
+            force=force,
+            gripper=qpos[..., index.robot_qpos[index.n_arm :]],
+            jaw_force=index.jaw_force,
+            result=episode.result,
+            step_count=self.env.sim.step_count.numpy().copy(),
+            cfg=stage.cfg,
+            phases=stage.planner.phases,
+        )
+
+
 class StubViews(SimpleNamespace):
     """Views that a test sets anew at every step, in place of a `Simulation`."""
 
     def part(self, name: str, columns: Any, *shape: int) -> torch.Tensor:
-        found = getattr(self, name)[:, getattr(columns, "at", columns)]
-        return found.unflatten(1, shape) if shape else found
+        view = getattr(self, name)[:, getattr(columns, "at", columns)]
+        return view.unflatten(1, shape) if shape else view

@@ -30,7 +30,7 @@ def _words(text: str) -> list[str]:
 
 
 QUICK = ["nworld=2", "sim=native", "gates=[baseline]"]
-JOBS = _words("gates collect export replay scaling study reachability train")
+JOBS = _words("gates collect export replay reachability train")
 CHOSEN = [*_words("task=stack task=box task=reach"), *(f"job={job}" for job in JOBS)]
 GROUPS = _words("""
 robot model scene timing solver batch sim action observation reset termination reward
@@ -141,17 +141,17 @@ Keys = dict[str, Any]
 
 def _value(draw: random.Random, args: list[str], keys: Keys) -> list[str]:
     """A key with a value near its own, or an odd one."""
-    key, own = draw.choice(list(keys.items()))
+    key, usual = draw.choice(list(keys.items()))
     value = draw.choice(ODD)
     if draw.random() < 0.7:
-        if isinstance(own, bool):
-            value = str(not own).lower()
-        elif isinstance(own, int | float):
-            value = str(type(own)(own * draw.choice((0.5, 1, 1, 2, 10, -1))))
-        elif isinstance(own, list) and own and isinstance(own[0], float):
-            value = str([each * draw.choice((0.9, 1.0, 1.1)) for each in own]).replace(" ", "")
-        elif isinstance(own, str):
-            value = own
+        if isinstance(usual, bool):
+            value = str(not usual).lower()
+        elif isinstance(usual, int | float):
+            value = str(type(usual)(usual * draw.choice((0.5, 1, 1, 2, 10, -1))))
+        elif isinstance(usual, list) and usual and isinstance(usual[0], float):
+            value = str([x * draw.choice((0.9, 1.0, 1.1)) for x in usual]).replace(" ", "")
+        elif isinstance(usual, str):
+            value = usual
     return [*args, f"{draw.choice(('', '', '', '', '+', '++'))}{key}={value}"]
 
 
@@ -282,8 +282,8 @@ def _damage(draw: random.Random, path: Path, cwd: Path) -> None:
     if path.is_dir() or (kind == "value" and not is_data):
         kind = draw.choice(("gone", "link", "kind"))
     if kind == "cut":
-        held = path.read_bytes()
-        path.write_bytes(held[: draw.randrange(len(held) + 1)])
+        content = path.read_bytes()
+        path.write_bytes(content[: draw.randrange(len(content) + 1)])
     elif kind == "text":
         path.write_bytes(draw.choice(TEXTS))
     elif kind == "value":
@@ -308,11 +308,11 @@ def _change_value(draw: random.Random, path: Path) -> None:
     )  # fmt: skip
     if path.suffix == ".npz":
         with np.load(path) as file:
-            held = dict(file)
-        name = draw.choice(sorted(held))
-        arrays = (held[name].ravel()[:1], np.array(3.0), np.array("evil"), np.zeros((0, 3)), np.nan)
-        held[name] = np.array(draw.choice(arrays))
-        np.savez(path, **held)
+            data = dict(file)
+        name = draw.choice(sorted(data))
+        arrays = (data[name].ravel()[:1], np.array(3.0), np.array("evil"), np.zeros((0, 3)), np.nan)
+        data[name] = np.array(draw.choice(arrays))
+        np.savez(path, **data)
         return
     text = path.read_text()
     data = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
@@ -336,7 +336,7 @@ def is_short(args: list[str]) -> bool:
     """Whether a command line that passed its check can be run to its end."""
     text = " ".join(args)
     long = (
-        r"seconds|seeds|repetitions|steps|iterations|physics_dt|decimation|scaling|study|timing"
+        r"seconds|seeds|repetitions|steps|iterations|physics_dt|decimation|scaling|solver|timing"
         r"|video|view|minutes|launcher|range|job.episodes=[^23]|/proc|nworld=(?![12]\b)"
     )
     if "job=collect" in text:  # a hundred episodes by default

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import mujoco
 import numpy as np
 import pytest
@@ -31,30 +33,29 @@ class Arm:
             self.home[self.names.index(name)] = value
         self.home[len(robot.arm_joints) :] = robot.gripper_open
 
-    def grasp_point(self, commands: np.ndarray) -> np.ndarray:
+    def _posed(self, commands: np.ndarray) -> Iterator[mujoco.MjData]:
+        """The arm at each of some commands."""
         data = mujoco.MjData(self.model)
-        out = []
         for command in np.asarray(commands, dtype=float):
             for name, value in zip(self.names, command, strict=True):
                 data.joint(name).qpos[0] = value
             mujoco.mj_kinematics(self.model, data)
-            out.append(np.mean([data.site(name).xpos for name in self.robot.grasp_sites], axis=0))
-        return np.array(out)
+            yield data
+
+    def grasp_point(self, commands: np.ndarray) -> np.ndarray:
+        sites = self.robot.grasp_sites
+        posed = self._posed(commands)
+        return np.array([np.mean([data.site(s).xpos for s in sites], axis=0) for data in posed])
 
     def directions(self, commands: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Closing and approach axis."""
-        data = mujoco.MjData(self.model)
         closing = []
         approach = []
-        for command in np.asarray(commands, dtype=float):
-            for name, value in zip(self.names, command, strict=True):
-                data.joint(name).qpos[0] = value
-            mujoco.mj_kinematics(self.model, data)
+        for data in self._posed(commands):
             first, second = (data.site(name).xpos for name in self.robot.grasp_sites)
             closing.append((second - first) / np.linalg.norm(second - first))
-            approach.append(
-                data.body(self.robot.approach_body).xmat.reshape(3, 3) @ self.robot.approach_axis
-            )
+            turned = data.body(self.robot.approach_body).xmat.reshape(3, 3)
+            approach.append(turned @ self.robot.approach_axis)
         return np.array(closing), np.array(approach)
 
     def jacobian(self, command: np.ndarray) -> np.ndarray:
@@ -96,9 +97,8 @@ class Arm:
         high = self.high - 1e-5
         ends = np.where(rng.random(commands.shape) < 0.5, low, high)
         chosen = rng.random(commands.shape) < 0.5
-        commands[:, self.moved] = np.where(chosen, ends, np.clip(commands, low, high))[
-            :, self.moved
-        ]
+        placed = np.where(chosen, ends, np.clip(commands, low, high))
+        commands[:, self.moved] = placed[:, self.moved]
         return commands
 
     def anywhere(self, nworld: int, seed: int) -> np.ndarray:

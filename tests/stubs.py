@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -11,10 +11,12 @@ import numpy as np
 import pyarrow.parquet as pq
 import torch
 
-from mjstack.episodes.context import RunContext
-from mjstack.jobs.demonstration import Played, StepRecorder
+from mjstack.config.schema import Config
+from mjstack.envs import Env
+from mjstack.episodes.batches import Batch, BatchPlan
+from mjstack.episodes.rollout import Episode
+from mjstack.episodes.stage import Stage
 from mjstack.scene.phases import build_phases
-from mjstack.sim import Simulation
 
 LAYOUT = {
     "observation.state": 6,
@@ -26,40 +28,46 @@ LAYOUT = {
 BROKEN = 8  # red not lifted
 
 
-def fake_demonstrations(
+def fake_batches(
     fails: Callable[[int, int], bool],
     after: Callable[[int, torch.Tensor], None] | None = None,
     *,
     noise: bool = False,
-) -> Callable[..., Played]:
-    """Stands in for `play_demonstrations`.
+) -> Callable[..., Iterator[Batch]]:
+    """Stands in for `play_batches`.
 
     Args:
         fails: Whether a world of a seed breaks a rule.
-        after: Called with the seed and its steps.
+        after: Called with the seed and its measured joints, ``(steps + 1, worlds, 6)``.
         noise: Steps that differ from each other and cannot be compressed, some 0.2 MB for each
             world.
     """
 
-    def play(context: RunContext, sim: Simulation, seed: int, worlds: range) -> Played:
-        steps = build_phases(context.cfg)[-1].stop
-        values = torch.zeros((steps, sim.nworld, sum(LAYOUT.values())))
-        for row, world in enumerate(worlds):
-            values[:, row] = 1e-3 * seed + 1e-6 * world
-            if noise:
-                values[:, row] = torch.randn(
-                    values[:, 0].shape, generator=torch.Generator().manual_seed(1000 * seed + world)
-                )
-        failed = np.array([BROKEN if fails(seed, world) else 0 for world in worlds], dtype=np.int32)
-        if after is not None:
-            after(seed, values)
-        return Played(
-            seed=seed,
-            steps=cast(StepRecorder, SimpleNamespace(values=values, schema=LAYOUT)),
-            failed=failed,
-            retries=np.array([world % 3 for world in worlds], dtype=np.int32),
-            worlds=worlds,
-        )
+    def play(
+        stage: Stage, plans: Iterable[BatchPlan], channels: object, *, cfg: Config
+    ) -> Iterator[Batch]:
+        steps = build_phases(stage.cfg)[-1].stop
+        for plan in plans:
+            rows = {}
+            for number, (name, dim) in enumerate(LAYOUT.items()):
+                count = steps + (name not in ("action", "next.reward"))
+                values = torch.zeros((count, len(plan.worlds), dim))
+                for row, world in enumerate(plan.worlds):
+                    values[:, row] = 1e-3 * plan.seed + 1e-6 * world
+                    if noise:
+                        seed = 10_000 * plan.seed + 10 * world + number
+                        generator = torch.Generator().manual_seed(seed)
+                        values[:, row] = torch.randn(count, dim, generator=generator)
+                rows[name] = values
+            if after is not None:
+                after(plan.seed, rows["observation.state"])
+            bits = [BROKEN if fails(plan.seed, world) else 0 for world in plan.worlds]
+            episode = SimpleNamespace(
+                failed=np.array(bits, dtype=np.int32),
+                retries=np.array([world % 3 for world in plan.worlds], dtype=np.int32),
+            )
+            env = SimpleNamespace(sim=SimpleNamespace(fields={}))
+            yield Batch(plan, cast(Env, env), cast(Episode, episode), rows)
 
     return play
 

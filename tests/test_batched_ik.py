@@ -5,7 +5,8 @@ from __future__ import annotations
 import gc
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -16,18 +17,17 @@ from compositions import load_config
 from ik_arm import CUDA, DEVICES, Arm, results, tensors
 from test_robot_models import REPO, upstream
 
-from mjstack.bench import cli
-from mjstack.bench.timing import Measurement
-from mjstack.episodes.context import RunContext
+from mjstack.episodes.stage import Stage
 from mjstack.errors import ArgumentError
 from mjstack.kinematics.mink_ik import GraspIk
 from mjstack.robots import robot_spec
 from mjstack.sim.warp_setup import torch_stream_scope
 
-Stage = Callable[[str], RunContext]
+GetStage = Callable[[str], Stage]
 
 MINK = 300  # targets that mink solves, one after the other
 TOLERANCE = 0.0005  # m, as the driver's
+TABLE = "on and above the table"
 
 
 @pytest.fixture(params=DEVICES)
@@ -35,12 +35,10 @@ def device(request: pytest.FixtureRequest) -> str:
     return request.param
 
 
-def above_table(
-    context: RunContext, arm: Arm, n: int, seed: int = 0
-) -> tuple[np.ndarray, np.ndarray]:
+def above_table(stage: Stage, arm: Arm, n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Random commands, and where they bring the grasp point: up to 25 cm above the table."""
-    center = np.array(context.cfg.scene.table_center)
-    half = np.array(context.cfg.scene.table_half)
+    center = np.array(stage.cfg.scene.table_center)
+    half = np.array(stage.cfg.scene.table_half)
     commands: list[np.ndarray] = []
     points: list[np.ndarray] = []
     while sum(map(len, points)) < n:
@@ -55,8 +53,8 @@ def above_table(
 
 
 @pytest.fixture(scope="module")
-def get_arm(stage: Stage) -> Callable[[str], Arm]:
-    return lambda robot: Arm(stage(robot).model, stage(robot).cfg.robot)
+def get_arm(get_stage: GetStage) -> Callable[[str], Arm]:
+    return lambda robot: Arm(get_stage(robot).model, get_stage(robot).cfg.robot)
 
 
 @pytest.fixture
@@ -66,54 +64,39 @@ def arm(robot: str, get_arm: Callable[[str], Arm]) -> Arm:
 
 @pytest.fixture(scope="module")
 def workspace(
-    stage: Stage, get_arm: Callable[[str], Arm]
+    get_stage: GetStage, get_arm: Callable[[str], Arm]
 ) -> Callable[[str], tuple[np.ndarray, np.ndarray]]:
-    made: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-
-    def get(robot: str) -> tuple[np.ndarray, np.ndarray]:
-        if robot not in made:
-            made[robot] = above_table(stage(robot), get_arm(robot), 1000)
-        return made[robot]
-
-    return get
+    return cache(lambda robot: above_table(get_stage(robot), get_arm(robot), 1000))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_grasp_point_is_native_mujocos(arm: Arm, device: str, dtype: torch.dtype) -> None:
+def test_forward_kinematics_are_native_mujocos(arm: Arm, device: str, dtype: torch.dtype) -> None:
     commands = np.random.default_rng(1).uniform(arm.low, arm.high, (200, len(arm.names)))
-    centre = arm.solver(200, device).forward(torch.as_tensor(commands, dtype=dtype, device=device))[
-        0
-    ]
-    assert centre.shape == (200, 3)
-    assert centre.dtype == torch.float32
-    assert np.abs(centre.cpu().numpy() - arm.grasp_point(commands)).max() <= 1e-6
+    commands[100:, len(arm.robot.arm_joints) :] = arm.robot.gripper_open  # else it may be shut
+    ik = arm.solver(200, device)
+    found = ik.forward(torch.as_tensor(commands, dtype=dtype, device=device))
+    assert {(part.shape, part.dtype) for part in found} == {((200, 3), torch.float32)}
+    point, *directions = (part.cpu().numpy() for part in found)
+    assert np.abs(point - arm.grasp_point(commands)).max() <= 1e-6
+    for axis, expected in zip(directions, arm.directions(commands[100:]), strict=True):
+        np.testing.assert_allclose(axis[100:], expected, atol=2e-6)
 
 
 def test_targets_in_the_workspace_are_reached(
     robot: str, arm: Arm, device: str, workspace: Callable
 ) -> None:
+    """All of them from home in 40 iterations, and almost all in eight."""
     _, targets = workspace(robot)
     start = arm.at_home(len(targets))
     command, distance = results(arm.solver(len(targets), device, iterations=40), start, targets)
     miss = np.linalg.norm(arm.grasp_point(command) - targets, axis=1)
-    print(
-        f"{robot}: {(miss <= TOLERANCE).mean():.2%} within 0.5 mm, largest"
-        f" {1e6 * miss.max():.2f} um"
-    )
     assert (miss <= 0.00001).all()
     np.testing.assert_allclose(distance, miss, atol=1e-6)
-
-
-def test_eight_iterations_reach_almost_every_target_from_home(
-    robot: str, arm: Arm, workspace: Callable
-) -> None:
-    _, targets = workspace(robot)
-    _, distance = results(arm.solver(len(targets)), arm.at_home(len(targets)), targets)
+    _, distance = results(arm.solver(len(targets), device), start, targets)
     assert (distance <= TOLERANCE).mean() >= 0.99
 
 
-@dataclass
-class Compared:
+class Compared(NamedTuple):
     """What mink makes of some targets, from home and drawn there.
 
     Attributes:
@@ -126,147 +109,104 @@ class Compared:
     commands: np.ndarray
     reached: np.ndarray
 
-    @property
-    def front(self) -> np.ndarray:
-        """Targets in front of the base."""
-        return self.targets[:, 0] > 0.0
-
 
 @pytest.fixture(scope="module")
 def by_mink(
-    stage: Stage, get_arm: Callable[[str], Arm], workspace: Callable
+    get_stage: GetStage, get_arm: Callable[[str], Arm], workspace: Callable
 ) -> Callable[[str], dict[str, Compared]]:
     """On and above the table, and wherever the arm reaches above the table's height; each target is
     solved once.
     """
-    made: dict[str, dict[str, Compared]] = {}
 
+    @cache
     def get(robot: str) -> dict[str, Compared]:
-        if robot not in made:
-            context = stage(robot)
-            arm = get_arm(robot)
-            top = context.cfg.scene.table_center[2] + context.cfg.scene.table_half[2]
-            anywhere = arm.grasp_point(arm.anywhere(3000, 25))
-            anywhere = anywhere[anywhere[:, 2] > top][:MINK]
-            assert len(anywhere) == MINK
-            mink = GraspIk(arm.robot, context.cfg.model, tolerance=TOLERANCE, iterations=60)
-            made[robot] = {}
-            for where, targets in (
-                ("on and above the table", workspace(robot)[1][:MINK]),
-                ("wherever it reaches", anywhere),
-            ):
-                pairs = [
-                    mink.solve(target, np.array(arm.robot.gripper_open), arm.home)
-                    for target in targets
-                ]
-                distance = np.array([left for _, left in pairs])
-                made[robot][where] = Compared(
-                    targets, np.array([command for command, _ in pairs]), distance <= TOLERANCE
-                )
-        return made[robot]
+        stage = get_stage(robot)
+        arm = get_arm(robot)
+        top = stage.cfg.scene.table_center[2] + stage.cfg.scene.table_half[2]
+        anywhere = arm.grasp_point(arm.anywhere(3000, 25))
+        anywhere = anywhere[anywhere[:, 2] > top][:MINK]
+        assert len(anywhere) == MINK
+        mink = GraspIk(arm.robot, stage.cfg.model, tolerance=TOLERANCE, iterations=60)
+        gripper = np.array(arm.robot.gripper_open)
+        made = {}
+        for where, targets in ((TABLE, workspace(robot)[1][:MINK]), ("anywhere", anywhere)):
+            solutions = [mink.solve(target, gripper, arm.home) for target in targets]
+            commands, distance = (np.array(part) for part in zip(*solutions, strict=True))
+            made[where] = Compared(targets, commands, distance <= TOLERANCE)
+        return made
 
     return get
 
 
-def shipped(context: RunContext) -> dict[str, float]:
+def shipped(stage: Stage) -> dict[str, float]:
     """The gains with which ``controller=closed_loop`` runs."""
-    c = context.cfg.controller
+    c = stage.cfg.controller
     return {"posture_gain": c.posture_gain, "approach_gain": c.approach_gain}
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("gains", ["shipped", "drawn home"])
 def test_reaches_what_mink_reaches(
-    robot: str, gains: str, stage: Stage, arm: Arm, by_mink: Callable, capsys: pytest.CaptureFixture
+    robot: str, gains: str, get_stage: GetStage, arm: Arm, by_mink: Callable
 ) -> None:
     """From home, in 40 iterations: with the gains that the robot is shipped with, and drawn home as
-    mink is.
+    mink is, where most solutions are the same one.
 
     In front of the base nothing that mink reaches is missed. Behind it, where the way from home
     ends at the joints' limits, either one ends short at times where the other arrives; with the
     base turned as mink turned it, nothing is missed at all."""
-    ik = arm.solver(
-        MINK,
-        iterations=40,
-        **(shipped(stage(robot)) if gains == "shipped" else {"posture_gain": 0.3}),
-    )
-    for where, mink in by_mink(robot).items():
-        theirs = mink.reached
-        front = mink.front
+    own = shipped(get_stage(robot)) if gains == "shipped" else {"posture_gain": 0.3}
+    ik = arm.solver(MINK, iterations=40, **own)
+    for mink in by_mink(robot).values():
+        front = mink.targets[:, 0] > 0.0
         command, distance = results(ik, arm.at_home(MINK), mink.targets)
-        ours = distance <= TOLERANCE
-        missed = theirs & ~ours
-        with capsys.disabled():
-            print(
-                f"\n{robot}, {gains}, {where}: of {MINK} mink reaches {theirs.sum()}, batched"
-                f" {ours.sum()}, only mink {missed.sum()} (in front of the base"
-                f" {(missed & front).sum()}), only batched {(ours & ~theirs).sum()}"
-            )
-            for target, left in zip(mink.targets[missed], distance[missed], strict=True):
-                print(f"  only mink: {target.round(3)} m, batched ends {1e3 * left:.1f} mm off")
-        assert theirs.mean() > 0.8
+        reached = distance <= TOLERANCE
+        missed = mink.reached & ~reached
+        assert mink.reached.mean() > 0.8
         assert not (missed & front).any()
         assert missed.mean() <= 0.01
         to_limit = np.minimum(command - arm.low, arm.high - command)[:, arm.moved].min(1)
         assert (to_limit[missed] < 0.001).all()
-        assert ours.sum() > theirs.sum()
-        assert (distance[ours & front] <= 0.0001).mean() >= 0.998
+        assert reached.sum() > mink.reached.sum()
+        assert (distance[reached & front] <= 0.0001).mean() >= 0.998
         turned = arm.at_home(MINK)
         turned[:, 0] = mink.commands[:, 0]
-        assert (results(ik, turned, mink.targets)[1][theirs] <= TOLERANCE).all()
-        np.testing.assert_allclose(
-            np.linalg.norm(arm.grasp_point(command) - mink.targets, axis=1), distance, atol=1e-6
-        )
-
-
-@pytest.mark.full
-def test_drawn_home_it_ends_where_mink_does(
-    robot: str, arm: Arm, by_mink: Callable, capsys: pytest.CaptureFixture
-) -> None:
-    """Both draw the arm home, so most solutions are the same one."""
-    ik = arm.solver(MINK, iterations=40, posture_gain=0.3)
-    for where, mink in by_mink(robot).items():
-        command, distance = results(ik, arm.at_home(MINK), mink.targets)
-        both = mink.reached & (distance <= TOLERANCE)
-        apart = np.abs(command - mink.commands)[both].max(1)
-        away, mink_away = (
-            np.linalg.norm(c - arm.home, axis=1)[both] for c in (command, mink.commands)
-        )
-        with capsys.disabled():
-            print(
-                f"\n{robot}, {where}: joints apart: median {np.median(apart):.4f} rad, over 0.1 rad"
-                f" in {(apart > 0.1).sum()}; from home on average {away.mean():.4f} rad, mink"
-                f" {mink_away.mean():.4f} rad"
+        assert (results(ik, turned, mink.targets)[1][mink.reached] <= TOLERANCE).all()
+        miss = np.linalg.norm(arm.grasp_point(command) - mink.targets, axis=1)
+        np.testing.assert_allclose(miss, distance, atol=1e-6)
+        if gains == "drawn home":
+            both = mink.reached & reached
+            apart = np.abs(command - mink.commands)[both].max(1)
+            away, mink_away = (
+                np.linalg.norm(c - arm.home, axis=1)[both] for c in (command, mink.commands)
             )
-        assert np.median(apart) < 0.005
-        assert (apart < 0.1).mean() > 0.9  # the others bend another way to the same point
-        assert away.mean() <= mink_away.mean() + 0.001
+            assert np.median(apart) < 0.005
+            assert (apart < 0.1).mean() > 0.9  # the others bend another way to the same point
+            assert away.mean() <= mink_away.mean() + 0.001
 
 
 @pytest.mark.full
-def test_an_approach_gain_leans_less_than_mink(
-    stage: Stage, get_arm: Callable[[str], Arm], by_mink: Callable
+def test_an_approach_gain_tilts_less_than_mink(
+    get_stage: GetStage, get_arm: Callable[[str], Arm], by_mink: Callable
 ) -> None:
     """What SO-101's gain is for: above the table its gripper is nowhere more tilted than where mink
     is drawn home.
     """
     arm = get_arm("so101")
-    mink = by_mink("so101")["on and above the table"]
-    command, _ = results(
-        arm.solver(MINK, iterations=40, **shipped(stage("so101"))), arm.at_home(MINK), mink.targets
-    )
+    mink = by_mink("so101")[TABLE]
+    ik = arm.solver(MINK, iterations=40, **shipped(get_stage("so101")))
+    command, _ = results(ik, arm.at_home(MINK), mink.targets)
     tilt, mink_tilt = (
         np.degrees(np.arccos(np.clip(-arm.directions(c[mink.reached])[1][:, 2], -1.0, 1.0)))
         for c in (command, mink.commands)
     )
-    print(f"so101: tilted by {tilt.mean():.1f} degrees on average, mink {mink_tilt.mean():.1f}")
     assert (tilt <= mink_tilt + 1.0).all()
     assert tilt.mean() < mink_tilt.mean() - 5.0
 
 
 @pytest.mark.full
 def test_follows_minks_way_as_shipped(
-    robot: str, stage: Stage, arm: Arm, by_mink: Callable, capsys: pytest.CaptureFixture
+    robot: str, get_stage: GetStage, arm: Arm, by_mink: Callable
 ) -> None:
     """With the controller's iterations per step and its gains, along the way from home to each of
     mink's solutions.
@@ -278,9 +218,8 @@ def test_follows_minks_way_as_shipped(
     steps = 200
     mujoco.mj_kinematics(arm.model, data)
     axis = data.joint(arm.names[0]).xanchor[:2]
-    ik = arm.solver(
-        MINK, iterations=stage(robot).cfg.controller.step_iterations, **shipped(stage(robot))
-    )
+    stage = get_stage(robot)
+    ik = arm.solver(MINK, iterations=stage.cfg.controller.step_iterations, **shipped(stage))
     for where, mink in by_mink(robot).items():
         goal = mink.commands.copy()
         goal[:, len(arm.robot.arm_joints) :] = arm.robot.gripper_open
@@ -294,13 +233,8 @@ def test_follows_minks_way_as_shipped(
             worst = np.maximum(worst, left.numpy())
             radius = np.minimum(radius, np.linalg.norm(target.numpy()[:, :2] - axis, axis=1))
         lost = mink.reached & ~(worst <= TOLERANCE)
-        with capsys.disabled():
-            print(
-                f"\n{robot}, {where}: {lost.sum()} of {mink.reached.sum()} ways not followed within"
-                f" 0.5 mm, {(mink.reached & ~(left.numpy() <= TOLERANCE)).sum()} targets missed"
-            )
         assert (radius[lost] < 0.03).all()
-        if where == "on and above the table":
+        if where == TABLE:
             assert not lost.any()
         assert lost.mean() < 0.03
 
@@ -324,9 +258,7 @@ def test_gains_do_not_spoil_the_position(
     gains = {"posture_gain": posture_gain, "approach_gain": approach_gain}
     ik = arm.solver(1000, device, iterations=40, **gains)
     _, distance = results(ik, arm.at_home(1000), targets)
-    print(f"{robot}: {1e6 * distance.max():.1f} um at most")
     assert (distance <= 0.0001).all()
-    assert not ik.unreachable.any()
     free = arm.free(start, 0.3)
     assert free.sum() > 100
     ik = arm.solver(1000, device, iterations=8, **gains)
@@ -336,7 +268,6 @@ def test_gains_do_not_spoil_the_position(
         towards_home = targets + 0.005 * k * np.array([-1.0, 0.0, 0.0])
         command, distance = results(ik, command, towards_home)
         worst = np.maximum(worst, distance)
-    print(f"{robot}: {(worst[free] <= 0.0001).mean():.2%} of {free.sum()} followed within 0.1 mm")
     assert (worst[free] <= 0.0001).mean() >= 0.98
 
 
@@ -355,22 +286,15 @@ def test_a_posture_is_approached_as_far_as_the_target_allows(
     command = ik.solve(given, goal, wanted)[0].cpu().numpy().astype(float)
     plain, _ = results(arm.solver(1000, device, iterations=100), start, targets)
     left = (posture - command)[:, arm.moved]
-    assert (
-        np.linalg.norm(left, axis=1)
-        <= np.linalg.norm((posture - plain)[:, arm.moved], axis=1) + 0.01
-    ).mean() > 0.98
+    plain_left = np.linalg.norm((posture - plain)[:, arm.moved], axis=1)
+    assert (np.linalg.norm(left, axis=1) <= plain_left + 0.01).mean() > 0.98
     # Near a stretched arm the damping lets the posture count along what would move the centre,
     # which settling then undoes.
-    supple = [
-        w
-        for w in np.flatnonzero(arm.free(command))[:300]
-        if np.linalg.svd(arm.jacobian(command[w]))[1][-1] > 0.1
-    ]
-    free = np.array(supple)
+    free = np.flatnonzero(arm.free(command))[:300]
+    free = np.array([w for w in free if np.linalg.svd(arm.jacobian(command[w]))[1][-1] > 0.1])
     assert len(free) > 150
     open_ = [np.abs(arm.spare(command[w]) @ left[w]).max() for w in free]
     before = [np.abs(arm.spare(start[w]) @ (posture - start[w])[arm.moved]).max() for w in free]
-    print(f"{robot}: {np.quantile(open_, 0.95):.4f} rad are left, {np.median(before):.2f} before")
     assert np.quantile(open_, 0.95) < 0.002
     assert np.median(before) > 0.2
 
@@ -388,10 +312,6 @@ def test_the_approach_axis_turns_down_as_far_as_the_target_allows(
     )
     plain, _ = results(arm.solver(1000, device, iterations=40), start, targets)
     down, plain_down = (-arm.directions(c)[1][:, 2] for c in (command, plain))
-    print(
-        f"{robot}: tilted by {np.degrees(np.arccos([down, plain_down])).mean(1).round(1)} degrees"
-        " with and without"
-    )
     assert (down >= plain_down - 1e-3).mean() > 0.97
     assert down.mean() > plain_down.mean() + 0.2
     free = np.flatnonzero(arm.free(command))[:100]
@@ -403,7 +323,6 @@ def test_the_approach_axis_turns_down_as_far_as_the_target_allows(
         steps[1::2, arm.moved] = -1e-4 * np.eye(len(arm.moved))
         z = -arm.directions(command[w] + steps)[1][:, 2]
         slopes.append(np.abs(arm.spare(command[w]) @ ((z[::2] - z[1::2]) / 2e-4)).max())
-    print(f"{robot}: slope {np.quantile(slopes, 0.9):.4f} of {len(free)}")
     assert np.quantile(slopes, 0.9) < 0.01
 
 
@@ -432,10 +351,6 @@ def test_the_approach_axis_turns_where_it_is_wished(
     before, after = (
         np.degrees(np.arccos(np.clip((arm.directions(c)[1] * wished).sum(1), -1, 1)))
         for c in (start, command)
-    )
-    print(
-        f"{robot}: off by {np.median(before):.1f} degrees before, {np.quantile(after, 0.95):.3f}"
-        f" after in 95 % of {len(start)}"
     )
     assert len(start) > 50
     assert np.median(before) > 3.0
@@ -487,56 +402,21 @@ def test_postures_of_all_worlds_or_each(arm: Arm, device: str) -> None:
     assert torch.equal(ik.solve(given, goal)[0], by_default)  # home again
 
 
-def test_a_posture_that_is_not_finite_stays_in_its_world(arm: Arm, device: str) -> None:
+@pytest.mark.parametrize("goal_name", ["posture", "approach"])
+def test_a_goal_that_is_not_finite_stays_in_its_world(
+    arm: Arm, device: str, goal_name: str
+) -> None:
     start = arm.at_home(4)
     target = arm.grasp_point(arm.anywhere(4, 33))
-    ik = arm.solver(4, device, posture_gain=0.3)
-    given, goal, posture = tensors(device, start, target, arm.at_home(4))
-    clean = ik.solve(given, goal, posture)[0].clone()
-    posture[2, arm.moved[0]] = torch.nan
-    command, distance = ik.solve(given, goal, posture)
+    ik = arm.solver(4, device, **{f"{goal_name}_gain": 0.3})
+    rows = arm.at_home(4) if goal_name == "posture" else np.tile([0.0, 0.0, -1.0], (4, 1))
+    given, goal, values = tensors(device, start, target, rows)
+    clean = ik.solve(given, goal, **{goal_name: values})[0].clone()
+    values[2, arm.moved[0] if goal_name == "posture" else 1] = torch.nan
+    command, distance = ik.solve(given, goal, **{goal_name: values})
     assert torch.isnan(distance).tolist() == [False, False, True, False]
-    assert ik.unreachable[2]
     np.testing.assert_allclose(command[2].cpu().numpy(), start[2], atol=1e-6)
     assert torch.equal(command[[0, 1, 3]], clean[[0, 1, 3]])
-
-
-@pytest.mark.parametrize("tolerance", [0.0005, 0.02])
-def test_unreachable_is_a_distance_above_the_tolerance(
-    arm: Arm, device: str, tolerance: float
-) -> None:
-    target = np.vstack(
-        [
-            arm.grasp_point(arm.anywhere(200, 34)),
-            np.random.default_rng(35).uniform(-1.0, 1.0, (200, 3)),
-        ]
-    )
-    target[7] = np.nan
-    ik = arm.solver(400, device, iterations=20, tolerance=tolerance)
-    _, distance = results(ik, arm.at_home(400), target)
-    found = ik.unreachable.cpu().numpy()
-    assert found.dtype == bool
-    assert found.shape == (400,)
-    np.testing.assert_array_equal(found, ~(distance <= np.float32(tolerance)))
-    assert found[7]
-    assert 50 < found.sum() < 350
-    address = ik.unreachable.data_ptr()
-    results(ik, arm.at_home(400), arm.grasp_point(arm.at_home(400)))
-    assert ik.unreachable.data_ptr() == address
-    assert not ik.unreachable.any()
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_directions_are_native_mujocos(arm: Arm, device: str, dtype: torch.dtype) -> None:
-    commands = np.random.default_rng(36).uniform(arm.low, arm.high, (200, len(arm.names)))
-    commands[:, len(arm.robot.arm_joints) :] = arm.robot.gripper_open
-    ik = arm.solver(200, device)
-    given = torch.as_tensor(commands, dtype=dtype, device=device)
-    _, closing, approach = ik.forward(given)
-    assert closing.shape == approach.shape == (200, 3)
-    expected = arm.directions(commands)
-    np.testing.assert_allclose(closing.cpu().numpy(), expected[0], atol=2e-6)
-    np.testing.assert_allclose(approach.cpu().numpy(), expected[1], atol=2e-6)
 
 
 @pytest.mark.full
@@ -586,10 +466,6 @@ def test_small_steps_arrive(robot: str, arm: Arm, device: str, workspace: Callab
     moved = command[:, arm.moved]
     free = ((moved > arm.low[arm.moved] + 1e-3) & (moved < arm.high[arm.moved] - 1e-3)).all(1)
     assert (usable & free).sum() > 700
-    print(
-        f"{robot}: {distance[usable & free].max() * 1e6:.2f} um at most, {distance[usable & ~free]}"
-        " m at limits"
-    )
     assert (distance[usable & free] <= 0.0001).all()
     assert np.abs(command - start)[usable].max() < 0.5
 
@@ -630,7 +506,6 @@ def test_small_steps_arrive_from_limits(robot: str, arm: Arm) -> None:
     near = np.linalg.norm(target - arm.grasp_point(start), axis=1) < 0.01
     assert near.sum() > 500
     _, distance = results(arm.solver(2000), start, target)
-    print(f"{robot}: {(distance[near] <= 0.0001).mean():.2%} of {near.sum()} within 0.1 mm")
     assert (distance[near] <= 0.0001).mean() >= 0.99
 
 
@@ -669,20 +544,6 @@ def test_a_start_at_its_target_stays(arm: Arm, device: str) -> None:
     assert (distance <= 1e-6).all()
 
 
-def test_an_approach_that_is_not_finite_stays_in_its_world(arm: Arm, device: str) -> None:
-    start = arm.at_home(4)
-    target = arm.grasp_point(arm.anywhere(4, 33))
-    ik = arm.solver(4, device, approach_gain=0.3)
-    given, goal, down = tensors(device, start, target, np.tile([0.0, 0.0, -1.0], (4, 1)))
-    clean = ik.solve(given, goal, approach=down)[0].clone()
-    down[2, 1] = torch.nan
-    command, distance = ik.solve(given, goal, approach=down)
-    assert torch.isnan(distance).tolist() == [False, False, True, False]
-    assert ik.unreachable[2]
-    np.testing.assert_allclose(command[2].cpu().numpy(), start[2], atol=1e-6)
-    assert torch.equal(command[[0, 1, 3]], clean[[0, 1, 3]])
-
-
 def test_not_finite_input_stays_in_its_world(arm: Arm, device: str) -> None:
     start = arm.at_home(8)
     target = arm.grasp_point(arm.anywhere(8, 8))
@@ -719,45 +580,29 @@ def test_world_k_of_n_is_world_k_of_one(robot: str, arm: Arm, workspace: Callabl
 
 
 def test_outputs_are_rewritten_in_place(arm: Arm, device: str) -> None:
-    """Whatever the last call left, of outputs or of working memory, does not show in the next."""
+    """Whatever the last call left, of outputs or of working memory, does not show in the next. An
+    output can be an input.
+    """
     start = arm.anywhere(20, 10)
     target = arm.grasp_point(arm.anywhere(20, 11))
     ik = arm.solver(20, device)
-    tensors_in = tensors(device, start, target)
-    centre, (command, distance) = ik.forward(tensors_in[0])[0], ik.solve(*tensors_in)
-    before = [t.clone() for t in (centre, command, distance)]
-
-    for t in (centre, command, distance):
-        t.fill_(torch.nan)
-    again_centre, (again_command, again_distance) = (
-        ik.forward(tensors_in[0])[0],
-        ik.solve(*tensors_in),
-    )
-    for old, new, expected in zip(
-        (centre, command, distance),
-        (again_centre, again_command, again_distance),
-        before,
-        strict=True,
-    ):
-        assert new.data_ptr() == old.data_ptr()
+    given, goal = tensors(device, start, target)
+    outputs = [ik.forward(given)[0], *ik.solve(given, goal)]
+    before = [output.clone() for output in outputs]
+    for output in outputs:
+        output.fill_(torch.nan)
+    again = [ik.forward(given)[0], *ik.solve(given, goal)]
+    for output, new, expected in zip(outputs, again, before, strict=True):
+        assert new.data_ptr() == output.data_ptr()
         assert torch.equal(new, expected)
-
-
-def test_its_own_output_can_be_its_input(arm: Arm) -> None:
-    start = arm.anywhere(20, 12)
-    target = arm.grasp_point(arm.anywhere(20, 13))
-    ik = arm.solver(20)
-    first, _ = results(ik, start, target)
-    second, _ = results(ik, first, target)
-    (goal,) = tensors("cpu", target)
-    ik.solve(*tensors("cpu", start, target))
-    assert (ik.solve(ik._view["solution"], goal)[0].numpy() == second).all()
+    second, _ = results(ik, before[1].cpu().numpy(), target)
+    ik.solve(given, goal)
+    assert (ik.solve(outputs[1], goal)[0].cpu().numpy() == second).all()
 
 
 def test_float32_and_float64_agree(arm: Arm) -> None:
-    start, target = (
-        a.astype(np.float32) for a in (arm.anywhere(20, 14), arm.grasp_point(arm.anywhere(20, 15)))
-    )
+    start = arm.anywhere(20, 14).astype(np.float32)
+    target = arm.grasp_point(arm.anywhere(20, 15)).astype(np.float32)
     ik = arm.solver(20)
     single = results(ik, start, target)
     double = results(ik, start.astype(float), target.astype(float))
@@ -765,8 +610,12 @@ def test_float32_and_float64_agree(arm: Arm) -> None:
         np.testing.assert_array_equal(a, b)
 
 
-def test_the_robot_alone_is_the_robot_in_its_scene(robot: str, stage: Stage, arm: Arm) -> None:
-    alone = Arm(robot_spec(stage(robot).cfg.robot, stage(robot).cfg.model).compile(), arm.robot)
+def test_the_robot_alone_is_the_robot_in_its_scene(
+    robot: str, get_stage: GetStage, arm: Arm
+) -> None:
+    alone = Arm(
+        robot_spec(get_stage(robot).cfg.robot, get_stage(robot).cfg.model).compile(), arm.robot
+    )
     start = arm.anywhere(20, 16)
     target = arm.grasp_point(arm.anywhere(20, 17))
     for a, b in zip(
@@ -785,7 +634,6 @@ def test_a_cuda_graph_holds_it(arm: Arm, cuda: str, gain: float) -> None:
     posture = tensors(cuda, arm.home)[0] if gain else None
     command, goal = tensors(cuda, arm.at_home(256), arm.grasp_point(arm.anywhere(256, 20)))
     out = torch.zeros_like(ik.solve(command, goal)[0])
-    flags = torch.zeros_like(ik.unreachable)
     stream = torch.cuda.Stream()
     graph = torch.cuda.CUDAGraph()
 
@@ -795,7 +643,6 @@ def test_a_cuda_graph_holds_it(arm: Arm, cuda: str, gain: float) -> None:
             command, here + 0.5 * (goal - here) + 0.0 * sum(ik.forward(command)[1:]), posture
         )
         out.copy_(new)
-        flags.copy_(ik.unreachable)
         command.copy_(new)
 
     start = command.clone()
@@ -817,40 +664,9 @@ def test_a_cuda_graph_holds_it(arm: Arm, cuda: str, gain: float) -> None:
         for _ in range(3):
             graph.replay()
         replayed = out.clone()
-        flagged = flags.clone()
         command.copy_(start)
         for _ in range(3):
             follow_goal()
         torch.cuda.synchronize()
         assert torch.isfinite(replayed).all()
         assert torch.equal(out, replayed)
-        assert torch.equal(flags, flagged)
-
-
-@pytest.mark.full
-def test_the_benchmark_prints_a_table(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    measure = cli.ik.measure_solve
-    results = []
-
-    def kept(*args: object, **kwargs: object) -> Measurement:
-        results.append(measure(*args, **kwargs))  # type: ignore[arg-type]
-        return results[-1]
-
-    monkeypatch.setattr(cli.ik, "measure_solve", kept)
-    small = ["sim.device=cpu", "--nworld", "8", "--repetitions", "2"]
-    cli.main("ik", [*small, "--iterations", "4", "8"])
-    assert "SO-101, cpu" in capsys.readouterr().out
-    cases = [(r.facts["iterations"], r.facts["gain"]) for r in results]
-    assert cases == [(4, 0.0), (4, 0.1), (8, 0.0), (8, 0.1)]
-    for result in results:
-        assert list(result.samples) == ["eager_ms"]
-        assert len(result.samples["eager_ms"]) == 2
-        assert min(result.samples["eager_ms"]) > 0.0
-    assert results[2].facts["reached"] == 1.0
-    for bad in (["--repetitions", "0"], ["--nworld", "0"], ["--iterations", "3"]):
-        with pytest.raises(SystemExit) as caught:
-            cli.main("ik", ["sim.device=cpu", "--nworld", "2", *bad])
-        assert caught.value.code == 2
-        assert capsys.readouterr().err.count("\n") == 1

@@ -6,14 +6,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from box_checker import BLUE, RED, BoxOutcome
-from box_recordings import RecordingContext, World, feed, put_cube, recording_context
+from box_recordings import World, faster_stage, feed, put_cube, recording
 from check_cases import Altered, Cases, rules_of
 from compositions import load_config
 from environments import at_double_speed
@@ -22,6 +23,8 @@ from mjstack.config.schema import Backend
 from mjstack.envs import Env
 from mjstack.episodes.failures import Sign
 from mjstack.episodes.rollout import NOMINAL
+from mjstack.episodes.run import Run
+from mjstack.episodes.stage import Stage
 from mjstack.gates.success import run_success
 from mjstack.report.record import Status
 from mjstack.sim import make_simulation
@@ -32,6 +35,7 @@ pytestmark = pytest.mark.full
 RULES = rules_of("box")
 CASES = Cases(RULES)
 HAIR = 2e-6  # [m], [m/s]: a good deal more than float32 rounds at these sizes
+LEVEL = [1.0, 0.0, 0.0, 0.0]
 
 
 @cache
@@ -41,22 +45,19 @@ def planned() -> SimpleNamespace:
     """
 
     def drop(env: Env, _: str) -> None:
-        if (
-            int(env.episode_step[-1])
-            == (context.phase("carry_red").start + context.phase("hold_red").start) // 2
-        ):
-            scene = context.cfg.scene
-            x, y = scene.objects["red"].xy
-            top = scene.table_center[2] + scene.table_half[2]
-            put_cube(
-                env, RED, [x - 0.08, y, top + scene.objects["red"].half_height, 1.0, 0.0, 0.0, 0.0]
-            )
+        middle = (stage.phase("carry_red").start + stage.phase("hold_red").start) // 2
+        if int(env.episode_step[-1]) == middle:
+            scene = stage.cfg.scene
+            red = scene.objects["red"]
+            height = scene.table_center[2] + scene.table_half[2] + red.half_height
+            put_cube(env, RED, [red.xy[0] - 0.08, red.xy[1], height, *LEVEL])
 
-    context = recording_context("so101", "nworld=2", disturb=drop)
-    sim = make_simulation(context.model, context.cfg, 2, backend=Backend.native)
-    context.play(sim, context.cfg.reset)
+    stage = faster_stage("so101", "nworld=2")
+    sim = make_simulation(stage.model, stage.cfg, 2, backend=Backend.native)
+    with recording(stage, drop) as recordings:
+        stage.play(sim, stage.cfg.reset)
     sim.close()
-    (rec,) = context.recordings
+    (rec,) = recordings
     return rec
 
 
@@ -73,11 +74,10 @@ def scripted() -> SimpleNamespace:
             at = env.index.object_qpos[cube]
             put_cube(env, cube, np.add(env.sim.qpos[-1, at : at + 3].numpy(), [0.0, 0.07, 0.0]))
 
-    context = recording_context(
-        "so101", "sim=native", "nworld=2", "gates=[success]", disturb=take_away
-    )
-    (result,) = run_success(context)
-    (rec,) = context.recordings
+    stage = faster_stage("so101", "sim=native", "nworld=2", "gates=[success]")
+    with recording(stage, take_away) as recordings:
+        (result,) = run_success(Run(stage))
+    (rec,) = recordings
     rec.gate = result
     return rec
 
@@ -115,25 +115,19 @@ def test_scripted_controller_passes_the_success_gate() -> None:
     metrics = rec.gate.metrics
     assert result.status is Status.passed, result.reason
     assert result.thresholds["success_rate_min"] == 0.97
-    assert (
-        metrics["succeeded"],
-        metrics["episodes"],
-        metrics["distinct_starts"],
-        metrics["unreachable"],
-    ) == (2, 2, 2, 0)
-    assert (metrics["retried"], metrics["retries"], metrics["retried_succeeded"]) == (1, 2, 1)
+    expected = {"succeeded": 2, "episodes": 2, "distinct_starts": 2, "unreachable": 0}
+    expected |= {"retried": 1, "retries": 2, "retried_succeeded": 1}
+    assert {name: metrics[name] for name in expected} == expected
     assert rec.episode.retries.tolist() == [0, 2]
     assert rec.watch.sign.tolist() == [Sign.NONE] * 2
-    names = [phase.name for phase in rec.context.planner.phases]
+    names = [phase.name for phase in rec.stage.planner.phases]
     worlds = [World.of(rec, k) for k in range(2)]
     assert worlds[0].order == names
     again = []
     for name in names:
         role, _, color = name.partition("_")
-        again += (
-            [f"approach_{color}", f"descend_{color}", f"close_{color}"] if role == "lift" else []
-        )
-        again.append(name)
+        retry = ("approach", "descend", "close") if role == "lift" else ()
+        again += [*(f"{part}_{color}" for part in retry), name]
     assert worlds[1].order == again
     assert (worlds[0].phase != worlds[1].phase).mean() > 0.5
     for world, attempts in zip(worlds, (1, 2), strict=True):
@@ -171,10 +165,11 @@ def test_mjwarp_fills_the_box(robot: str, controller: str, device: str) -> None:
     cpu = device == "cpu"
     faster = at_double_speed(robot, "box") if cpu else ()
     cfg = load_config(["task=box", f"robot={robot}", f"controller={controller}", *faster])
-    context = RecordingContext(cfg=cfg)
+    stage = Stage(cfg)
     nworld, reset = (1, NOMINAL) if cpu else (64, cfg.reset)
-    sim = make_simulation(context.model, cfg, nworld, backend=Backend.mjwarp, device=device)
-    episode = context.play(sim, reset)
+    sim = make_simulation(stage.model, cfg, nworld, backend=Backend.mjwarp, device=device)
+    with recording(stage) as recordings:
+        episode = stage.play(sim, reset)
     for failed in episode.result.failed.tolist():
         assert failed == 0, RULES.describe(failed)
     assert episode.timing.captured == (not cpu)
@@ -183,7 +178,7 @@ def test_mjwarp_fills_the_box(robot: str, controller: str, device: str) -> None:
     assert int(sim.peak_constraints.max()) <= sizes.njmax
     sim.close()
 
-    worlds = [World.of(context.recordings[0], k) for k in range(nworld)]
+    worlds = [World.of(recordings[0], k) for k in range(nworld)]
     for world in worlds:
         carry = world.steps("carry_red")
         steps = [20, carry[len(carry) // 2], -1]  # on the table, red in the air, in the box
@@ -201,254 +196,184 @@ def test_mjwarp_fills_the_box(robot: str, controller: str, device: str) -> None:
         assert_same(episode.result, k, expected)
 
 
-def both(name: str, rules: set[str], alter: Callable[[World, int, str], None]) -> None:
-    """Registers an alteration for each cube; ``*`` in a rule is its colour."""
+Alter = Callable[[World, int, str], None]
+UP = [0.0, 0.0, 1.0]  # N
+PUSH = [0.1, 0.0, 0.0]  # N
+
+
+def both(name: str, rules: str, alter: Alter, *, red: str = "") -> None:
+    """Registers an alteration for each cube; ``*`` in a rule is its colour. For red ``red`` breaks
+    too.
+    """
     for cube, color in ((RED, "red"), (BLUE, "blue")):
-        broken = {rule.replace("*", color.upper()) for rule in rules}
+        broken = {*rules.replace("*", color.upper()).split(), *(red.split() if cube == RED else ())}
         CASES.add(
             f"{name}_{color}", broken, lambda w, cube=cube, color=color: alter(w, cube, color)
         )
 
 
-def _grasp_of_nine_steps(w: World, cube: int, color: str) -> None:
-    w.jaw(cube, 0)[w.steps(f"close_{color}")[::10]] = 0.0
+def sides(outside: str, inside: str, rules: str, *, red: str = "", by: float = HAIR) -> Any:
+    """Registers both sides of a threshold, from which the decorated function goes away ``by``."""
+
+    def register(alter: Callable[[World, int, str, float], None]) -> None:
+        both(outside, rules, partial(_beyond, alter, by), red=red)
+        both(inside, "", partial(_beyond, alter, -by))
+
+    return register
 
 
-def _grasp_by_one_jaw(w: World, cube: int, color: str) -> None:
-    w.jaw(cube, 1)[w.steps(f"close_{color}")] = 0.0
+def _beyond(
+    alter: Callable[[World, int, str, float], None], by: float, w: World, cube: int, color: str
+) -> None:
+    alter(w, cube, color, by)
 
 
-def _grasp_of_ten_steps(w: World, cube: int, color: str) -> None:
-    w.jaw(cube, 0)[w.steps(f"close_{color}")[:-10]] = 0.0
+def steps_of(w: World, roles: str, color: str) -> np.ndarray:
+    return w.steps(*(f"{role}_{color}" if role != "done" else role for role in roles.split()))
 
 
-def _forces_below_the_threshold(w: World, cube: int, color: str) -> None:
-    w.jaw(cube, 0)[w.steps(f"close_{color}")] = [0.0, 0.9e-5, 0.0]
+# Forces: the rules that break, what presses on the cube (a jaw, or the table and the other cube),
+# when, and how much [N].
+FORCES: dict[str, tuple[str, str, int, str, Any, Any]] = {
+    "grasp_of_nine_steps": ("GRASP_*", "jaw", 0, "close", np.s_[::10], 0.0),
+    "grasp_by_one_jaw": ("GRASP_*", "jaw", 1, "close", np.s_[:], 0.0),
+    "grasp_of_ten_steps": ("", "jaw", 0, "close", np.s_[:-10], 0.0),
+    "forces_below_the_threshold": ("GRASP_*", "jaw", 0, "close", np.s_[:], [0.0, 0.9e-5, 0.0]),
+    "forces_above_the_threshold": ("", "jaw", 0, "close", np.s_[-40:], [0.0, 1.1e-5, 0.0]),
+    "table_touched_every_25th_step": ("LIFT_*", "support", 0, "lift carry", np.s_[::25], UP),
+    "cube_touched_every_25th_step": ("LIFT_*", "support", 1, "lift carry", np.s_[::25], UP),
+    "table_touched_every_26th_step": ("", "support", 0, "lift carry", np.s_[::26], UP),
+    "touched_in_every_10th_step_of_the_carry": ("CARRY_*", "support", 0, "carry", np.s_[::10], UP),
+    "one_jaw_loses_it_in_the_carry": ("DROP_*", "jaw", 0, "carry", 70, 0.0),
+    "the_other_jaw_loses_it_in_the_hold": ("DROP_*", "jaw", 1, "hold", -1, 0.0),
+    "lost_at_the_start_of_the_lift": ("DROP_*", "jaw", 1, "lift", 0, 0.0),
+    "lost_as_the_closing_ends": ("DROP_*", "jaw", 0, "close", -1, 0.0),
+    "lost_with_nine_steps_of_closing_left": ("DROP_*", "jaw", 0, "close", -10, 0.0),
+    "lost_and_grasped_anew_in_the_last_ten_steps_of_closing": ("", "jaw", 0, "close", -11, 0.0),
+    "released_in_the_first_step_of_the_opening": ("", "jaw", 0, "open", 0, 0.0),
+    "touched_50_steps_before_the_end_of_settling": ("SETTLED_*", "jaw", 0, "settle", -50, PUSH),
+    "touched_51_steps_before_the_end_of_settling": ("", "jaw", 0, "settle", -51, PUSH),
+    "stuck_to_a_jaw": (
+        *("RELEASE_* SETTLED_*", "jaw", 1, "open retreat settle"),
+        *(np.s_[:], [0.0, 0.1, 0.0]),
+    ),
+}
 
 
-def _forces_above_the_threshold(w: World, cube: int, color: str) -> None:
-    w.jaw(cube, 0)[w.steps(f"close_{color}")[-40:]] = [0.0, 1.1e-5, 0.0]
+def _press(
+    w: World, cube: int, color: str, sensor: str, number: int, roles: str, at: Any, force: Any
+) -> None:
+    getattr(w, sensor)(cube, number)[steps_of(w, roles, color)[at]] = force
 
 
-both("grasp_of_nine_steps", {"GRASP_*"}, _grasp_of_nine_steps)
-both("grasp_by_one_jaw", {"GRASP_*"}, _grasp_by_one_jaw)
-both("grasp_of_ten_steps", set(), _grasp_of_ten_steps)
-both("forces_below_the_threshold", {"GRASP_*"}, _forces_below_the_threshold)
-both("forces_above_the_threshold", set(), _forces_above_the_threshold)
+for name, (rules, *args) in FORCES.items():
+    red = "ORDER" if name == "stuck_to_a_jaw" else ""
+    both(name, rules, lambda w, cube, color, args=args: _press(w, cube, color, *args), red=red)
 
 
-def _touches(number: int, every: int, *roles: str) -> Callable[[World, int, str], None]:
-    def alter(w: World, cube: int, color: str) -> None:
-        steps = w.steps(*(f"{role}_{color}" for role in roles))
-        w.support(cube, number)[steps[::every]] = [0.0, 0.0, 1.0]
-
-    return alter
-
-
-both("table_touched_every_25th_step", {"LIFT_*"}, _touches(0, 25, "lift", "carry"))
-both("cube_touched_every_25th_step", {"LIFT_*"}, _touches(1, 25, "lift", "carry"))
-both("table_touched_every_26th_step", set(), _touches(0, 26, "lift", "carry"))
-both("touched_in_every_10th_step_of_the_carry", {"CARRY_*"}, _touches(0, 10, "carry"))
-
-
-def _dragged(w: World, cube: int, color: str) -> None:
-    w.pose(cube)[w.steps(f"lift_{color}", f"carry_{color}"), 2] = w.pose(cube)[0, 2]
-
-
-def _carried_less_far(by: float) -> Callable[[World, int, str], None]:
-    def alter(w: World, cube: int, color: str) -> None:
-        steps = w.steps(f"carry_{color}")
-        w.pose(cube)[steps, :2] = w.pose(cube)[0, :2]
-        w.pose(cube)[steps[-1], 0] += w.t.carry_distance + by
-
-    return alter
-
-
-def _lift_height(by: float) -> Callable[[World, int, str], None]:
-    def alter(w: World, cube: int, color: str) -> None:
-        steps = w.steps(f"lift_{color}", f"carry_{color}")
-        scene = w.context.cfg.scene
-        w.pose(cube)[steps, 3:] = [1.0, 0.0, 0.0, 0.0]
-        top = scene.table_center[2] + scene.table_half[2]
-        w.pose(cube)[steps, 2] = top + scene.objects["red"].half_height + w.t.lift_height + by
-        w.support(cube)[steps] = 0.0
-
-    return alter
-
-
-both("dragged", {"LIFT_*", "CARRY_*"}, _dragged)
-both("carried_just_too_little", {"CARRY_*"}, _carried_less_far(-HAIR))
-both("carried_just_enough", set(), _carried_less_far(HAIR))
-both("lifted_just_too_little", {"LIFT_*", "CARRY_*"}, _lift_height(-HAIR))
-both("lifted_just_enough", set(), _lift_height(HAIR))
-
-
-def _edge(cube: int, w: World, axis: int, by: float) -> float:
+def _edge(w: World, axis: int, by: float) -> float:
     """Where a cube that is not turned has its corners ``by`` outside of the box's inside, high
     side.
     """
-    scene = w.context.cfg.scene
+    scene = w.stage.cfg.scene
     assert scene.box is not None
     return scene.box.center[axis] + scene.box.half[axis] - scene.objects["red"].half_height + by
 
 
-def _over(last: bool, by: float, axis: int) -> Callable[[World, int, str], None]:
-    def alter(w: World, cube: int, color: str) -> None:
-        steps = w.steps(f"hold_{color}")
-        steps = steps[-1:] if last else steps[:-1]
-        w.pose(cube)[steps, 3:] = [1.0, 0.0, 0.0, 0.0]
-        w.pose(cube)[steps, axis] = _edge(cube, w, axis, by)
-
-    return alter
-
-
-both("a_corner_beside_the_box_before_opening", {"CARRY_*"}, _over(True, HAIR, 0))
-both("a_corner_beside_the_far_side_before_opening", {"CARRY_*"}, _over(True, HAIR, 1))
-both("corners_just_over_the_box_before_opening", set(), _over(True, -HAIR, 1))
-both("beside_the_box_until_the_last_step", set(), _over(False, 0.05, 1))
-
-
-def _unloaded(role: str, at: int, jaw: int) -> Callable[[World, int, str], None]:
-    def alter(w: World, cube: int, color: str) -> None:
-        w.jaw(cube, jaw)[w.steps(f"{role}_{color}")[at]] = 0.0
-
-    return alter
+# Places: the rules that break, when, along which axis the cube is beyond the inside of the box, and
+# how far [m].
+LIMIT = 0.003  # m: a corner may be that far outside
+PLACES: dict[str, tuple[str, str, Any, int, float]] = {
+    "a_corner_beside_the_box_before_opening": ("CARRY_*", "hold", np.s_[-1:], 0, HAIR),
+    "a_corner_beside_the_far_side_before_opening": ("CARRY_*", "hold", np.s_[-1:], 1, HAIR),
+    "corners_just_over_the_box_before_opening": ("", "hold", np.s_[-1:], 1, -HAIR),
+    "beside_the_box_until_the_last_step": ("", "hold", np.s_[:-1], 1, 0.05),
+    "outside_in_one_step_of_settling": ("SETTLED_*", "settle", -30, 0, LIMIT + HAIR),
+    "at_the_limit_in_one_step_of_settling": ("", "settle", -30, 0, LIMIT - HAIR),
+    "outside_in_the_last_step": ("INSIDE", "done", -1, 1, LIMIT + HAIR),
+    "at_the_limit_in_the_last_step": ("", "done", -1, 1, LIMIT - HAIR),
+    "outside_50_steps_before_the_end": ("INSIDE", "done", -50, 1, LIMIT + 0.05),
+    "outside_51_steps_before_the_end": ("", "done", -51, 1, LIMIT + 0.05),
+}
 
 
-both("one_jaw_loses_it_in_the_carry", {"DROP_*"}, _unloaded("carry", 70, 0))
-both("the_other_jaw_loses_it_in_the_hold", {"DROP_*"}, _unloaded("hold", -1, 1))
-both("lost_at_the_start_of_the_lift", {"DROP_*"}, _unloaded("lift", 0, 1))
-both("lost_as_the_closing_ends", {"DROP_*"}, _unloaded("close", -1, 0))
-both("lost_with_nine_steps_of_closing_left", {"DROP_*"}, _unloaded("close", -10, 0))
-both("lost_and_grasped_anew_in_the_last_ten_steps_of_closing", set(), _unloaded("close", -11, 0))
-both("released_in_the_first_step_of_the_opening", set(), _unloaded("open", 0, 0))
+def _put(w: World, cube: int, color: str, role: str, at: Any, axis: int, by: float) -> None:
+    step = steps_of(w, role, color)[at]
+    w.pose(cube)[step, 3:] = LEVEL
+    w.pose(cube)[step, axis] = _edge(w, axis, by)
 
 
-def _opened(by: float) -> Callable[[World, int, str], None]:
-    def alter(w: World, cube: int, color: str) -> None:
-        robot = w.context.cfg.robot
-        t = w.t
-        limit = robot.gripper_closed[0] + (t.open_fraction + by) * (
-            robot.gripper_open[0] - robot.gripper_closed[0]
-        )
-        steps = w.steps(f"open_{color}", f"retreat_{color}", f"settle_{color}")
-        w.gripper[steps] = np.minimum(w.gripper[steps], limit)
-
-    return alter
+for name, (rules, *args) in PLACES.items():
+    both(name, rules, lambda w, cube, color, args=args: _put(w, cube, color, *args))
 
 
-CASES.add(
-    "red_not_opened_far_enough", {"RELEASE_RED", "ORDER"}, lambda w: _opened(-1e-5)(w, RED, "red")
-)
-CASES.add("blue_not_opened_far_enough", {"RELEASE_BLUE"}, lambda w: _opened(-1e-5)(w, BLUE, "blue"))
-both("opened_just_far_enough", set(), _opened(1e-5))
+def _above_the_rim(w: World, cube: int, color: str, *, role: str) -> None:
+    w.pose(cube)[steps_of(w, role, color)[-1], 2] += 0.0085
 
 
-def _stuck_to_a_jaw(w: World, cube: int, color: str) -> None:
-    w.jaw(cube, 1)[w.steps(f"open_{color}", f"retreat_{color}", f"settle_{color}")] = [
-        0.0,
-        0.1,
-        0.0,
-    ]
+both("above_the_rim_as_settling_ends", "SETTLED_*", partial(_above_the_rim, role="settle"))
+both("above_the_rim_at_the_end", "INSIDE", partial(_above_the_rim, role="done"))
 
 
-CASES.add(
-    "red_stuck_to_a_jaw",
-    {"RELEASE_RED", "SETTLED_RED", "ORDER"},
-    lambda w: _stuck_to_a_jaw(w, RED, "red"),
-)
-CASES.add(
-    "blue_stuck_to_a_jaw",
-    {"RELEASE_BLUE", "SETTLED_BLUE"},
-    lambda w: _stuck_to_a_jaw(w, BLUE, "blue"),
-)
+def _dragged(w: World, cube: int, color: str) -> None:
+    w.pose(cube)[steps_of(w, "lift carry", color), 2] = w.pose(cube)[0, 2]
 
 
-def _touched_before_the_end_of_settling(steps: int) -> Callable[[World, int, str], None]:
-    def alter(w: World, cube: int, color: str) -> None:
-        w.jaw(cube, 0)[w.steps(f"settle_{color}")[-steps]] = [0.1, 0.0, 0.0]
-
-    return alter
+both("dragged", "LIFT_* CARRY_*", _dragged)
 
 
-def _at_rest_speed(by: float) -> Callable[[World, int, str], None]:
-    def alter(w: World, cube: int, color: str) -> None:
-        w.velocity(cube)[w.steps(f"settle_{color}")[-1]] = [
-            0.0,
-            w.t.rest_speed + by,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-        ]
-
-    return alter
+@sides("carried_just_too_little", "carried_just_enough", "CARRY_*")
+def _carried(w: World, cube: int, color: str, by: float) -> None:
+    steps = steps_of(w, "carry", color)
+    w.pose(cube)[steps, :2] = w.pose(cube)[0, :2]
+    w.pose(cube)[steps[-1], 0] += w.t.carry_distance - by
 
 
-def _spin(by: float) -> Callable[[World, int, str], None]:
-    def alter(w: World, cube: int, color: str) -> None:
-        t = w.t
-        half = w.context.cfg.scene.objects["red"].half_height
-        spin = (t.rest_speed + by) / (
-            math.sqrt(2.0) * half
-        )  # about an axis through a face: its corners are sqrt(2) half away
-        w.velocity(cube)[w.steps(f"settle_{color}")[-20]] = [0.0, 0.0, 0.0, 0.0, spin, 0.0]
+@sides("lifted_just_too_little", "lifted_just_enough", "LIFT_* CARRY_*")
+def _lifted(w: World, cube: int, color: str, by: float) -> None:
+    steps = steps_of(w, "lift carry", color)
+    scene = w.stage.cfg.scene
+    w.pose(cube)[steps, 3:] = LEVEL
+    top = scene.table_center[2] + scene.table_half[2]
+    w.pose(cube)[steps, 2] = top + scene.objects["red"].half_height + w.t.lift_height - by
+    w.support(cube)[steps] = 0.0
 
-    return alter
+
+@sides("not_opened_far_enough", "opened_just_far_enough", "RELEASE_*", red="ORDER", by=1e-5)
+def _opened(w: World, cube: int, color: str, by: float) -> None:
+    closed = w.stage.cfg.robot.gripper_closed[0]
+    limit = closed + (w.t.open_fraction - by) * (w.stage.cfg.robot.gripper_open[0] - closed)
+    steps = steps_of(w, "open retreat settle", color)
+    w.gripper[steps] = np.minimum(w.gripper[steps], limit)
+
+
+@sides("moving_as_settling_ends", "slow_as_settling_ends", "SETTLED_*")
+def _moving(w: World, cube: int, color: str, by: float) -> None:
+    speed = w.t.rest_speed + by
+    w.velocity(cube)[steps_of(w, "settle", color)[-1]] = [0.0, speed, 0.0, 0.0, 0.0, 0.0]
+
+
+@sides("spinning", "spinning_slowly", "SETTLED_*")
+def _spinning(w: World, cube: int, color: str, by: float) -> None:
+    """About an axis through a face: its corners are sqrt(2) half away."""
+    half = w.stage.cfg.scene.objects["red"].half_height
+    spin = (w.t.rest_speed + by) / (math.sqrt(2.0) * half)
+    w.velocity(cube)[steps_of(w, "settle", color)[-20]] = [0.0, 0.0, 0.0, 0.0, spin, 0.0]
 
 
 def _rolling(w: World, cube: int, color: str) -> None:
     """Each part is slow enough; together they move one edge faster than allowed, and the opposite
     one not at all.
     """
-    half = w.context.cfg.scene.objects["red"].half_height
-    step = w.steps(f"settle_{color}")[-20]
+    half = w.stage.cfg.scene.objects["red"].half_height
+    step = steps_of(w, "settle", color)[-20]
     w.pose(cube)[step, 3:] = [math.cos(0.3), 0.0, 0.0, math.sin(0.3)]
     along = np.array([math.cos(0.6), math.sin(0.6), 0.0])
-    w.velocity(cube)[step] = [
-        *(0.03 * along),
-        0.0,
-        0.02 / half,
-        0.0,
-    ]  # turning about its own y, moving along its own x
+    # turning about its own y, moving along its own x
+    w.velocity(cube)[step] = [*(0.03 * along), 0.0, 0.02 / half, 0.0]
 
 
-def _outside(role: str, at: int, axis: int, by: float) -> Callable[[World, int, str], None]:
-    def alter(w: World, cube: int, color: str) -> None:
-        step = w.steps(f"{role}_{color}" if role != "done" else role)[at]
-        w.pose(cube)[step, 3:] = [1.0, 0.0, 0.0, 0.0]
-        w.pose(cube)[step, axis] = _edge(cube, w, axis, w.t.inside + by)
-
-    return alter
-
-
-def _above_the_rim(role: str) -> Callable[[World, int, str], None]:
-    def alter(w: World, cube: int, color: str) -> None:
-        step = w.steps(f"{role}_{color}" if role != "done" else role)[-1]
-        w.pose(cube)[step, 2] += 0.0085
-
-    return alter
-
-
-both(
-    "touched_50_steps_before_the_end_of_settling",
-    {"SETTLED_*"},
-    _touched_before_the_end_of_settling(50),
-)
-both("touched_51_steps_before_the_end_of_settling", set(), _touched_before_the_end_of_settling(51))
-both("moving_as_settling_ends", {"SETTLED_*"}, _at_rest_speed(HAIR))
-both("slow_as_settling_ends", set(), _at_rest_speed(-HAIR))
-both("spinning", {"SETTLED_*"}, _spin(HAIR))
-both("spinning_slowly", set(), _spin(-HAIR))
-both("rolling", {"SETTLED_*"}, _rolling)
-both("outside_in_one_step_of_settling", {"SETTLED_*"}, _outside("settle", -30, 0, HAIR))
-both("at_the_limit_in_one_step_of_settling", set(), _outside("settle", -30, 0, -HAIR))
-both("above_the_rim_as_settling_ends", {"SETTLED_*"}, _above_the_rim("settle"))
-both("outside_in_the_last_step", {"INSIDE"}, _outside("done", -1, 1, HAIR))
-both("at_the_limit_in_the_last_step", set(), _outside("done", -1, 1, -HAIR))
-both("outside_50_steps_before_the_end", {"INSIDE"}, _outside("done", -50, 1, 0.05))
-both("outside_51_steps_before_the_end", set(), _outside("done", -51, 1, 0.05))
-both("above_the_rim_at_the_end", {"INSIDE"}, _above_the_rim("done"))
+both("rolling", "SETTLED_*", _rolling)
 
 
 @CASES.case("INSIDE")
@@ -478,16 +403,12 @@ def blue_touched_by_one_jaw_before_red_is_released(w: World) -> None:
     w.jaw(BLUE, 1)[w.steps("close_red", "lift_red")] = [0.0, 0.1, 0.0]
 
 
-def _jaws_at(by: float) -> Callable[[World], None]:
-    def alter(w: World) -> None:
-        clearance = w.outcome.values["jaw_clearance_m"]
-        w.xpos[:, 2] += w.t.jaw_clearance - clearance + by
-
-    return alter
+def _jaws_at(w: World, by: float) -> None:
+    w.xpos[:, 2] += w.t.jaw_clearance - w.outcome.values["jaw_clearance_m"] + by
 
 
-CASES.add("jaws_just_too_low", {"JAW_CLEAR"}, _jaws_at(-HAIR))
-CASES.add("jaws_just_high_enough", set(), _jaws_at(HAIR))
+CASES.add("jaws_just_too_low", {"JAW_CLEAR"}, lambda w: _jaws_at(w, -HAIR))
+CASES.add("jaws_just_high_enough", set(), lambda w: _jaws_at(w, HAIR))
 
 
 @CASES.case()
@@ -548,10 +469,7 @@ def blue_dropped_and_grasped_at_the_second_attempt(w: World) -> None:
 
 @CASES.case("GRASP_BLUE")
 def blue_grasped_at_the_first_attempt_only(w: World) -> None:
-    def last_attempt(w: World, steps: np.ndarray) -> None:
-        w.jaw(BLUE, 0)[steps + len(steps)] = 0.0
-
-    _second_attempt(w, "blue", last_attempt)
+    _second_attempt(w, "blue", lambda w, steps: w.jaw(BLUE, 0).__setitem__(steps + len(steps), 0.0))
 
 
 @CASES.case("DROP_RED")
@@ -573,20 +491,18 @@ def test_altered_recording(name: str, altered: Altered) -> None:
     assert_same(result, k, world.outcome)
 
 
-def test_episode_cut_short_fails_whatever_came_before() -> None:
-    world = World.of(planned())
-    for name in ("phase", "qpos", "qvel", "sensordata"):
-        setattr(world, name, getattr(world, name)[:-1])
-    assert {"STEPS", "INSIDE", "JAW_CLEAR"} <= CASES.broken(feed([world]))
-
-
-def test_episode_that_goes_on_fails_for_its_length_alone() -> None:
+@pytest.mark.parametrize("more", [-1, 60])
+def test_episode_of_another_length_fails_whatever_came_before(more: int) -> None:
+    """Cut short, or with the cubes back on the table."""
     world = World.of(planned())
     for name in ("phase", "qpos", "qvel", "sensordata"):
         values = getattr(world, name)
-        setattr(world, name, np.concatenate([values, values[:60]]))  # cubes back on the table
-    result = feed([world])
-    assert CASES.broken(result) == {"STEPS", "INSIDE", "JAW_CLEAR"}
+        rows = values[:more] if more < 0 else np.concatenate([values, values[:more]])
+        setattr(world, name, rows)
+    broken = CASES.broken(feed([world]))
+    assert broken == {"STEPS", "INSIDE", "JAW_CLEAR"} or (
+        more < 0 and {"STEPS", "INSIDE", "JAW_CLEAR"} <= broken
+    )
 
 
 def test_every_rule_has_words_and_a_case_of_its_own() -> None:
@@ -600,7 +516,7 @@ def test_every_rule_has_words_and_a_case_of_its_own() -> None:
 def test_explained_rules_are_the_rules() -> None:
     rec = planned()
     values = {name: float(v[0]) for name, v in rec.result.values.items()}
-    check = rec.context.check
+    check = rec.stage.check
     told = check.report(rec.result)
     assert set(told) | {"FINITE", "STEPS", "OVERFLOW"} == set(RULES)
     assert all(found and wanted for found, wanted in told.values())
@@ -629,18 +545,8 @@ def test_expert_episodes_of_the_box_pass_without_phases() -> None:
 def test_cheats_in_the_box_break_a_rule() -> None:
     """Each of them, judged without phases, by the check and by the plain checker."""
     rec = planned()
-    names = (
-        "no_grasp",
-        "early_blue",
-        "never_open",
-        "held",
-        "thrown",
-        "pushed",
-        "knocked",
-        "leaned",
-    )
-    names += ("moving_at_the_end", "touched")
-    worlds = {name: World.of(rec) for name in names}
+    names = "no_grasp early_blue never_open held thrown pushed knocked leaned moving_at_the_end"
+    worlds = {name: World.of(rec) for name in (*names.split(), "touched")}
     worlds["no_grasp"].jaw(0, 0)[:] = 0.0
     for jaw in (0, 1):
         worlds["early_blue"].jaw(1, jaw)[worlds["early_blue"].steps("hold_red")[-1]] = 1.0

@@ -8,19 +8,20 @@ would take long to drive, are written into a recorded episode.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from check_cases import rules_of
+from environments import Keep
 from stack_checker import BLUE, RED
 from test_stack_check import World, feed, reference
 
 from mjstack.drivers.driver import Driver
-from mjstack.envs import Env
-from mjstack.episodes.context import RunContext
-from mjstack.episodes.rollout import Observer, play_episode
+from mjstack.episodes.rollout import play_episode
+from mjstack.episodes.stage import Stage
 from mjstack.sim import Simulation
 
 RULES = rules_of("stack")
@@ -38,69 +39,34 @@ class Targets(Driver):
         return next(self._rest)
 
 
-class Keep(Observer):
-    """Keeps actions and states at every step end."""
-
-    def start(self, env: Env, driver: Driver) -> None:
-        super().start(env, driver)
-        self.actions: list[torch.Tensor] = []
-        self.states: dict[str, list[torch.Tensor]] = {"qpos": [], "qvel": [], "sensordata": []}
-
-    def after_step(self, step: int) -> None:
-        self.actions.append(self.env.action_manager.action.clone())
-        for name, kept in self.states.items():
-            kept.append(getattr(self.env.sim, name).clone())
-
-
-def worlds_of(keep: Keep, rec: SimpleNamespace) -> list[World]:
-    """The kept worlds, for the plain checker."""
-    index = keep.env.index
-    qpos, qvel, force = (torch.stack(kept).numpy() for kept in keep.states.values())
-    pose = np.stack([qpos[..., a : a + 7] for a in index.object_qpos], axis=2)
-    velocity = np.stack([qvel[..., a : a + 6] for a in index.object_qvel], axis=2)
-    gripper = qpos[..., index.robot_qpos[index.n_arm :]]
-    count = keep.env.sim.step_count.tolist()
-    return [
-        World(pose[:, k], velocity[:, k], force[:, k], gripper[:, k], count[k], rec)
-        for k in range(NWORLD)
-    ]
-
-
 @pytest.fixture(scope="module")
 def drive(
-    stage: Callable[[str], RunContext], make_sim: Callable[..., Simulation]
+    get_stage: Callable[[str], Stage], make_sim: Callable[..., Simulation]
 ) -> Callable[..., list[set[str]]]:
     """Drives jittered native worlds without phases by the expert's joint targets, changed; the
     broken rules of each world, on which the plain checker agrees.
     """
-    experts: dict[str, tuple[torch.Tensor, dict[str, slice]]] = {}
 
-    def expert(robot: str) -> tuple[torch.Tensor, dict[str, slice]]:
-        if robot not in experts:
-            context = stage(robot)
-            keep = Keep()
-            context.play(make_sim("native", NWORLD, robot=robot), context.cfg.reset, [keep])
-            spans = {p.name: slice(p.start, p.stop) for p in context.planner.phases}
-            experts[robot] = (torch.stack(keep.actions), spans)
-        return experts[robot]
+    @cache
+    def expert(robot: str) -> torch.Tensor:
+        stage = get_stage(robot)
+        keep = Keep()
+        stage.play(make_sim("native", NWORLD, robot=robot), stage.cfg.reset, [keep])
+        return torch.stack(keep.actions)
 
     def play(
         robot: str, change: Callable[[torch.Tensor, dict[str, slice]], None]
     ) -> list[set[str]]:
-        context = stage(robot)
-        targets, spans = expert(robot)
-        targets = targets.clone()
-        change(targets, spans)
-        env = context.start(make_sim("native", NWORLD, robot=robot), context.cfg.reset)
+        stage = get_stage(robot)
+        targets = expert(robot).clone()
+        change(targets, {p.name: slice(p.start, p.stop) for p in stage.planner.phases})
+        env = stage.start(make_sim("native", NWORLD, robot=robot), stage.cfg.reset)
         keep = Keep()
         episode = play_episode(env, Targets(targets), [keep])
-        rec = SimpleNamespace(
-            cfg=context.cfg, phases=context.planner.phases, jaw_force=context.index.jaw_force
-        )
+        rec = keep.recording(stage, episode)
         broken = [set(RULES.broken(int(bits))) for bits in episode.failed]
-        worlds = worlds_of(keep, rec)
         for k in (0, NWORLD - 1):
-            assert reference(worlds[k], phased=False).failed == broken[k]
+            assert reference(World.of(rec, k), phased=False).failed == broken[k]
         return broken
 
     return play

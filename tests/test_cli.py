@@ -6,6 +6,7 @@ import json
 import logging
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -22,20 +23,13 @@ from mjstack import cli
 from mjstack.cli import run
 from mjstack.config import load_config
 from mjstack.config.session import CONFIG_FOLDER
-from mjstack.episodes.context import RunContext
-from mjstack.errors import CompositionError
+from mjstack.episodes.stage import Stage
+from mjstack.errors import MjstackError
 from mjstack.jobs import CheckedJob
 
 SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "run.py"
-PROVENANCE = {
-    "versions",
-    "device",
-    "driver",
-    "cpu_count",
-    "git_commit",
-    "config_sha256",
-    "model_sha256",
-}
+PROVENANCE = {"versions", "device", "driver", "cpu_count", "git_commit"}
+PROVENANCE |= {"config_sha256", "model_sha256"}
 
 
 @pytest.fixture
@@ -53,98 +47,57 @@ def the_report(folder: Path) -> dict:
     return json.loads(path.read_text())
 
 
-@pytest.mark.parametrize(
-    "args", [["devices=2", "job=reachability"], ["-m", "job=train", "seed=1,2"]]
-)
-def test_torchrun_is_for_one_training(
-    args: list[str],
-    folder: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    """The first process refuses as well, before it writes."""
-    if "-m" in args:
-        monkeypatch.setenv("WORLD_SIZE", "2")
-    assert run([*args, "sim=native"]) == 2
-    assert re.search("torchrun.*: expected", capsys.readouterr().err)
-    assert not everything(folder)
-
-
-@pytest.mark.parametrize("launcher", [[], ["hydra/launcher=gpus"]])
-def test_a_sweep_shares_no_job_among_devices(
-    launcher: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(["-m", *launcher, "sim=native", "seed=0,1", "devices=2"]) == 2
-    assert capsys.readouterr().err.strip() == (
-        "mjstack: devices=2: expected null with -m. Leave it out: with hydra/launcher=gpus each job"
-        " has one GPU, and hydra.launcher.jobs is how many run at once."
+def in_a_process(folder: Path, *command: str | Path) -> subprocess.CompletedProcess:
+    """Python on a command."""
+    return subprocess.run(
+        [sys.executable, *command], cwd=folder, capture_output=True, text=True, timeout=120
     )
+
+
+def test_torchrun_is_for_one_job(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    assert run(["-m", "job=train", "seed=1,2", "sim=native"]) == 2
+    assert "torchrun: expected" in capsys.readouterr().err
     assert not everything(folder)
 
 
 # Refusals of the composition itself are in test_config.py.
-BAD = [
-    ["nworld=0"],
-    ["sim=mjwarp", "sim.device=cuda:77"],
-    ["-m", "nworld =3"],
-    ["--helpp"],
-    ["-x", "nworld=3"],
-    ["hydra.run.dir=afile/below"],
-    ["hydra.nothing=1"],
-    ["hydra/job_logging=none"],
-    ["hydra.output_subdir=/proc/x"],
-    ["+hydra.callbacks.x={_target_: nope.nope}", "gates=[baseline]"],
-    ["-m", "robot=so101,so100", "gates=[baseline]"],
-    ["-m", "nworld=1,0"],
-    ["video=true", "gates=[batch]"],
-    ["+bogus=1"],
-    ["++sim.nworlds=3"],
-    ["hydra.run.dir=${foo}"],
-    ["robot.gripper_open=[9.0]"],
-    ["robot.grasp_sites=[x,y]"],
-    ["scene.objects.red.xy=[0.48,-0.2]"],
-    ["reset.cubes.params.xy=0.5"],
-    ["~reset.cubes.params.xy"],
-    ["reset.cubes.func=mjstack.mdp.reset.JiterObjects"],
-    ["reward.progress.params.scale=wide"],
-    ["action.arm.params.mode=sideways"],
-    ["observation.policy.terms.joint_pos.history=0"],
-    ["reset=randomized", "reset.cubes.params.xy=[0.0,0.001]", "reset.cubes.params.gap=0.5"],
-    ["-cn", "foo"],
-    ["-m", "robot=glob(*)"],
-    ["-m", "nworld=range(4,1)"],
-]
+BAD = r"""
+sim=mjwarp sim.device=cuda:77
+-m 'nworld =3'
+-x nworld=3
+hydra.run.dir=afile/below
+hydra.nothing=1
+hydra/job_logging=none
+hydra.output_subdir=/proc/x
+'+hydra.callbacks.x={_target_: nope.nope}' gates=[baseline]
+-m robot=so101,so100 gates=[baseline]
+-m nworld=1,0
+video=true gates=[batch]
+'hydra.run.dir=${foo}'
+robot.gripper_open=[9.0]
+robot.grasp_sites=[x,y]
+scene.objects.red.xy=[0.48,-0.2]
+reset.cubes.params.xy=0.5
+~reset.cubes.params.xy
+reset.cubes.func=mjstack.mdp.reset.JiterObjects
+reward.progress.params.scale=wide
+action.arm.params.mode=sideways
+observation.policy.terms.joint_pos.history=0
+reset=randomized reset.cubes.params.xy=[0.0,0.001] reset.cubes.params.gap=0.5
+-m robot=glob(*)
+-m nworld=range(4,1)
+"""
+FLAGS = ["--cfg nope", "-c", "--package", "--info x", "--version=1", "-m --cfg job", "-cn foo"]
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("args", BAD, ids=[" ".join(args) for args in BAD])
-def test_bad_input_exits_2_in_one_line_and_writes_nothing(
-    args: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    if "hydra.run.dir=afile/below" in args:
-        (folder / "afile").write_text("")
-    before = everything(folder)
-    assert run(args) == 2
-    out, err = capsys.readouterr()
-    assert err.startswith("mjstack: ")
-    assert len(err.strip().splitlines()) == 1
-    assert "Traceback" not in out + err
-    assert everything(folder) == before
-
-
-FLAGS = ["--cfg nope", "-c", "--package", "--info x", "--version=1", "-m --cfg job", "-sc"]
-
-
-@pytest.mark.parametrize("flags", [*FLAGS, "nworld=2 -m gates=[nope]", "--cfg job -p gate.nope"])
-def test_flags_that_cannot_be_used_are_a_line(
-    flags: str, folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(flags.split()) == 2
-    assert re.fullmatch("mjstack: .+\n", capsys.readouterr().err)
-    assert everything(folder) == []
-
-
-TOLD = [
+ALONE = (
+    "devices=2: expected null with -m. Leave it out: with hydra/launcher=gpus each job has one GPU,"
+    " and hydra.launcher.jobs is how many run at once."
+)
+LINES = [
     ("+foo=1", "configuration key 'foo' does not exist. Did you mean 'robot'? Available: action"),
     ("++robot.hoem=1", "configuration key 'robot.hoem' does not exist. Did you mean 'robot.home'?"),
     ("+gate.batch.seds=1", "'gate.batch.seds' does not exist. Did you mean 'gate.batch.seeds'?"),
@@ -158,17 +111,32 @@ TOLD = [
     ("hydra/launcher=nope", ". Others are plugins of Hydra, which pip installs, such as hydra-"),
     ("cameras=[front,wirst]", "cameras=wirst: 'wirst' does not exist. Did you mean 'wrist'?"),
     ("-sc", "-sc: expected install=SHELL or uninstall=SHELL alone."),
+    ("devices=2 job=reachability sim=native", "torchrun, devices: expected"),
+    ("-m sim=native seed=0,1 devices=2", ALONE),
+    ("-m hydra/launcher=gpus sim=native seed=0,1 devices=2", ALONE),
+    ("--gate.batch.seeds=[1]", "flag '--gate.batch.seeds=[1]' does not exist. "),
+    ("--nworld 64", "flag '--nworld' does not exist. "),
+    ("--seed nworld=2", "Keys are set without dashes: nworld=64."),
 ]
 
 
-@pytest.mark.parametrize(("args", "says"), TOLD, ids=[args for args, _ in TOLD])
-def test_the_line_says_how_to_go_on(
-    args: str, says: str, folder: Path, capsys: pytest.CaptureFixture[str]
+LINES += [(flags, "mjstack: ") for flags in FLAGS]
+LINES += [("nworld=2 -m gates=[nope]", "gate 'nope'"), ("--cfg job -p gate.nope", "gate.nope")]
+CASES = [pytest.param(*row, id=row[0]) for row in LINES]
+CASES += [pytest.param(a, "", id=a, marks=pytest.mark.full) for a in BAD.strip().splitlines()]
+
+
+@pytest.mark.parametrize(("args", "words"), CASES)
+def test_bad_input_exits_2_in_one_line_and_writes_nothing(
+    args: str, words: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(args.split()) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert says in line
-    assert everything(folder) == []
+    (folder / "afile").write_text("")
+    assert run(shlex.split(args)) == 2
+    out, err = capsys.readouterr()
+    assert re.fullmatch("mjstack: .+\n", err)
+    assert words in err
+    assert "Traceback" not in out + err
+    assert everything(folder) == [folder / "afile"]
 
 
 UNEXPECTED = (
@@ -176,7 +144,7 @@ UNEXPECTED = (
     MemoryError("5 GiB"),
     RecursionError("deep"),
     SystemExit(0),
-    CompositionError("a wrong value"),
+    MjstackError("a wrong value"),
 )
 
 
@@ -209,30 +177,24 @@ def test_any_error_of_the_run_is_a_line(
     capsys: pytest.CaptureFixture[str],
     caplog: pytest.LogCaptureFixture,
     monkeypatch: pytest.MonkeyPatch,
-    stage: Callable[..., RunContext],
+    get_stage: Callable[..., Stage],
 ) -> None:
     def work(*_: object) -> None:
         raise error
 
     # Hydra's of an earlier test writes to a stream that is closed.
     monkeypatch.setattr(logging.getLogger(), "handlers", [caplog.handler])
-    job = CheckedJob(context=stage("so101"), title="[/]", work=work)
+    job = CheckedJob(stage=get_stage("so101"), title="[/]", work=work)
     assert job.run(folder, ["[/]"]).exit_code == 1
     assert re.fullmatch("mjstack: .+\n", capsys.readouterr().err)
     assert "Traceback" in caplog.text
     assert the_report(folder)["status"] == "fail"
 
 
-@pytest.mark.parametrize("args", [["robot=so100"], ["nworld=many"]], ids=" ".join)
-def test_bad_input_in_a_process_of_its_own(args: list[str], folder: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, SCRIPT, *args], cwd=folder, capture_output=True, text=True, timeout=60
-    )
-    assert done.returncode == 2
-    lines = [line for line in done.stderr.splitlines() if line.strip()]
-    assert len(lines) == 1, done.stderr
-    assert lines[0].startswith("mjstack: ")
-    assert done.stdout == ""
+def test_bad_input_in_a_process_of_its_own(folder: Path) -> None:
+    done = in_a_process(folder, SCRIPT, "robot=so100")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert re.fullmatch("mjstack: .+\n", done.stderr)
     assert everything(folder) == []
 
 
@@ -253,14 +215,7 @@ main()
 
 def starting(folder: Path, module: str, before: str, *args: str) -> subprocess.CompletedProcess:
     """A command line on which somebody presses Ctrl-C as a module is loaded."""
-    program = STARTING.format(module=module, before=before)
-    return subprocess.run(
-        [sys.executable, "-c", program, *args],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
+    return in_a_process(folder, "-c", STARTING.format(module=module, before=before), *args)
 
 
 @pytest.mark.full
@@ -294,23 +249,9 @@ for args in (["robo=so101"], ["nworld=many"], ["--nworld=3"], ["--version"], ["-
     except SystemExit as stop:
         print(stop.code, {"torch", "warp"} & set(sys.modules), file=sys.stderr)
 """
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=folder, capture_output=True, text=True, timeout=60
-    )
+    done = in_a_process(folder, "-c", program)
     said = [line for line in done.stderr.splitlines() if not line.startswith("mjstack: ")]
     assert said == ["2 set()"] * 3 + ["0 set()"] * 2
-
-
-@pytest.mark.parametrize(
-    "args", [["--gate.batch.seeds=[1]"], ["--nworld", "64"], ["--seed", "nworld=2"]], ids=" ".join
-)
-def test_an_override_with_dashes_is_told_without(
-    args: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(args) == 2
-    said = capsys.readouterr().err.strip()
-    assert said.startswith(f"mjstack: flag '{args[0]}' does not exist. ")
-    assert said.endswith(" Keys are set without dashes: nworld=64.")
 
 
 @pytest.mark.full
@@ -336,9 +277,7 @@ try:
 except KeyboardInterrupt:
     print("mine")
 """
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=folder, capture_output=True, text=True, timeout=60
-    )
+    done = in_a_process(folder, "-c", program)
     assert done.stdout.split() == ["2", "2", "mine"], done.stderr
 
 
@@ -359,12 +298,8 @@ def test_help_says_what_there_is_to_choose(
     out = capsys.readouterr().out
     assert max(map(len, out.splitlines())) <= 79
     said = " ".join(out.split())
-    for group in CONFIG_FOLDER.iterdir():
-        for choice in group.glob("*.yaml"):
-            assert re.search(rf" {group.name} [^:]*: .*\b{choice.stem}\b", said), (
-                group.name,
-                choice.stem,
-            )
+    for path in CONFIG_FOLDER.glob("*/*.yaml"):
+        assert re.search(rf" {path.parent.name} [^:]*: .*\b{path.stem}\b", said), path
     keys = {name for name, value in asdict(load_config()).items() if not isinstance(value, dict)}
     for name in keys:
         assert re.search(rf"^  {name} ", out, re.MULTILINE), name
@@ -390,11 +325,18 @@ def test_version(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert everything(folder) == []
 
 
-def test_a_part_of_the_configuration_is_shown(
-    folder: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("args", "line"),
+    [
+        (["robot=rebot", "--cfg", "job"], "name: rebot\n"),
+        (["job=collect", "job.episodes=7", "--cfg", "job", "-p", "job"], "episodes: 7\n"),
+    ],
+)
+def test_cfg_prints_and_writes_nothing(
+    args: list[str], line: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(["job=collect", "job.episodes=7", "--cfg", "job", "-p", "job"]) == 0
-    assert "episodes: 7\n" in capsys.readouterr().out
+    assert run(args) == 0
+    assert line in capsys.readouterr().out
     assert everything(folder) == []
 
 
@@ -413,15 +355,10 @@ def test_baseline_leaves_a_whole_report(folder: Path) -> None:
     assert all(isinstance(v, float | int) for v in gate["metrics"].values())
     (job,) = {path.parent for path in folder.rglob("report.json")}
     assert job.relative_to(folder).parts[0] == "outputs"
-    for name in (
-        "report.md",
-        "report.html",
-        "run.log",
-        *(["scene.png"] if has_gl() else []),
-        "trajectories.png",
-        ".hydra/config.yaml",
-        ".hydra/overrides.yaml",
-    ):
+    names = (
+        "report.md report.html run.log trajectories.png .hydra/config.yaml .hydra/overrides.yaml"
+    )
+    for name in [*names.split(), *(["scene.png"] if has_gl() else [])]:
         assert (job / name).stat().st_size > 0, name
     assert [path.name for path in folder.iterdir()] == ["outputs"]
 
@@ -435,16 +372,10 @@ def test_sweep_reports_each_job_and_exits_with_its_worst(folder: Path) -> None:
     assert failed["gates"][0]["status"] == "fail"
     assert "not stacked" in failed["gates"][0]["reason"]
     (summary,) = folder.rglob("summary.md")
-    rows = summary.read_text().splitlines()
-    assert len(rows) == 4
-    assert "xy_err=0.015" in rows[2]
-    assert "xy_err=1e-06" in rows[3]
-
-
-def test_cfg_prints_and_writes_nothing(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["--cfg", "job", "robot=rebot"]) == 0
-    assert "name: rebot" in capsys.readouterr().out
-    assert everything(folder) == []
+    rows = [line for line in summary.read_text().splitlines() if line.startswith("| ")]
+    assert rows[0].startswith("| job | task.check.xy_err | baseline | ")
+    assert rows[2].startswith("| 0 | 0.015 | pass: ")
+    assert rows[3].startswith("| 1 | 1e-06 | fail: ")
 
 
 @pytest.mark.full

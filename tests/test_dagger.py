@@ -7,37 +7,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from compositions import load_config
-from test_train import report, weights
+from policies import interrupted, report, same
 
-import mjstack.interrupt as interrupt
-import mjstack.train.clone_learner as clone
 import mjstack.train.dagger as dagger
 from mjstack.cli import run
-from mjstack.errors import MjstackError
-from mjstack.interrupt import handle_interrupts
-from mjstack.jobs.train import check_train
 from mjstack.policy import load_policy
+from mjstack.train.clone_learner import CloneLearner
 
 TINY = (
-    "job=train",
-    "trainer=dagger",
-    "task=reach",
-    "sim=native",
-    "nworld=4",
-    "job.rounds=2",
-    "job.episodes=4",
-    "job.hidden=[32]",
-    "job.batches=20",
-    "job.batch_size=64",
+    *("job=train", "trainer=dagger", "task=reach", "sim=native", "nworld=4", "job.rounds=2"),
+    *("job.episodes=4", "job.hidden=[32]", "job.batches=20", "job.batch_size=64"),
     "gate.success.rate=0.0",
 )
 
 
 @pytest.mark.full
-def test_rounds_leave_a_policy_and_go_on_bit_for_bit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rounds_leave_a_policy_and_go_on_bit_for_bit(tmp_path: Path) -> None:
     """Interrupted in the first round, when it is over, and in the second one."""
     whole = tmp_path / "whole"
     assert run([*TINY, f"job.folder={whole}"]) == 0
@@ -52,45 +37,16 @@ def test_rounds_leave_a_policy_and_go_on_bit_for_bit(
     assert not list(whole.glob("round-*"))
 
     parts = tmp_path / "parts"
-    step = clone.Learner._step
-
-    def stop(self: clone.Learner, rate: float) -> None:
-        step(self, rate)
-        if self.done + 1 == stops[0]:
-            patch.setattr(interrupt, "_asked", True)
-
-    stops = [7, 20, 33]
-    while stops:
-        with monkeypatch.context() as patch:
-            patch.setattr(clone.Learner, "_step", stop)
-            patch.setattr(clone, "_SHOWN", 1)
-            with handle_interrupts():
-                assert run([*TINY, f"job.folder={parts}"]) == 130
-        del stops[0]
+    for number in (7, 20, 33):
+        interrupted([*TINY, f"job.folder={parts}"], CloneLearner, number)
     assert run([*TINY, f"job.folder={parts}"]) == 0
-    first = weights(whole / "last")
-    assert all(torch.equal(v, first[k]) for k, v in weights(parts / "last").items())
+    assert same(whole / "last", parts / "last")
     other = np.genfromtxt(parts / "train.csv", delimiter=",", names=True)
     for name in ("success", "validation_loss"):
         assert rows[name].tolist() == other[name].tolist()
 
 
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("controller=closed_loop", "controller=closed_loop: expected state_based, because"),
-        ("job.dataset=outputs", "job.dataset=outputs: expected null"),
-        ("job.rounds=0", "job.rounds=0"),
-        ("job.episodes=1", "job.episodes=1: expected at least 2"),
-    ],
-)
-def test_what_cannot_be_trained_is_one_line(override: str, message: str) -> None:
-    with pytest.raises(MjstackError, match=message) as error:
-        check_train(load_config([*TINY, override]))
-    assert "\n" not in str(error.value)
-
-
-def test_the_share_of_the_expert(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_share_of_the_expert() -> None:
     """Worlds in which the policy drives alone get its targets; in the others the expert drives for
     about its share of the spells.
     """

@@ -29,23 +29,14 @@ from mjstack.datasets import (
     EpisodeData,
     Feature,
     lerobot,
+    part,
     read_dataset,
-)
-from mjstack.datasets import (
-    writer as writer_module,
 )
 from mjstack.datasets.lerobot import QUANTILES
 from mjstack.datasets.lerobot import STATISTICS as NAMES
 from mjstack.datasets.part import PartWriter
 from mjstack.datasets.reader import uncommitted
-from mjstack.errors import (
-    ArgumentError,
-    DatasetError,
-    FolderError,
-    MissingExtra,
-    UnknownName,
-    UnwrittenError,
-)
+from mjstack.errors import ArgumentError, FolderError, MissingExtra, UnknownName
 
 GUIDE = Path(__file__).resolve().parents[1] / "docs" / "datasets.md"
 JOINTS = ("shoulder", "elbow", "jaw")
@@ -165,19 +156,11 @@ def test_the_files_are_those_of_lerobot(tmp_path: Path) -> None:
         "video_path": None,
         "splits": {"train": "0:5"},
     }
-    assert features["observation.state"] == {
-        "dtype": "float32",
-        "shape": [3],
-        "names": list(JOINTS),
-    }
+    state = {"dtype": "float32", "shape": [3], "names": list(JOINTS)}
+    assert features["observation.state"] == state
     assert features["next.done"] == {"dtype": "bool", "shape": [1], "names": ["done"]}
-    assert list(features)[-5:] == [
-        "timestamp",
-        "frame_index",
-        "episode_index",
-        "index",
-        "task_index",
-    ]
+    indices = "timestamp frame_index episode_index index task_index"
+    assert list(features)[-5:] == indices.split()
     assert features["timestamp"] == {"dtype": "float32", "shape": [1], "names": None}
     assert own["config_sha256"] == "c" * 64
     assert own["units"]["action"] == ["rad", "rad"]
@@ -186,18 +169,12 @@ def test_the_files_are_those_of_lerobot(tmp_path: Path) -> None:
     schema = pq.read_schema(tmp_path / "data/chunk-000/file-000.parquet")
     assert schema.names == list(features)
     assert schema.field("observation.state").type == pa.list_(pa.float32(), 3)
-    assert [str(schema.field(name).type) for name in ("next.reward", "next.done", "index")] == [
-        "float",
-        "bool",
-        "int64",
-    ]
-    told = json.loads(schema.metadata[b"huggingface"])["info"]["features"]
-    assert told["action"] == {
-        "feature": {"dtype": "float32", "_type": "Value"},
-        "length": 2,
-        "_type": "List",
-    }
-    assert told["next.done"] == {"dtype": "bool", "_type": "Value"}
+    types = [str(schema.field(name).type) for name in ("next.reward", "next.done", "index")]
+    assert types == ["float", "bool", "int64"]
+    known = json.loads(schema.metadata[b"huggingface"])["info"]["features"]
+    value = {"dtype": "float32", "_type": "Value"}
+    assert known["action"] == {"feature": value, "length": 2, "_type": "List"}
+    assert known["next.done"] == {"dtype": "bool", "_type": "Value"}
 
     tasks = pq.read_table(tmp_path / "meta/tasks.parquet")
     assert tasks.to_pylist() == [{"task_index": 0, "task": "stack"}]
@@ -278,12 +255,10 @@ def test_statistics_are_those_of_all_frames(tmp_path: Path) -> None:
         episodes = np.split(frames, np.cumsum(lengths)[:-1])
         for kind, quantile in QUANTILES.items():
             each = np.array([np.quantile(one, quantile, axis=0) for one in episodes])
-            assert np.allclose(
-                rows[f"stats/{name}/{kind}"].to_pylist(), each, rtol=1e-12, atol=1e-12
-            )
-            assert np.allclose(
-                found[kind], np.average(each, axis=0, weights=lengths), rtol=1e-9, atol=1e-12
-            )
+            stored = rows[f"stats/{name}/{kind}"].to_pylist()
+            assert np.allclose(stored, each, rtol=1e-12, atol=1e-12)
+            mean = np.average(each, axis=0, weights=lengths)
+            assert np.allclose(found[kind], mean, rtol=1e-9, atol=1e-12)
 
 
 def test_a_resumed_dataset_is_the_uninterrupted_one(tmp_path: Path) -> None:
@@ -302,10 +277,8 @@ def test_writers_that_differ_are_on_record(tmp_path: Path) -> None:
     write(tmp_path, range(2, 3), spec=newest)
     write(tmp_path, range(3, 4), spec=newest)
     found = read_dataset(tmp_path).info["mjstack"]["provenance"]
-    assert [(one["from_episode"], one["versions"]["mujoco"]) for one in found] == [
-        (0, "4.0.0"),
-        (2, "4.2.0"),
-    ]
+    versions = [(facts["from_episode"], facts["versions"]["mujoco"]) for facts in found]
+    assert versions == [(0, "4.0.0"), (2, "4.2.0")]
 
 
 def test_tasks_keep_their_indices(tmp_path: Path) -> None:
@@ -315,15 +288,8 @@ def test_tasks_keep_their_indices(tmp_path: Path) -> None:
         writer.add([episode(2, task="reach"), episode(3, task="box")])
     assert read_dataset(tmp_path).tasks == ["stack", "box", "reach"]
     table = pq.read_table(tmp_path / "data")
-    assert [
-        table.filter(pa.compute.equal(table["episode_index"], k))["task_index"][0].as_py()
-        for k in range(4)
-    ] == [
-        0,
-        1,
-        2,
-        1,
-    ]
+    rows = {row["episode_index"]: row["task_index"] for row in table.to_pylist()}
+    assert rows == {0: 0, 1: 1, 2: 2, 3: 1}
 
 
 def test_a_full_file_is_committed_and_chunks_follow(
@@ -368,11 +334,10 @@ def test_frames_are_not_held(tmp_path: Path) -> None:
 
 KILLED = """
 import os, signal, sys
-from pathlib import Path
-sys.path.insert(0, {tests!r})
+sys.path.insert(0, sys.argv[1])
 import test_datasets as t
-folder, survive = Path(sys.argv[1]), int(sys.argv[2])
-writer = t.DatasetWriter(folder, t.SPEC)
+survive = int(sys.argv[3])
+writer = t.DatasetWriter(sys.argv[2], t.SPEC)
 writer.add([t.episode(w, task="stack" if w < 3 else "box") for w in range(3)])
 writer.flush()
 real, done = os.replace, []
@@ -390,6 +355,12 @@ os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
+def run_script(script: str, *args: object) -> subprocess.CompletedProcess[str]:
+    """Run Python code whose arguments are the folder of tests and others."""
+    command = [sys.executable, "-c", script, Path(__file__).parent, *args]
+    return subprocess.run(map(str, command), capture_output=True, text=True, timeout=300)
+
+
 @pytest.mark.full
 @pytest.mark.parametrize("survive", range(6))
 def test_a_kill_at_any_moment_keeps_what_was_committed(survive: int, tmp_path: Path) -> None:
@@ -397,14 +368,7 @@ def test_a_kill_at_any_moment_keeps_what_was_committed(survive: int, tmp_path: P
     statistics, info; and after.
     """
     folder = tmp_path / "dataset"
-    program = [
-        sys.executable,
-        "-c",
-        KILLED.format(tests=str(Path(__file__).parent)),
-        str(folder),
-        str(survive),
-    ]
-    killed = subprocess.run(program, capture_output=True, text=True, timeout=300)
+    killed = run_script(KILLED, folder, survive)
     assert killed.returncode == -signal.SIGKILL, killed.stderr
     assert killed.stdout.split()[-1] == ("committed" if survive == 5 else "added")
     kept = 6 if survive == 5 else 3
@@ -429,7 +393,7 @@ class FullDisk:
         fdopen = os.fdopen
         monkeypatch.setattr(os, "fdopen", lambda *args: self.wrap(fdopen(*args)))
         opened = lambda *args: self.wrap(open(*args))  # noqa: E731, SIM115
-        monkeypatch.setattr(writer_module, "open", opened, raising=False)
+        monkeypatch.setattr(part, "open", opened, raising=False)
 
     def wrap(self, file: Any) -> Any:
         disk = self
@@ -469,9 +433,8 @@ def test_a_full_disk_keeps_what_was_committed(tmp_path: Path) -> None:
         second_batch(writer)
         needed = 10**9 - disk.room
     failed = 0
-    for number, room in enumerate(
-        [*np.linspace(0, needed - 1, 12).astype(int), needed - 2000, needed]
-    ):
+    rooms = [*np.linspace(0, needed - 1, 12).astype(int), needed - 2000, needed]
+    for number, room in enumerate(rooms):
         folder = tmp_path / str(number)
         write(folder, range(3))
         before = contents(folder)
@@ -481,12 +444,11 @@ def test_a_full_disk_keeps_what_was_committed(tmp_path: Path) -> None:
             if room >= needed:
                 second_batch(writer)
                 break
-            with pytest.raises(
-                UnwrittenError, match=r"No space left on device\): 3 committed episodes are kept"
-            ) as caught:
+            full = r"No space left on device\): 3 committed episodes are kept"
+            with pytest.raises(FolderError, match=full) as caught:
                 second_batch(writer)
             assert "\n" not in str(caught.value)
-            with pytest.raises(DatasetError, match="the writer is closed"):
+            with pytest.raises(FolderError, match="the writer is closed"):
                 writer.flush()
         failed += 1
         assert len(writer.committed) == 3
@@ -516,11 +478,10 @@ writer.flush()
 resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
 try:
     writer.add([t.episode(w, frames=600) for w in range(1, 200)])
-except t.UnwrittenError as error:
+except t.FolderError as error:
     print(error)
 """
-    command = [sys.executable, "-c", program, str(Path(__file__).parent), str(tmp_path / "dataset")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    done = run_script(program, tmp_path / "dataset")
     assert done.returncode == 0, done.stderr
     assert re.search(r"File too large\): 1 committed episodes are kept", done.stdout)
     assert worlds_of(tmp_path / "dataset") == [0]
@@ -541,9 +502,8 @@ def test_ctrl_c_in_a_script_keeps_what_is_committed(
         add(self, *args)
 
     monkeypatch.setattr(PartWriter, "write", interrupted)
-    before = signal.signal(
-        signal.SIGINT, signal.default_int_handler
-    )  # a shell's background jobs start with it ignored
+    # A shell's background jobs start with it ignored.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with DatasetWriter(tmp_path, SPEC) as writer:
             writer.add([episode(0)])
@@ -570,43 +530,41 @@ def test_an_error_elsewhere_keeps_what_was_added(tmp_path: Path) -> None:
 def test_another_configuration_is_refused(tmp_path: Path) -> None:
     write(tmp_path, range(1))
     before = contents(tmp_path)
-    with pytest.raises(
-        DatasetError,
-        match=f"has config_sha256={'c' * 64}, expected {'d' * 64}. Give another folder",
-    ):
-        DatasetWriter(tmp_path, replace(SPEC, config_sha256="d" * 64))
-    others = [
-        (replace(SPEC, fps=25), "has fps=50, expected 25"),
-        (replace(SPEC, robot_type="rebot"), "has robot_type=so101, expected rebot"),
+
+    def with_feature(name: str, feature: Feature) -> dict[str, Any]:
+        return {"features": {**SPEC.features, name: feature}}
+
+    others: list[tuple[dict[str, Any], str]] = [
         (
-            replace(SPEC, features={**SPEC.features, "action": vector("shoulder", "hand")}),
+            {"config_sha256": "d" * 64},
+            f"has config_sha256={'c' * 64}, expected {'d' * 64}. Give another folder",
+        ),
+        ({"fps": 25}, "has fps=50, expected 25"),
+        ({"robot_type": "rebot"}, "has robot_type=so101, expected rebot"),
+        (
+            with_feature("action", vector("shoulder", "hand")),
             r"has features\['action'\]=.*jaw",
         ),
+        (with_feature("next.success", vector("s")), r"has features\['next.success'\]=None"),
         (
-            replace(SPEC, features={**SPEC.features, "next.success": vector("s")}),
-            r"has features\['next.success'\]=None",
-        ),
-        (
-            replace(
-                SPEC, features={**SPEC.features, "action": vector("shoulder", "jaw", unit="m")}
-            ),
+            with_feature("action", vector("shoulder", "jaw", unit="m")),
             r"has units\['action'\]",
         ),
-        (replace(SPEC, values={}), "has values"),
+        ({"values": {}}, "has values"),
     ]
-    for spec, message in others:
-        with pytest.raises(DatasetError, match=message):
-            DatasetWriter(tmp_path, spec)
+    for changes, message in others:
+        with pytest.raises(FolderError, match=message):
+            DatasetWriter(tmp_path, replace(SPEC, **changes))
     assert contents(tmp_path) == before
 
 
 def test_other_folders_are_left_alone(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
-    with pytest.raises(DatasetError, match="is a file, expected a folder"):
+    with pytest.raises(FolderError, match="is a file, expected a folder"):
         DatasetWriter(tmp_path / "file", SPEC)
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "cat.jpg").write_text("x")
-    with pytest.raises(DatasetError, match=r"has cat.jpg and no meta/info.json"):
+    with pytest.raises(FolderError, match=r"has cat.jpg and no meta/info.json"):
         DatasetWriter(tmp_path / "photos", SPEC)
     for name, text, message in [
         ("lerobot", '{"codebase_version": "v3.0", "total_episodes": 1}', "KeyError: 'mjstack'"),
@@ -616,7 +574,7 @@ def test_other_folders_are_left_alone(tmp_path: Path) -> None:
         path = tmp_path / name / "meta" / "info.json"
         path.parent.mkdir(parents=True)
         path.write_text(text)
-        with pytest.raises(DatasetError, match=message) as caught:
+        with pytest.raises(FolderError, match=message) as caught:
             DatasetWriter(tmp_path / name, SPEC)
         assert "\n" not in str(caught.value)
         assert contents(tmp_path / name) == {"meta/info.json": text.encode()}
@@ -636,36 +594,32 @@ def with_array(name: str, array: Any) -> EpisodeData:
     return replace(good, arrays={**good.arrays, name: array})
 
 
+def with_value(name: str, value: Any) -> EpisodeData:
+    good = episode(1)
+    return replace(good, values={**good.values, name: value})
+
+
 NOT_FINITE = episode(1).arrays["action"].copy()
 NOT_FINITE[5, 1] = np.nan
+STATE = "observation.state"
 BAD_EPISODES = {
     r"action has shape \(23, 3\), expected \(23, 2\)": with_array("action", np.zeros((23, 3))),
     r"action has shape \(22, 2\), expected \(23, 2\)": with_array("action", np.zeros((22, 2))),
-    r"observation.state has shape \(0, 3\), expected \(frames, 3\)": with_array(
-        "observation.state", np.zeros((0, 3))
-    ),
+    rf"{STATE} has shape \(0, 3\), expected \(frames, 3\)": with_array(STATE, np.zeros((0, 3))),
     r"action has shape \(23,\)": with_array("action", np.zeros(23)),
     r"next.done is float64, expected bool": with_array("next.done", np.zeros(23)),
     r"action is not finite in 1 of 23 frames \(first: 5\)": with_array("action", NOT_FINITE),
-    r"observation.state is not finite in 23 of 23": with_array(
-        "observation.state", np.full((23, 3), 1e300)
-    ),
-    r"feature names are observation.state, .*, acton, expected observation.state": with_array(
-        "acton", np.zeros((23, 2))
-    ),
-    r"feature names are action, .*, expected observation.state, action": replace(
-        episode(1), arrays={k: v for k, v in episode(1).arrays.items() if k != "observation.state"}
+    rf"{STATE} is not finite in 23 of 23": with_array(STATE, np.full((23, 3), 1e300)),
+    rf"feature names are {STATE}, .*, acton, expected {STATE}": with_array("acton", np.zeros(23)),
+    rf"feature names are action, .*, expected {STATE}, action": replace(
+        episode(1), arrays={k: v for k, v in episode(1).arrays.items() if k != STATE}
     ),
     r"value names are missing, expected xy_err, peak": replace(episode(1), values={}),
-    r"value names are xy_err, .*, xy, expected xy_err": replace(
-        episode(1), values={**episode(1).values, "xy": 1.0}
-    ),
-    r"xy_err is 'small', expected float64": replace(
-        episode(1), values={**episode(1).values, "xy_err": "small"}
-    ),
-    r"peak is 1.5, expected int64": replace(episode(1), values={**episode(1).values, "peak": 1.5}),
-    r"settled is 1, expected bool": replace(episode(1), values={**episode(1).values, "settled": 1}),
-    r"note is 3, expected string": replace(episode(1), values={**episode(1).values, "note": 3}),
+    r"value names are xy_err, .*, xy, expected xy_err": with_value("xy", 1.0),
+    r"xy_err is 'small', expected float64": with_value("xy_err", "small"),
+    r"peak is 1.5, expected int64": with_value("peak", 1.5),
+    r"settled is 1, expected bool": with_value("settled", 1),
+    r"note is 3, expected string": with_value("note", 3),
     r"success is 'yes', expected bool": replace(episode(1), success="yes"),
 }
 
@@ -675,9 +629,8 @@ def test_an_episode_that_does_not_fit_is_refused_with_its_batch(
     message: str, tmp_path: Path
 ) -> None:
     with DatasetWriter(tmp_path, SPEC) as writer:
-        with pytest.raises(
-            DatasetError, match=rf"^episode of seed 7, world 1: .*{message}"
-        ) as caught:
+        line = rf"^episode of seed 7, world 1: .*{message}"
+        with pytest.raises(FolderError, match=line) as caught:
             writer.add([episode(0), BAD_EPISODES[message]])
         assert "\n" not in str(caught.value)
         assert writer.pending == 0
@@ -716,7 +669,7 @@ def test_without_pyarrow_one_line_says_what_to_install(
     assert not (tmp_path / "new").exists()
 
 
-def edit_table(path: Path, change: Callable[[pa.Table], pa.Table], rows: int | None = None) -> None:
+def edit_table(path: Path, change: Callable[[pa.Table], pa.Table]) -> None:
     """Writes a parquet file anew, changed, with its row groups as they were."""
     file = pq.ParquetFile(path)
     groups = [file.read_row_group(k) for k in range(file.num_row_groups)]
@@ -725,57 +678,8 @@ def edit_table(path: Path, change: Callable[[pa.Table], pa.Table], rows: int | N
     with pq.ParquetWriter(path, table.schema) as writer:
         start = 0
         for group in groups:
-            length = len(group) if rows is None else rows
-            writer.write_table(table.slice(start, length), row_group_size=max(length, 1))
-            start += length
-
-
-def edit_json(path: Path, change: Callable[[dict], None]) -> None:
-    data = json.loads(path.read_text())
-    change(data)
-    path.write_text(json.dumps(data))
-
-
-DATA = "data/chunk-000/file-000.parquet"
-ROWS = "meta/episodes/chunk-000/file-000.parquet"
-INFO = lerobot.INFO
-STATS = lerobot.STATS
-DAMAGE: dict[str, tuple[str, Any]] = {
-    "3 episodes and 66 frames, expected 3 and 69": (DATA, lambda table: table.slice(0, 66)),
-    "2 episodes and 69 frames, expected 3 and 69": (ROWS, lambda table: table.slice(0, 2)),
-    "3 episodes and 69 frames, expected 4 and 69": (
-        INFO,
-        lambda info: info.update(total_episodes=4),
-    ),
-    "cannot be read .*'robot_type'": (INFO, lambda info: info.pop("robot_type")),
-}
-
-
-@pytest.mark.parametrize("message", DAMAGE)
-def test_damage_is_found(message: str, tmp_path: Path) -> None:
-    write(tmp_path, range(3))
-    file, change = DAMAGE[message]
-    if file.endswith(".json"):
-        edit_json(tmp_path / file, change)
-    else:
-        edit_table(tmp_path / file, change)
-    for use in (read_dataset, lambda folder: DatasetWriter(folder, SPEC)):
-        with pytest.raises(DatasetError, match=message) as caught:
-            use(tmp_path)
-        assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("file", [DATA, ROWS, lerobot.TASKS, INFO])
-def test_missing_and_cut_files_are_named(file: str, tmp_path: Path) -> None:
-    write(tmp_path, range(3))
-    whole = (tmp_path / file).read_bytes()
-    (tmp_path / file).write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(DatasetError, match=re.escape(file)):
-        read_dataset(tmp_path)
-    (tmp_path / file).unlink()
-    for use in (read_dataset, lambda folder: DatasetWriter(folder, SPEC)):
-        with pytest.raises(DatasetError, match=re.escape(file)):
-            use(tmp_path)
+            writer.write_table(table.slice(start, len(group)), row_group_size=len(group))
+            start += len(group)
 
 
 def set_column(name: str, value: Any) -> Callable[[pa.Table], pa.Table]:
@@ -788,48 +692,80 @@ def set_column(name: str, value: Any) -> Callable[[pa.Table], pa.Table]:
     return change
 
 
-STRANGE: dict[str, tuple[str, Any]] = {
-    "features": (INFO, lambda info: info.update(features=[3])),
-    "shape": (INFO, lambda info: info["features"]["action"].update(shape="x")),
-    "dtype": (INFO, lambda info: info["features"]["action"].update(dtype="evil")),
-    "values": (INFO, lambda info: info["mjstack"].update(values=["x"])),
-    "provenance": (INFO, lambda info: info["mjstack"].update(provenance=[3])),
-    "from_episode": (INFO, lambda info: info["mjstack"]["provenance"][0].update(from_episode="x")),
-    "shards": (INFO, lambda info: info["mjstack"].update(shards=1.5)),
-    "total_tasks": (INFO, lambda info: info.update(total_tasks=2)),
-    "length": (ROWS, set_column("length", None)),
-    "seed": (ROWS, set_column("seed", None)),
-    "world": (ROWS, set_column("world", "x")),
-    "dataset_from_index": (ROWS, set_column("dataset_from_index", 7)),
-    "task": (lerobot.TASKS, set_column("task", None)),
+DATA = "data/chunk-000/file-000.parquet"
+ROWS = "meta/episodes/chunk-000/file-000.parquet"
+INFO = lerobot.INFO
+STATS = lerobot.STATS
+OTHER = "cannot be read"
+# By name: the file, what is done to it (None: it gets 100,000 brackets), and the message
+DAMAGE: dict[str, tuple[str, Any, str]] = {
+    "frames": (DATA, lambda table: table.slice(0, 66), "and 66 frames, expected 3 and 69"),
+    "rows": (ROWS, lambda table: table.slice(0, 2), "2 episodes and 69 frames, expected 3 and"),
+    "total": (INFO, lambda info: info.update(total_episodes=4), "and 69 frames, expected 4 and 69"),
+    "robot": (INFO, lambda info: info.pop("robot_type"), "cannot be read .*'robot_type'"),
+    "features": (INFO, lambda info: info.update(features=[3]), OTHER),
+    "shape": (INFO, lambda info: info["features"]["action"].update(shape="x"), OTHER),
+    "dtype": (INFO, lambda info: info["features"]["action"].update(dtype="evil"), OTHER),
+    "values": (INFO, lambda info: info["mjstack"].update(values=["x"]), OTHER),
+    "provenance": (INFO, lambda info: info["mjstack"].update(provenance=[3]), OTHER),
+    "from_episode": (
+        INFO,
+        lambda info: info["mjstack"]["provenance"][0].update(from_episode="x"),
+        OTHER,
+    ),
+    "shards": (INFO, lambda info: info["mjstack"].update(shards=1.5), OTHER),
+    "total_tasks": (INFO, lambda info: info.update(total_tasks=2), OTHER),
+    "length": (ROWS, set_column("length", None), OTHER),
+    "seed": (ROWS, set_column("seed", None), OTHER),
+    "world": (ROWS, set_column("world", "x"), OTHER),
+    "dataset_from_index": (ROWS, set_column("dataset_from_index", 7), OTHER),
+    "task": (lerobot.TASKS, set_column("task", None), OTHER),
+    "deep": (INFO, None, OTHER),
 }
 
 
-@pytest.mark.parametrize("name", [*STRANGE, "deep"])
-def test_a_strangers_files_are_one_line(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", DAMAGE)
+def test_damage_and_a_strangers_files_are_one_line(name: str, tmp_path: Path) -> None:
     write(tmp_path, range(3))
-    if name == "deep":
-        (tmp_path / INFO).write_text("[" * 100_000)
-    elif STRANGE[name][0] == INFO:
-        edit_json(tmp_path / INFO, STRANGE[name][1])
+    file, change, message = DAMAGE[name]
+    path = tmp_path / file
+    if change is None:
+        path.write_text("[" * 100_000)
+    elif file == INFO:
+        info = json.loads(path.read_text())
+        change(info)
+        path.write_text(json.dumps(info))
     else:
-        edit_table(tmp_path / STRANGE[name][0], STRANGE[name][1])
+        edit_table(path, change)
     before = contents(tmp_path)
     for use in (read_dataset, lambda folder: DatasetWriter(folder, SPEC)):
-        with pytest.raises(DatasetError, match="cannot be read") as caught:
+        with pytest.raises(FolderError, match=message) as caught:
             use(tmp_path)
         assert "\n" not in str(caught.value)
     assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("file", [DATA, ROWS, lerobot.TASKS, INFO])
+def test_missing_and_cut_files_are_named(file: str, tmp_path: Path) -> None:
+    write(tmp_path, range(3))
+    whole = (tmp_path / file).read_bytes()
+    (tmp_path / file).write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(FolderError, match=re.escape(file)):
+        read_dataset(tmp_path)
+    (tmp_path / file).unlink()
+    for use in (read_dataset, lambda folder: DatasetWriter(folder, SPEC)):
+        with pytest.raises(FolderError, match=re.escape(file)):
+            use(tmp_path)
 
 
 @pytest.mark.parametrize("value", [None, [1.0], [float("nan")] * 2, ["x", "y"]])
 def test_strange_statistics_and_frames_are_one_line(value: Any, tmp_path: Path) -> None:
     write(tmp_path, range(3))
     edit_table(tmp_path / ROWS, set_column("stats/action/mean", value))
-    with pytest.raises(DatasetError, match="cannot be read"):
+    with pytest.raises(FolderError, match="cannot be read"):
         DatasetWriter(tmp_path, SPEC)
     edit_table(tmp_path / DATA, set_column("action", value))
-    with pytest.raises(DatasetError, match="cannot be read"):
+    with pytest.raises(FolderError, match="cannot be read"):
         read_dataset(tmp_path).frames("action")
 
 
@@ -840,7 +776,7 @@ def test_a_writer_follows_no_link_out_of_the_dataset(tmp_path: Path) -> None:
     (folder / "data").symlink_to(tmp_path / "elsewhere")
     stale = tmp_path / "elsewhere" / "chunk-000" / "file-007.parquet"
     stale.write_bytes(b"somebody's")
-    with pytest.raises(DatasetError, match="data is a link, expected a folder or file"):
+    with pytest.raises(FolderError, match="data is a link, expected a folder or file"):
         DatasetWriter(folder, SPEC)
     assert stale.read_bytes() == b"somebody's"
 
@@ -855,11 +791,8 @@ def test_statistics_that_were_removed_are_written_anew(tmp_path: Path) -> None:
 
 def test_the_guides_lines_read_it_in_another_process(tmp_path: Path) -> None:
     """The guide's reading lines, and nothing else, on a dataset in the folder that they name."""
-    (lines,) = [
-        block
-        for block in re.findall(r"```python\n(.*?)```", GUIDE.read_text(), re.S)
-        if "DatasetWriter" not in block
-    ]
+    blocks = re.findall(r"```python\n(.*?)```", GUIDE.read_text(), re.S)
+    (lines,) = [block for block in blocks if "DatasetWriter" not in block]
     assert "mjstack" not in re.sub(r'info\["mjstack"\]', "", lines)
     (folder,) = re.findall(r'^folder = Path\("(.+)"\)$', lines, re.M)
     write(tmp_path / folder, range(3))

@@ -29,12 +29,10 @@ STARTED = 7
 
 
 def test_lines_keep_their_numbers() -> None:
-    text = (
-        "A\n\n```python\nx = 1\n```\n\n```console\n$ ls\n```\n\n"
-        "```python\ny = x\nrunner.learn(y)\n```\n\n```python\nz = x\n```\n"
-    )
-    kept = {number: line for number, line in enumerate(python_lines(text).split("\n"), 1) if line}
-    assert kept == {4: "x = 1", 17: "z = x"}
+    text = "A\n\n```python\nx = 1\n```\n\n```console\n$ ls\n```\n\n"
+    text += "```python\ny = x\nrunner.learn(y)\n```\n\n```python\nz = x\n```\n"
+    lines = {number: line for number, line in enumerate(python_lines(text).split("\n"), 1) if line}
+    assert lines == {4: "x = 1", 17: "z = x"}
 
 
 @pytest.fixture
@@ -72,13 +70,13 @@ def shown_commands() -> list[dict[str, str]]:
         lines = re.findall(rf"(?m)^\$ {COMMAND}(.*)$", text)
         for line in [*lines, *re.findall(rf"`{COMMAND}([^`]+)`", text)]:
             words = shlex.split(line, comments=True)
-            given = [word for word in words if "=" in word or word.startswith("~")]
+            overrides = [word for word in words if "=" in word or word.startswith("~")]
             if any("<" in word or "--config-dir" in word for word in words):
                 continue  # a placeholder; a folder that another test has
             if "-m" in words:
-                parsed = OverridesParser.create().parse_overrides(given)
-                given = list(BasicSweeper.split_arguments(parsed, None)[0][0])
-            commands.append({word.partition("=")[0]: word for word in given})
+                parsed = OverridesParser.create().parse_overrides(overrides)
+                overrides = list(BasicSweeper.split_arguments(parsed, None)[0][0])
+            commands.append({word.partition("=")[0]: word for word in overrides})
     return commands
 
 
@@ -90,7 +88,7 @@ def test_shown_commands_compose() -> None:
     groups: list[list[dict[str, str]]] = []
     for command in shown_commands():
         for group in groups:
-            together = {key: word for other in group for key, word in other.items()}
+            together = {key: word for shown in group for key, word in shown.items()}
             # Thresholds are a task's own, and starts from a file refuse seeds and regions.
             alike = all(command.get(key) == group[0].get(key) for key in ("task", "reset"))
             if alike and all(
@@ -111,9 +109,9 @@ def compose_together(commands: list[dict[str, str]]) -> None:
     words = list(dict.fromkeys(word for command in commands for word in command.values()))
     lists = [word for word in words if word.startswith("gates=[")]
     gates = dict.fromkeys(name for word in lists for name in word[7:-1].split(","))
-    others = [word for word in words if word not in lists]
+    settings = [word for word in words if word not in lists]
     try:
-        load_config([*others, f"gates=[{','.join(gates)}]"] if gates else others)
+        load_config([*settings, f"gates=[{','.join(gates)}]"] if gates else settings)
     except MjstackError:
         if len(commands) == 1:
             raise
@@ -144,9 +142,9 @@ def train(block: str, capsys: pytest.CaptureFixture[str]) -> list[float]:
     finally:
         torch.set_num_threads(threads)
     iterations = capsys.readouterr().out.split(" Learning iteration ")[1:]
-    found = [re.search(r"episode/return: *(\S+)", iteration) for iteration in iterations]
-    assert len(found) == ITERATIONS
-    return [float(match[1]) for match in found if match]
+    returns = [re.findall(r"episode/return: *(\S+)", iteration)[:1] for iteration in iterations]
+    assert len(returns) == ITERATIONS
+    return [float(value) for values in returns for value in values]
 
 
 @pytest.mark.full

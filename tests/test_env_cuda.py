@@ -57,10 +57,10 @@ def test_a_bad_action_is_named_and_stays_in_its_world(value: float) -> None:
             env.step(action)
         ends.append(env.sim.qpos.clone())
         if not spoilt:
-            env.raise_faults()
+            env.faults.raise_first()
     cause = "the reward is not finite" if math.isfinite(value) else "actions were not finite"
     with pytest.raises(mjstack.MjstackError, match=rf"{cause} in 1 of 2048 worlds \(2\)") as caught:
-        env.raise_faults()
+        env.faults.raise_first()
     assert ("after an action of" in str(caught.value)) is math.isfinite(value)
     others = [end[torch.arange(2048, device=env.device) != 2] for end in ends]
     assert ((others[0] - others[1]).abs().amax(1) < 1e-3).float().mean() > 0.99

@@ -22,10 +22,12 @@ from environments import one_second_episode
 
 import mjstack.report.web as web
 from mjstack.cli import run
-from mjstack.episodes.context import RunContext
-from mjstack.episodes.motion import MotionRecorder
+from mjstack.episodes.motion import motion_recorder
 from mjstack.episodes.rollout import Hook
-from mjstack.report.web import Shapes, World, choose_worlds, save_episode
+from mjstack.episodes.stage import Stage
+from mjstack.report.geometry import Shapes
+from mjstack.report.page import World, frame_stride
+from mjstack.report.web import choose_worlds, save_episode
 from mjstack.sim import Simulation
 
 PRIMITIVES = """
@@ -91,14 +93,15 @@ def test_shapes_are_mujocos() -> None:
     model = mujoco.MjModel.from_xml_string(PRIMITIVES)
     shapes = Shapes(model)
     assert shapes.bodies == [0, 1]  # a body without joints is part of the one that holds it
-    found = {rgba[:3]: vertices for number, rgba, vertices, _ in shapes if number == 1}
+    found = {rgba[:3]: mesh[0] for number, rgba, mesh in shapes.meshes if number == 1}
     assert len(found) == 7  # neither the hidden nor the invisible one
     box = (
         (found[1, 0, 0] - [0.1, 0.0, 0.0])
         @ np.array([[1, -1, 0], [1, 1, 0], [0, 0, 2**0.5]])
         / 2**0.5
     )
-    assert np.allclose(np.abs(box), [0.1, 0.2, 0.3])
+    assert np.allclose(np.ptp(box, 0), [0.2, 0.4, 0.6])
+    assert np.allclose(np.abs(box / [0.1, 0.2, 0.3]).max(1), 1.0)
     cylinder = found[0, 0, 1]
     assert np.allclose(np.abs(cylinder[:, 2]), 0.3)
     assert np.linalg.norm(cylinder[:, :2], axis=1).max() == pytest.approx(0.1)
@@ -114,21 +117,21 @@ def test_shapes_are_mujocos() -> None:
     assert np.allclose(turns[0, 1], model.qpos0[3:])
 
 
-def motion(stage: Callable[..., RunContext], worlds: int, frames: int) -> list[World]:
+def motion(get_stage: Callable[..., Stage], worlds: int, frames: int) -> list[World]:
     """Worlds whose first cube rises and whose arm turns."""
-    model = stage("so101").stage.visual_model
+    model = get_stage("so101").assets.visual_model
     qpos = np.repeat(model.qpos0[None], frames, 0)
-    at = stage("so101").index.object_qpos[0]
+    at = get_stage("so101").index.object_qpos[0]
     qpos[:, at + 2] += np.linspace(0.0, 0.2, frames)
-    qpos[:, stage("so101").index.robot_qpos[0]] += np.linspace(0.0, 1.0, frames)
+    qpos[:, get_stage("so101").index.robot_qpos[0]] += np.linspace(0.0, 1.0, frames)
     return [World(label=str(w), qpos=qpos.copy(), failed=w == 0) for w in range(worlds)]
 
 
-def test_a_page_holds_every_frame(stage: Callable[..., RunContext], tmp_path: Path) -> None:
+def test_a_page_holds_every_frame(get_stage: Callable[..., Stage], tmp_path: Path) -> None:
     path = tmp_path / "episode.html"
-    worlds = motion(stage, 3, 5)
+    worlds = motion(get_stage, 3, 5)
     worlds[2].qpos[3:] = np.nan  # it diverged
-    model = stage("so101").stage.visual_model
+    model = get_stage("so101").assets.visual_model
     save_episode(path, model, worlds, 0.04)
     assert outside(path) == []
     assert path.stat().st_size < 2e6
@@ -142,8 +145,8 @@ def test_a_page_holds_every_frame(stage: Callable[..., RunContext], tmp_path: Pa
         for _, message in sent
         if message["type"] == "BatchedMeshesMessage"
     }
-    assert len(names) == len(list(shapes))
-    numbers = [number for number, *_ in shapes]
+    assert len(names) == len(shapes.meshes)
+    numbers = [number for number, *_ in shapes.meshes]
     name = f"/{numbers.index(rising)}"
     updates = [
         (time, message["updates"]["batched_positions"])
@@ -179,19 +182,19 @@ def test_sixty_four_worlds_are_shared_by_the_gates() -> None:
 
 
 def test_the_recorder_takes_frames_from_the_start_on(
-    stage: Callable[..., RunContext], make_sim: Callable[..., Simulation]
+    get_stage: Callable[..., Stage], make_sim: Callable[..., Simulation]
 ) -> None:
-    context = stage("so101")
+    stage = get_stage("so101")
     sim = make_sim("native", 3)
-    every: list[np.ndarray] = []
-    recorder = MotionRecorder()
-    keep = Hook(lambda step, sim: every.append(sim.qpos.numpy().copy()))
-    episode = context.play(sim, context.cfg.reset, [recorder, keep])
-    held = recorder.positions([2, 0])
-    stride = web.frame_stride(context.cfg.timing.step_dt)
-    assert np.array_equal(held[:, 0], episode.start[[2, 0]])
-    ends = np.stack(every, 1)[[2, 0], stride - 1 :: stride]
-    assert np.array_equal(held[:, 1:], ends)
+    all_steps: list[np.ndarray] = []
+    recorder = motion_recorder(stage.cfg.timing.step_dt)
+    hook = Hook(lambda step, sim: all_steps.append(sim.qpos.numpy().copy()))
+    episode = stage.play(sim, stage.cfg.reset, [recorder, hook])
+    recorded = recorder.rows["qpos"].swapaxes(0, 1).numpy()
+    stride = frame_stride(stage.cfg.timing.step_dt)
+    assert np.array_equal(recorded[:, 0], episode.start)
+    ends = np.stack(all_steps, 1)[:, stride - 1 :: stride]
+    assert np.array_equal(recorded[:, 1:], ends)
 
 
 def test_without_viser_a_run_says_how_to_have_the_page(
@@ -288,11 +291,11 @@ def colored(tab: Tab) -> dict[str, int]:
 
 @pytest.mark.full
 def test_a_browser_plays_the_episode(
-    stage: Callable[..., RunContext], tmp_path: Path, tab: Tab
+    get_stage: Callable[..., Stage], tmp_path: Path, tab: Tab
 ) -> None:
     """It loads without an error, asks for nothing else, and shows the arm and the cubes."""
     path = tmp_path / "episode.html"
-    save_episode(path, stage("so101").stage.visual_model, motion(stage, 2, 250), 0.04)
+    save_episode(path, get_stage("so101").assets.visual_model, motion(get_stage, 2, 250), 0.04)
     address = f"file://{urllib.parse.quote(str(path))}"
     tab.open(address)
     tab.wait("document.querySelector('canvas') !== null")

@@ -8,7 +8,7 @@ import ast
 import json
 import runpy
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +24,8 @@ from mjstack.config import load_config
 from mjstack.config.schema import Config
 from mjstack.config.session import search_path
 from mjstack.drivers.policy import PolicyDriver
-from mjstack.episodes.context import RunContext
 from mjstack.episodes.rollout import NOMINAL
+from mjstack.episodes.stage import Stage
 from mjstack.jobs import play as play_job
 from mjstack.jobs.export import check_export, export_facts
 from mjstack.policy import load_policy, save_policy
@@ -71,7 +71,7 @@ def test_onnxruntime_gives_torchs_numbers(exported: Path, batch: int) -> None:
     session = onnxruntime.InferenceSession(to_onnx(network, {}))
     (found,) = session.run(["action"], {"observation": seen.numpy()})
     np.testing.assert_allclose(found, network(seen).numpy(), rtol=0.0, atol=2e-6)
-    assert found.shape == (batch, network.chunk, network.joints)
+    assert found.shape == (batch, network.chunk, network.width)
     if batch > 1:
         joints = torch.from_numpy(found).flatten(0, 1)
         torch.testing.assert_close(joints.amin(0), middle - 0.01)
@@ -84,9 +84,8 @@ def test_the_metadata_is_what_a_program_needs(exported: Path) -> None:
     cfg = configure("task=reach")
     assert facts["action"] == {
         "joints": cfg.robot.joints,
-        "kind": "absolute joint targets",
         "width": 6,
-        "terms": {},
+        "terms": {name: asdict(term) for name, term in cfg.controller.action.items()},
         "chunk": 6,
         "execute": 4,
         "step_dt": 0.02,
@@ -120,9 +119,9 @@ def test_the_example_imports_no_mjstack() -> None:
 
 def drivers_targets(policy: Path, cfg: Config, steps: int) -> np.ndarray:
     """Joint targets of PolicyDriver from the nominal start."""
-    context = RunContext(cfg)
-    sim = context.batch_simulation(1)
-    env = context.start(sim, NOMINAL)
+    stage = Stage(cfg)
+    sim = stage.batch_simulation(1)
+    env = stage.start(sim, NOMINAL)
     driver = PolicyDriver(env, load_policy(policy))
     targets = []
     for _ in range(steps):
@@ -156,9 +155,8 @@ def test_actions_of_a_policys_own_are_described(tmp_path: Path) -> None:
     policy = make_policy(cfg, chunk=1, execute=5)
     save_policy(tmp_path / "policy", policy)
     facts = export_facts(configure("task=reach"), load_policy(tmp_path / "policy"))
-    assert facts["action"]["kind"] == "action terms"
     assert list(facts["action"]["terms"]) == list(cfg.action)
-    assert facts["action"]["width"] == policy.network.joints == policy.widths["last_action"]
+    assert facts["action"]["width"] == policy.network.width == policy.widths["last_action"]
     assert facts["columns"]["units"][-1] == "1"
     assert len(facts["columns"]["names"]) == sum(policy.widths.values())
 
@@ -175,7 +173,7 @@ def test_a_task_that_brings_a_controller_takes_a_policy(
     monkeypatch.setattr(play_job, "require_offscreen", lambda model: None)
     with search_path([conf]):
         checked = {"export": check_export, "play": play_job.check_play}[job](cfg)
-    assert checked.context.cfg.controller.name == "policy"
+    assert checked.stage.cfg.controller.name == "policy"
 
 
 def refused(capsys: pytest.CaptureFixture[str]) -> str:

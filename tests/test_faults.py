@@ -16,8 +16,8 @@ from environments import at_double_speed
 from mjstack.config.schema import Backend
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
-from mjstack.episodes.context import RunContext
 from mjstack.episodes.rollout import Observer, play_episode
+from mjstack.episodes.stage import Stage
 from mjstack.errors import ArgumentError
 from mjstack.managers import required_fields
 from mjstack.sim import Simulation, make_simulation
@@ -87,20 +87,17 @@ class FaultyDriver:
         return command
 
 
-def worlds_of(backend: str, controller: str, faults: int) -> tuple[RunContext, Simulation]:
+def worlds_of(backend: str, controller: str, faults: int) -> tuple[Stage, Simulation]:
     """Some worlds more than faults, with the model fields that are spoilt."""
     is_cuda = backend.endswith("cuda")
-    cfg = load_config(
-        [
-            f"controller={controller}",
-            "+reset.mass={func:mjstack.mdp.reset.ObjectMass,params:{scale:[0.99,1.01]}}",
-            "+reset.friction={func:mjstack.mdp.reset.ObjectFriction,params:{sliding:[1.1,1.2]}}",
-            *at_double_speed(),
-        ]
+    fields = (
+        "+reset.mass={func:mjstack.mdp.reset.ObjectMass,params:{scale:[0.99,1.01]}}",
+        "+reset.friction={func:mjstack.mdp.reset.ObjectFriction,params:{sliding:[1.1,1.2]}}",
     )
-    context = RunContext(cfg)
-    return context, make_simulation(
-        context.model,
+    cfg = load_config([f"controller={controller}", *fields, *at_double_speed()])
+    stage = Stage(cfg)
+    return stage, make_simulation(
+        stage.model,
         cfg,
         2048 if is_cuda else FIRST + faults + 2,
         backend=Backend.native if backend == "native" else Backend.mjwarp,
@@ -113,9 +110,9 @@ def worlds_of(backend: str, controller: str, faults: int) -> tuple[RunContext, S
 @pytest.mark.parametrize("value", VALUES[:2])
 def test_a_target_that_is_not_finite_is_refused_by_its_world(value: float) -> None:
     """On CUDA it counts as 0, and its world fails."""
-    context, sim = worlds_of("native", "open_loop", 1)
-    env = context.start(sim, context.cfg.reset)
-    driver = FaultyDriver(context.driver(env), 2, [("target", value)], finite=False)
+    stage, sim = worlds_of("native", "open_loop", 1)
+    env = stage.start(sim, stage.cfg.reset)
+    driver = FaultyDriver(stage.driver(env), 2, [("target", value)], finite=False)
     with pytest.raises(ArgumentError, match=f"{value}.* in world {FIRST}, expected finite numbers"):
         play_episode(env, driver)
     sim.close()
@@ -125,20 +122,18 @@ def test_a_target_that_is_not_finite_is_refused_by_its_world(value: float) -> No
 @pytest.mark.parametrize("controller", ["open_loop", "closed_loop"])
 def test_a_fault_stays_in_its_world(backend: str, controller: str) -> None:
     if (backend, controller) == ("mjwarp", "closed_loop"):
-        pytest.skip(
-            "the expert's kernels take a minute on Warp's CPU device; native and CUDA do it"
-        )
+        pytest.skip("the expert's kernels take a minute on Warp's CPU device")
     # Warp's CPU device is slow: one fault of each kind
     faults = [*FAULTS[::5], FAULTS[-1]] if backend == "mjwarp" else FAULTS
-    context, sim = worlds_of(backend, controller, len(faults))
+    stage, sim = worlds_of(backend, controller, len(faults))
     is_cuda = backend.endswith("cuda")
     nworld = sim.nworld
-    cfg = context.cfg
-    at = context.phase("lift_red").start
+    cfg = stage.cfg
+    at = stage.phase("lift_red").start
     episodes = []
     for observers in ([], [Faults(at, faults)]):
-        env = context.start(sim, cfg.reset)
-        driver = context.driver(env)
+        env = stage.start(sim, cfg.reset)
+        driver = stage.driver(env)
         if observers:
             # On the CPU a target that is not finite is refused, see above
             driver = FaultyDriver(driver, at, faults, finite=not is_cuda)
@@ -149,7 +144,7 @@ def test_a_fault_stays_in_its_world(backend: str, controller: str) -> None:
     worlds = np.arange(FIRST, FIRST + len(faults))
     others = np.delete(np.arange(nworld), worlds)
     told = {
-        faults[world - FIRST]: context.check.rules.broken(int(faulty.failed[world]))
+        faults[world - FIRST]: stage.check.rules.broken(int(faulty.failed[world]))
         for world in worlds
     }
     for (target, value), broken in told.items():
@@ -164,6 +159,6 @@ def test_a_fault_stays_in_its_world(backend: str, controller: str) -> None:
         return
     failing = [int((episode.failed[others] != 0).sum()) for episode in (clean, faulty)]
     assert abs(failing[1] - failing[0]) <= 0.005 * nworld, failing
-    columns = [a + i for a in context.index.object_qpos for i in range(3)]
+    columns = [a + i for a in stage.index.object_qpos for i in range(3)]
     apart = np.abs(others_end[others][:, columns] - ends[others][:, columns]).max(1)
     assert (apart < 1e-3).mean() > 0.9, np.quantile(apart, (0.5, 0.9, 0.95, 0.99))

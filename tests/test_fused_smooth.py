@@ -9,17 +9,11 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from environments import configure
+from environments import DEVICES, configure, fused_sim
 
-from mjstack.config.schema import Backend
-from mjstack.scene import build_model
-from mjstack.sim import fused_smooth, make_simulation
-from mjstack.sim.mjwarp import MjwarpSimulation
-from mjstack.sim.sizes import resolve_env_sizes
-from mjstack.sim.warp_setup import mjw
+from mjstack.sim.fused import smooth
+from mjstack.sim.mujoco_warp import mjw
 
-CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
-DEVICES = ["cpu", pytest.param("cuda:0", marks=[pytest.mark.gpu, CUDA])]
 N = 3
 POSES = (
     *("xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis", "geom_xpos", "geom_xmat"),
@@ -35,7 +29,6 @@ FIELDS = (
     *("body_gravcomp", "jnt_stiffness", "dof_armature", "dof_damping", "geom_pos", "site_pos"),
     *("actuator_gainprm", "actuator_biasprm", "actuator_gear", "actuator_forcerange"),
 )
-OFF = mujoco.mjtDisableBit
 
 # Joints of all kinds, several of a body, a free body with an arm, bodies that are fixed to others
 # or moved by hand, springs, damping and forces of all kinds, actuators with and without dynamics.
@@ -103,12 +96,12 @@ def read(d: mjw.Data, names: tuple[str, ...]) -> dict[str, np.ndarray]:
     return {name: getattr(d, name).numpy().copy() for name in names}
 
 
-def agree(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> None:
+def agree(fused_values: dict[str, np.ndarray], stock_values: dict[str, np.ndarray]) -> None:
     """Within the rounding of float32: of a world's largest value."""
-    for name, expected in theirs.items():
+    for name, expected in stock_values.items():
         values = expected.reshape(N, -1).astype(float)
         scale = np.abs(values).max(1, keepdims=True, initial=1e-6)
-        difference = (ours[name].reshape(N, -1) - values) / scale
+        difference = (fused_values[name].reshape(N, -1) - values) / scale
         np.testing.assert_allclose(difference, 0.0, atol=1e-5, err_msg=name)
 
 
@@ -116,37 +109,33 @@ def compare(m: mjw.Model, d: mjw.Data) -> None:
     """All stages from one state: each has what MJWarp's stages before it have written."""
     moving = m.body_weldid.numpy()[m.geom_bodyid.numpy()] != 0
     stages = (
-        (POSES, fused_smooth.positions, (mjw.kinematics, mjw.com_pos)),
+        (POSES, smooth.positions, (mjw.kinematics, mjw.com_pos)),
         (
             FORCES,
-            fused_smooth.forces,
+            smooth.forces,
             (mjw.crb, mjw.transmission, mjw.fwd_velocity, mjw.fwd_actuation, accelerate),
         ),
-        (
-            STATE,
-            fused_smooth.advance,
-            (mjw.collision, mjw.make_constraint, mjw.solve, mjw.implicit),
-        ),
+        (STATE, smooth.advance, (mjw.collision, mjw.make_constraint, mjw.solve, mjw.implicit)),
     )
-    for names, own, stock in stages:
+    for names, fused, stock in stages:
         for stage in stock[:-1]:
             stage(m, d)
         before = read(d, names)
         stock[-1](m, d)
-        theirs = read(d, names)
+        stock_values = read(d, names)
         for name in names:
             if names is STATE and name != "qacc_warmstart":
                 getattr(d, name).assign(before[name])
             elif name.startswith("geom"):
-                spoilt = theirs[name].copy()
+                spoilt = stock_values[name].copy()
                 spoilt[:, moving] = math.nan
                 getattr(d, name).assign(spoilt)
             else:
                 getattr(d, name).fill_(math.nan)
-        own(m, d)
-        agree(read(d, names), theirs)
+        fused(m, d)
+        agree(read(d, names), stock_values)
         for name in names:
-            getattr(d, name).assign(theirs[name])
+            getattr(d, name).assign(stock_values[name])
 
 
 def accelerate(m: mjw.Model, d: mjw.Data) -> None:
@@ -157,18 +146,8 @@ def accelerate(m: mjw.Model, d: mjw.Data) -> None:
 @pytest.mark.parametrize("args", [("robot=so101",), ("robot=rebot",), ("robot=so101", "task=box")])
 def test_robots(args: tuple[str, ...], device: str) -> None:
     """Random commands and thrown objects, every world with masses, gains and places of its own."""
-    cfg = configure(*args)
-    sim = make_simulation(
-        build_model(cfg),
-        cfg,
-        N,
-        backend=Backend.mjwarp,
-        device=device,
-        sizes=resolve_env_sizes(cfg),
-        fields=FIELDS,
-    )
-    assert isinstance(sim, MjwarpSimulation)
-    assert fused_smooth.why_not(sim._m) == ""
+    sim = fused_sim(configure(*args), N, device, fields=FIELDS)
+    assert smooth.why_not(sim._m) == ""
     generator = torch.Generator().manual_seed(0)
 
     def rand(like: torch.Tensor) -> torch.Tensor:
@@ -193,37 +172,31 @@ def test_robots(args: tuple[str, ...], device: str) -> None:
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(
-    ("boxes", "flags"),
+    ("boxes", "off"),
     [
-        (0, 0),
-        (4, 0),  # more than 32 degrees of freedom
-        (1, OFF.mjDSBL_GRAVITY | OFF.mjDSBL_CLAMPCTRL),
-        (0, OFF.mjDSBL_ACTUATION),
-        (0, OFF.mjDSBL_SPRING),
-        (0, OFF.mjDSBL_DAMPER),
-        (0, OFF.mjDSBL_SPRING | OFF.mjDSBL_DAMPER),
-        (0, OFF.mjDSBL_SPRING | OFF.mjDSBL_DAMPER | OFF.mjDSBL_ACTUATION),
+        (0, ""),
+        (4, ""),  # more than 32 degrees of freedom
+        (1, "GRAVITY CLAMPCTRL"),
+        *((0, "ACTUATION"), (0, "SPRING"), (0, "DAMPER")),
+        *((0, "SPRING DAMPER"), (0, "SPRING DAMPER ACTUATION")),
     ],
 )
-def test_parts(boxes: int, flags: int, device: str) -> None:
-    model = parts(boxes, int(flags))
+def test_parts(boxes: int, off: str, device: str) -> None:
+    flags = [getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}") for name in off.split()]
+    model = parts(boxes, sum(map(int, flags)))
     generator = torch.Generator().manual_seed(0)
-
-    def add(array: wp.array, size: float) -> None:
-        view = wp.to_torch(array)
-        view += size * torch.randn(view.shape, generator=generator).to(device)
-
     with wp.ScopedDevice(device):
         m = mjw.put_model(model)
         m.opt.warn_overflow = 0
         d = mjw.make_data(model, nworld=N, njmax=200, nconmax=100)
-        assert fused_smooth.why_not(m) == ""
+        assert smooth.why_not(m) == ""
         for k in range(8):
             for array, size in (
                 *((d.ctrl, 1.0), (d.qvel, 0.3), (d.qfrc_applied, 0.01), (d.mocap_pos, 0.1)),
                 *((d.mocap_quat, 0.1), (d.xfrc_applied, 0.01 * (k % 2))),
             ):
-                add(array, size)
+                view = wp.to_torch(array)
+                view += size * torch.randn(view.shape, generator=generator).to(device)
             wp.synchronize_device(device)  # torch's stream, too
             for _ in range(5):
                 mjw.step(m, d)
@@ -241,7 +214,7 @@ def test_overflow_is_reported() -> None:
         for counter, limit in ((d.nacon, d.naconmax), (d.ncollision, d.naconmax)):
             counter.fill_(limit + 1)
         d.nefc.assign([8, 9, 3])
-        fused_smooth.advance(m, d)
+        smooth.advance(m, d)
     bits = mjw.OverflowType
     lost = int(bits.BROADPHASE | bits.NARROWPHASE)
     assert d.overflow.numpy().tolist() == [lost, lost | int(bits.NEFC), lost]
@@ -261,10 +234,10 @@ def test_nan_stays_in_its_world(device: str) -> None:
                 wp.to_torch(d.qvel)[1, 3] = math.nan
                 wp.to_torch(d.qpos)[1, 8] = math.nan
             wp.synchronize_device(device)
-            fused_smooth.positions(m, d)
-            fused_smooth.forces(m, d)
+            smooth.positions(m, d)
+            smooth.forces(m, d)
             d.efc.Ma.zero_()
-            fused_smooth.advance(m, d)
+            smooth.advance(m, d)
             results.append(read(d, (*POSES, *FORCES, *STATE)))
     assert np.isnan(results[1]["qvel"][1]).any()
     for name, values in results[0].items():
@@ -300,44 +273,22 @@ def test_models_that_mjwarp_does(edit, reason: str) -> None:
     edit(spec)
     with wp.ScopedDevice("cpu"):
         m = mjw.put_model(spec.compile())
-    assert fused_smooth.why_not(m) == reason
+    assert smooth.why_not(m) == reason
 
 
 def test_callbacks_and_many_bodies_are_left_to_mjwarp() -> None:
     with wp.ScopedDevice("cpu"):
         m = mjw.put_model(parts())
         m.callback.passive = lambda m, d: None
-        assert fused_smooth.why_not(m) == "there are callbacks"
+        assert smooth.why_not(m) == "there are callbacks"
         plates = "".join("<body><geom size='.01'/></body>" for _ in range(250))
-        many = mujoco.MjModel.from_xml_string(PARTS.format(boxes=plates))
-        assert "bytes of shared memory" in fused_smooth.why_not(mjw.put_model(many))
-
-
-def test_a_step_names_what_mjwarp_does(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level("INFO")
-    cfg = configure("sim.step=fused")
-    model = build_model(cfg)
-    model.opt.density = 1.2
-    model.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
-    sim = make_simulation(
-        model, cfg, 2, backend=Backend.mjwarp, device="cpu", sizes=resolve_env_sizes(cfg)
-    )
-    described = (
-        "fused step (MJWarp's contact rows, because cones are pyramidal;"
-        " MJWarp's smooth dynamics, because there is a fluid)"
-    )
-    assert sim.description.endswith(f", {described}")
-    assert f"sim.step: {described}" in caplog.text
-    sim.step(3)
-    assert bool(sim.qpos.isfinite().all())
+        crowded = mujoco.MjModel.from_xml_string(PARTS.format(boxes=plates))
+        assert "bytes of shared memory" in smooth.why_not(mjw.put_model(crowded))
 
 
 def test_a_later_step_reads_nothing_back(monkeypatch: pytest.MonkeyPatch) -> None:
     """And it makes no kernel. A graph could not be captured."""
-    cfg = configure("sim.step=fused", "graph=off")
-    sim = make_simulation(
-        build_model(cfg), cfg, 2, backend=Backend.mjwarp, device="cpu", sizes=resolve_env_sizes(cfg)
-    )
+    sim = fused_sim(configure("graph=off"), 2)
     sim.step(1)
     read = []
     monkeypatch.setattr(wp.array, "numpy", read.append)

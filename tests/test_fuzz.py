@@ -43,6 +43,7 @@ from mjstack.config.session import hydra_session
 COUNTS = {"commands": 1000, "folders": 200}
 CASES = {"commands": command_lines, "folders": damaged_folders}
 PASSED = 77  # exit status of a child whose check has passed
+ENDS = {PASSED: "passed", 0: "shown, or run", 2: "one line"}
 SECONDS = 40  # of processor time that a check may take; the slowest of them takes three
 AT_ONCE = 3  # the process that forks works too
 
@@ -119,39 +120,31 @@ def main(kind: str, *numbers: str) -> int:
         cases = [case for span in spans for case in range(span[0], span[-1] + 1)]
         cases = cases or list(range(COUNTS[kind]))
         talks = len(cases) < 30
-        told: Counter[str] = Counter()
-        bad = 0
-        passed = []
-        for child, outcome in _fork_all(cases, make, fixture):
-            problem = outcome.problem()
-            told[problem or {PASSED: "passed", 0: "shown", 2: "one line"}[outcome.status]] += 1
-            bad += bool(problem)
-            if problem or talks:
-                print(
-                    f"{kind} {child.case}: {shlex.join(child.args)}\n  {problem}:"
-                    f" {outcome.lines()}",
-                    flush=True,
-                )
-            if outcome.status == PASSED and is_short(child.args):
-                passed.append(child.case)
-        tenth = min(told["passed"] // 10 + 1, len(passed))
-        chosen = passed if talks else random.Random(kind).sample(passed, tenth)
-        for child, outcome in _fork_all(chosen, make, fixture, run=True):
-            problem = outcome.problem(ran=True)
-            told[problem or f"run to its end: {outcome.status}"] += 1
-            bad += bool(problem)
-            if problem or talks:
-                print(
-                    f"{kind} {child.case}, run: {shlex.join(child.args)}\n  {problem}:"
-                    f" {outcome.lines()}",
-                    flush=True,
-                )
+        counts: Counter[str] = Counter()
+
+        def judge(numbers: Sequence[int], *, run: bool = False) -> list[int]:
+            """Count how cases end, and return those that pass and are short."""
+            passed = []
+            for child, outcome in _fork_all(numbers, make, fixture, run=run):
+                problem = outcome.problem(ran=run)
+                counts["bad"] += bool(problem)
+                counts[problem or ENDS.get(outcome.status, f"status {outcome.status}")] += 1
+                if problem or talks:
+                    line = f"{kind} {child.case}{', run' * run}: {shlex.join(child.args)}"
+                    print(f"{line}\n  {problem}: {outcome.lines()}", flush=True)
+                if outcome.status == PASSED and is_short(child.args):
+                    passed.append(child.case)
+            return passed
+
+        passed = judge(cases)
+        tenth = min(counts["passed"] // 10 + 1, len(passed))
+        judge(passed if talks else random.Random(kind).sample(passed, tenth), run=True)
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     print(
-        f"{len(cases)} cases: {dict(told)}; {time.monotonic() - began:.0f} s, of which the"
+        f"{len(cases)} cases: {dict(counts)}; {time.monotonic() - began:.0f} s, of which the"
         f" processors worked {used.ru_utime + used.ru_stime:.0f} s"
     )
-    return min(bad, 1)
+    return min(counts["bad"], 1)
 
 
 def _fork_all(
@@ -234,23 +227,19 @@ def _outcome(child: Child, status: int) -> Outcome:
 
 def _content(folder: Path) -> dict[str, str]:
     """Every path below a folder, with the hash of a file and the target of a link."""
-    found = {}
-    for path in folder.rglob("*"):
+
+    def digest(path: Path) -> str:
         if path.is_symlink():
-            said = os.readlink(path)
-        elif path.is_file():
-            said = hashlib.sha256(path.read_bytes()).hexdigest()
-        else:
-            said = ""
-        found[str(path.relative_to(folder))] = said
-    return found
+            return os.readlink(path)
+        return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+
+    return {str(path.relative_to(folder)): digest(path) for path in folder.rglob("*")}
 
 
 def _preload() -> None:
-    """Load what a command line loads, and keep what it reads of YAML and what Hydra looks up."""
+    """Load what a command line loads, and keep what it reads of YAML."""
     import matplotlib
     import yaml
-    from hydra._internal import defaults_list
 
     matplotlib.use("Agg")
     torch.set_num_threads(1)  # a forked child waits for ever for OpenMP's threads of its parent
@@ -270,20 +259,10 @@ def _preload() -> None:
         return copy.deepcopy(known[text])
 
     yaml.load = load
-    choices_of = defaults_list._create_interpolation_map
-    choices: dict[str, Any] = {}
-
-    def known_choices(overrides: Any, defaults: list, self_added: bool) -> Any:
-        key = f"{overrides.known_choices} {defaults} {self_added}"
-        if key not in choices:
-            choices[key] = choices_of(overrides, defaults, self_added)
-        return choices[key]
-
-    defaults_list._create_interpolation_map = known_choices
-    with hydra_session() as hydra:
+    with hydra_session():
         for chosen in [[], *([choice] for choice in CHOSEN)]:
             for more in [[], QUICK[1:2]]:
-                compose(hydra, chosen + more)
+                compose(chosen + more)
 
 
 if __name__ == "__main__":

@@ -5,12 +5,13 @@ captured anew.
 from __future__ import annotations
 
 import logging
+from functools import partial
 
 import pytest
 import torch
 import warp as wp
 from compositions import make_env
-from environments import actions, configure, returned
+from environments import CUDA, DEVICES, actions, configure, returned
 
 from mjstack.envs import Env
 from mjstack.errors import MjstackError
@@ -19,9 +20,7 @@ from mjstack.rng import uniform
 from mjstack.sim.draws import draw_uniform
 from mjstack.sim.graph import StepGraph
 
-CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 BACKENDS = ["mjwarp", pytest.param("mjwarp-cuda", marks=[pytest.mark.gpu, CUDA])]
-DEVICES = ["cpu", pytest.param("cuda:0", marks=[pytest.mark.gpu, CUDA])]
 
 
 def make(backend: str, graph: str, nworld: int, *overrides: str) -> Env:
@@ -46,12 +45,9 @@ def test_eager_and_replayed_steps_agree_through_resets(backend: str) -> None:
     """
     steps = 20
     total = 300
-    only_time_out = [
-        "~termination.success",
-        "~termination.object_off_table",
-        "~termination.joint_limit",
-    ]
-    common = ["task=reach", *only_time_out, f"termination.time_out.params.steps={steps}"]
+    ends = ("success", "object_off_table", "joint_limit")
+    common = ["task=reach", *(f"~termination.{name}" for name in ends)]
+    common += [f"termination.time_out.params.steps={steps}"]
     nworld = 64
     if backend == "mjwarp":  # an eager substep takes 10 ms there, whatever nworld is
         nworld = 2
@@ -60,9 +56,8 @@ def test_eager_and_replayed_steps_agree_through_resets(backend: str) -> None:
     eager = make(backend, "off", nworld, *common)
     replayed = make(backend, "require", nworld, *common)
     starts = []
-    for a, b in ((eager.reset(seed=3), replayed.reset(seed=3)),):
-        for name in a[0]:
-            assert torch.equal(a[0][name], b[0][name])
+    first, again = (env.reset(seed=3)[0] for env in (eager, replayed))
+    assert all(torch.equal(first[name], again[name]) for name in first)
     spread = 0.0
     for t, action in enumerate(actions(eager, total)):
         a = returned(eager.step(action))
@@ -74,17 +69,15 @@ def test_eager_and_replayed_steps_agree_through_resets(backend: str) -> None:
             assert torch.equal(eager.sim.qpos, replayed.sim.qpos)
             continue
         if (t + 1) % steps == 0:
-            assert a["truncated"].all()
-            assert b["truncated"].all()
+            assert (a["truncated"] & b["truncated"]).all()
             # The new episodes' starts come from random numbers alone.
             assert torch.equal(eager.sim.qpos, replayed.sim.qpos)
             starts.append(replayed.sim.qpos.clone())
         if t % steps < 5:  # later, contacts have drawn two runs of the same apart
             spread = max(spread, float((a["reward"] - b["reward"]).abs().quantile(0.95)))
     assert torch.isfinite(eager.sim.qpos).all()
-    episodes = total // steps * nworld
-    assert eager.read_statistics()["episodes"] == episodes
-    assert replayed.read_statistics()["episodes"] == episodes
+    for env in (eager, replayed):
+        assert env.read_statistics()["episodes"] == total // steps * nworld
     if backend == "mjwarp-cuda":
         assert replayed.graph.captured
         assert spread < 1e-4
@@ -94,43 +87,18 @@ def test_eager_and_replayed_steps_agree_through_resets(backend: str) -> None:
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_the_kernel_draws_what_the_generator_draws(device: str) -> None:
-    n = 33
-    size = 11
-    world = torch.arange(n)
-    episode = world * 7 + 1
-    step = world * 1000003 + 5
+    wp.init()  # nothing may have used it yet
+    world = torch.arange(33)
+    rows = {"world": world, "episode": world * 7 + 1, "step": world * 1000003 + 5}
+    on_device = {name: values.to(device) for name, values in rows.items()}
     for seed, stream in ((0, 0), (4294967295, 0x9ABCDEF0)):
-        expected = uniform(
-            seed=seed, world=world, episode=episode, step=step, stream=stream, size=size
-        )
-        out = draw_uniform(
-            key=torch.tensor([seed], device=device),
-            stream=stream,
-            world=world.to(device),
-            episode=episode.to(device),
-            step=step.to(device),
-            size=size,
-        )
-        assert torch.equal(out.cpu(), expected)
-        scaled = draw_uniform(
-            key=torch.tensor([seed], device=device),
-            stream=stream,
-            world=world.to(device),
-            episode=episode.to(device),
-            step=None,
-            size=size,
-            low=0.7,
-            high=1.3,
-        )
-        plain = uniform(
-            seed=seed,
-            world=world,
-            episode=episode,
-            step=torch.zeros_like(world),
-            stream=stream,
-            size=size,
-        )
-        torch.testing.assert_close(scaled.cpu(), 0.7 + 0.3 * (plain + 1.0), rtol=1e-6, atol=0.0)
+        key = torch.tensor([seed], device=device)
+        draw = partial(draw_uniform, key=key, stream=stream, size=11)
+        expect = partial(uniform, seed=seed, stream=stream, size=11)
+        assert torch.equal(draw(**on_device).cpu(), expect(**rows))
+        scaled = draw(**on_device | {"step": None}, low=0.7, high=1.3).cpu()
+        plain = expect(**rows | {"step": torch.zeros_like(world)})
+        torch.testing.assert_close(scaled, 0.7 + 0.3 * (plain + 1.0), rtol=1e-6, atol=0.0)
 
 
 @pytest.mark.full
@@ -209,11 +177,11 @@ def test_without_capture_the_work_just_runs() -> None:
 @pytest.mark.gpu
 @CUDA
 def test_an_episode_of_the_gate_is_captured_and_accepted() -> None:
-    from mjstack.episodes.context import RunContext
+    from mjstack.episodes.stage import Stage
 
-    context = RunContext(cfg=configure("nworld=32", "sim=mjwarp", "graph=require"))
-    sim = context.batch_simulation(32)
-    episode = context.play(sim, context.cfg.reset)
+    stage = Stage(configure("nworld=32", "sim=mjwarp", "graph=require"))
+    sim = stage.batch_simulation(32)
+    episode = stage.play(sim, stage.cfg.reset)
     assert not episode.result.failed.any()
     assert episode.timing.capture_seconds > 0.0
 
@@ -226,13 +194,11 @@ def _add_one(values: wp.array[float]):
 
 def test_what_failed_is_captured_anew_after_a_change() -> None:
     version = 0
-    calls = 0
+    results = iter([None, RuntimeError("this cannot be captured")])
 
     def work() -> None:
-        nonlocal calls
-        calls += 1
-        if calls == 2:
-            raise RuntimeError("this cannot be captured")
+        if error := next(results, None):
+            raise error
 
     graph = StepGraph(work, "cpu", "auto", name="failing once", version=lambda: version)
     for _ in range(4):
@@ -245,7 +211,7 @@ def test_what_failed_is_captured_anew_after_a_change() -> None:
 
 
 def test_what_a_step_returns_is_the_callers_own() -> None:
-    """One block of memory; but to autograd each tensor is one of its own."""
+    """To autograd, too: each tensor is a copy."""
     env = make_env(["task=reach", "sim=native"], nworld=2)
     env.reset(seed=0)
     zero = torch.zeros((2, env.action_manager.action_dim))

@@ -89,17 +89,12 @@ def test_any_chain_of_hinges_and_slides(device: str) -> None:
     assert np.abs(ik.forward(given)[0].cpu().numpy() - arm.grasp_point(commands)).max() <= 1e-6
     for found, expected in zip(ik.forward(given)[1:], arm.directions(commands), strict=True):
         assert np.abs(found.cpu().numpy() - expected).max() <= 2e-6
-    near = np.clip(
-        commands + np.random.default_rng(19).normal(scale=0.005, size=commands.shape),
-        arm.low,
-        arm.high,
-    )
+    nudge = np.random.default_rng(19).normal(scale=0.005, size=commands.shape)
+    near = np.clip(commands + nudge, arm.low, arm.high)
     near[:, 0] = np.clip(near[:, 0], -0.1, 0.3)
     command, distance = results(ik, commands, arm.grasp_point(near))
     assert np.quantile(distance, 0.95) <= 1e-6
-    assert (
-        command[:, 0] >= -0.1
-    ).all()  # its actuator's range is narrower below, the joint's above
+    assert (command[:, 0] >= -0.1).all()  # its actuator's range is narrower below
     _, distance = results(ik, commands, np.tile([0.0, 0.0, -5.0], (100, 1)))
     assert np.isfinite(distance).all()
 
@@ -107,9 +102,8 @@ def test_any_chain_of_hinges_and_slides(device: str) -> None:
 def test_the_narrower_of_both_ranges_holds() -> None:
     arm = odd_arm()
     for z, limit in ((5.0, 0.3), (-5.0, -0.1)):
-        command, _ = results(
-            arm.solver(1, iterations=60), arm.at_home(1), np.array([[0.0, 0.0, z]])
-        )
+        target = np.array([[0.0, 0.0, z]])
+        command, _ = results(arm.solver(1, iterations=60), arm.at_home(1), target)
         assert command[0, 0] == pytest.approx(limit, abs=1e-6)
         assert -0.1 <= command[0, 0] <= 0.3
 
@@ -133,9 +127,8 @@ def test_missing_names_are_named(change: dict[str, list[str]], name: str) -> Non
 def test_an_approach_body_that_not_every_joint_moves_is_refused() -> None:
     arm = odd_arm()
     for body in ("shoulder", "finger"):
-        with pytest.raises(
-            ConfigError, match=f"robot.approach_body={body}: expected .* moves: palm"
-        ):
+        says = f"robot.approach_body={body}: expected .* moves: palm"
+        with pytest.raises(ConfigError, match=says):
             BatchedIk(arm.model, replace(arm.robot, approach_body=body), 2, "cpu")
 
 
@@ -168,14 +161,16 @@ def test_other_joint_types_are_refused() -> None:
 
 
 def test_shapes_are_not_broadcast() -> None:
-    ik = odd_arm().solver(3)
-    with pytest.raises(ArgumentError, match=r"q: found shape \(1, 5\), expected shape \(3, 5\)"):
-        ik.solve(torch.zeros(1, 5), torch.zeros(3, 3))
-    with pytest.raises(ArgumentError, match=r"target: found shape \(3,\), expected shape \(3, 3\)"):
-        ik.solve(torch.zeros(3, 5), torch.zeros(3))
+    ik = odd_arm().solver(3, posture_gain=0.1)
+    q = torch.zeros(3, 5)
+    goal = torch.zeros(3, 3)
+    postures = [(q, goal, torch.zeros(shape)) for shape in ((4,), (1, 5), (3, 4), (1, 3, 5))]
+    for arguments, says in (
+        ((torch.zeros(1, 5), goal), r"q: found shape \(1, 5\), expected shape \(3, 5\)"),
+        ((q, torch.zeros(3)), r"target: found shape \(3,\), expected shape \(3, 3\)"),
+        *((posture, "posture: found shape") for posture in postures),
+    ):
+        with pytest.raises(ArgumentError, match=says):
+            ik.solve(*arguments)
     with pytest.raises(ArgumentError, match="q: found shape"):
         ik.forward(torch.zeros(3, 4))
-    drawn = odd_arm().solver(3, posture_gain=0.1)
-    for shape in ((4,), (1, 5), (3, 4), (1, 3, 5)):
-        with pytest.raises(ArgumentError, match="posture: found shape"):
-            drawn.solve(torch.zeros(3, 5), torch.zeros(3, 3), torch.zeros(shape))

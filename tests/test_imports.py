@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 import re
+import subprocess
+import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,6 +30,7 @@ LAYERS = [
     {"episodes", "bench"},
     {"adapters", "datasets", "gates", "train"},
     {"jobs"},
+    {"cli_sweep"},
     {"cli"},
     {"__main__"},
 ]
@@ -39,8 +42,8 @@ HOMES = {
     "warp": ("sim/", "kinematics/"),
     "mink": ("kinematics/mink_ik.py",),
     "mujoco_menagerie": ("robots/source.py",),
-    "hydra": ("config/", "cli.py"),
-    "omegaconf": ("config/", "cli.py", "jobs/"),
+    "hydra": ("config/", "cli.py", "cli_sweep.py"),
+    "omegaconf": ("config/", "cli.py", "cli_sweep.py", "jobs/"),
     "matplotlib": ("report/",),
     "PIL": ("report/",),
     "glfw": ("report/picture.py",),
@@ -51,10 +54,10 @@ HOMES = {
     "tensordict": ("adapters/",),
     "pyarrow": ("datasets/",),
     "safetensors": ("policy/",),
+    "trimesh": ("report/geometry.py",),
     "viser": ("report/web.py",),
-    "trimesh": ("report/web.py",),
     "onnx": ("policy/onnx.py",),
-    "rich": ("jobs/", "cli.py", "bench/", "report/table.py", "managers/term.py"),
+    "rich": ("jobs/", "cli.py", "report/table.py", "managers/term.py"),
 }
 
 
@@ -105,6 +108,50 @@ def test_layers_import_downwards_only() -> None:
     assert not wrong
 
 
+def test_trainers_and_benchmarks_take_a_stage() -> None:
+    """Folder, records and page are the run's: gates and jobs alone know it."""
+    users = {file for file, names in FILES.items() if "mjstack.episodes.run" in names}
+    assert {package(file) for file in users} <= {"episodes", "gates", "jobs"}
+    assert len(users) <= 15
+
+
+# A name says what a thing is: it is none of these, nor one with an underscore, digit or ending.
+PRONOUNS = re.compile(
+    "_*(found|held|ones?|each|own|then|good|every|theirs|ours|mine|hers|his|told|asks|says|wanted"
+    "|drawn|looking|shown|given|taken|kept|others?|another|such|both|either|neither|some|few|many)"
+    "(s|es|_|[0-9])*",
+    re.IGNORECASE,
+)
+
+
+def bound_names(path: Path) -> Iterator[tuple[str, int]]:
+    """Names that a file binds: variables, parameters, attributes, functions and classes."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Name | ast.Attribute) and isinstance(node.ctx, ast.Store):
+            yield getattr(node, "id", None) or node.attr, node.lineno  # type: ignore[attr-defined]
+        elif isinstance(node, ast.arg):
+            yield node.arg, node.lineno
+        elif isinstance(node, ast.FunctionDef | ast.ClassDef):
+            yield node.name, node.lineno
+
+
+def test_no_name_is_a_pronoun() -> None:
+    wrong = [
+        f"{path.relative_to(ROOT)}:{line}: {name}"
+        for path in sorted(ROOT.rglob("*.py"))
+        for name, line in bound_names(path)
+        if PRONOUNS.fullmatch(name)
+    ]
+    assert not wrong
+
+
+def test_jobs_alone_write_pages() -> None:
+    """Below them, parts of a run fill in the data of `report.page`."""
+    writers = {"mjstack.report.html", "mjstack.report.web"}
+    users = {package(file) for file, names in FILES.items() if names & writers}
+    assert users <= {"jobs", "report"}
+
+
 def test_third_party_packages_have_one_home() -> None:
     wrong = [
         f"{file} imports {name}"
@@ -144,17 +191,47 @@ def test_only_tasks_know_tasks() -> None:
     assert not wrong
 
 
+def test_packages_choose_how_mujoco_draws_before_they_import_it() -> None:
+    users = {
+        package(file)
+        for file, names in FILES.items()
+        for name in names
+        if name.split(".")[0] in {"mujoco", "mujoco_warp", "mink"}
+    }
+    first = [ast.parse((ROOT / name / "__init__.py").read_text()).body[1] for name in sorted(users)]
+    assert {ast.unparse(node) for node in first} == {"import mjstack.report.gl"}
+
+
 def test_homes_are_lived_in() -> None:
     used = {name.split(".")[0] for names in FILES.values() for name in names}
     assert set(HOMES) <= used
 
 
-def test_native_runs_do_not_load_warp() -> None:
-    """`sim.build` imports the Warp backend inside a function, and only there."""
-    module_level = ast.parse((ROOT / "sim" / "build.py").read_text()).body
-    top = {node.module for node in module_level if isinstance(node, ast.ImportFrom)}
-    assert "mjstack.sim.mjwarp" not in top
-    assert "mjstack.sim.mjwarp" in FILES["sim/build.py"]
+def test_native_runs_load_what_they_need(tmp_path: Path) -> None:
+    """Neither Warp nor the browser's server; plots when they are drawn."""
+    program = """
+import sys, torch
+import mjstack
+from mjstack.cli import run
+
+HEAVY = {"warp", "mujoco_warp", "matplotlib", "viser", "pyarrow", "tensorboard", "rsl_rl"}
+
+def report(step):
+    print(step, sorted(HEAVY & sys.modules.keys()), file=sys.stderr)
+
+env = mjstack.make_env(["sim=native"], nworld=1)
+env.reset()
+env.step(torch.zeros(1, env.action_manager.action_dim))
+report("step")
+env.close()
+import mjstack.jobs.gates
+report("jobs")
+report(run(["gates=[baseline]", "sim=native", "web.episode=false", "hydra.run.dir=run"]))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=120
+    )
+    assert done.stderr.splitlines() == ["step []", "jobs []", "0 ['matplotlib']"]
 
 
 def test_the_package_has_what_its_configuration_names() -> None:

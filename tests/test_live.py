@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.error import URLError
@@ -22,31 +21,27 @@ import pytest
 import test_ppo
 import test_train
 from browser import EXECUTABLE, browse
-from compositions import load_config
+from compositions import load_config, refusal
 from environments import configure, has_gl
 
 import mjstack.jobs.showing as showing
 import mjstack.report.web as web
 from mjstack.cli import run
-from mjstack.envs import build_env
-from mjstack.episodes.context import RunContext
-from mjstack.episodes.live import LiveView, read_worlds
+from mjstack.drivers.driver import Driver
+from mjstack.envs import Env, build_env
 from mjstack.episodes.rollout import rollout
-from mjstack.errors import MjstackError
+from mjstack.episodes.stage import Stage
 from mjstack.jobs import check_job
-from mjstack.report.web import Shapes, start_server, stop_server
-from mjstack.sim.cameras import color_cameras
+from mjstack.jobs.live import LiveView, read_worlds
+from mjstack.report.geometry import Shapes
+from mjstack.report.web import start_server, stop_server
+from mjstack.sim.cameras import with_outputs
 
 GL = pytest.mark.skipif(not has_gl(), reason="MuJoCo does not draw offscreen here")
 
 
 def refusal_of(*overrides: str) -> str:
-    """The line in which a command line is refused, before it writes anything."""
-    with pytest.raises(MjstackError) as caught:
-        check_job(load_config([*overrides]), overrides)
-    assert caught.value.exit_code == 2
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
+    return refusal(lambda: check_job(load_config(overrides), overrides))
 
 
 @pytest.mark.parametrize(
@@ -68,6 +63,24 @@ def test_worlds_are_read_from_text(text: str, count: int, worlds: list[int]) -> 
     assert read_worlds(text, count) == worlds
 
 
+class NoActions(Driver):
+    """Stands for the driver of worlds that a test moves itself: it has no phases."""
+
+    def __init__(self, env: Env) -> None:
+        super().__init__(env.nworld, sys.maxsize, env.device)
+
+    def command(self) -> Any:
+        raise NotImplementedError
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    """Wait for something that comes within 20 s."""
+    until = time.monotonic() + 20.0
+    while not condition():
+        assert time.monotonic() < until
+        time.sleep(0.01)
+
+
 @pytest.fixture
 def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """A server at which somebody looks."""
@@ -78,14 +91,14 @@ def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 
 
 def test_worlds_pause_step_and_are_chosen(
-    server: Any, stage: Callable[..., RunContext], monkeypatch: pytest.MonkeyPatch
+    server: Any, get_stage: Callable[..., Stage], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model = stage("so101").stage.visual_model
+    stage = get_stage("so101")
     env = build_env(configure("task=reach", "reset=randomized"), nworld=5)
-    view = LiveView(server, lambda: model)
+    view = LiveView(server, stage)
     view.begin("training")
     env.reset()
-    view.start(env)
+    view.start(env, NoActions(env))
     made: list[int] = []
     on = threading.Event()
 
@@ -99,10 +112,7 @@ def test_worlds_pause_step_and_are_chosen(
             made.append(step)
 
     def settle(count: int) -> None:
-        until = time.monotonic() + 20.0
-        while len(made) != count:
-            assert time.monotonic() < until
-            time.sleep(0.01)
+        wait_until(lambda: len(made) == count)
         time.sleep(0.1)
         assert len(made) == count
 
@@ -112,7 +122,7 @@ def test_worlds_pause_step_and_are_chosen(
     try:
         settle(0)  # it waits in its first step
         assert "**training**, step 1, 5 worlds" in view._status.content
-        assert view._stage is not None
+        assert view._view is not None
         view._advance()
         settle(1)
         view._advance()
@@ -125,26 +135,20 @@ def test_worlds_pause_step_and_are_chosen(
         assert plot.data[0].tolist()[-1] == 4.0
         # Another choice of worlds, while it waits
         view._worlds.value = "4, 1"
-        deadline = time.monotonic() + 20.0
-        while view._shown != [4, 1]:
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
+        wait_until(lambda: view._numbers == [4, 1])
         time.sleep(0.2)
-        places, _ = Shapes(model).poses(env.sim.qpos[[4, 1]].double().numpy())
-        for body, handle in view._stage._handles:
+        places, _ = Shapes(stage.assets.visual_model).poses(env.sim.qpos[[4, 1]].double().numpy())
+        for body, handle in view._view._handles:
             held = np.asarray(handle.batched_positions)
             assert np.allclose(held[:, 2], places[:, body, 2], atol=1e-4)
         view._worlds.value = "99"
-        while "Worlds: '99' names none, expected numbers from 0 to 4" not in view._status.content:
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
-        assert view._shown == [4, 1]
+        line = "Worlds: '99' names none, expected numbers from 0 to 4"
+        wait_until(lambda: line in view._status.content)
+        assert view._numbers == [4, 1]
         # Another plotted world: its own lines, from here on
         assert plot.data[0].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
         view._plotted.value = 3
-        while "world 3: step" not in view._status.content:
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
+        wait_until(lambda: "world 3: step" in view._status.content)
         assert plot.data[0].tolist() == [4.0]
         values = env.reward_manager.values[3].tolist()
         assert np.allclose([column[0] for column in plot.data], [4.0, sum(values), *values])
@@ -164,16 +168,15 @@ def test_a_driven_episode_shows_cameras_and_rewards(server: Any, backend: str) -
     sizes = [f"scene.cameras.{name}.size=[32,32]" for name in ("front", "wrist")]
     args = ["view=web", f"sim={backend}", "cameras=[front,wrist]", "looks=randomized", *sizes]
     cfg = load_config((*args, "reset=randomized", "sim.device=cpu"))
-    context = RunContext(cfg)
-    sim = context.batch_simulation(3)
-    env = context.start(sim, cfg.reset)
+    stage = Stage(cfg)
+    sim = stage.batch_simulation(3)
+    env = stage.start(sim, cfg.reset)
     assert env.images == {}
-    renderer = partial(context.stage.color_renderer, 1)
-    with closing(LiveView(server, lambda: context.stage.visual_model, renderer=renderer)) as view:
+    with closing(LiveView(server, stage)) as view:
         view._plotted.value = 2
-        rollout(env, context.driver(env), [view], steps=3)
+        rollout(env, stage.driver(env), [view], steps=3)
         view._show(3)
-        drawn = sim.make_cameras(color_cameras(cfg.scene.cameras))
+        drawn = sim.make_cameras(with_outputs(cfg.scene.cameras, ["rgb"]))
         images = drawn.allocate()
         drawn.draw(images, dict.fromkeys(cfg.scene.cameras))
         drawn.close()
@@ -184,19 +187,19 @@ def test_a_driven_episode_shows_cameras_and_rewards(server: Any, backend: str) -
         names = {title: names for title, *names in view._plots}
         assert names["reward"] == ["sum", *cfg.reward]
         assert "success no" in view._status.content
-    unseen = context.with_config(replace(cfg, view="false")).start(sim, cfg.reset)
+    unseen = stage.with_config(replace(cfg, view="false")).start(sim, cfg.reset)
     assert unseen.reward_manager.names == []
     sim.close()
 
 
 def test_without_a_browser_nothing_is_drawn(
-    server: Any, stage: Callable[..., RunContext], monkeypatch: pytest.MonkeyPatch
+    server: Any, get_stage: Callable[..., Stage], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     env = build_env(configure("task=reach"), nworld=2)
     env.reset()
     monkeypatch.setattr(server, "get_clients", dict)
-    view = LiveView(server, lambda: stage("so101").stage.visual_model)
-    view.start(env)
+    view = LiveView(server, get_stage("so101"))
+    view.start(env, NoActions(env))
     drawn: list[int] = []
     monkeypatch.setattr(view, "_show", drawn.append)
     for step in range(3):
@@ -217,15 +220,14 @@ def test_without_a_browser_nothing_is_drawn(
 
 
 def test_a_paused_run_goes_on_when_the_last_browser_leaves(
-    server: Any, stage: Callable[..., RunContext], monkeypatch: pytest.MonkeyPatch
+    server: Any, get_stage: Callable[..., Stage], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Not at once: a page that is loaded anew leaves and comes back."""
     env = build_env(configure("task=reach"), nworld=2)
     env.reset()
     lines: list[str] = []
-    model = stage("so101").stage.visual_model
-    view = LiveView(server, lambda: model, print_line=lines.append)
-    view.start(env)
+    view = LiveView(server, get_stage("so101"), lines.append)
+    view.start(env, NoActions(env))
     view._toggle()
     began = time.perf_counter()
     monkeypatch.setattr(
@@ -250,17 +252,12 @@ def port() -> int:
         return probe.getsockname()[1]
 
 
-@pytest.fixture
-def taken() -> Iterator[int]:
-    """A port that another program has."""
+def test_a_port_in_use_is_one_line() -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
-        yield other.getsockname()[1]
-
-
-def test_a_port_in_use_is_one_line(taken: int) -> None:
-    line = refusal_of("view=web", f"web.port={taken}")
+        taken = other.getsockname()[1]
+        line = refusal_of("view=web", f"web.port={taken}")
     assert f"web.port={taken}: expected a port that is free on 127.0.0.1" in line
     assert "Set another web.port" in line
 
@@ -271,10 +268,7 @@ def test_a_port_in_use_is_one_line(taken: int) -> None:
         (["view=web", "web.host=203.0.113.1"], "web.host=203.0.113.1: expected an address of this"),
         (["view=web", "web.host=::1"], "web.host=::1: expected an address of this machine"),
         (["view=web", "web.port=0"], "web.port=0: expected an integer from 1 to 65535"),
-        (
-            ["view=web", "gates=[capacity]"],
-            "expected gates with baseline, parity, batch or success",
-        ),
+        (["view=web", "gates=[capacity]"], "expected gates with baseline, parity, batch or"),
         (["view=web", "job=reachability"], "expected false with job=reachability"),
         (["view=true", "job=train", "trainer=clone"], "expected web or false with job=train"),
         (["view=perhaps"], "view=perhaps: expected one of false, true, web"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from functools import partial
 
 import mujoco
 import numpy as np
@@ -11,47 +12,45 @@ import pytest
 import torch
 from comparison import assert_worlds_step_alone
 from compositions import load_config
+from environments import CUDA
 
 from mjstack.config.schema import Backend
-from mjstack.episodes.context import RunContext
-from mjstack.errors import MjstackError, RebindError, UnknownName
+from mjstack.episodes.stage import Stage
+from mjstack.errors import MjstackError, UnknownName
 from mjstack.sim import BatchSizes, Simulation, make_simulation
 from mjstack.sim.model_fields import FIELD_NAMES
 
 N = 3
 FIELDS = (
-    "body_mass",
-    "body_inertia",
-    "body_subtreemass",
-    "body_invweight0",
-    "dof_invweight0",
-    "dof_damping",
-    "geom_friction",
-    "actuator_gainprm",
-    "actuator_biasprm",
+    *("body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0"),
+    *("dof_damping", "geom_friction", "actuator_gainprm", "actuator_biasprm"),
 )
 Make = Callable[..., Simulation]
-Stage = Callable[[str], RunContext]
+GetStage = Callable[[str], Stage]
+
+
+def simulate(
+    model: mujoco.MjModel, backend: str, nworld: int, fields: tuple[str, ...]
+) -> Simulation:
+    kind = Backend.native if backend == "native" else Backend.mjwarp
+    device = "cuda:0" if backend == "mjwarp-cuda" else "cpu"
+    return make_simulation(
+        model, load_config([]), nworld, backend=kind, device=device, fields=fields
+    )
 
 
 @pytest.fixture(scope="module")
-def make_fields(stage: Stage) -> Make:
+def make_fields(get_stage: GetStage) -> Make:
     """Simulations of the SO-101 scene with fields, reset and with the model's values, shared by the
     tests of this file.
     """
     made: dict[tuple, Simulation] = {}
 
-    def make(
-        backend: str, nworld: int = N, fields: tuple[str, ...] = FIELDS, *overrides: str
-    ) -> Simulation:
-        key = (backend, nworld, fields, overrides)
-        model = stage("so101").model
+    def make(backend: str, nworld: int = N, fields: tuple[str, ...] = FIELDS) -> Simulation:
+        key = (backend, nworld, fields)
+        model = get_stage("so101").model
         if key not in made:
-            kind = Backend.native if backend == "native" else Backend.mjwarp
-            device = "cuda:0" if backend == "mjwarp-cuda" else "cpu"
-            made[key] = make_simulation(
-                model, load_config([*overrides]), nworld, backend=kind, device=device, fields=fields
-            )
+            made[key] = simulate(model, *key)
         for name, field in made[key].fields.items():
             field[:] = torch.from_numpy(getattr(model, name)).to(field)
         made[key].reset()
@@ -60,45 +59,45 @@ def make_fields(stage: Stage) -> Make:
     return make
 
 
-def cube(context: RunContext) -> tuple[int, int, int]:
+def cube(stage: Stage) -> tuple[int, int, int]:
     """First cube: its body, and where its position and velocity begin."""
-    q = int(context.index.object_qpos[0])
-    v = int(context.index.object_qvel[0])
-    return int(context.model.dof_bodyid[v]), q, v
+    q = int(stage.index.object_qpos[0])
+    v = int(stage.index.object_qvel[0])
+    return int(stage.model.dof_bodyid[v]), q, v
 
 
-def scale_cube(sim: Simulation, context: RunContext, world: int, s: float) -> None:
+def scale_cube(sim: Simulation, stage: Stage, world: int, s: float) -> None:
     """Makes the cube of one world s times as heavy, with all that MuJoCo derives from it."""
-    body, _, v = cube(context)
+    body, _, v = cube(stage)
     for name in ("body_mass", "body_inertia", "body_subtreemass"):
         sim.fields[name][world, body] *= s
     sim.fields["body_invweight0"][world, body] /= s
     sim.fields["dof_invweight0"][world, v : v + 6] /= s
 
 
-def randomise(sim: Simulation, context: RunContext) -> None:
+def randomise(sim: Simulation, stage: Stage) -> None:
     """Other mass, friction and gains in every world, the same for every backend."""
     for k in range(sim.nworld):
         rng = np.random.default_rng(k)
-        scale_cube(sim, context, k, rng.uniform(0.5, 2.0))
+        scale_cube(sim, stage, k, rng.uniform(0.5, 2.0))
         sim.fields["geom_friction"][k, :, 0] *= rng.uniform(0.6, 1.4)
         gain = rng.uniform(0.8, 1.2)
         sim.fields["actuator_gainprm"][k, :, 0] *= gain
         sim.fields["actuator_biasprm"][k, :, 1] *= gain
 
 
-def start(sim: Simulation, context: RunContext) -> None:
+def start(sim: Simulation, stage: Stage) -> None:
     """Home, jittered cubes, and a command that moves every joint."""
-    context.start(sim, context.cfg.reset)
-    sim.ctrl[:, torch.from_numpy(context.index.ctrl)] += 0.05
+    stage.start(sim, stage.cfg.reset)
+    sim.ctrl[:, torch.from_numpy(stage.index.ctrl)] += 0.05
 
 
 @pytest.mark.full
 def test_every_field_has_mujocos_shape_and_values(
-    backend: str, make_fields: Make, stage: Stage
+    backend: str, make_fields: Make, get_stage: GetStage
 ) -> None:
     sim = make_fields(backend, N, FIELD_NAMES)
-    m = stage("so101").model
+    m = get_stage("so101").model
     assert tuple(sim.fields) == FIELD_NAMES
     for name, field in sim.fields.items():
         value = getattr(m, name)
@@ -111,13 +110,13 @@ def test_every_field_has_mujocos_shape_and_values(
 
 @pytest.mark.full
 def test_the_models_values_change_nothing(
-    backend: str, make_fields: Make, make_sim: Make, stage: Stage
+    backend: str, make_fields: Make, make_sim: Make, get_stage: GetStage
 ) -> None:
     # On CUDA sums have no fixed order: in a few steps their rounding has no time to grow.
     steps = 5 if backend == "mjwarp-cuda" else 20
     finals = []
     for sim in (make_sim(backend, N), make_fields(backend, N, FIELD_NAMES)):
-        start(sim, stage("so101"))
+        start(sim, get_stage("so101"))
         sim.step(steps)
         finals.append([sim.qpos.clone(), sim.qvel.clone(), sim.geom_xpos.clone()])
     for a, b in zip(*finals, strict=True):
@@ -151,76 +150,55 @@ def test_fields_keep_their_address(backend: str, make_fields: Make) -> None:
     sim.reset()
     sim.fields["body_mass"] *= 2.0  # Python sets the item to the very same tensor
     assert {name: field.data_ptr() for name, field in sim.fields.items()} == before
-    with pytest.raises(
-        RebindError,
-        match=r"^sim\.fields\['body_mass'\] is a view .* write sim\.fields\['body_mass'\]\[:\] = ",
-    ):
+    words = r"^sim\.fields\['body_mass'\] is a view .* write sim\.fields\['body_mass'\]\[:\] = "
+    with pytest.raises(MjstackError, match=words):
         sim.fields["body_mass"] = torch.zeros(N)
-    with pytest.raises(
-        MjstackError, match=r"geom_size.* is not a per-world field of this simulation"
-    ):
+    words = r"geom_size.* is not a per-world field of this simulation"
+    with pytest.raises(MjstackError, match=words):
         sim.fields["geom_size"]
 
 
 @pytest.mark.full
+@pytest.mark.parametrize("kind", ["native", "mjwarp"])
 @pytest.mark.parametrize(
     ("name", "nearest"),
-    [("body_mas", "body_mass"), ("geom_frictoin", "geom_friction"), ("bodymass", "body_mass")],
+    [
+        *(("body_mas", "body_mass"), ("geom_frictoin", "geom_friction"), ("bodymass", "body_mass")),
+        *((name, None) for name in ("geom_dataid", "body_parentid", "dof_M0", "opt")),
+    ],
 )
-def test_an_unknown_field_names_the_nearest(
-    backend: str, stage: Stage, name: str, nearest: str
+def test_a_field_that_is_unknown_or_cannot_differ_is_refused(
+    kind: str, get_stage: GetStage, name: str, nearest: str | None
 ) -> None:
-    kind = Backend.native if backend == "native" else Backend.mjwarp
-    with pytest.raises(
-        UnknownName,
-        match=rf"^per-world model field '{name}' does not exist. Did you mean '{nearest}'\? ",
-    ) as caught:
-        make_simulation(
-            stage("so101").model,
-            load_config([]),
-            1,
-            backend=kind,
-            device="cpu",
-            fields=("body_mass", name),
-        )
+    words = f"^per-world model field '{name}' does not exist. "
+    words += rf"Did you mean '{nearest}'\? " if nearest else ""
+    with pytest.raises(UnknownName, match=words) as caught:
+        simulate(get_stage("so101").model, kind, 1, ("body_mass", name))
     assert caught.value.exit_code == 2
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("name", ["geom_dataid", "body_parentid", "dof_M0", "opt"])
-def test_a_field_that_cannot_differ_is_refused(stage: Stage, name: str) -> None:
-    for kind in (Backend.native, Backend.mjwarp):
-        with pytest.raises(UnknownName):
-            make_simulation(
-                stage("so101").model, load_config([]), 1, backend=kind, device="cpu", fields=(name,)
-            )
-
-
-def test_a_heavy_cube_is_slowed_less(backend: str, make_fields: Make, stage: Stage) -> None:
+def test_a_heavy_cube_is_slowed_less(backend: str, make_fields: Make, get_stage: GetStage) -> None:
     """Damping c stops mass m as exp(-c t / m): the implicit integrator divides the speed by 1 + c
     dt / m in every step.
     """
-    context = stage("so101")
-    body, q, v = cube(context)
+    stage = get_stage("so101")
+    body, q, v = cube(stage)
     sim = make_fields(backend)
     sim.step(10)  # a graph that is captured before anything is written sees it all the same
     sim.reset()
     sim.fields["dof_damping"][:, v : v + 3] = 0.8
     sim.fields["dof_damping"][:, v + 3 : v + 6] = 1e-4
-    scale_cube(sim, context, 1, 4.0)
+    scale_cube(sim, stage, 1, 4.0)
     sim.qpos[:, q + 2] = 2.0
     sim.qvel[:, v] = 1.0
     sim.qvel[:, v + 5] = 1.0
     sim.step(10)
-    mass, inertia = (getattr(context.model, name)[body] for name in ("body_mass", "body_inertia"))
-    dt = context.model.opt.timestep
+    mass, inertia = (getattr(stage.model, name)[body] for name in ("body_mass", "body_inertia"))
+    dt = stage.model.opt.timestep
     for k, s in enumerate((1.0, 4.0, 1.0)):
-        assert float(sim.qvel[k, v]) == pytest.approx(
-            (1 + 0.8 * dt / (s * mass)) ** -10, rel=1e-4
-        ), k
-        assert float(sim.qvel[k, v + 5]) == pytest.approx(
-            (1 + 1e-4 * dt / (s * inertia[2])) ** -10, rel=1e-4
-        ), k
+        for column, damping, inert in ((v, 0.8, mass), (v + 5, 1e-4, inertia[2])):
+            speed = (1 + damping * dt / (s * inert)) ** -10
+            assert float(sim.qvel[k, column]) == pytest.approx(speed, rel=1e-4), k
         # Gravity pulls a heavy cube as fast as a light one, apart from the damping.
         fall = 0.0
         for _ in range(10):
@@ -230,15 +208,14 @@ def test_a_heavy_cube_is_slowed_less(backend: str, make_fields: Make, stage: Sta
 
 @pytest.mark.full
 def test_friction_stops_a_cube_in_one_world_only(
-    backend: str, make_fields: Make, stage: Stage
+    backend: str, make_fields: Make, get_stage: GetStage
 ) -> None:
-    context = stage("so101")
-    _, _, v = cube(context)
+    stage = get_stage("so101")
+    _, q, v = cube(stage)
     sim = make_fields(backend)
-    start(sim, context)
+    start(sim, stage)
     sim.step(50)
     before = sim.qpos.clone()
-    _, q, _ = cube(context)
     sim.fields["geom_friction"][:, :, 0] = torch.tensor([[1.0], [0.02], [1.0]], device=sim.device)
     sim.qvel[:, v + 1] = 0.3
     for _ in range(6):
@@ -269,24 +246,15 @@ STATIC = """
 def test_static_geoms_follow_their_fields(backend: str) -> None:
     """MJWarp by itself places geoms that never move once, when the data is made."""
     m = mujoco.MjModel.from_xml_string(STATIC)
-    kind, device = (
-        (Backend.native, "cpu")
-        if backend == "native"
-        else (Backend.mjwarp, "cuda:0" if "cuda" in backend else "cpu")
-    )
     names = ("body_pos", "geom_pos", "geom_quat", "site_pos")
-    sim = make_simulation(m, load_config([]), N, backend=kind, device=device, fields=names)
+    sim = simulate(m, backend, N, names)
     sim.step(1)
     sim.fields["body_pos"][1, 1, 2] += 0.1  # the table, up to the ball
     sim.fields["geom_pos"][2] += 0.01
     sim.fields["geom_quat"][2] = torch.tensor([0.8, 0.0, 0.0, 0.6]).to(sim.qpos)
     sim.fields["site_pos"][2] += 0.01
-    for refresh in (
-        sim.forward,
-        sim.kinematics,
-        lambda: sim.step(1),
-        lambda: sim.step(1, kinematics=True),
-    ):
+    step = partial(sim.step, 1)
+    for refresh in (sim.forward, sim.kinematics, step, partial(step, kinematics=True)):
         sim.reset()
         sim.geom_xpos.fill_(float("nan"))
         refresh()
@@ -304,18 +272,20 @@ def test_static_geoms_follow_their_fields(backend: str) -> None:
 
 
 @pytest.mark.full
-def test_world_k_of_n_is_world_k_of_one(backend: str, make_fields: Make, stage: Stage) -> None:
+def test_world_k_of_n_is_world_k_of_one(
+    backend: str, make_fields: Make, get_stage: GetStage
+) -> None:
     many = make_fields(backend)
-    context = stage("so101")
-    randomise(many, context)
-    start(many, context)
+    stage = get_stage("so101")
+    randomise(many, stage)
+    start(many, stage)
     assert_worlds_step_alone(many, make_fields(backend, 1), backend)
 
 
 @pytest.mark.full
-def test_reset_leaves_fields(backend: str, make_fields: Make, stage: Stage) -> None:
+def test_reset_leaves_fields(backend: str, make_fields: Make, get_stage: GetStage) -> None:
     sim = make_fields(backend)
-    randomise(sim, stage("so101"))
+    randomise(sim, get_stage("so101"))
     before = {name: field.clone() for name, field in sim.fields.items()}
     sim.reset(torch.tensor([True, False, True], device=sim.device))
     sim.step(2)
@@ -334,32 +304,32 @@ def test_reset_starts_from_the_worlds_own_qpos0(backend: str, make_fields: Make)
     assert torch.equal(sim.qpos, expected)
 
 
-@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
-def test_backends_agree(make_fields: Make, stage: Stage, device: str) -> None:
-    if device == "cuda" and not torch.cuda.is_available():
-        pytest.skip("no CUDA device here")
+@pytest.mark.parametrize(
+    "mjwarp", ["mjwarp", pytest.param("mjwarp-cuda", marks=[pytest.mark.gpu, CUDA])]
+)
+def test_backends_agree(make_fields: Make, get_stage: GetStage, mjwarp: str) -> None:
     finals = []
-    for backend in ("native", "mjwarp" if device == "cpu" else "mjwarp-cuda"):
+    for backend in ("native", mjwarp):
         sim = make_fields(backend)
-        randomise(sim, stage("so101"))
-        start(sim, stage("so101"))
+        randomise(sim, get_stage("so101"))
+        start(sim, get_stage("so101"))
         for _ in range(5):
             sim.step(10, kinematics=True)
         finals.append((sim.qpos.double().cpu(), sim.site_xpos.double().cpu()))
-    for native, mjwarp in zip(*finals, strict=True):
-        torch.testing.assert_close(native, mjwarp, rtol=0, atol=1e-4)
+    for a, b in zip(*finals, strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=1e-4)
 
 
-def test_a_scaled_free_body_is_what_set_const_computes(stage: Stage) -> None:
+def test_a_scaled_free_body_is_what_set_const_computes(get_stage: GetStage) -> None:
     """All that mj_setConst derives for a body of its own scales with its mass, or with
     one over it.
     """
-    context = stage("so101")
-    body, _, v = cube(context)
+    stage = get_stage("so101")
+    body, _, v = cube(stage)
     s = 1.7
     dofs = slice(v, v + 6)
-    scaled = copy.copy(context.model)
-    derived = copy.copy(context.model)
+    scaled = copy.copy(stage.model)
+    derived = copy.copy(stage.model)
     for name, where, factor in (
         ("body_mass", body, s),
         ("body_inertia", body, s),
@@ -371,20 +341,18 @@ def test_a_scaled_free_body_is_what_set_const_computes(stage: Stage) -> None:
     derived.body_mass[body] *= s
     derived.body_inertia[body] *= s
     mujoco.mj_setConst(derived, mujoco.MjData(derived))
-    derived.body_subtreemass[0] = scaled.body_subtreemass[
-        0
-    ]  # the mass of the whole scene, which no physics reads
+    # The mass of the whole scene, which no physics reads
+    derived.body_subtreemass[0] = scaled.body_subtreemass[0]
     compared = 0
     for name in dir(derived):
         value = getattr(derived, name)
         # Native worlds take care of dof_M0 themselves: the next test.
         if isinstance(value, np.ndarray) and value.dtype.kind == "f" and name != "dof_M0":
-            np.testing.assert_allclose(
-                getattr(scaled, name), value, rtol=1e-9, atol=1e-12, err_msg=name
-            )
+            got = getattr(scaled, name)
+            np.testing.assert_allclose(got, value, rtol=1e-9, atol=1e-12, err_msg=name)
             compared += 1
     assert compared > 100
-    assert derived.body_mass[body] == s * context.model.body_mass[body]
+    assert derived.body_mass[body] == s * stage.model.body_mass[body]
 
 
 @pytest.mark.full
@@ -402,13 +370,10 @@ def test_native_mass_matrix_of_a_simple_body_follows_its_mass(joints: str) -> No
     """MuJoCo reads the inertia of such a body from dof_M0, made at compile time, and its weight
     from body_mass.
     """
-    xml = (
-        f"<mujoco><worldbody><body pos='0 0 1'>{joints}<geom type='box' size='.1 .2"
-        " .3'/></body></worldbody></mujoco>"
-    )
-    m = mujoco.MjModel.from_xml_string(xml)
+    body = f"<body pos='0 0 1'>{joints}<geom type='box' size='.1 .2 .3'/></body>"
+    m = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
     fields = ("body_mass", "body_inertia", "dof_armature")
-    sim = make_simulation(m, load_config([]), 2, backend=Backend.native, fields=fields)
+    sim = simulate(m, "native", 2, fields)
     sim.fields["body_mass"][1] *= 3.0
     sim.fields["body_inertia"][1] *= torch.tensor([2.0, 3.0, 4.0])
     sim.fields["dof_armature"][1] += 0.05
@@ -428,9 +393,9 @@ def test_native_mass_matrix_of_a_simple_body_follows_its_mass(joints: str) -> No
 
 
 @pytest.mark.full
-def test_buffer_sizes_can_be_given(make_fields: Make, stage: Stage) -> None:
+def test_buffer_sizes_can_be_given(get_stage: GetStage) -> None:
     sizes = BatchSizes(nconmax=40, njmax=200)
-    sim = make_simulation(
-        stage("so101").model, load_config([]), 2, backend=Backend.mjwarp, device="cpu", sizes=sizes
-    )
+    model = get_stage("so101").model
+    backend = Backend.mjwarp
+    sim = make_simulation(model, load_config([]), 2, backend=backend, device="cpu", sizes=sizes)
     assert sim.sizes is sizes  # type: ignore[attr-defined]

@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mjstack.report.html import Page, Worlds, to_html
+from mjstack.report.html import to_html
+from mjstack.report.page import Map, Page, Worlds
 from mjstack.report.record import GateResult, Report, Status
-from mjstack.report.svg import Map
+from mjstack.report.sections import make_sections
 from mjstack.report.table import Table
 
 VOID = {"br", "img", "link", "meta"}
@@ -116,7 +117,12 @@ def page(tmp_path: Path, count: int = 64) -> str:
     )
     shown = Page(worlds={"batch": worlds}, episode="episode.html")
     shown.tables.append(Table(title="Rates", header=["worlds", "rate"], rows=[["1", "2"]]))
-    return to_html(report, shown)
+    return to_html(make_sections(report, shown))
+
+
+def batch_page(folder: Path, gate: GateResult, worlds: Worlds) -> str:
+    report = Report(folder=folder, gates=[gate])
+    return to_html(make_sections(report, Page(worlds={"batch": worlds})))
 
 
 def test_the_page_asks_for_nothing_but_itself(tmp_path: Path) -> None:
@@ -134,14 +140,17 @@ def test_gates_are_tables(tmp_path: Path) -> None:
     tables = Reader(page(tmp_path)).tables
     (differences,) = (t for t in tables if t[0][:1] == ["state"])
     assert differences[0] == ["state", "qpos", "qvel"]
-    assert differences[1] == ["lifted, step1", "2e-07of 1e-06", "0.0004of 0.0001"]
-    assert differences[2] == ["placed, step1", "8e-07of 1e-06", ""]
-    assert [["", "m"], ["red", "1"], ["blue", "2"]] in tables
+    assert differences[1] == ["lifted, step1", "2e-07 / 1e-06", "0.0004 / 0.0001"]
+    assert differences[2] == ["placed, step1", "8e-07 / 1e-06", ""]
+    assert [["", "m"], ["final: red", "1"], ["final: blue", "2"]] in tables
     assert ["dz", "0.04 m", "0.03 m to 0.05 m"] in [row for t in tables for row in t]
     assert ["xy err max", "0.02 m", "0.015 m"] in [row for t in tables for row in t]
-    assert [["required", ""], ["window steps", "50"]] in tables
-    (rules,) = (t for t in tables if t[0][:1] == ["rule"])
-    assert rules[1][:3] == ["STACKED", "not stacked", "13"]
+    assert ["window steps", "", "50"] in [row for t in tables for row in t]
+    (outcomes,) = (t for t in tables if t[0][:1] == ["outcome"])
+    assert [row[:3] for row in outcomes[1:]] == [
+        ["success", "", "51"],
+        ["STACKED", "not stacked", "13"],
+    ]
 
 
 def test_histograms_count_every_world(tmp_path: Path) -> None:
@@ -181,12 +190,12 @@ def test_maps_show_ways(tmp_path: Path) -> None:
     way = np.array([[0.1, 0.1], [0.1, 0.1], [0.3, 0.1], [np.nan, np.nan], [0.1, 0.1]])
     lost = np.full((3, 2), np.nan)
     worlds.maps[0].ways = [("5: STACKED", True, way), ("1", False, way[:3]), ("2", False, lost)]
-    text = to_html(Report(folder=tmp_path, gates=[gate]), Page(worlds={"batch": worlds}))
+    text = batch_page(tmp_path, gate, worlds)
     assert re.findall(r"<path class='?(w[ x]*)'? d='(.*?)'><title>(.*?)<", text) == [
         ("w", "M123 246L123 123", "1"),
         ("w x", "M123 246L123 123L123 246", "5: STACKED"),
     ]
-    assert "Lines are the objects' ways in 3 of the episodes." in text
+    assert " ways in 3 of the episodes." in text
 
 
 def test_text_is_not_markup(tmp_path: Path) -> None:
@@ -209,7 +218,7 @@ def test_text_is_not_markup(tmp_path: Path) -> None:
     )
     report = Report(folder=tmp_path, overrides=[bad], provenance={bad: bad}, gates=[gate])
     shown = Page(title=bad, worlds={bad: worlds}, tables=gate.tables, note=bad)
-    reader = Reader(to_html(report, shown))
+    reader = Reader(to_html(make_sections(report, shown)))
     assert "script" not in reader.tags
     assert reader.open == []
 
@@ -220,5 +229,5 @@ def test_numbers_that_are_not_finite_have_a_page(tmp_path: Path, value: float) -
     worlds.values["xy_err_m"][:] = value
     worlds.maps[0].xy[:] = value
     gate.metrics["lifted.step1.qpos"] = gate.thresholds["step1.qpos"] = value
-    text = to_html(Report(folder=tmp_path, gates=[gate]), Page(worlds={"batch": worlds}))
+    text = batch_page(tmp_path, gate, worlds)
     assert str(float(value)) in text

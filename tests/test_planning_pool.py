@@ -19,13 +19,13 @@ from mjstack import interrupt
 from mjstack.config.schema import Config
 from mjstack.drivers import open_loop
 from mjstack.drivers.open_loop import OpenLoopPlanner, Plan
-from mjstack.episodes.context import RunContext
+from mjstack.episodes.stage import Stage
 from mjstack.errors import MjstackError, Unreachable
 from mjstack.scene.phases import nominal_xy
 
 pytestmark = pytest.mark.full
 
-Stage = Callable[[str], RunContext]
+GetStage = Callable[[str], Stage]
 FAR = [1.5, 0.0]
 
 
@@ -39,9 +39,9 @@ def two_processes(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     assert not active_children()
 
 
-def layouts(context: RunContext, nworld: int) -> np.ndarray:
+def layouts(stage: Stage, nworld: int) -> np.ndarray:
     shifts = np.random.default_rng(7).uniform(-0.002, 0.002, (nworld, 4))
-    return nominal_xy(context.cfg.scene) + shifts.reshape(nworld, 2, 2)
+    return nominal_xy(stage.cfg.scene) + shifts.reshape(nworld, 2, 2)
 
 
 def plan_alone(cfg: Config, xy: np.ndarray) -> list[Plan]:
@@ -50,16 +50,16 @@ def plan_alone(cfg: Config, xy: np.ndarray) -> list[Plan]:
 
 
 @pytest.mark.usefixtures("two_processes")
-def test_plans_are_those_of_one_process(stage: Stage) -> None:
+def test_plans_are_those_of_one_process(get_stage: GetStage) -> None:
     """To the last bit, twins included, and progress is told up to the end."""
-    context = stage("so101")
-    xy = layouts(context, 24)
+    stage = get_stage("so101")
+    xy = layouts(stage, 24)
     xy[[10, 23]] = xy[[2, 20]]
     told: list[int] = []
-    planner = OpenLoopPlanner(context.cfg)
+    planner = OpenLoopPlanner(stage.cfg)
     planner.plan_world = None  # type: ignore[assignment,method-assign]  # nothing is planned here
     shared = planner.plan(xy, told.append)
-    for world, knots, error in plan_alone(context.cfg, xy):
+    for world, knots, error in plan_alone(stage.cfg, xy):
         assert shared.knots[world].numpy().tobytes() == knots.tobytes()
         assert shared.waypoint_error[world] == error
     assert len(told) == 22
@@ -68,26 +68,26 @@ def test_plans_are_those_of_one_process(stage: Stage) -> None:
 
 
 @pytest.mark.usefixtures("two_processes")
-def test_the_first_unreachable_world_is_named(stage: Stage) -> None:
+def test_the_first_unreachable_world_is_named(get_stage: GetStage) -> None:
     """World 7 fails in another process, and often before."""
-    context = stage("so101")
-    xy = layouts(context, 16)
+    stage = get_stage("so101")
+    xy = layouts(stage, 16)
     xy[[5, 7, 12], 0] = FAR
     with pytest.raises(Unreachable) as shared:
-        OpenLoopPlanner(context.cfg).plan(xy)
+        OpenLoopPlanner(stage.cfg).plan(xy)
     with pytest.raises(Unreachable) as alone:
-        plan_alone(context.cfg, xy)
+        plan_alone(stage.cfg, xy)
     assert str(shared.value) == str(alone.value)
     assert (shared.value.world, shared.value.phase) == (5, "above_red")
     assert shared.value.distance == alone.value.distance
 
 
 @pytest.mark.usefixtures("two_processes")
-def test_kept_processes_serve_every_plan(stage: Stage) -> None:
+def test_kept_processes_serve_every_plan(get_stage: GetStage) -> None:
     """They start before the first plan, and an error in it leaves them at work for the next."""
-    context = stage("so101")
-    xy = layouts(context, 32)
-    planner = OpenLoopPlanner(context.cfg)
+    stage = get_stage("so101")
+    xy = layouts(stage, 32)
+    planner = OpenLoopPlanner(stage.cfg)
     with planner.processes(len(xy)):
         started = {child.pid for child in active_children()}
         far = xy.copy()
@@ -97,50 +97,40 @@ def test_kept_processes_serve_every_plan(stage: Stage) -> None:
         shared = planner.plan(xy)
         assert {child.pid for child in active_children()} == started
     assert len(started) == 2
-    knots = [plan for _, plan, _ in plan_alone(context.cfg, xy)]
+    knots = [plan for _, plan, _ in plan_alone(stage.cfg, xy)]
     assert shared.knots.numpy().tobytes() == np.array(knots).tobytes()
 
 
 @pytest.mark.usefixtures("two_processes")
-def test_a_killed_process_is_one_clear_error(stage: Stage) -> None:
-    context = stage("so101")
+@pytest.mark.parametrize("way", ["kill", "raise", "ask"])
+def test_processes_end_with_what_ends_the_planning(
+    way: str, get_stage: GetStage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A process that is killed is one clear error. After Ctrl-C in a step they are gone although
+    every step is still alive, and the command's handler does not wait until they have loaded.
+    """
+    stage = get_stage("so101")
+    planner = OpenLoopPlanner(stage.cfg)
 
-    def kill(done: int) -> None:
-        if done == 1:
+    def stop(done: int) -> None:
+        if way == "kill" and done == 1:
             active_children()[0].kill()
-
-    with pytest.raises(MjstackError, match="a planning process was killed") as caught:
-        OpenLoopPlanner(context.cfg).plan(layouts(context, 256), kill)
-    assert "\n" not in str(caught.value)
-    assert "taskset" in str(caught.value)
-
-
-@pytest.mark.usefixtures("two_processes")
-def test_interrupt_ends_the_processes(stage: Stage) -> None:
-    context = stage("so101")
-
-    def interrupt(done: int) -> None:
-        if done == 5:
+        if way == "raise" and done == 5:
             raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt) as caught:
-        OpenLoopPlanner(context.cfg).plan(layouts(context, 256), interrupt)
-    assert caught.tb is not None  # they are gone although every step is still alive
-    assert not active_children()
-
-
-@pytest.mark.usefixtures("two_processes")
-def test_an_interrupted_command_does_not_wait_until_they_have_loaded(
-    stage: Stage, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    context = stage("so101")
-    planner = OpenLoopPlanner(context.cfg)
-    monkeypatch.setattr(interrupt, "_asked", True)  # as the command's handler does
+    if way == "ask":
+        monkeypatch.setattr(interrupt, "_asked", True)
     used = os.times()
-    with pytest.raises(KeyboardInterrupt):
-        planner.plan(layouts(context, 256))
+    with pytest.raises(MjstackError if way == "kill" else KeyboardInterrupt) as caught:
+        planner.plan(layouts(stage, 256), stop)
+    assert caught.tb is not None
     assert not active_children()
-    assert os.times().children_user - used.children_user < 2.0
+    if way == "kill":
+        assert "a planning process was killed" in str(caught.value)
+        assert "taskset" in str(caught.value)
+        assert "\n" not in str(caught.value)
+    if way == "ask":
+        assert os.times().children_user - used.children_user < 2.0
 
 
 SCRIPT = """
@@ -199,41 +189,35 @@ def is_running(pid: str) -> bool:
 @pytest.mark.parametrize(
     ("cores", "nworld", "distinct", "processes"),
     [
-        (16, 511, 511, 1),
-        (16, 4096, 511, 1),
-        (16, 512, 512, 4),
-        (16, 4096, 4096, 16),
-        (2, 4096, 4096, 2),
-        (1, 4096, 4096, 1),
+        (16, 511, 511, []),
+        (16, 4096, 511, []),
+        (16, 512, 512, [4]),
+        (16, 4096, 4096, [16]),
+        (2, 4096, 4096, [2]),
+        (1, 4096, 4096, []),
     ],
 )
 def test_processes_by_cores_and_distinct_worlds(
     cores: int,
     nworld: int,
     distinct: int,
-    processes: int,
-    stage: Stage,
+    processes: list[int],
+    get_stage: GetStage,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    context = stage("so101")
-    planner = OpenLoopPlanner(context.cfg)
+    stage = get_stage("so101")
+    planner = OpenLoopPlanner(stage.cfg)
     made: list[int] = []
-    plan = planner.plan_world(0, layouts(context, 1)[0])
+    plan = planner.plan_world(0, layouts(stage, 1)[0])
 
     @contextmanager
-    def start(_: Config, count: int) -> Iterator[object]:
+    def start(_: Config, count: int) -> Iterator[None]:
         made.append(count)
-        yield object()
+        yield
 
-    def parallel(_: object, worlds: list[int], __: np.ndarray, take: Callable[..., None]) -> None:
-        for world in worlds:
-            take(world, *plan)
-
-    monkeypatch.setattr(planner, "plan_world", lambda *_: plan)
+    monkeypatch.setattr(planner, "_plans", lambda worlds, _: [(world, *plan) for world in worlds])
     monkeypatch.setattr(open_loop, "_start_processes", start)
-    monkeypatch.setattr(open_loop, "plan_in_parallel", parallel)
     monkeypatch.setattr(open_loop, "available_cores", lambda: cores)
-    xy = layouts(context, distinct)[np.arange(nworld) % distinct]
-    tape = planner.plan(xy)
-    assert made == ([] if processes == 1 else [processes])
-    assert np.isfinite(tape.knots.numpy()).all()
+    trajectory = planner.plan(layouts(stage, distinct)[np.arange(nworld) % distinct])
+    assert made == processes
+    assert np.isfinite(trajectory.knots.numpy()).all()

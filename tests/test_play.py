@@ -17,13 +17,14 @@ from policies import write_policy
 
 import mjstack
 import mjstack.jobs.play as play
+import mjstack.jobs.runner as runner
 import mjstack.jobs.showing as showing
 from mjstack.cli import run
-from mjstack.episodes.context import RunContext
+from mjstack.episodes.rollout import Hook
+from mjstack.episodes.stage import Stage
 from mjstack.errors import MjstackError
 from mjstack.report.picture import save_video
 from mjstack.scene import build_model
-from mjstack.sim import Simulation
 
 REACH = ("job=play", "task=reach", "task.episode_steps=60", "sim=native")
 
@@ -31,6 +32,20 @@ REACH = ("job=play", "task=reach", "task.episode_steps=60", "sim=native")
 def result(folder: Path) -> dict:
     (gate,) = json.loads((folder / "report.json").read_text())["gates"]
     return gate
+
+
+@pytest.fixture
+def refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """The line in which a command is refused, before it writes anything."""
+
+    def refuse(*args: str) -> str:
+        out = tmp_path / "out"
+        assert run([*args, f"hydra.run.dir={out}"]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert not out.exists()
+        return line
+
+    return refuse
 
 
 @pytest.fixture
@@ -64,9 +79,9 @@ def test_a_policy_plays_worlds_as_a_batch_starts_them(
 
     chosen = ("task=reach", "task.episode_steps=60", "reset=randomized", "sim=native", "nworld=2")
     cfg = load_config([*chosen, "seed=5", "controller=policy", f"policy={policy}"])
-    context = RunContext(cfg)
-    sim = context.batch_simulation(2)
-    context.play(sim, cfg.reset)
+    stage = Stage(cfg)
+    sim = stage.batch_simulation(2)
+    stage.play(sim, cfg.reset)
     assert np.array_equal(qpos[:, -1], sim.qpos.numpy())
 
 
@@ -76,16 +91,12 @@ def test_the_expert_plays_without_a_policy_in_the_viewer(
     """Every step of every world is shown; a video is written on request alone."""
     shown: list[int] = []
 
-    def viewer(context: RunContext) -> Callable[[int, Simulation], None]:
-        return lambda step, sim: shown.append(step)
-
-    monkeypatch.setattr(showing, "_viewer", viewer)
+    hook = Hook(lambda step, sim: shown.append(step))
+    monkeypatch.setattr(runner, "find_viewers", lambda stage: [hook])
     monkeypatch.setattr(showing, "opens_windows", lambda: True)
     out = tmp_path / "out"
-    fast = [
-        f"controller.phases.{name}.seconds=0.2"
-        for name in configure("task=reach").controller.phases
-    ]
+    names = configure("task=reach").controller.phases
+    fast = [f"controller.phases.{name}.seconds=0.2" for name in names]
     args = [*REACH, *fast, "task.check.window=5", "view=true", "nworld=2"]
     assert run([*args, f"hydra.run.dir={out}"]) == 0
     steps = len(shown) // 2
@@ -112,7 +123,7 @@ def test_a_video_has_worlds_side_by_side(tmp_path: Path) -> None:
     cfg = configure()
     model = build_model(cfg, visuals=True)
     home = np.tile(model.qpos0, (3, 4, 1))
-    home[1, :, RunContext(cfg).index.object_qpos[0] + 2] += 0.1  # its cube is in the air
+    home[1, :, Stage(cfg).index.object_qpos[0] + 2] += 0.1  # its cube is in the air
     save_video(tmp_path / "x.mp4", model, home, 0.02)
     frames = imageio_ffmpeg.read_frames(str(tmp_path / "x.mp4"))
     facts = next(frames)
@@ -179,19 +190,15 @@ def test_a_loop_lasts_as_long_as_the_episode(ending: str, tmp_path: Path) -> Non
 
 
 def test_without_a_writer_nothing_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     monkeypatch.setattr(features, "check", lambda feature: False)
-    out = tmp_path / "out"
     for form, says in (
         ("mp4", "needs imageio-ffmpeg, which is not installed: run pip install 'mjstack[video]'"),
         ("webp", "Pillow here writes no WebP. Use job.format=gif or job.format=mp4."),
     ):
-        assert run(["job=play", "task=reach", f"job.format={form}", f"hydra.run.dir={out}"]) == 2
-        (line,) = capsys.readouterr().err.splitlines()
-        assert says in line
-        assert not out.exists()
+        assert says in refused("job=play", "task=reach", f"job.format={form}")
 
 
 BAD = [
@@ -208,13 +215,9 @@ BAD = [
 
 @pytest.mark.parametrize(("overrides", "says"), BAD, ids=[" ".join(o) for o, _ in BAD])
 def test_bad_input_is_one_line(
-    overrides: list[str], says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    overrides: list[str], says: str, refused: Callable[..., str]
 ) -> None:
-    out = tmp_path / "out"
-    assert run([*REACH, *overrides, f"hydra.run.dir={out}"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert says in line
-    assert not out.exists()
+    assert says in refused(*REACH, *overrides)
 
 
 def test_a_task_without_phases_needs_a_policy() -> None:
@@ -225,32 +228,25 @@ def test_a_task_without_phases_needs_a_policy() -> None:
 
 
 def test_without_gl_nothing_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*args: object) -> None:
         raise AttributeError("no GL")
 
     monkeypatch.setattr(mujoco, "Renderer", fail)
-    out = tmp_path / "out"
-    assert run(["job=play", "task=reach", "sim=native", f"hydra.run.dir={out}"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
+    line = refused("job=play", "task=reach", "sim=native")
     assert "offscreen rendering fails" in line
     assert line.endswith("Set MUJOCO_GL=egl or osmesa.")
-    assert not out.exists()
 
 
 def test_without_a_display_nothing_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """MuJoCo's viewer would end the process."""
     monkeypatch.setenv("DISPLAY", ":98765")
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    out = tmp_path / "out"
-    args = ["job=play", "task=reach", "sim=native", "controller=open_loop", "view=true"]
-    assert run([*args, f"hydra.run.dir={out}"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
+    line = refused("job=play", "task=reach", "sim=native", "controller=open_loop", "view=true")
     assert "view=true: expected a display that opens windows (DISPLAY=:98765)" in line
-    assert not out.exists()
 
 
 def test_a_video_that_cannot_be_written_fails_the_job(

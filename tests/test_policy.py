@@ -10,7 +10,9 @@ import math
 import os
 import shutil
 from collections.abc import Callable
+from functools import reduce
 from hashlib import sha256
+from operator import getitem
 from pathlib import Path
 
 import mujoco
@@ -19,7 +21,7 @@ import pytest
 import torch
 from compositions import load_config
 from environments import configure, on_new_sim, one_second_episode
-from policies import hold_above_red, make_policy, write_policy
+from policies import hold_above_red, make_policy, report, write_policy
 from safetensors.torch import load, save
 
 import mjstack
@@ -28,8 +30,9 @@ from mjstack.cli import run
 from mjstack.config.schema import ObservationTermCfg
 from mjstack.drivers.policy import PolicyDriver
 from mjstack.envs import Env, driven_config
-from mjstack.episodes.rollout import CommandRecorder, rollout
-from mjstack.errors import MjstackError, PolicyError
+from mjstack.episodes.recorder import CommandRecorder
+from mjstack.episodes.rollout import rollout
+from mjstack.errors import FolderError, MjstackError
 from mjstack.jobs.gates import check_machine
 from mjstack.policy import load_policy, save_policy
 
@@ -61,10 +64,21 @@ def test_a_saved_policy_gives_the_same_bits(tmp_path: Path) -> None:
     loaded = load_policy(tmp_path / "one")
     seen = torch.randn(5, sum(policy.widths.values()))
     assert torch.equal(policy.network(seen), loaded.network(seen))
-    for name in ("group", "observation", "widths", "execute", "hidden", "config", "training"):
+    for name in ("group", "observation", "widths", "execute", "config", "training"):
         assert getattr(loaded, name) == getattr(policy, name), name
+    assert loaded.network.hidden == policy.network.hidden
     assert loaded.joints == configure().robot.joints
     assert {"mjstack", "mujoco", "torch"} == set(loaded.versions)
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_a_policy_of_version_0_1_is_read(version: int, folder: Path) -> None:
+    """Without action terms its actions are joint targets."""
+    terms = load_policy(folder).action
+    assert terms == configure("action=joint_absolute").action
+    edit(lambda d: d.update(format=version))(folder)
+    change("action", "terms", value={})(folder)
+    assert load_policy(folder).action == terms
 
 
 def test_a_checkout_that_is_not_installed_saves(
@@ -88,12 +102,10 @@ def test_a_second_policy_replaces_the_first_at_once(
     first = make_policy(configure(), seed=1)
     save_policy(tmp_path, first)
     real = module.write_atomic
-    for failing in (1, 2):
-        calls = []
+    for failing in (".safetensors", ".json"):
 
-        def full(path: Path, content: bytes, calls: list = calls, failing: int = failing) -> None:
-            calls.append(path)
-            if len(calls) == failing:
+        def full(path: Path, content: bytes, failing: str = failing) -> None:
+            if path.suffix == failing:
                 raise OSError(28, "No space left on device")
             real(path, content)
 
@@ -151,13 +163,10 @@ def test_a_history_is_that_of_the_environment() -> None:
     policy = make_policy(cfg, execute=3)
     assert any(term.history > 1 for term in policy.observation.terms.values())
     driver = PolicyDriver(env, policy)
-    ended = 0
     for step in range(12):
         command = driver.command()
-        own = driver._observed.clone()
-        assert torch.equal(own, env.observation_manager.groups["policy"]), step
-        _, _, terminated, truncated, _ = env.step(command.clone())
-        ended += int((terminated | truncated).sum())
+        assert torch.equal(driver._observed, env.observation_manager.groups["policy"]), step
+        env.step(command.clone())
         if step == 5:
             env.reset(mask=torch.tensor([True, False, False, False]))
 
@@ -237,23 +246,22 @@ def test_a_policy_of_something_else_is_refused(
 
 def assert_refused(overrides: list[str], folder: Path, says: str) -> None:
     """One line, before anything is written."""
+    gates = ["controller=policy", f"policy={folder}", "gates=[baseline]"]
     with pytest.raises(MjstackError) as caught:
-        check_machine(
-            load_config(["controller=policy", f"policy={folder}", "gates=[baseline]", *overrides])
-        )
+        check_machine(load_config([*gates, *overrides]))
     assert caught.value.exit_code == 2
     message = str(caught.value)
     assert "\n" not in message
     assert says in message, message
 
 
-def edit(change: Callable[[dict], object]) -> Callable[[Path], object]:
+def edit(update: Callable[[dict], object]) -> Callable[[Path], object]:
     """Change policy.json."""
 
     def apply(folder: Path) -> None:
         path = folder / "policy.json"
         facts = json.loads(path.read_text())
-        change(facts)
+        update(facts)
         path.write_text(json.dumps(facts))
 
     return apply
@@ -264,10 +272,9 @@ def weights(folder: Path) -> Path:
     return path
 
 
-def put(facts: dict, *keys: str, value: object) -> None:
-    for key in keys[:-1]:
-        facts = facts[key]
-    facts[keys[-1]] = value
+def change(*keys: str, value: object) -> Callable[[Path], object]:
+    """Give a value of policy.json another one."""
+    return edit(lambda facts: reduce(getitem, keys[:-1], facts).update({keys[-1]: value}))
 
 
 GRIPPER = "mjstack.mdp.action.Gripper"
@@ -283,32 +290,32 @@ DAMAGED: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda f: (f / "policy.json").write_text((f / "policy.json").read_text()[:200]),
         "cannot be read (JSONDecodeError",
     ),
-    "another format": (edit(lambda d: put(d, "format", value=7)), "has format 7, expected 3"),
-    "another network": (edit(lambda d: put(d, "network", "hidden", value=[16])), "cannot be read"),
-    "no number": (edit(lambda d: put(d, "action", "execute", value=0)), "cannot be read"),
+    "another format": (change("format", value=7), "has format 7, expected 3 to 5"),
+    "another network": (change("network", "hidden", value=[16]), "cannot be read"),
+    "no number": (change("action", "execute", value=0), "cannot be read"),
     "a key less": (edit(lambda d: d["config"]["robot"].pop("home")), "cannot be read (KeyError"),
     "a strange function": (
-        edit(lambda d: put(d, *TERM, "func", value="os.system")),
+        change(*TERM, "func", value="os.system"),
         "joint_pos.func=os.system: expected a name of mjstack",
     ),
     "a function that is gone": (
-        edit(lambda d: put(d, *TERM, "func", value="mjstack.mdp.observation.nope")),
+        change(*TERM, "func", value="mjstack.mdp.observation.nope"),
         "'nope' does not exist",
     ),
     "a strange action": (
-        edit(lambda d: put(d, "action", "terms", value={"arm": {"func": "os.system"}})),
+        change("action", "terms", value={"arm": {"func": "os.system"}}),
         "action.arm.func=os.system: expected a name of mjstack",
     ),
     "another action": (
-        edit(lambda d: put(d, "action", "terms", value={"grip": {"func": GRIPPER}})),
+        change("action", "terms", value={"grip": {"func": GRIPPER}}),
         "was trained with action.width=6, and here it is 1",
     ),
     "another object": (
-        edit(lambda d: put(d, "observation", "terms", "red_to_blue", "params", "a", value="green")),
-        "its observation or action cannot be computed here: observation.policy.terms.red_to_blue",
+        change("observation", "terms", "red_to_blue", "params", "a", value="green"),
+        "its observation cannot be computed here: observation.policy.terms.red_to_blue",
     ),
     "another width": (
-        edit(lambda d: put(d, *TERM, "func", value="mjstack.mdp.observation.grasp_point_pos")),
+        change(*TERM, "func", value="mjstack.mdp.observation.grasp_point_pos"),
         "observation.policy.terms.joint_pos.width=6, and here it is 3",
     ),
 }
@@ -330,7 +337,7 @@ def put_weights(content: bytes | Callable[[bytes], bytes]) -> Callable[[Path], N
         digest = sha256(other).hexdigest()
         path.unlink()
         (folder / f"weights-{digest[:12]}.safetensors").write_bytes(other)
-        edit(lambda d: put(d, "weights_sha256", value=digest))(folder)
+        change("weights_sha256", value=digest)(folder)
 
     return apply
 
@@ -370,28 +377,28 @@ STRANGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "deep": (lambda f: (f / "policy.json").write_text("[" * 100_000), "(RecursionError"),
     "bytes": (lambda f: (f / "policy.json").write_bytes(b"\xff\x00" * 99), "(JSONDecodeError"),
     "large": (lambda f: os.truncate(f / "policy.json", 2**40), "more than 16777216"),
-    "text": (edit(lambda d: put(d, "action", "chunk", value="6")), "action.chunk is '6', not a"),
-    "a fraction": (edit(lambda d: put(d, "action", "execute", value=4.0)), "execute is 4.0, not"),
-    "long": (edit(lambda d: put(d, "action", "execute", value=1001)), "from 1 to 1000"),
-    "NaN": (edit(lambda d: put(d, "action", "chunk", value=math.nan)), "action.chunk is nan, not"),
-    "negative": (edit(lambda d: put(d, "network", "hidden", value=[-16])), "hidden is -16, not a"),
-    "many digits": (edit(lambda d: put(d, "action", "execute", value=10**30)), "not a whole"),
-    "huge": (edit(lambda d: put(d, "network", "hidden", value=HUGE)), "cannot be read (Runtime"),
-    "many layers": (edit(lambda d: put(d, "network", "hidden", value=[1] * 9999)), "9999 layers"),
+    "text": (change("action", "chunk", value="6"), "action.chunk is '6', not a"),
+    "a fraction": (change("action", "execute", value=4.0), "execute is 4.0, not"),
+    "long": (change("action", "execute", value=1001), "from 1 to 1000"),
+    "NaN": (change("action", "chunk", value=math.nan), "action.chunk is nan, not"),
+    "negative": (change("network", "hidden", value=[-16]), "hidden is -16, not a"),
+    "many digits": (change("action", "execute", value=10**30), "not a whole"),
+    "huge": (change("network", "hidden", value=HUGE), "cannot be read (Runtime"),
+    "many layers": (change("network", "hidden", value=[1] * 9999), "9999 layers"),
     "a width": (
-        edit(lambda d: put(d, "observation", "widths", "joint_pos", value=True)),
+        change("observation", "widths", "joint_pos", value=True),
         "joint_pos is True, not a whole number",
     ),
     "other terms": (
-        edit(lambda d: put(d, "observation", "widths", value={"x": 24})),
+        change("observation", "widths", value={"x": 24}),
         "observation, action and config do not fit together",
     ),
     "other joints": (
-        edit(lambda d: put(d, "action", "joints", value=["a"] * 6)),
+        change("action", "joints", value=["a"] * 6),
         "observation, action and config do not fit together",
     ),
     "no group": (edit(lambda d: d["observation"].pop("group")), "cannot be read (KeyError: 'group"),
-    "a path": (edit(lambda d: put(d, "weights_sha256", value="/../x")), "is no SHA-256"),
+    "a path": (change("weights_sha256", value="/../x"), "is no SHA-256"),
     "no header": (put_weights(b""), "safetensors: cannot be read (SafetensorError"),
     "long header": (put_weights(b"\xff" * 7 + b"\x7f{}"), "cannot be read (SafetensorError"),
     "cut": (put_weights(lambda b: b[:-4]), "cannot be read (SafetensorError"),
@@ -415,7 +422,7 @@ def test_a_strangers_policy_is_refused_in_one_line(whole: Path, tmp_path: Path, 
     folder = Path(shutil.copytree(whole, tmp_path / "policy"))
     damage, says = STRANGE[case]
     damage(folder)
-    with pytest.raises(PolicyError) as caught:
+    with pytest.raises(FolderError) as caught:
         load_policy(folder)
     message = str(caught.value)
     assert "\n" not in message
@@ -443,30 +450,14 @@ def test_nothing_is_written_where_a_policy_is_refused(
     assert error.count("\n") == 1
 
 
-def report(folder: Path) -> dict:
-    gates = json.loads((folder / "report.json").read_text())["gates"]
-    return {gate["name"]: gate for gate in gates}
-
-
 def test_every_gate_takes_a_policy(folder: Path, tmp_path: Path) -> None:
     """A policy that fails is judged in every world, and a replay ends bit for bit where it did."""
     out = tmp_path / "run"
     policy = ["controller=policy", f"policy={folder}"]
-    status = run(
-        [
-            *SHORT,
-            *policy,
-            "task.episode_steps=60",
-            "sim=native",
-            "nworld=5",
-            "gates=[baseline,batch,throughput,success]",
-            "gate.throughput.measurements=[physics,episode]",
-            "gate.success.seeds=1",
-            "video=false",
-            f"hydra.run.dir={out}",
-        ]
-    )
-    assert status == 1
+    options = ["task.episode_steps=60", "sim=native", "nworld=5", "video=false"]
+    asked = ["gates=[baseline,batch,throughput,success]", "gate.success.seeds=1"]
+    asked.append("gate.throughput.measurements=[physics,episode]")
+    assert run([*SHORT, *policy, *options, *asked, f"hydra.run.dir={out}"]) == 1
     gates = report(out)
     assert {"baseline", "batch", "throughput", "success"} <= set(gates)
     assert "not lifted" in gates["baseline"]["reason"]
@@ -544,21 +535,9 @@ def test_a_policy_collects(folder: Path, tmp_path: Path) -> None:
     """Its episodes become a dataset; without a success they are kept on request."""
     pytest.importorskip("pyarrow")
     out = tmp_path / "data"
-    status = run(
-        [
-            *SHORT,
-            "job=collect",
-            "controller=policy",
-            f"policy={folder}",
-            "task.episode_steps=60",
-            "sim=native",
-            "nworld=2",
-            "job.episodes=2",
-            "job.keep_failures=true",
-            f"hydra.run.dir={out}",
-        ]
-    )
-    assert status == 0
+    collect = ["job=collect", "controller=policy", f"policy={folder}", "job.episodes=2"]
+    options = ["task.episode_steps=60", "sim=native", "nworld=2", "job.keep_failures=true"]
+    assert run([*SHORT, *collect, *options, f"hydra.run.dir={out}"]) == 0
     assert "the policy succeeded in 0 of 2" in report(out)["collect"]["reason"]
 
 
@@ -572,7 +551,7 @@ def test_the_rollout_plays_a_policy(backend: str) -> None:
     env = driven(3, "graph=require", backend=backend)
     recorder = CommandRecorder()
     timing = rollout(env, PolicyDriver(env, policy), [recorder], steps=8)
-    recorded = recorder.recorded.rewind()
+    recorded = recorder.recorded
     commands = torch.stack([recorded.command().cpu() for _ in range(8)])
     torch.testing.assert_close(commands, wanted, rtol=0.0, atol=1e-4)
     assert timing.captured == (backend == "mjwarp-cuda")

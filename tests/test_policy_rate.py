@@ -40,19 +40,17 @@ def test_a_held_action_is_that_action_again_and_again() -> None:
         torch.testing.assert_close(reward, torch.stack(rewards).sum(0))
         assert not torch.stack(ends).any()
     assert torch.equal(env.reward_manager.episode_sums, single.reward_manager.episode_sums)
-    theirs = state_of(single)
-    for name, value in state_of(env).items():
-        if name != "previous_action":
-            assert torch.equal(value, theirs[name]), name
+    expected = state_of(single)
+    for name in expected.keys() - {"previous_action"}:
+        assert torch.equal(state_of(env)[name], expected[name]), name
 
 
 @pytest.mark.parametrize(("history", "calls"), [(1, 1), (2, HELD)])
 def test_held_steps_are_observed_for_a_history_alone(
     history: int, calls: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    env = on_new_sim(
-        "native", 2, held(f"observation.policy.terms.grasp_point_to_goal.history={history}")
-    )
+    term = "observation.policy.terms.grasp_point_to_goal"
+    env = on_new_sim("native", 2, held(f"{term}.history={history}"))
     env.reset(seed=1)
     seen: list[int] = []
     compute = env.observation_manager.compute
@@ -103,13 +101,13 @@ def test_an_episode_ends_within_a_decision(ends: list[str], last: int, success: 
 @pytest.mark.parametrize("action", ["joint_delta", "ee_upright"])
 def test_a_policy_drives_as_it_was_trained(action: str) -> None:
     """With its own action terms, observed last action and rate: the same joint targets and states
-    as in the environment of its training. A driver's joint targets are float32.
+    as in the environment of its training, bit for bit.
     """
     cfg = configure("task=reach", f"action={action}", f"timing.policy_decimation={HELD}")
     policy = make_policy(cfg, chunk=1, execute=HELD)
     trained = on_new_sim("native", 3, cfg)
     obs, _ = trained.reset(seed=2)
-    driven = on_new_sim("native", 3, driven_config(cfg))
+    driven = on_new_sim("native", 3, driven_config(cfg, action=policy.action))
     driven.reset(seed=2)
     driver = PolicyDriver(driven, policy)
     network = policy.network.double()
@@ -120,8 +118,8 @@ def test_a_policy_drives_as_it_was_trained(action: str) -> None:
             driven.action_manager.process(driver.command())
             driven.advance()
         obs, *_ = trained.step(answer)
-        torch.testing.assert_close(trained.sim.ctrl, driven.sim.ctrl, rtol=0.0, atol=1e-6)
-        torch.testing.assert_close(trained.sim.qpos, driven.sim.qpos, rtol=0.0, atol=1e-6)
+        assert torch.equal(trained.sim.ctrl, driven.sim.ctrl)
+        assert torch.equal(trained.sim.qpos, driven.sim.qpos)
     assert (trained.sim.ctrl - trained.sim.ctrl[:1]).abs().max() > 1e-4  # worlds differ
 
 
@@ -195,12 +193,9 @@ def test_the_gripper_tilts_as_far_as_it_is_told(robot: str) -> None:
 
 def test_a_roll_needs_a_free_joint() -> None:
     says = r"roll=0\.03: expected 0, because robot\.roll_joint=None is not free"
+    cfg = configure("action=ee_upright", "robot.roll_joint=null", "controller.yaw_alignment=0")
     with pytest.raises(MjstackError, match=says):
-        on_shared_sim(
-            "native",
-            1,
-            configure("action=ee_upright", "robot.roll_joint=null", "controller.yaw_alignment=0"),
-        )
+        on_shared_sim("native", 1, cfg)
 
 
 def test_a_gripper_with_a_step_stays_as_it_is_until_it_is_told() -> None:

@@ -25,8 +25,8 @@ import mjstack
 from mjstack.config.schema import Backend, Config
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env, build_env
-from mjstack.episodes.context import RunContext
 from mjstack.episodes.rollout import Observer, rollout
+from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError
 from mjstack.managers.term import Term
 from mjstack.tasks.check import make_check
@@ -85,21 +85,21 @@ def configure(task: str, robot: str, *, hurried: bool = True) -> Config:
 def expert(task: str, robot: str, *, nworld: int = NWORLD, hurried: bool = True) -> SimpleNamespace:
     """Rewards and success along accepted native episodes, shape ``(steps, nworld)``."""
     cfg = configure(task, robot, hurried=hurried)
-    context = RunContext(cfg)
+    stage = Stage(cfg)
     terms = Terms(cfg)
-    sim = context.simulation(nworld, Backend.native, "cpu")
+    sim = stage.simulation(nworld, Backend.native, "cpu")
     if cfg.task.check is None:
-        env = context.start(sim, cfg.reset)
-        rollout(env, context.driver(env), [terms])
+        env = stage.start(sim, cfg.reset)
+        rollout(env, stage.driver(env), [terms])
     else:
         freely = JudgeWithoutPhases()
-        episode = context.play(sim, cfg.reset, [terms, freely])
+        episode = stage.play(sim, cfg.reset, [terms, freely])
         assert not episode.failed.any()
         assert not freely.failed.any(), "accepted with phases, not without"
         assert not episode.retries.any()
     sim.close()
     value, success, total = torch.stack(terms.rows).unbind(1)
-    phases = context.planner.phases
+    phases = stage.planner.phases
     return SimpleNamespace(cfg=cfg, phases=phases, value=value, success=success, total=total)
 
 

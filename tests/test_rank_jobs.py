@@ -5,6 +5,7 @@ leaves.
 from __future__ import annotations
 
 import json
+import socket
 import subprocess
 import sys
 import time
@@ -13,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from environments import at_double_speed, one_second_episode
-from one_node_slurm import free_ports
 from test_ranks import SCRIPT, SHORT, play, report_of, start_python
 
 from mjstack.datasets import read_dataset
@@ -29,13 +29,10 @@ def test_two_nodes(allowed: int, tmp_path: Path) -> None:
     """Two agents of torchrun, as on two machines with one disk: one report, and neither agent waits
     for the other after it, also if the gate has failed.
     """
-    run = [
-        *SHORT,
-        "nworld=3",
-        f"gate.batch.failed_worlds={allowed}",
-        f"hydra.run.dir={tmp_path}/run",
-    ]
-    (port,) = free_ports(1)
+    run = [*SHORT, "nworld=3", f"gate.batch.failed_worlds={allowed}"]
+    run.append(f"hydra.run.dir={tmp_path}/run")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
     nodes = []
     for node in (0, 1):
         (tmp_path / str(node)).mkdir()
@@ -57,8 +54,8 @@ def test_two_nodes(allowed: int, tmp_path: Path) -> None:
 
 
 def test_each_rank_sizes_its_own_worlds(tmp_path: Path) -> None:
-    own = ["sim=mjwarp", "sim.device=cpu", "gates=[capacity]", "gate.capacity.random_steps=20"]
-    args = [*own, "nworld=3", *one_second_episode(), f"hydra.run.dir={tmp_path}/capacity"]
+    capacity = ["sim=mjwarp", "sim.device=cpu", "gates=[capacity]", "gate.capacity.random_steps=20"]
+    args = [*capacity, "nworld=3", *one_second_episode(), f"hydra.run.dir={tmp_path}/capacity"]
     play(2, args, tmp_path, None)
     (gate,) = report_of(tmp_path / "capacity")["gates"]
     assert gate["notes"]["ranks"] == "each of 2 ranks its own worlds; figures are rank 0's"
@@ -67,8 +64,8 @@ def test_each_rank_sizes_its_own_worlds(tmp_path: Path) -> None:
 
 def test_two_ranks_beside_one(tmp_path: Path) -> None:
     """scripts/bench_many.py: figures of throughput are sums over the ranks."""
-    few = ["repetitions=2", "steps=2", "env_steps=2", "episodes=1"]
-    small = ["sim=native", *at_double_speed(), *(f"gate.throughput.{key}" for key in few)]
+    short = ["repetitions=2", "steps=2", "env_steps=2", "episodes=1"]
+    small = ["sim=native", *at_double_speed(), *(f"gate.throughput.{key}" for key in short)]
     bench = [str(SCRIPT.parent / "bench_many.py"), "--gpus=2", "--worlds=2", "--rounds=1"]
     command = [sys.executable, *bench, f"--folder={tmp_path}/many", "--", *small]
     done = subprocess.run(command, capture_output=True, text=True, timeout=900, cwd=tmp_path)
@@ -89,25 +86,25 @@ def test_ranks_collect_images(tmp_path: Path) -> None:
     args += one_second_episode()
     for ranks in (1, 2):
         play(ranks, [*args, f"job.folder={tmp_path}/{ranks}"], tmp_path)
-    one, two = (read_dataset(tmp_path / name / "dataset") for name in "12")
+    alone, shared = (read_dataset(tmp_path / name / "dataset") for name in "12")
     for key in ("world", "length"):
-        assert [row[key] for row in two.episodes] == [row[key] for row in one.episodes]
-    np.testing.assert_array_equal(two.frames("action"), one.frames("action"))
+        assert [row[key] for row in shared.episodes] == [row[key] for row in alone.episodes]
+    np.testing.assert_array_equal(shared.frames("action"), alone.frames("action"))
     key = "observation.images.front"
     for episode in range(3):
-        ours, theirs = (stored.images(key, episode).astype(float) for stored in (two, one))
-        assert ours.shape == theirs.shape
-        assert abs(ours - theirs).mean() < 1.0  # the encoder sees other neighbours
-        assert ours.std() > 10.0
+        first, second = (stored.images(key, episode).astype(float) for stored in (alone, shared))
+        assert first.shape == second.shape
+        assert abs(first - second).mean() < 1.0  # the encoder sees other neighbours
+        assert second.std() > 10.0
 
 
 def test_ranks_learn_from_pixels(tmp_path: Path) -> None:
     """Each draws images of its own episodes; both have one policy, which the first one writes."""
-    few = ["channels=[4,8]", "features=8", "pool=40", "uses=2", "shift=1", "cameras=[front]"]
+    vision = ["channels=[4,8]", "features=8", "pool=40", "uses=2", "shift=1", "cameras=[front]"]
     sizes = ["episodes=4", "noisy_episodes=0", "hidden=[16]", "batches=4", "batch_size=16"]
     args = ["job=train", "trainer=pixels", *CAMERA, "task=reach", "nworld=4", "web.episode=false"]
     args += ["controller.phases.hold.seconds=0.4", "task.episode_steps=70", "task.check.window=10"]
-    args += [f"job.vision.{key}" for key in few] + [f"job.{key}" for key in sizes]
+    args += [f"job.vision.{key}" for key in vision] + [f"job.{key}" for key in sizes]
     args += ["job.save_every=2", "gate.success.rate=0.0", f"job.folder={tmp_path}/out"]
     text = play(2, args, tmp_path)
     assert text.count("status: pass") == 1

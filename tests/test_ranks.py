@@ -14,7 +14,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,9 +29,10 @@ from mjstack.cli import run
 from mjstack.config.schema import Backend, Config
 from mjstack.datasets import read_dataset
 from mjstack.distributed import Ranks, current_ranks
-from mjstack.episodes.context import RunContext
+from mjstack.episodes.batches import BatchPlan, play_batches
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.seeds import _record as record_of
+from mjstack.episodes.stage import Stage
 from mjstack.errors import ArgumentError, ConfigError, MjstackError
 from mjstack.jobs import check_ranks, count_devices
 
@@ -63,7 +63,7 @@ with joined() as ranks:
         ranks.in_all(lambda: ranks.rank and refuse())
     except RankError as error:
         assert "rank 1 of 2: ValueError: no" in str(error), error
-        print("rank", ranks.rank, "told" if error.told else "tells")
+        print("rank", ranks.rank, "silent" if error.printed else "prints")
     ranks.end()
 """
 
@@ -125,15 +125,20 @@ def assert_same_episodes(one: Path, other: Path) -> None:
 
 
 @pytest.mark.full
-def test_two_ranks_play_what_one_plays(tmp_path: Path) -> None:
-    """Five worlds: the shares differ. Batch and success, whose starts are drawn; every gate has one
-    result, and says where its worlds were.
+@pytest.mark.parametrize("backend", ["native", "mjwarp"])
+def test_ranks_play_what_one_plays(backend: str, tmp_path: Path) -> None:
+    """Five worlds, so that shares differ, with the feedback of the closed loop. Batch and success,
+    whose starts are drawn; every gate has one result, and says where its worlds were.
     """
-    args = [*SHORT, "gates=[baseline,batch,success]", "nworld=5", "gate.batch.seeds=2"]
-    text = play(0, [*args, "devices=2", f"hydra.run.dir={tmp_path}/two"], tmp_path, 1)
+    args = [*SHORT, f"sim={backend}", "sim.device=cpu", "gates=[baseline,batch,success]"]
+    args += ["nworld=5", "gate.batch.seeds=2", "controller=closed_loop"]
     assert run([*args, f"hydra.run.dir={tmp_path}/one"]) == 1  # the episodes are too short
+    text = play(0, [*args, "devices=2", f"hydra.run.dir={tmp_path}/two"], tmp_path, 1)
+    play(3, [*args, f"hydra.run.dir={tmp_path}/three"], tmp_path, 1)
     assert_same_episodes(tmp_path / "one", tmp_path / "two")
-    assert len(list(csv.reader((tmp_path / "two/starts_seed0.csv").open()))) == 6
+    assert_same_episodes(tmp_path / "one", tmp_path / "three")
+    with np.load(tmp_path / "two/starts_seed0.npz") as starts:
+        assert {len(array) for array in starts.values()} == {5}
 
     assert text.count("status: fail") == 1  # one process prints
     one, two = (report_of(tmp_path / name) for name in ("one", "two"))
@@ -153,25 +158,20 @@ def test_two_ranks_play_what_one_plays(tmp_path: Path) -> None:
 def test_shares_played_apart_join_to_the_whole(finished: Path) -> None:
     """Three worlds as two ranks share them, in one process: bit for bit what one rank played."""
     cfg = load_config([*SHORT, "nworld=3"])
-    context = RunContext(cfg)
+    stage = Stage(cfg)
     parts = []
     for rank in (0, 1):
-        own = replace(context, ranks=Ranks(rank, 2))
-        with closing(own.batch_simulation(len(own.worlds))) as sim:
-            episode = own.play(sim, cfg.reset, seed=1, worlds=own.worlds)
-            parts.append(record_of(own, sim, 1, episode, []))
+        own = stage.with_config(stage.cfg, ranks=Ranks(rank, 2))
+        for batch in play_batches(own, [BatchPlan(1, own.worlds)]):
+            parts.append(record_of(own, batch, None))
     joined = EpisodeRecord.join(parts)
     whole = EpisodeRecord.read(finished, 1, whole=True)
     assert whole is not None
     assert list(joined.ranks) == [0, 1]
     assert len(np.unique(joined.start, axis=0)) == 3
-    for name in ("failed", "qpos", "start"):
-        np.testing.assert_array_equal(getattr(joined, name), getattr(whole, name), err_msg=name)
-    for name in ("values", "measured"):
-        ours, theirs = (getattr(each, name) for each in (joined, whole))
-        assert ours.keys() == theirs.keys()
-        for key in ours:
-            np.testing.assert_array_equal(ours[key], theirs[key], err_msg=key)
+    assert joined.worlds.keys() <= whole.worlds.keys()
+    for name, values in joined.worlds.items():
+        np.testing.assert_array_equal(values, whole.worlds[name], err_msg=name)
 
 
 def test_two_ranks_meet(tmp_path: Path) -> None:
@@ -180,40 +180,12 @@ def test_two_ranks_meet(tmp_path: Path) -> None:
         free.bind(("127.0.0.1", 0))
         port = str(free.getsockname()[1])
     (tmp_path / "meeting.py").write_text(MEETING)
-    root = str(Path(mjstack.__file__).parents[1])
-    own = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "PYTHONPATH": root}
-    processes = [
-        subprocess.Popen(
-            [sys.executable, str(tmp_path / "meeting.py")],
-            env=os.environ | own | {"RANK": str(rank), "OMP_NUM_THREADS": "1"},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
-        for rank in (0, 1)
-    ]
+    group = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
+    processes = [start_python(["meeting.py"], tmp_path, RANK=str(n), **group) for n in (0, 1)]
     texts = [process.communicate(timeout=200)[0] for process in processes]
     assert [process.returncode for process in processes] == [0, 0], texts
-    assert "rank 0 tells" in texts[0]
-    assert "rank 1 told" in texts[1]
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("backend", ["native", "mjwarp"])
-def test_three_ranks(backend: str, tmp_path: Path) -> None:
-    """Uneven shares, and the feedback of the closed loop, on either backend of a CPU."""
-    args = [
-        *SHORT,
-        f"sim={backend}",
-        "sim.device=cpu",
-        "gates=[batch,success]",
-        "nworld=5",
-        "controller=closed_loop",
-    ]
-    for ranks in (1, 2, 3):
-        play(ranks, [*args, f"hydra.run.dir={tmp_path}/{ranks}"], tmp_path, 1)
-    assert_same_episodes(tmp_path / "1", tmp_path / "2")
-    assert_same_episodes(tmp_path / "1", tmp_path / "3")
+    assert "rank 0 prints" in texts[0]
+    assert "rank 1 silent" in texts[1]
 
 
 @pytest.fixture
@@ -240,12 +212,8 @@ def test_a_rank_that_breaks(env: dict[str, str], why: str, trap: list[str], tmp_
     assert re.match(r"rank 1 of 2 \(.*\).*" + why, gate["reason"])
     assert f"resume={folder}" in gate["reason"]
     assert f"mjstack: {gate['reason'].split('.')[0]}" in text
-    assert sorted(path.name for path in folder.glob("*_seed*.npz")) == [
-        "worlds_seed0.npz",
-        "worlds_seed1.npz",
-    ]
-
     before = {path: path.stat().st_mtime_ns for path in folder.glob("*_seed*.npz")}
+    assert {path.name for path in before} == {"worlds_seed0.npz", "worlds_seed1.npz"}
     play(0, [*trap, f"resume={folder}"], tmp_path, 1)
     play(0, [*trap, f"hydra.run.dir={tmp_path}/whole"], tmp_path, 1)
     assert_same_episodes(tmp_path / "whole", folder)
@@ -270,10 +238,8 @@ def test_a_killed_first_rank_is_named(script: bool, trap: list[str], tmp_path: P
     process = start_python(command, tmp_path, TRAPPED="0", KILL="1")
     text, _ = process.communicate(timeout=400)
     assert process.returncode == 1, text
-    assert (
-        len(re.findall(r"mjstack: rank 1: rank 0 of [23] \(.*, process \d+\) was killed", text))
-        == 1
-    )
+    killed = r"mjstack: rank 1: rank 0 of [23] \(.*, process \d+\) was killed"
+    assert len(re.findall(killed, text)) == 1
     assert "mjstack: rank 2" not in text
     assert ("mjstack: rank 0 of 2 was killed (SIGKILL)" in text) == (not script)
     assert report_of(folder)["status"] == "interrupted"
@@ -395,17 +361,16 @@ class Others(Ranks):
 
 
 def test_unequal_versions_are_refused() -> None:
-    ranks = Others(0, 2)
     Others.change = {}
-    context = RunContext(load_config(["sim=native"]), ranks=ranks)
-    check_ranks(context)
+    stage = Stage(load_config(["sim=native"]), ranks=Others(0, 2))
+    check_ranks(stage)
     Others.change = {"torch": "1.0"}
     with pytest.raises(MjstackError, match=r"rank 1 \(.*\) has torch 1\.0 and rank 0 \(.*\) \d"):
-        check_ranks(context)
+        check_ranks(stage)
     Others.change = {}
-    context = replace(context, cfg=replace(context.cfg, nworld=1))
+    stage = stage.with_config(replace(stage.cfg, nworld=1))
     with pytest.raises(ConfigError, match="nworld=1: expected at least 2, a world for each rank"):
-        check_ranks(context)
+        check_ranks(stage)
 
 
 @pytest.mark.parametrize("value", ["0", "some", "-1", "1.5"])
@@ -431,11 +396,11 @@ def test_more_devices_than_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_two_ranks_on_one_gpu_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(RunContext, "backend", ON_CUDA)
+    monkeypatch.setattr(Stage, "backend", ON_CUDA)
     monkeypatch.setattr("mjstack.jobs.runner.cuda_uuid", lambda device: "GPU-7")
     monkeypatch.setattr(Others, "change", {}, raising=False)
     with pytest.raises(MjstackError, match=r"ranks 0 and 1 \(.*\) have one GPU, GPU-7, expected"):
-        check_ranks(RunContext(load_config([]), ranks=Others(0, 2)))
+        check_ranks(Stage(load_config([]), ranks=Others(0, 2)))
 
 
 @pytest.mark.full

@@ -4,7 +4,9 @@ explained.
 
 from __future__ import annotations
 
+import io
 import json
+import math
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -14,26 +16,27 @@ import numpy as np
 import pytest
 import torch
 from check_cases import rules_of
-from compositions import load_config, put
-from environments import at_double_speed, has_gl, one_second_episode
+from compositions import load_config, put, refusal
+from environments import at_double_speed, has_gl, one_second_episode, stack_starts
 from omegaconf import OmegaConf
 
 from mjstack.cli import run
 from mjstack.config.check import validate
 from mjstack.config.load import load_saved
 from mjstack.config.schema import Backend, TermCfg
-from mjstack.episodes.context import RunContext
 from mjstack.episodes.earlier_run import STEM, archive_starts, copy_names
 from mjstack.episodes.record import EpisodeRecord
-from mjstack.episodes.replay import _sizes_alone
+from mjstack.episodes.replay import simulate_alone
 from mjstack.episodes.rollout import snapshot
-from mjstack.errors import MjstackError
+from mjstack.episodes.run import Run
 from mjstack.jobs import check_job
 from mjstack.jobs.replay import _compare
 from mjstack.sim import BatchSizes
 
 RULES = rules_of("stack")
 
+EARLIER = ["gates=[batch]", "sim=native", "nworld=5", "gate.batch.seeds=2"]
+EARLIER += ["task.check.xy_err=0.00134", *at_double_speed()]
 FAILING = "0:2"
 SUCCEEDED = "1:3"  # of the run below
 
@@ -44,15 +47,7 @@ def earlier(tmp_path_factory: pytest.TempPathFactory) -> Path:
     some fail.
     """
     folder = tmp_path_factory.mktemp("earlier") / "run"
-    args = [
-        "gates=[batch]",
-        "sim=native",
-        "nworld=5",
-        "gate.batch.seeds=2",
-        "task.check.xy_err=0.00134",
-        *at_double_speed(),
-    ]
-    assert run([*args, f"hydra.run.dir={folder}"]) == 1
+    assert run([*EARLIER, f"hydra.run.dir={folder}"]) == 1
     return folder
 
 
@@ -68,13 +63,6 @@ def failing(earlier: Path) -> tuple[Path, int, dict]:
     return out, *replay_into(out, earlier, f"world={FAILING}")
 
 
-@pytest.fixture(scope="module")
-def succeeded(earlier: Path) -> tuple[Path, int, dict]:
-    """Likewise of an succeeded one, of the other seed."""
-    out = earlier.parent / "succeeded"
-    return out, *replay_into(out, earlier, f"world={SUCCEEDED}")
-
-
 @pytest.fixture
 def replay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[int, dict]]:
     """Replays with some arguments into ``out``; returns the exit status and the report."""
@@ -86,20 +74,11 @@ def replay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tup
     return do
 
 
-def refusal(*values: str) -> str:
-    """The line in which the job refuses a folder, before it writes anything."""
+def refusal_of(*values: str) -> str:
+    """The line in which the job refuses a folder."""
     cfg = put(load_config(["job=replay"]), *values)
     cfg.world = None if cfg.world is None else str(cfg.world)
-
-    def check() -> None:
-        validate(cfg)
-        check_job(cfg, ["job=replay", *values])
-
-    with pytest.raises(MjstackError) as caught:
-        check()
-    assert caught.value.exit_code == 2
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
+    return refusal(lambda: (validate(cfg), check_job(cfg, ["job=replay", *values])))
 
 
 def record_of(folder: Path, seed: int) -> EpisodeRecord:
@@ -122,75 +101,64 @@ def test_failing_world_fails_again_bit_for_bit(
     assert report["status"] == "fail"
     (gate,) = report["gates"]
     assert (gate["name"], gate["status"]) == ("replay_native", "fail")
-    assert (
-        gate["reason"] == "failed: not stacked; as recorded, and it ends bit for bit where it did"
-    )
-    assert gate["metrics"]["xy_err_m"] == record.values["xy_err_m"][2]
+    as_recorded = "as recorded, and it ends bit for bit where it did"
+    assert gate["reason"] == f"failed: not stacked; {as_recorded}"
+    assert gate["metrics"]["xy_err_m"] == record.named("value")["xy_err_m"][2]
     assert gate["thresholds"]["xy_err_m"] == 0.00134
     broken = [line for line in gate["details"] if "BROKEN" in line]
     assert len(broken) == 1
     assert broken[0].startswith("STACKED: BROKEN, not stacked: stacked_steps 0, xy_err_m ")
-    assert f"xy_err_m {record.values['xy_err_m'][2]:.4g}, dz_m" in broken[0]
+    assert f"xy_err_m {record.named('value')['xy_err_m'][2]:.4g}, dz_m" in broken[0]
     assert broken[0].endswith("(wanted: at least 50)")
     assert len(gate["details"]) == len(RULES)
     with np.load(out / "trajectory.npz") as held:
         assert np.array_equal(held["qpos"][-1], record.qpos[2])
-        assert (int(held["seed"]), int(held["world"]), int(held["failed"])) == (
-            0,
-            2,
-            RULES["STACKED"],
-        )
-    assert sorted(path.name for path in (out).iterdir()) == [
-        ".hydra",
-        "episode.html",
-        "replayed_config.yaml",
-        "report.html",
-        "report.json",
-        "report.md",
-        "run.log",
-        *(["scene.png"] if has_gl() else []),
-        "trajectories.png",
-        "trajectory.npz",
-    ]
+        facts = [int(held[name]) for name in ("seed", "world", "failed")]
+        assert facts == [0, 2, RULES["STACKED"]]
+    names = ".hydra episode.html replayed_config.yaml report.html report.json report.md run.log"
+    names += f"{' scene.png' if has_gl() else ''} trajectories.png trajectory.npz"
+    assert sorted(path.name for path in out.iterdir()) == names.split()
 
 
 @pytest.mark.full
-def test_accepted_world_of_another_seed(earlier: Path, succeeded: tuple[Path, int, dict]) -> None:
+def test_an_accepted_world_of_another_seed(earlier: Path, tmp_path: Path) -> None:
+    """Its saved configuration is the run's, with that seed."""
     record = record_of(earlier, 1)
     assert record.failed[3] == 0
-    out, status, report = succeeded
+    status, report = replay_into(tmp_path / "out", earlier, f"world={SUCCEEDED}")
     assert status == 0
     (gate,) = report["gates"]
     assert gate["status"] == "pass"
     assert gate["reason"].endswith("; as recorded, and it ends bit for bit where it did")
     assert not [line for line in gate["details"] if "BROKEN" in line]
-    with np.load(out / "trajectory.npz") as held:
+    with np.load(tmp_path / "out" / "trajectory.npz") as held:
         assert np.array_equal(held["qpos"][-1], record.qpos[3])
+    recorded = json.loads((earlier / "report.json").read_text())["provenance"]
+    assert report["provenance"]["model_sha256"] == recorded["model_sha256"]
+    assert load_saved(earlier / ".hydra" / "config.yaml") == load_config(EARLIER)
+    played = OmegaConf.load(tmp_path / "out" / "replayed_config.yaml")
+    assert (played.seed, played.task.check.xy_err) == (1, 0.00134)
 
 
 def test_trajectory_holds_the_episode(
-    failing: tuple[Path, int, dict], new_context: Callable[..., RunContext]
+    failing: tuple[Path, int, dict], new_run: Callable[..., Run]
 ) -> None:
-    context = new_context("sim=native", "task.check.xy_err=0.00134", *at_double_speed())
-    sim = context.batch_simulation(5)
-    controller = context.driver(context.start(sim, context.cfg.reset))
+    run = new_run("sim=native", "task.check.xy_err=0.00134", *at_double_speed())
+    sim = run.stage.batch_simulation(5)
+    controller = run.stage.driver(run.stage.start(sim, run.cfg.reset))
     with np.load(failing[0] / "trajectory.npz") as held:
         assert np.array_equal(held["start_qpos"], snapshot(sim).qpos[2])
         assert not np.array_equal(held["start_qpos"], snapshot(sim).qpos[0])
         assert (held["start_qvel"] == 0.0).all()
         commands = np.stack([controller.command()[2].numpy() for _ in range(controller.steps)])
-        assert np.allclose(held["ctrl"][:, context.index.ctrl], commands)
+        assert np.allclose(held["ctrl"][:, run.stage.index.ctrl], commands)
         assert held["time_s"][[0, -1]] == pytest.approx([0.02, 6.0])
-        assert [str(held["phase"][i]) for i in (0, 29, 30, -1)] == [
-            "above_red",
-            "above_red",
-            "descend_red",
-            "done",
-        ]
-        red, blue = (held["qpos"][:, a : a + 3] for a in context.index.object_qpos)
+        phases = held["phase"][[0, 29, 30, -1]].tolist()
+        assert phases == ["above_red", "above_red", "descend_red", "done"]
+        red, blue = (held["qpos"][:, a : a + 3] for a in run.stage.index.object_qpos)
         assert held["xy_err_m"] == pytest.approx(np.hypot(*(red - blue)[:, :2].T), abs=1e-6)
         assert held["dz_m"] == pytest.approx((red - blue)[:, 2], abs=1e-6)
-        v = context.index.object_qvel[0]
+        v = run.stage.index.object_qvel[0]
         speed = np.linalg.norm(held["qvel"][:, v : v + 3], axis=1)
         speed += np.sqrt(3.0) * 0.022 * np.linalg.norm(held["qvel"][:, v + 3 : v + 6], axis=1)
         assert held["object_speed_m_per_s"][:, 0] == pytest.approx(speed, rel=1e-5, abs=1e-6)
@@ -198,28 +166,6 @@ def test_trajectory_holds_the_episode(
         assert abs(low[-1, 1]) < 0.001  # blue on the table,
         assert low[-1, 0] == pytest.approx(0.044, abs=0.001)  # red one cube above it
     sim.close()
-
-
-@pytest.mark.full
-def test_saved_configuration_is_the_runs_own(
-    earlier: Path, succeeded: tuple[Path, int, dict]
-) -> None:
-    out, _, report = succeeded
-    then = json.loads((earlier / "report.json").read_text())["provenance"]
-    assert report["provenance"]["model_sha256"] == then["model_sha256"]
-    loaded = load_saved(earlier / ".hydra" / "config.yaml")
-    assert loaded == load_config(
-        [
-            "gates=[batch]",
-            "sim=native",
-            "nworld=5",
-            "gate.batch.seeds=2",
-            "task.check.xy_err=0.00134",
-            *at_double_speed(),
-        ]
-    )
-    played = OmegaConf.load(out / "replayed_config.yaml")
-    assert (played.seed, played.task.check.xy_err) == (1, 0.00134)
 
 
 @pytest.mark.full
@@ -251,70 +197,23 @@ def test_another_verdict_is_said(
     assert (status, gate["status"]) == (0, "pass")
 
 
+APART = "its objects end 1e-06 mm from where they did, "
+EXACT = "as recorded, and it ends bit for bit where it did"
+CARRY_BIT = RULES["CARRY"]
+
+
 @pytest.mark.parametrize(
     ("bits", "moved", "device", "changes", "kept", "says"),
     [
-        (0, 0.0, "cpu", [], True, "as recorded, and it ends bit for bit where it did"),
-        (0, 0.0, "cpu", ["mujoco"], True, "as recorded, and it ends bit for bit where it did"),
-        (
-            0,
-            1e-9,
-            "cpu",
-            [],
-            False,
-            (
-                "NOT as recorded (the same result): its objects end 1e-06 mm from where they did,"
-                " expected"
-            ),
-        ),
-        (
-            0,
-            1e-9,
-            "cpu",
-            ["mujoco"],
-            True,
-            "as recorded, but its objects end 1e-06 mm from where they did, and not all is as",
-        ),
-        (
-            0,
-            1e-9,
-            "cuda:0",
-            [],
-            True,
-            "as recorded, but its objects end 1e-06 mm from where they did, and runs on CUDA agree",
-        ),
-        (
-            RULES["CARRY"],
-            0.0,
-            "cpu",
-            [],
-            False,
-            "NOT as recorded (red not carried): it ends bit for bit where it did",
-        ),
-        (
-            RULES["CARRY"],
-            0.002,
-            "cpu",
-            [],
-            False,
-            "NOT as recorded (red not carried): its objects end 2 mm from where they did",
-        ),
-        (
-            RULES["CARRY"],
-            0.002,
-            "cuda:0",
-            [],
-            True,
-            "NOT as recorded (red not carried): its objects end 2 mm",
-        ),
-        (
-            RULES["OVERFLOW"],
-            0.002,
-            "cpu",
-            [],
-            True,
-            "mm from where they did, and a world alone shares no contact pool",
-        ),
+        (0, 0.0, "cpu", [], True, EXACT),
+        (0, 0.0, "cpu", ["mujoco"], True, EXACT),
+        (0, 1e-9, "cpu", [], False, f"NOT as recorded (the same result): {APART}expected"),
+        (0, 1e-9, "cpu", ["mujoco"], True, f"as recorded, but {APART}and not all is as"),
+        (0, 1e-9, "cuda:0", [], True, f"as recorded, but {APART}and runs on CUDA agree"),
+        (CARRY_BIT, 0.0, "cpu", [], False, "(red not carried): it ends bit for bit where it did"),
+        (CARRY_BIT, 0.002, "cpu", [], False, "NOT as recorded (red not carried): its objects"),
+        (CARRY_BIT, 0.002, "cuda:0", [], True, "NOT as recorded (red not carried): its objects"),
+        (RULES["OVERFLOW"], 0.002, "cpu", [], True, "and a world alone shares no contact pool"),
     ],
 )
 def test_what_is_promised_of_another_end(
@@ -324,29 +223,28 @@ def test_what_is_promised_of_another_end(
     changes: list[str],
     kept: bool,
     says: str,
-    new_context: Callable[..., RunContext],
+    new_run: Callable[..., Run],
 ) -> None:
     """Bit for bit, but on CUDA, with other versions, and where the contact pool was too small."""
-    context = new_context("sim=native")
-    ours = np.zeros(context.model.nq)
-    theirs = ours.copy()
-    theirs[context.index.object_qpos[1]] = moved
-    failed = np.array([0, int(bits)], np.int32)
+    run = new_run("sim=native")
+    end = np.zeros(run.stage.model.nq)
+    recorded = end.copy()
+    recorded[run.stage.index.object_qpos[1]] = moved
     record = EpisodeRecord(
         seed=0,
         backend="mjwarp",
         device=device,
-        failed=failed,
-        values={},
-        start=np.stack((ours, ours)),
-        qpos=np.stack((ours, theirs)),
+        worlds={
+            "failed": np.array([0, bits], np.int32),
+            "start_qpos": np.stack((end, end)),
+            "qpos": np.stack((end, recorded)),
+        },
     )
-    plan = SimpleNamespace(record=record, world=1, gate="batch")
+    plan = SimpleNamespace(record=record, world=1, where=[(Backend.mjwarp, device)])
     episode = SimpleNamespace(failed=np.zeros(1, dtype=np.int32))
-    done = SimpleNamespace(episode=episode, recorder=SimpleNamespace(qpos=ours[None]))
-    found = _compare(plan, done, Backend.mjwarp, device, changes, context)
-    assert found[0] is kept
-    assert says in found[1]
+    agrees, text = _compare(plan, 0, episode, end, changes, run)
+    assert agrees is kept
+    assert says in text
 
 
 @pytest.mark.full
@@ -375,10 +273,16 @@ def test_a_start_that_is_not_the_recorded_one_is_refused(
     assert [path.name for path in tmp_path.iterdir()] == ["copy"]
 
 
-CARRY = """world,red_x_m,red_y_m,red_yaw_rad,blue_x_m,blue_y_m,blue_yaw_rad,red_mass_kg
-0,0.33,-0.13,0,0.33,0.06,0,0.08
-1,0.31,-0.1,0.3,0.34,0.08,-0.5,0.09
-"""
+def carry(red_x: float = 0.31, red_mass: float = 0.09) -> bytes:
+    """A starts file of two worlds, the second one's cube at a place and with a mass."""
+    starts = stack_starts(
+        [(0.33, -0.13, 0.0), (red_x, -0.1, 0.3)],
+        [(0.33, 0.06, 0.0), (0.34, 0.08, -0.5)],
+        red_mass_kg=[0.08, red_mass],
+    )
+    file = io.BytesIO()
+    np.savez(file, **starts)
+    return file.getvalue()
 
 
 @pytest.fixture(scope="module")
@@ -388,19 +292,13 @@ def from_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """
     home = tmp_path_factory.mktemp("from_file")
     noise = ["+reset.noise.func=mjstack.mdp.reset.JointNoise", "+reset.noise.params.arm=0.01"]
-    start = [
-        "reset=starts_file",
-        "starts=carry.csv",
-        *noise,
-        "nworld=2",
-        "sim=native",
-        "hydra.run.dir=run",
-    ]
+    start = ["reset=starts_file", "starts=carry.npz", "nworld=2", "sim=native", *noise]
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(home)
-        Path("carry.csv").write_text(CARRY)
-        assert run(["gates=[batch,success]", *start, *one_second_episode()]) == 1
-        Path("carry.csv").unlink()
+        Path("carry.npz").write_bytes(carry())
+        args = ["gates=[batch,success]", *start, *one_second_episode(), "hydra.run.dir=run"]
+        assert run(args) == 1
+        Path("carry.npz").unlink()
     return home / "run"
 
 
@@ -409,10 +307,9 @@ def from_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_run_from_a_file_replays_from_its_own_copy(
     gate: str, from_file: Path, replay: Callable[..., tuple[int, dict]], tmp_path: Path
 ) -> None:
-    assert (from_file / "starts_played.csv").read_text() == CARRY
-    (tmp_path / "carry.csv").write_text(
-        CARRY.replace("0.31", "0.32")
-    )  # a file of that name where the replay is called
+    assert (from_file / "starts_played.npz").read_bytes() == carry()
+    # A file of that name where the replay is called
+    (tmp_path / "carry.npz").write_bytes(carry(red_x=0.32))
     _, report = replay(from_file, f"world={gate}:1")
     (found,) = report["gates"]
     assert found["reason"].endswith("as recorded, and it ends bit for bit where it did")
@@ -425,20 +322,14 @@ def test_a_run_from_a_file_replays_from_its_own_copy(
 @pytest.mark.parametrize(
     ("edit", "says"),
     [
+        (lambda copy: copy.unlink(), "has no starts_played.npz, expected a copy of the starts"),
         (
-            lambda copy: copy.unlink(),
-            (
-                "has no starts_played.csv, expected a copy of the starts file that it started from,"
-                " carry"
-            ),
-        ),
-        (
-            lambda copy: _replace(copy, "0.31", "0.315"),
+            lambda copy: copy.write_bytes(carry(red_x=0.315)),
             "would start up to 0.005 (m, rad) from where it did",
         ),
         (
-            lambda copy: _replace(copy, "0.31", "left"),
-            "starts_played.csv, line 3, column red_x_m: expected a finite number",
+            lambda copy: copy.write_bytes(carry(red_x=math.nan)),
+            "starts_played.npz, world 1, red_xy: expected 0.19 to 0.51, it is nan",
         ),
     ],
     ids=["lost", "edited", "damaged"],
@@ -450,8 +341,8 @@ def test_another_layout_is_refused(
     tmp_path: Path,
 ) -> None:
     folder = copy_of(from_file, tmp_path)
-    edit(folder / "starts_played.csv")
-    assert says in refusal(f"run={folder}", "world=batch:1")
+    edit(folder / "starts_played.npz")
+    assert says in refusal_of(f"run={folder}", "world=batch:1")
 
 
 @pytest.mark.full
@@ -460,7 +351,7 @@ def test_what_the_start_does_not_show_is_found_at_the_end(
 ) -> None:
     """Another mass."""
     folder = copy_of(from_file, tmp_path)
-    _replace(folder / "starts_played.csv", "0.09", "0.1")
+    (folder / "starts_played.npz").write_bytes(carry(red_mass=0.1))
     status, report = replay(folder, "world=batch:1")
     assert "; NOT as recorded (the same result): its objects end " in report["gates"][0]["reason"]
     assert status == 1
@@ -471,10 +362,10 @@ def test_copies_of_layouts(tmp_path: Path) -> None:
     """Each file once, byte for byte."""
     folder = tmp_path / "run"
     folder.mkdir()
-    own = tmp_path / "own.csv"
+    own = tmp_path / "own.csv"  # of version 0.1: its ending stays, by which it is refused
     own.write_bytes(b"own")
-    (tmp_path / "a.csv").write_bytes(b"\xef\xbb\xbfworld\r\n")
-    cfg = load_config(["reset=starts_file", f"starts={tmp_path}/a.csv"])
+    (tmp_path / "a.npz").write_bytes(b"any")
+    cfg = load_config(["reset=starts_file", f"starts={tmp_path}/a.npz"])
     cfg.reset["own"] = TermCfg(
         func="mjstack.mdp.starts.starts_file.FromStartsFile", params={"path": str(own)}
     )
@@ -484,22 +375,20 @@ def test_copies_of_layouts(tmp_path: Path) -> None:
     )
     found = archive_starts(cfg, folder)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == {
-        f"{STEM}.csv": b"\xef\xbb\xbfworld\r\n",
+        f"{STEM}.npz": b"any",
         f"{STEM}_2.csv": b"own",
     }
     read = [term.params["path"] for term in found.reset.values()]
-    assert read == [str(folder / f"{STEM}{number}.csv") for number in ("", "_2", "_2")]
+    assert read == [str(folder / f"{STEM}{end}") for end in (".npz", "_2.csv", "_2.csv")]
     assert found.reset["again"].params["pose"] == "home"
-    assert (
-        cfg.reset["starts"].params["path"] == f"{tmp_path}/a.csv"
-    )  # what is saved and shown stays
+    assert cfg.reset["starts"].params["path"] == f"{tmp_path}/a.npz"  # as saved and shown
 
     plain = load_config(["gates=[batch]"])
     assert archive_starts(plain, folder) == plain
     plain.gate.success.reset = dict(cfg.reset)
     assert not copy_names(plain)  # of a gate that does not run
     plain.gates = ["success"]
-    assert list(copy_names(plain)) == [f"{tmp_path}/a.csv", str(own)]
+    assert list(copy_names(plain)) == [f"{tmp_path}/a.npz", str(own)]
 
 
 @pytest.mark.full
@@ -507,14 +396,8 @@ def test_sim_native_plays_native_alone_and_randomized_fields_are_kept(
     replay: Callable[..., tuple[int, dict]], tmp_path: Path
 ) -> None:
     folder = tmp_path / "random"
-    args = [
-        "gates=[batch]",
-        "sim=native",
-        "nworld=3",
-        "reset=randomized",
-        *one_second_episode(),
-    ]
-    run([*args, f"hydra.run.dir={folder}"])
+    args = ["gates=[batch]", "sim=native", "nworld=3", "reset=randomized"]
+    run([*args, *one_second_episode(), f"hydra.run.dir={folder}"])
     _, report = replay(folder, "world=2", "sim=native")
     assert report["gates"][0]["reason"].endswith(
         "as recorded, and it ends bit for bit where it did"
@@ -529,14 +412,8 @@ def test_mjwarp_world_is_played_on_both_engines(
     replay: Callable[..., tuple[int, dict]], tmp_path: Path
 ) -> None:
     folder = tmp_path / "warp"
-    args = [
-        "gates=[batch]",
-        "sim=mjwarp",
-        "sim.device=cpu",
-        "nworld=2",
-        *one_second_episode(),
-    ]
-    assert run([*args, f"hydra.run.dir={folder}"]) == 1
+    args = ["gates=[batch]", "sim=mjwarp", "sim.device=cpu", "nworld=2"]
+    assert run([*args, *one_second_episode(), f"hydra.run.dir={folder}"]) == 1
     status, report = replay(folder, "world=1")
     assert status == 1
     warp, native = report["gates"]
@@ -560,18 +437,8 @@ def test_cuda_world_ends_near_where_it_did(
     replay: Callable[..., tuple[int, dict]], tmp_path: Path
 ) -> None:
     folder = tmp_path / "cuda"
-    assert (
-        run(
-            [
-                "gates=[batch]",
-                "sim=mjwarp",
-                "sim.device=cuda:0",
-                "nworld=64",
-                f"hydra.run.dir={folder}",
-            ]
-        )
-        == 0
-    )
+    args = ["gates=[batch]", "sim=mjwarp", "sim.device=cuda:0", "nworld=64"]
+    assert run([*args, f"hydra.run.dir={folder}"]) == 0
     record = record_of(folder, 0)
     status, report = replay(folder, "world=41")
     assert status == 0
@@ -582,13 +449,17 @@ def test_cuda_world_ends_near_where_it_did(
         assert np.abs(held["qpos"][-1] - record.qpos[41]).max() < 0.01
 
 
-def test_a_world_alone_has_its_room() -> None:
+@pytest.mark.parametrize(("nworld", "nconmax"), [(64, 80), (2, 40)])
+def test_a_world_alone_has_its_room(
+    nworld: int, nconmax: int, new_run: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A world may have taken more than its share of the pool, but never more than the pool."""
-    small = BatchSizes(nconmax=20, njmax=100)
-    assert _sizes_alone(small, 64) == BatchSizes(nconmax=80, njmax=100)
-    assert _sizes_alone(small, 2) == BatchSizes(nconmax=40, njmax=100)
-    pooled = BatchSizes(nconmax=20, njmax=100, naconmax=30, nccdmax=4)
-    assert _sizes_alone(pooled, 64) == BatchSizes(nconmax=30, njmax=100)
+    sizes = ["batch.nconmax=20", "batch.njmax=100"]
+    stage = new_run("sim=mjwarp", "sim.device=cpu", f"nworld={nworld}", *sizes).stage
+    made = []
+    monkeypatch.setattr(stage, "simulation", lambda *args, sizes: made.append(sizes))
+    simulate_alone(stage, *stage.backend)
+    assert made == [BatchSizes(nconmax=nconmax, njmax=100)]
 
 
 WRONG = [
@@ -597,12 +468,12 @@ WRONG = [
     (["run=nowhere", "world=1"], "run=nowhere: has no .hydra/config.yaml"),
     (["run={run}", "world=7"], "a world from 0 to 4"),
     (["run={run}", "world=2:1"], "a seed from 0 to 1"),
+    (["run={run}", "world=success:1"], "a world of a gate that run had, batch"),
+    (["run={run}", "world=success:failing"], "failing worlds of a gate that run had, batch"),
+    (["run={run}", "world=failing", "video=true"], "one world, such as 17, which view and video"),
     (["run={run}", "world=-1"], "world=-1"),
     (["run={run}", "world=1.5"], "world=1.5"),
-    (
-        ["run={run}", "world=1", "nworld=3"],
-        "nworld=3: expected only run, world, sim, view, video, web",
-    ),
+    (["run={run}", "world=1", "nworld=3"], "nworld=3: expected only run, world, sim, view, video"),
     (["run={run}", "world=1", "sim.device=cuda:77"], "cuda:77"),
 ]
 
@@ -610,15 +481,11 @@ WRONG = [
 @pytest.mark.full
 @pytest.mark.parametrize(("values", "says"), WRONG, ids=[" ".join(v) for v, _ in WRONG])
 def test_values_that_name_no_world(values: list[str], says: str, earlier: Path) -> None:
-    assert says in refusal(*(value.format(run=earlier) for value in values))
+    assert says in refusal_of(*(value.format(run=earlier) for value in values))
 
 
 BAD = [
     (["run={run}", "world=7"], "a world from 0 to 4"),
-    (
-        ["run={run}", "world=1", "robot=rebot"],
-        "robot=rebot: expected only run, world, sim, view, video, web",
-    ),
     (["run={run}", "world=1", "~reset.cubes"], "reset.cubes"),
     (["run={run}", "world=1", "sim=native", "sim.device=cuda:0"], "cuda:0"),
 ]
@@ -648,76 +515,52 @@ def _refused(capsys: pytest.CaptureFixture[str], says: str) -> None:
     assert "Traceback" not in out + err
 
 
-DAMAGE = {
-    "no report": (lambda f: (f / "report.json").unlink(), "has no report.json"),
-    "no JSON": (lambda f: (f / "report.json").write_text("{"), "report.json: cannot be read"),
-    "another report": (
-        lambda f: (f / "report.json").write_text("[]"),
-        "report.json: cannot be read",
-    ),
-    "no YAML": (
-        lambda f: (f / ".hydra" / "config.yaml").write_text("a: [1"),
-        "no configuration of this mjstack",
-    ),
-    "empty": (
-        lambda f: (f / ".hydra" / "config.yaml").write_text(""),
-        "no configuration of this mjstack",
-    ),
-    "another tool's": (
-        lambda f: (f / ".hydra" / "config.yaml").write_text("model: resnet\n"),
-        "no configuration of this mjstack",
-    ),
-    "a key too many": (lambda f: _append(f / ".hydra" / "config.yaml", "colour: red\n"), "colour"),
-    "a value out of range": (
-        lambda f: _replace(f / ".hydra" / "config.yaml", "nworld: 5", "nworld: 0"),
-        "nworld=0",
-    ),
-    "a key too few": (
-        lambda f: _replace(f / ".hydra" / "config.yaml", "nworld: 5\n", ""),
-        "nworld is missing",
-    ),
+REPORT = "report.json"
+CONFIG = ".hydra/config.yaml"
+NO_CONFIG = "no configuration of this mjstack"
+# By name: the file, its new content or a part of it and what takes its place, and the line.
+# None removes the file.
+DAMAGE: dict[str, tuple[str, str | tuple[str, str] | None, str]] = {
+    "no report": (REPORT, None, "has no report.json"),
+    "no JSON": (REPORT, "{", "report.json: cannot be read"),
+    "another report": (REPORT, "[]", "report.json: cannot be read"),
+    "no YAML": (CONFIG, "a: [1", NO_CONFIG),
+    "empty": (CONFIG, "", NO_CONFIG),
+    "another tool's": (CONFIG, "model: resnet\n", NO_CONFIG),
+    "a key too many": (CONFIG, ("nworld: 5\n", "nworld: 5\ncolour: red\n"), "colour"),
+    "a value out of range": (CONFIG, ("nworld: 5", "nworld: 0"), "nworld=0"),
+    "a key too few": (CONFIG, ("nworld: 5\n", ""), "nworld is missing"),
     "another nworld": (
-        lambda f: _replace(f / ".hydra" / "config.yaml", "nworld: 5", "nworld: 4"),
+        CONFIG,
+        ("nworld: 5", "nworld: 4"),
         "a record of 5 worlds of seed 0, expected one of 4 worlds",
     ),
-    "another job": (
-        lambda f: _replace(f / ".hydra" / "config.yaml", "name: gates", "name: replay"),
-        "job=replay",
-    ),
+    "another job": (CONFIG, ("name: gates", "name: replay"), "job=replay"),
     "a training": (  # has keys that no other job has
-        lambda f: _replace(
-            f / ".hydra" / "config.yaml", "name: gates", "name: train\n  trainer: null"
-        ),
+        CONFIG,
+        ("name: gates", "name: train\n  trainer: null"),
         "is a run of job=train, expected one of job=gates",
     ),
-    "no record": (
-        lambda f: (f / "worlds_seed0.npz").unlink(),
-        "gate batch has left no record of seed 0",
-    ),
-    "record": (
-        lambda f: (f / "worlds_seed0.npz").write_bytes(b"PK"),
-        "worlds_seed0.npz: cannot be read",
-    ),
+    "no record": ("worlds_seed0.npz", None, "gate batch has left no record of seed 0"),
+    "record": ("worlds_seed0.npz", "PK", "worlds_seed0.npz: cannot be read"),
 }
-
-
-def _append(path: Path, text: str) -> None:
-    path.write_text(path.read_text() + text)
-
-
-def _replace(path: Path, old: str, new: str) -> None:
-    text = path.read_text()
-    assert text.count(old) == 1
-    path.write_text(text.replace(old, new))
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", DAMAGE)
 def test_damaged_folder_is_one_line(name: str, earlier: Path, tmp_path: Path) -> None:
     folder = copy_of(earlier, tmp_path)
-    damage, says = DAMAGE[name]
-    damage(folder)
-    assert says in refusal(f"run={folder}", "world=1")
+    file, content, says = DAMAGE[name]
+    path = folder / file
+    if isinstance(content, tuple):
+        text = path.read_text()
+        assert text.count(content[0]) == 1
+        path.write_text(text.replace(*content))
+    elif content is not None:
+        path.write_text(content)
+    else:
+        path.unlink()
+    assert says in refusal_of(f"run={folder}", "world=1")
 
 
 @pytest.mark.full

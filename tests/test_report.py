@@ -5,18 +5,26 @@ from __future__ import annotations
 import json
 import math
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mjstack.files import write_atomic
+from mjstack.report import formats
+from mjstack.report.page import Page
 from mjstack.report.record import GateResult, Report, Status
-from mjstack.report.write import safely_write, write_report
+from mjstack.report.sections import Section
+from mjstack.report.write import safely_write
 
 
 def gate(status: Status, name: str = "g", **metrics: float) -> GateResult:
     return GateResult(name=name, status=status, metrics=metrics)
+
+
+def write_report(report: Report) -> None:
+    formats.write_formats(report, Page())
 
 
 def strict_json(path: Path) -> dict:
@@ -62,9 +70,8 @@ def test_file_appears_complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 def test_numbers_that_are_not_finite_stay_json(tmp_path: Path) -> None:
     bad = gate(Status.failed, a=math.nan, b=math.inf, c=-math.inf, d=0.5)
     bad.thresholds["t"] = math.nan
-    report = Report(
-        folder=tmp_path, provenance={"x": math.nan, "versions": {"y": math.inf}}, gates=[bad]
-    )
+    facts = {"x": math.nan, "versions": {"y": math.inf}}
+    report = Report(folder=tmp_path, provenance=facts, gates=[bad])
     report.conclude()
     write_report(report)
     data = strict_json(tmp_path / "report.json")
@@ -74,9 +81,21 @@ def test_numbers_that_are_not_finite_stay_json(tmp_path: Path) -> None:
     assert "nan" in (tmp_path / "report.md").read_text()
 
 
-def test_status_before_the_end_is_interrupted(tmp_path: Path) -> None:
+def test_a_format_is_a_function_of_sections_and_takes_no_result_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(sections: Sequence[Section]) -> str:
+        raise ValueError
+
+    def plain(sections: Sequence[Section]) -> str:
+        return "\n".join(section.heading for section in sections)
+
+    monkeypatch.setattr(formats, "FORMATS", {"report.md": broken, "report.txt": plain})
     write_report(Report(folder=tmp_path, gates=[gate(Status.passed)]))
-    assert strict_json(tmp_path / "report.json")["status"] == "interrupted"
+    assert sorted(os.listdir(tmp_path)) == ["report.json", "report.txt"]
+    assert strict_json(tmp_path / "report.json")["status"] == "interrupted"  # before the end
+    text = (tmp_path / "report.txt").read_text()
+    assert text == "mjstack run: interrupted\ng: pass\nProvenance"
 
 
 @pytest.mark.parametrize(
@@ -109,11 +128,8 @@ def test_markdown_has_every_gate_and_skip(tmp_path: Path) -> None:
 def test_table_cells_survive_a_bar_in_a_reason(tmp_path: Path) -> None:
     bad = GateResult(name="baseline", status=Status.failed, reason="a | b")
     write_report(Report(folder=tmp_path, gates=[bad]))
-    row = next(
-        line
-        for line in (tmp_path / "report.md").read_text().splitlines()
-        if line.startswith("| baseline")
-    )
+    lines = (tmp_path / "report.md").read_text().splitlines()
+    (row,) = (line for line in lines if line.startswith("| baseline"))
     assert row.replace("\\|", "").count("|") == 5
 
 
@@ -138,7 +154,7 @@ def test_figures_and_limits_have_a_row_each(tmp_path: Path) -> None:
     assert "| final, red: position | 0.001 m |" in text
     assert "| physics: captured | yes |" in text
     assert "| backend | native |" in text
-    assert "| rate min | 0.9 |" in text
+    assert "| rate min |  | 0.9 |" in text
     assert "step1.qpos" not in text
 
 

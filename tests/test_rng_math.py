@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 
 import mujoco
 import numpy as np
@@ -48,14 +49,8 @@ def test_philox_known_answers(counter: str, key: str, expected: str) -> None:
 def draw(
     n: int, *, seed: int = 0, episode: int = 0, step: int = 0, stream: int = 1, size: int = 6
 ) -> torch.Tensor:
-    fill = torch.full((n,), 0)
     return uniform(
-        seed=seed,
-        world=torch.arange(n),
-        episode=fill + episode,
-        step=fill + step,
-        stream=stream,
-        size=size,
+        seed, stream, torch.arange(n), torch.full((n,), episode), torch.full((n,), step), size
     )
 
 
@@ -74,15 +69,7 @@ def test_uniform_range_mean_and_spread() -> None:
 
 def test_world_draws_the_same_whatever_nworld() -> None:
     assert torch.equal(draw(2048)[:16], draw(16))
-    one = uniform(
-        seed=0,
-        world=torch.tensor([5]),
-        episode=torch.tensor([0]),
-        step=torch.tensor([0]),
-        stream=1,
-        size=6,
-    )
-    assert torch.equal(draw(16)[5:6], one)
+    assert torch.equal(draw(16)[5:6], uniform(0, 1, torch.tensor([5]), torch.tensor([0]), None, 6))
 
 
 @pytest.mark.parametrize("change", [{"seed": 1}, {"episode": 1}, {"step": 1}, {"stream": 2}])
@@ -101,36 +88,33 @@ def quats() -> np.ndarray:
     return q / np.linalg.norm(q, axis=1, keepdims=True)
 
 
+def by_mujoco(func: Callable[..., None], width: int, *columns: np.ndarray) -> np.ndarray:
+    """What a function of MuJoCo writes for each row."""
+    out = np.empty((len(columns[0]), width))
+    for row, *values in zip(out, *columns, strict=True):
+        func(row, *values)
+    return out
+
+
 def test_quat_mul_is_mujocos(quats: np.ndarray) -> None:
-    a = quats
-    b = np.roll(quats, 1, axis=0)
-    expected = np.empty_like(a)
-    for row, x, y in zip(expected, a, b, strict=True):
-        mujoco.mju_mulQuat(row, x, y)
-    np.testing.assert_allclose(
-        quat_mul(torch.from_numpy(a), torch.from_numpy(b)).numpy(), expected, atol=1e-14
-    )
+    pair = (quats, np.roll(quats, 1, axis=0))
+    got = quat_mul(*map(torch.from_numpy, pair)).numpy()
+    np.testing.assert_allclose(got, by_mujoco(mujoco.mju_mulQuat, 4, *pair), atol=1e-14)
 
 
 def test_quat_from_yaw_is_mujocos() -> None:
     yaw = np.linspace(-7.0, 7.0, 29)
-    expected = np.empty((29, 4))
-    for row, angle in zip(expected, yaw, strict=True):
-        mujoco.mju_axisAngle2Quat(row, np.array([0.0, 0.0, 1.0]), angle)
+    axes = np.tile([0.0, 0.0, 1.0], (29, 1))
+    expected = by_mujoco(mujoco.mju_axisAngle2Quat, 4, axes, yaw)
     np.testing.assert_allclose(quat_from_yaw(torch.from_numpy(yaw)).numpy(), expected, atol=1e-14)
 
 
 def test_quat_angle_is_mujocos_whatever_the_signs(quats: np.ndarray) -> None:
-    a = quats
-    b = np.roll(quats, 1, axis=0)
-    expected = np.empty(len(a))
-    vel = np.empty(3)
-    for k, (x, y) in enumerate(zip(a, b, strict=True)):
-        mujoco.mju_subQuat(vel, x, y)
-        expected[k] = np.linalg.norm(vel)
+    other = np.roll(quats, 1, axis=0)
+    turns = np.linalg.norm(by_mujoco(mujoco.mju_subQuat, 3, quats, other), axis=1)
     for sign in (1.0, -1.0):
-        got = quat_angle(torch.from_numpy(a), torch.from_numpy(sign * b)).numpy()
-        np.testing.assert_allclose(got, np.minimum(expected, 2 * np.pi - expected), atol=1e-7)
+        got = quat_angle(torch.from_numpy(quats), torch.from_numpy(sign * other)).numpy()
+        np.testing.assert_allclose(got, np.minimum(turns, 2 * np.pi - turns), atol=1e-7)
 
 
 def test_small_angles_keep_their_precision_in_float32() -> None:
@@ -142,47 +126,32 @@ def test_small_angles_keep_their_precision_in_float32() -> None:
 
 
 def test_z_row_is_mujocos(quats: np.ndarray) -> None:
-    expected = np.empty((len(quats), 3))
-    mat = np.empty(9)
-    for row, q in zip(expected, quats, strict=True):
-        mujoco.mju_quat2Mat(mat, q)
-        row[:] = mat[6:]
-    np.testing.assert_allclose(quat_z_row(torch.from_numpy(quats)).numpy(), expected, atol=1e-14)
+    got = quat_z_row(torch.from_numpy(quats)).numpy()
+    expected = by_mujoco(mujoco.mju_quat2Mat, 9, quats)[:, 6:]
+    np.testing.assert_allclose(got, expected, atol=1e-14)
 
 
-def test_one_number_that_is_not_finite_marks_its_row() -> None:
-    first = torch.full((5, 3), 1e30)
+def test_numbers_that_are_not_finite_mark_their_rows() -> None:
+    """A sum of finite numbers may overflow, and two infinities may cancel to NaN."""
+    first = torch.full((5, 3), 3e38)
     second = torch.zeros(5, 2, dtype=torch.float64)
-    first[1, 2] = torch.nan
-    first[2, 0] = torch.inf
-    second[3, 1] = -torch.inf
+    assert not not_finite(first, second).any()
+    first[1, 2] = math.nan
+    first[2, :2] = torch.tensor([math.inf, -math.inf])
+    second[3, 1] = -math.inf
     assert not_finite(first, second).tolist() == [False, True, True, True, False]
     assert not_finite(second).tolist() == [False, False, False, True, False]
+    assert not_finite(torch.ones(4, 0)).tolist() == [False] * 4
 
 
 def test_lowest_corner_against_eight_corners(quats: np.ndarray) -> None:
     pos = np.random.default_rng(1).normal(size=(len(quats), 3))
-    expected = []
-    for p, q in zip(pos, quats, strict=True):
-        heights = []
-        for signs in itertools.product((-0.022, 0.022), repeat=3):
-            corner = np.empty(3)
-            mujoco.mju_rotVecQuat(corner, np.array(signs), q)
-            heights.append(p[2] + corner[2])
-        expected.append(min(heights))
+    heights = []
+    for signs in itertools.product((-0.022, 0.022), repeat=3):
+        corners = by_mujoco(mujoco.mju_rotVecQuat, 3, np.tile(signs, (len(quats), 1)), quats)
+        heights.append(pos[:, 2] + corners[:, 2])
     got = lowest_point(torch.from_numpy(pos), torch.from_numpy(quats), "box", [0.022] * 3)
-    np.testing.assert_allclose(got.numpy(), expected, atol=1e-14)
-
-
-def test_not_finite_asks_row_by_row_where_a_sum_is_not_finite() -> None:
-    """A sum of finite numbers may overflow, and two infinities may cancel to NaN."""
-    huge = torch.full((4, 3), 3e38)
-    assert not not_finite(huge).any()
-    odd = huge.clone()
-    odd[1, 0] = math.nan
-    odd[2, :2] = torch.tensor([math.inf, -math.inf])
-    assert not_finite(torch.zeros(4, 2), odd).tolist() == [False, True, True, False]
-    assert not_finite(torch.ones(4, 0)).tolist() == [False] * 4
+    np.testing.assert_allclose(got.numpy(), np.min(heights, axis=0), atol=1e-14)
 
 
 @pytest.mark.parametrize("indices", [(1, 2), (3, 0)])

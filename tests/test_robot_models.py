@@ -27,66 +27,18 @@ MASS_BOUNDS = {"so101": (0.4, 1.0), "rebot": (4.0, 8.0)}
 
 KIND_COUNT = {"body": "nbody", "joint": "njnt", "site": "nsite", "actuator": "nu", "camera": "ncam"}
 
-OPTIONS = [
-    "timestep",
-    "integrator",
-    "cone",
-    "impratio",
-    "iterations",
-    "ls_iterations",
-    "tolerance",
-    "solver",
-]
-OPTIONS += [
-    "jacobian",
-    "gravity",
-    "noslip_iterations",
-    "disableflags",
-    "enableflags",
-    "density",
-    "viscosity",
-]
-JOINT_FIELDS = [
-    "jnt_type",
-    "jnt_axis",
-    "jnt_pos",
-    "jnt_range",
-    "jnt_limited",
-    "jnt_stiffness",
-    "jnt_margin",
-]
-JOINT_FIELDS += [
-    "jnt_solref",
-    "jnt_solimp",
-    "jnt_actfrclimited",
-    "jnt_actfrcrange",
-    "qpos0",
-    "qpos_spring",
-]
-DOF_FIELDS = ["dof_damping", "dof_armature", "dof_frictionloss", "dof_solref", "dof_solimp"]
-ACTUATOR_FIELDS = ["gaintype", "gainprm", "biastype", "biasprm", "dyntype", "gear", "trntype"]
-ACTUATOR_FIELDS += ["ctrllimited", "ctrlrange", "forcelimited", "forcerange"]
-EQUALITY_FIELDS = ["eq_type", "eq_data", "eq_solref", "eq_solimp", "eq_active0"]
-CONTACT_FIELDS = [
-    "type",
-    "pos",
-    "size",
-    "contype",
-    "conaffinity",
-    "condim",
-    "friction",
-    "solref",
-    "solimp",
-]
-CONTACT_FIELDS += ["priority", "solmix", "margin", "gap"]
-CAMERA_FIELDS = [
-    "cam_mode",
-    "cam_pos",
-    "cam_resolution",
-    "cam_sensorsize",
-    "cam_intrinsic",
-    "cam_fovy",
-]
+OPTIONS = """timestep integrator cone impratio iterations ls_iterations tolerance solver jacobian
+gravity noslip_iterations disableflags enableflags density viscosity"""
+FIELDS = """body_parentid body_pos body_gravcomp
+jnt_bodyid jnt_type jnt_axis jnt_pos jnt_range jnt_limited jnt_stiffness jnt_margin jnt_solref
+jnt_solimp jnt_actfrclimited jnt_actfrcrange qpos0 qpos_spring
+dof_damping dof_armature dof_frictionloss dof_solref dof_solimp
+actuator_gaintype actuator_gainprm actuator_biastype actuator_biasprm actuator_dyntype actuator_gear
+actuator_trntype actuator_ctrllimited actuator_ctrlrange actuator_forcelimited actuator_forcerange
+eq_obj1id eq_obj2id eq_type eq_data eq_solref eq_solimp eq_active0 key_qpos key_ctrl
+cam_bodyid cam_mode cam_pos cam_resolution cam_sensorsize cam_intrinsic cam_fovy"""
+CONTACT_FIELDS = """type pos size contype conaffinity condim friction solref solimp priority solmix
+margin gap"""
 
 # Name, built-in model, upstream model.
 Pair = tuple[str, mujoco.MjModel, mujoco.MjModel]
@@ -127,21 +79,10 @@ def names(model: mujoco.MjModel, kind: str) -> list[str]:
     return [getattr(model, kind)(i).name for i in range(getattr(model, KIND_COUNT[kind]))]
 
 
-def assert_fields(ours: object, theirs: object, fields: list[str], **tolerance: float) -> None:
-    """Every listed array is equal (within 1e-12 unless told)."""
-    tol = {"rtol": 1e-12, "atol": 1e-14} | tolerance
-    for field in fields:
-        np.testing.assert_allclose(
-            getattr(ours, field), getattr(theirs, field), err_msg=field, **tol
-        )
-
-
-def assert_same_rotation(ours: np.ndarray, theirs: np.ndarray, atol: float = 1e-12) -> None:
+def assert_same_rotation(a: np.ndarray, b: np.ndarray) -> None:
     """Unit quaternions, row by row, equal up to sign."""
-    a = np.atleast_2d(ours)
-    b = np.atleast_2d(theirs)
-    sign = np.where(np.sum(a * b, axis=1) < 0, -1.0, 1.0)
-    np.testing.assert_allclose(a * sign[:, None], b, rtol=0, atol=atol)
+    sign = np.where(np.sum(a * b, axis=-1, keepdims=True) < 0, -1.0, 1.0)
+    np.testing.assert_allclose(a * sign, b, rtol=0, atol=1e-12)
 
 
 def inertia_tensor(model: mujoco.MjModel, body: int) -> np.ndarray:
@@ -154,153 +95,102 @@ def inertia_tensor(model: mujoco.MjModel, body: int) -> np.ndarray:
 
 def collision_geoms(model: mujoco.MjModel, body: int) -> list[int]:
     """Non-mesh geoms of a body that can touch something, in order."""
-    return [
-        g
-        for g in range(model.ngeom)
-        if model.geom_bodyid[g] == body
-        and (model.geom_contype[g] or model.geom_conaffinity[g])
-        and model.geom_type[g] != mujoco.mjtGeom.mjGEOM_MESH
-    ]
+    solid = (model.geom_bodyid == body) & (model.geom_type != mujoco.mjtGeom.mjGEOM_MESH)
+    touching = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    return np.flatnonzero(solid & touching).tolist()
 
 
-# ---- against upstream
-# ----------------------------------------------------------------------------------------------
+# Against upstream
 
 
-@pytest.mark.parametrize("kind", ["body", "joint", "actuator", "camera"])
-def test_same_names(pair: Pair, kind: str) -> None:
-    _, ours, theirs = pair
-    assert names(ours, kind) == names(theirs, kind)
-
-
-def test_same_tree_and_steps(pair: Pair) -> None:
-    _, ours, theirs = pair
-    np.testing.assert_array_equal(ours.body_parentid, theirs.body_parentid)
-    assert_fields(ours, theirs, ["body_pos", "body_gravcomp"])
-    assert_same_rotation(ours.body_quat, theirs.body_quat)
+def test_same_names_tree_joints_servos_and_cameras(pair: Pair) -> None:
+    robot, built, menagerie = pair
+    for kind in ("body", "joint", "actuator", "camera"):
+        assert names(built, kind) == names(menagerie, kind)
+    keys = [[model.key(i).name for i in range(model.nkey)] for model in (built, menagerie)]
+    assert keys[0] == keys[1]
+    assert built.neq == {"so101": 0, "rebot": 1}[robot]
+    for field in FIELDS.split():
+        values = (getattr(built, field), getattr(menagerie, field))
+        np.testing.assert_allclose(*values, rtol=1e-12, atol=1e-14, err_msg=field)
+    for field in OPTIONS.split():
+        values = (getattr(built.opt, field), getattr(menagerie.opt, field))
+        np.testing.assert_allclose(*values, rtol=1e-12, atol=1e-14, err_msg=field)
+    joints = (built.actuator_trnid[:, 0], menagerie.actuator_trnid[:, 0])
+    np.testing.assert_array_equal(*joints)
+    assert_same_rotation(built.body_quat, menagerie.body_quat)
+    assert_same_rotation(built.cam_quat, menagerie.cam_quat)
+    for name in names(menagerie, "site"):
+        site = built.site(name)
+        assert site.bodyid == menagerie.site(name).bodyid, name
+        np.testing.assert_allclose(site.pos, menagerie.site(name).pos, rtol=0, atol=1e-14)
+        assert_same_rotation(site.quat, menagerie.site(name).quat)
 
 
 def test_same_mass_and_inertia(pair: Pair) -> None:
-    _, ours, theirs = pair
-    for body, name in enumerate(names(theirs, "body")):
+    _, built, menagerie = pair
+    for body, name in enumerate(names(menagerie, "body")):
         # The camera mount's inertia comes from a mesh upstream and may move a little between MuJoCo
         # versions.
         rtol = 1e-7 if name == "camera_mount" else 1e-10
-        np.testing.assert_allclose(
-            ours.body_mass[body], theirs.body_mass[body], rtol=rtol, err_msg=name
-        )
-        np.testing.assert_allclose(
-            ours.body_ipos[body], theirs.body_ipos[body], rtol=0, atol=0.1 * rtol, err_msg=name
-        )
-        expected = inertia_tensor(theirs, body)
-        atol = rtol * np.abs(expected).max()
-        np.testing.assert_allclose(
-            inertia_tensor(ours, body), expected, rtol=0, atol=atol, err_msg=name
-        )
-
-
-def test_same_joints(pair: Pair) -> None:
-    _, ours, theirs = pair
-    np.testing.assert_array_equal(ours.jnt_bodyid, theirs.jnt_bodyid)
-    assert_fields(ours, theirs, JOINT_FIELDS + DOF_FIELDS)
-
-
-def test_same_actuators(pair: Pair) -> None:
-    _, ours, theirs = pair
-    np.testing.assert_array_equal(
-        ours.actuator_trnid[:, 0], theirs.actuator_trnid[:, 0]
-    )  # same joint
-    assert_fields(ours, theirs, [f"actuator_{field}" for field in ACTUATOR_FIELDS])
-
-
-def test_same_equalities(pair: Pair) -> None:
-    robot, ours, theirs = pair
-    assert ours.neq == theirs.neq == {"so101": 0, "rebot": 1}[robot]
-    np.testing.assert_array_equal(ours.eq_obj1id, theirs.eq_obj1id)
-    np.testing.assert_array_equal(ours.eq_obj2id, theirs.eq_obj2id)
-    assert_fields(ours, theirs, EQUALITY_FIELDS)
-
-
-def test_same_options(pair: Pair) -> None:
-    _, ours, theirs = pair
-    assert_fields(ours.opt, theirs.opt, OPTIONS)
-
-
-def test_same_keyframes(pair: Pair) -> None:
-    _, ours, theirs = pair
-    assert [ours.key(i).name for i in range(ours.nkey)] == [
-        theirs.key(i).name for i in range(theirs.nkey)
-    ]
-    assert_fields(ours, theirs, ["key_qpos", "key_ctrl"])
-
-
-def test_same_cameras_and_upstream_sites(pair: Pair) -> None:
-    _, ours, theirs = pair
-    assert_fields(ours, theirs, CAMERA_FIELDS)
-    np.testing.assert_array_equal(ours.cam_bodyid, theirs.cam_bodyid)
-    assert_same_rotation(ours.cam_quat, theirs.cam_quat)
-    for name in names(theirs, "site"):
-        a = ours.site(name)
-        b = theirs.site(name)
-        assert a.bodyid == b.bodyid, name
-        np.testing.assert_allclose(a.pos, b.pos, rtol=0, atol=1e-14, err_msg=name)
-        assert_same_rotation(a.quat, b.quat)
+        assert built.body_mass[body] == pytest.approx(menagerie.body_mass[body], rel=rtol), name
+        off = np.abs(built.body_ipos[body] - menagerie.body_ipos[body]).max()
+        assert off <= 0.1 * rtol, name
+        expected = inertia_tensor(menagerie, body)
+        off = np.abs(inertia_tensor(built, body) - expected).max()
+        assert off <= rtol * np.abs(expected).max(), name
 
 
 def test_so101_keeps_every_primitive_collision_geom() -> None:
-    ours = built_in("so101")
-    theirs = upstream("so101")
+    models = (built_in("so101"), upstream("so101"))
     count = 0
-    for body, name in enumerate(names(theirs, "body")):
-        kept = collision_geoms(ours, body)
-        expected = collision_geoms(theirs, body)
-        assert len(kept) == len(expected), name
-        for mine, its in zip(kept, expected, strict=True):
-            if theirs.geom(its).name:
-                assert ours.geom(mine).name == theirs.geom(its).name
-            for field in CONTACT_FIELDS:
-                a = getattr(ours, f"geom_{field}")[mine]
-                b = getattr(theirs, f"geom_{field}")[its]
-                np.testing.assert_allclose(
-                    a, b, rtol=1e-12, atol=1e-14, err_msg=f"{ours.geom(mine).name} {field}"
-                )
-            assert_same_rotation(ours.geom_quat[mine], theirs.geom_quat[its])
-            count += 1
+    for body, name in enumerate(names(models[1], "body")):
+        geoms = [collision_geoms(model, body) for model in models]
+        assert len(geoms[0]) == len(geoms[1]), name
+        assert all(
+            models[1].geom(b).name in ("", models[0].geom(a).name)
+            for a, b in zip(*geoms, strict=True)
+        )
+        for field in CONTACT_FIELDS.split():
+            values = [getattr(m, f"geom_{field}")[g] for m, g in zip(models, geoms, strict=True)]
+            message = f"{name} {field}"
+            np.testing.assert_allclose(*values, rtol=1e-12, atol=1e-14, err_msg=message)
+        assert_same_rotation(*(m.geom_quat[g] for m, g in zip(models, geoms, strict=True)))
+        count += len(geoms[0])
     assert count == 27
 
 
 def upstream_grasp_point(robot: str, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
     """Grasp point from first principles: midpoint of the tip centroids, or of the finger bodies."""
     if robot == "so101":
-        return np.mean(
-            [np.mean([data.geom(tip).xpos for tip in jaw], axis=0) for jaw in SO101_TIPS], axis=0
-        )
+        return np.mean([data.geom(tip).xpos for jaw in SO101_TIPS for tip in jaw], axis=0)
     return (data.body("gripper_left").xpos + data.body("gripper_right").xpos) / 2
 
 
 def test_same_grasp_point(pair: Pair) -> None:
     """200 random configurations; the largest distance between the two centres is at most 1 um."""
-    robot, ours, theirs = pair
+    robot, built, menagerie = pair
     rng = np.random.default_rng(20240817)
-    mine = mujoco.MjData(ours)
-    its = mujoco.MjData(theirs)
-    low, high = theirs.jnt_range.T
+    built_data = mujoco.MjData(built)
+    menagerie_data = mujoco.MjData(menagerie)
+    low, high = menagerie.jnt_range.T
     centres = []
     errors = []
     for _ in range(200):
         q = rng.uniform(low, high)
-        mine.qpos[:] = its.qpos[:] = q
-        mujoco.mj_kinematics(ours, mine)
-        mujoco.mj_kinematics(theirs, its)
-        centre = np.mean([mine.site(site).xpos for site in GRASP_SITES[robot]], axis=0)
+        built_data.qpos[:] = menagerie_data.qpos[:] = q
+        mujoco.mj_kinematics(built, built_data)
+        mujoco.mj_kinematics(menagerie, menagerie_data)
+        centre = np.mean([built_data.site(site).xpos for site in GRASP_SITES[robot]], axis=0)
         centres.append(centre)
-        errors.append(np.linalg.norm(centre - upstream_grasp_point(robot, theirs, its)))
+        errors.append(
+            np.linalg.norm(centre - upstream_grasp_point(robot, menagerie, menagerie_data))
+        )
     assert np.ptp(centres, axis=0).min() > 0.2  # the configurations do move the hand
     assert max(errors) <= 1e-6
 
 
-# ---- on their own
-# --------------------------------------------------------------------------------------------------
+# On their own
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
@@ -338,19 +228,15 @@ def test_visible_parts_never_touch(robot: str) -> None:
 
 def test_so101_contact_parameters() -> None:
     model = built_in("so101")
-    for g in range(model.ngeom):
-        if model.geom_group[g] != 3:
-            continue
-        geom = model.geom(g)
-        jaw = (
-            model.body(geom.bodyid[0]).name in SO101_JAW_BODIES and geom.name != "gripper_neck_box"
-        )
-        assert (geom.contype[0], geom.conaffinity[0]) == (1, 1), geom.name
-        assert geom.condim[0] == (6 if jaw else 3), geom.name
-        assert geom.priority[0] == (1 if jaw else 0), geom.name
-        np.testing.assert_allclose(
-            geom.friction, [1, 0.005, 0.0005] if jaw else [1, 0.005, 0.0001], err_msg=geom.name
-        )
+    for geom in map(model.geom, np.flatnonzero(model.geom_group == 3)):
+        body = model.body(geom.bodyid[0]).name
+        jaw = body in SO101_JAW_BODIES and geom.name != "gripper_neck_box"
+        flags = [
+            getattr(geom, name)[0] for name in ("contype", "conaffinity", "condim", "priority")
+        ]
+        assert flags == ([1, 1, 6, 1] if jaw else [1, 1, 3, 0]), geom.name
+        friction = [1, 0.005, 0.0005 if jaw else 0.0001]
+        np.testing.assert_allclose(geom.friction, friction, err_msg=geom.name)
         np.testing.assert_allclose(geom.solref, [0.01 if jaw else 0.02, 1], err_msg=geom.name)
 
 
@@ -376,17 +262,15 @@ def test_grasp_point_sites() -> None:
     """
     so101 = built_in("so101")
     rebot = built_in("rebot")
-    for site, body, tips in zip(
-        GRASP_SITES["so101"], ("gripper", "moving_jaw_so101_v1"), SO101_TIPS, strict=True
-    ):
-        assert so101.body(so101.site(site).bodyid[0]).name == body
-        centroid = np.mean([so101.geom(tip).pos for tip in tips], axis=0)
-        np.testing.assert_allclose(so101.site(site).pos, centroid, rtol=0, atol=1e-15)
-    for site, body in zip(GRASP_SITES["rebot"], ("gripper_left", "gripper_right"), strict=True):
-        assert rebot.body(rebot.site(site).bodyid[0]).name == body
-        np.testing.assert_array_equal(rebot.site(site).pos, 0)
-    assert all(
-        m.site(s).group[0] == 4
-        for r, m in (("so101", so101), ("rebot", rebot))
-        for s in GRASP_SITES[r]
-    )
+    sites = [
+        (so101, "grasp_fixed", "gripper", SO101_TIPS[0]),
+        (so101, "grasp_moving", "moving_jaw_so101_v1", SO101_TIPS[1]),
+        (rebot, "grasp_left", "gripper_left", []),
+        (rebot, "grasp_right", "gripper_right", []),
+    ]
+    for model, name, body, tips in sites:
+        site = model.site(name)
+        assert model.body(site.bodyid[0]).name == body
+        centroid = np.mean([model.geom(tip).pos for tip in tips] or [np.zeros(3)], axis=0)
+        np.testing.assert_allclose(site.pos, centroid, rtol=0, atol=1e-15 if tips else 0)
+        assert site.group[0] == 4

@@ -52,8 +52,8 @@ class UprightCfg(GateFuncCfg):
     note: str = "none"
 
 
-def run_upright(context):
-    cfg = context.cfg.gate["upright"]
+def run_upright(run):
+    cfg = run.cfg.gate["upright"]
     status = Status.passed if cfg.limit < 2.0 else Status.failed
     return [GateResult(name="upright", status=status, reason=cfg.note)]
 
@@ -103,11 +103,11 @@ def test_an_environment_of_another_folder(lean: Path) -> None:
 def test_the_search_path_is_an_override_too(lean: Path) -> None:
     cfg = load_config([f"hydra.searchpath=[file://{lean}]", "task=lean"])
     assert cfg.reward["height"].func == "lean.height"
-    other = lean.parent / "it's mine"
-    (other / "task").mkdir(parents=True)
+    second = lean.parent / "it's mine"
+    (second / "task").mkdir(parents=True)
     with search_path([lean]):
         assert search_path_args() == ["--config-dir", str(lean)]
-        with search_path([other]):
+        with search_path([second]):
             (override,) = search_path_args()
     assert load_config([override, "task=lean"]).task.name == "lean"
 
@@ -177,9 +177,9 @@ def test_a_gate_of_one_s_own(
     assert run([*flags, "gate.upright.limit=3.0", "hydra.run.dir=b"]) == 1
     capsys.readouterr()
     assert run([*flags, "--help", "gate.upright", "task.check.window"]) == 0
-    told = capsys.readouterr().out
-    assert "gate.upright.limit=1.0\n  Accepts a number above 0 [m]." in told
-    assert "task.check.window=50\n" in told
+    out = capsys.readouterr().out
+    assert "gate.upright.limit=1.0\n  Accepts a number above 0 [m]." in out
+    assert "task.check.window=50\n" in out
     said = refused([*flags, "gate.upright.limit=0.0"], capsys)
     assert said == "mjstack: gate.upright.limit=0.0: expected a number above 0 [m]."
     assert "Did you mean 'limit'?" in refused([*flags, "+gate.upright.limits=1.0"], capsys)

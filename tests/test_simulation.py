@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
+from functools import partial
 
 import mujoco
 import numpy as np
 import pytest
 import torch
 from comparison import assert_same_run, assert_worlds_step_alone
-from compositions import load_config
+from compositions import load_config, refusal
 
 from mjstack.config.schema import Backend
-from mjstack.episodes.context import RunContext
-from mjstack.errors import ArgumentError, RebindError, UnsupportedModel
-from mjstack.math import quat_angle
-from mjstack.scene import build_model, build_scene
+from mjstack.episodes.stage import Stage
+from mjstack.errors import MjstackError
+from mjstack.scene import build_model
 from mjstack.sim import Simulation, SolverLimit, make_simulation
 
 N = 3
@@ -24,7 +25,7 @@ POSES = ("xpos", "xquat", "site_xpos", "geom_xpos")
 VIEWS = (*STATE, *POSES, "qfrc_actuator", "sensordata")
 COUNTS = ("contact_count", "constraint_count", "peak_contacts", "peak_constraints", "overflow")
 Make = Callable[..., Simulation]
-Stage = Callable[[str], RunContext]
+GetStage = Callable[[str], Stage]
 
 
 # An arm with an activation and sensors, and a ball: what the robots' scenes lack.
@@ -64,30 +65,20 @@ def sensing() -> Callable[[str], Simulation]:
     return get
 
 
-def start(sim: Simulation, context: RunContext) -> None:
+def start(sim: Simulation, stage: Stage) -> None:
     """Home, jittered cubes, and a command that moves every joint."""
-    context.start(sim, context.cfg.reset)
-    sim.ctrl[:, torch.from_numpy(context.index.ctrl)] += 0.05
+    stage.start(sim, stage.cfg.reset)
+    sim.ctrl[:, torch.from_numpy(stage.index.ctrl)] += 0.05
 
 
-def test_shapes_types_and_device(backend: str, make_sim: Make, stage: Stage) -> None:
+def test_shapes_types_and_device(backend: str, make_sim: Make, get_stage: GetStage) -> None:
     sim = make_sim(backend, N)
-    m = stage("so101").model
-    shapes = {
-        "qpos": (N, m.nq),
-        "qvel": (N, m.nv),
-        "act": (N, m.na),
-        "ctrl": (N, m.nu),
-        "xpos": (N, m.nbody, 3),
-        "xquat": (N, m.nbody, 4),
-        "site_xpos": (N, m.nsite, 3),
-        "geom_xpos": (N, m.ngeom, 3),
-        "qfrc_actuator": (N, m.nv),
-        "sensordata": (N, m.nsensordata),
-    }
-    for name, shape in shapes.items():
+    m = get_stage("so101").model
+    poses = [(m.nbody, 3), (m.nbody, 4), (m.nsite, 3), (m.ngeom, 3)]
+    shapes = [(m.nq,), (m.nv,), (m.na,), (m.nu,), *poses, (m.nv,), (m.nsensordata,)]
+    for name, shape in zip(VIEWS, shapes, strict=True):
         view = getattr(sim, name)
-        assert tuple(view.shape) == shape, name
+        assert tuple(view.shape) == (N, *shape), name
         assert view.dtype is (torch.float64 if backend == "native" else torch.float32), name
         assert view.device == sim.device, name
     for name in COUNTS:
@@ -120,16 +111,13 @@ def test_views_keep_their_address(backend: str, make_sim: Make) -> None:
 def test_views_cannot_be_rebound(backend: str, make_sim: Make, name: str) -> None:
     sim = make_sim(backend, N)
     view = getattr(sim, name)
-    with pytest.raises(RebindError) as caught:
+    with pytest.raises(MjstackError) as caught:
         setattr(sim, name, torch.zeros(N))
     setattr(sim, name, view)
     assert getattr(sim, name) is view
     written = "sim.fields[name]" if name == "fields" else f"sim.{name}"
-    assert (
-        str(caught.value)
-        == f"{written} is a view of the simulation's memory and cannot be rebound: write"
-        f" {written}[:] = ... instead."
-    )
+    why = f"{written} is a view of the simulation's memory and cannot be rebound"
+    assert str(caught.value) == f"{why}: write {written}[:] = ... instead."
 
 
 @pytest.mark.parametrize(
@@ -138,10 +126,7 @@ def test_views_cannot_be_rebound(backend: str, make_sim: Make, name: str) -> Non
         (torch.zeros(N), r"a torch.float32 tensor of shape \(3,\) on "),
         (torch.zeros(N + 1, dtype=torch.bool), r"a torch.bool tensor of shape \(4,\) on "),
         (torch.zeros(N, 1, dtype=torch.bool), r"a torch.bool tensor of shape \(3, 1\) on "),
-        (
-            torch.zeros(N, dtype=torch.bool, device="meta"),
-            r"a torch.bool tensor of shape \(3,\) on meta",
-        ),
+        (torch.zeros(N, dtype=torch.bool, device="meta"), r"a torch.bool .* \(3,\) on meta"),
         ([True] * N, "a list"),
     ],
 )
@@ -151,13 +136,8 @@ def test_a_wrong_mask_is_refused(backend: str, make_sim: Make, mask: object, fou
     if isinstance(mask, torch.Tensor) and mask.device.type == "cpu":
         mask = mask.to(sim.device)
     for call in (sim.reset, sim.kinematics):
-        with pytest.raises(
-            ArgumentError,
-            match=rf"^mask: found {found}.*, expected a torch.bool tensor of shape \(3,\) on ",
-        ) as caught:
-            call(mask)
-        assert "\n" not in str(caught.value)
-        assert caught.value.exit_code == 2
+        words = rf"^mask: found {found}.*, expected a torch.bool tensor of shape \(3,\) on "
+        assert re.search(words, refusal(partial(call, mask)))
     assert sim.step_count.tolist() == [1] * N
 
 
@@ -174,11 +154,11 @@ def test_step_counts(backend: str, make_sim: Make) -> None:
     assert sim.step_count.tolist() == [23, 10, 23]
 
 
-def test_masked_reset(backend: str, make_sim: Make, stage: Stage) -> None:
+def test_masked_reset(backend: str, make_sim: Make, get_stage: GetStage) -> None:
     sim = make_sim(backend, N)
-    context = stage("so101")
+    stage = get_stage("so101")
     fresh = {name: getattr(sim, name).clone() for name in ("qpos", "qvel", "ctrl")}
-    start(sim, context)
+    start(sim, stage)
     sim.step(10)
     sim.overflow.fill_(1)
     before = {name: getattr(sim, name).clone() for name in (*fresh, *COUNTS)}
@@ -208,11 +188,11 @@ def test_reset_world_goes_on_as_a_fresh_one(backend: str, make_sim: Make) -> Non
     assert not torch.equal(sim.qpos[0], expected[0])
 
 
-def test_twice_the_same_run(backend: str, make_sim: Make, stage: Stage) -> None:
+def test_twice_the_same_run(backend: str, make_sim: Make, get_stage: GetStage) -> None:
     finals = []
     for _ in range(2):
         sim = make_sim(backend, N)
-        start(sim, stage("so101"))
+        start(sim, get_stage("so101"))
         for _ in range(4):
             sim.step(10)
         finals.append([getattr(sim, name).clone() for name in VIEWS])
@@ -221,16 +201,18 @@ def test_twice_the_same_run(backend: str, make_sim: Make, stage: Stage) -> None:
     assert not torch.equal(finals[0][0][0], finals[0][0][1])
 
 
-def test_world_k_of_n_is_world_k_of_one(backend: str, make_sim: Make, stage: Stage) -> None:
+def test_world_k_of_n_is_world_k_of_one(backend: str, make_sim: Make, get_stage: GetStage) -> None:
     many = make_sim(backend, N)
-    start(many, stage("so101"))
+    start(many, get_stage("so101"))
     assert_worlds_step_alone(many, make_sim(backend, 1), backend)
 
 
-def test_forward_writes_every_derived_number(backend: str, make_sim: Make, stage: Stage) -> None:
+def test_forward_writes_every_derived_number(
+    backend: str, make_sim: Make, get_stage: GetStage
+) -> None:
     sim = make_sim(backend, N)
-    m = stage("so101").model
-    start(sim, stage("so101"))
+    m = get_stage("so101").model
+    start(sim, get_stage("so101"))
     sim.forward()
     derived = (*POSES, "qfrc_actuator")
     expected = {name: getattr(sim, name).clone() for name in derived}
@@ -281,9 +263,11 @@ def test_activations_and_sensors(backend: str, sensing: Callable[[str], Simulati
         assert value[~mask].any(), name
 
 
-def test_kinematics_belongs_to_the_last_state(backend: str, make_sim: Make, stage: Stage) -> None:
+def test_kinematics_belongs_to_the_last_state(
+    backend: str, make_sim: Make, get_stage: GetStage
+) -> None:
     sim = make_sim(backend, N)
-    start(sim, stage("so101"))
+    start(sim, get_stage("so101"))
     sim.step(10)
     stale = {name: getattr(sim, name).clone() for name in POSES}
     sim.kinematics()
@@ -304,32 +288,28 @@ def test_kinematics_belongs_to_the_last_state(backend: str, make_sim: Make, stag
     assert sim.step_count.tolist() == [20] * N
 
 
-def test_kinematics_changes_no_physics(backend: str, make_sim: Make, stage: Stage) -> None:
+def test_kinematics_changes_no_physics(backend: str, make_sim: Make, get_stage: GetStage) -> None:
     if backend == "mjwarp-cuda":
         pytest.skip("CUDA repeats no run bit for bit")
     finals = []
     for kinematics in (False, True):
         sim = make_sim(backend, N)
-        start(sim, stage("so101"))
+        start(sim, get_stage("so101"))
         for _ in range(5):
             sim.step(4, kinematics=kinematics)
             sim.step(1, kinematics=kinematics)
             if kinematics:
                 sim.kinematics()
-        finals.append(
-            [
-                getattr(sim, name).clone()
-                for name in (*STATE, "qfrc_actuator", *COUNTS, "step_count")
-            ]
-        )
+        names = (*STATE, "qfrc_actuator", *COUNTS, "step_count")
+        finals.append([getattr(sim, name).clone() for name in names])
     for a, b in zip(*finals, strict=True):
         assert torch.equal(a, b)
 
 
 @pytest.mark.full
-def test_native_kinematics_visits_masked_worlds_only(make_sim: Make, stage: Stage) -> None:
+def test_native_kinematics_visits_masked_worlds_only(make_sim: Make, get_stage: GetStage) -> None:
     sim = make_sim("native", N)
-    start(sim, stage("so101"))
+    start(sim, get_stage("so101"))
     sim.forward()
     before = {name: getattr(sim, name).clone() for name in POSES}
     sim.qpos[:, 0] += 0.1
@@ -341,38 +321,30 @@ def test_native_kinematics_visits_masked_worlds_only(make_sim: Make, stage: Stag
         assert torch.isnan(getattr(sim, name)[2]).all(), name
 
 
-def test_forward_agrees_with_mujoco(backend: str, make_sim: Make, stage: Stage) -> None:
+def test_forward_agrees_with_mujoco(backend: str, make_sim: Make, get_stage: GetStage) -> None:
     sim = make_sim(backend, N)
-    context = stage("so101")
-    start(sim, context)
+    stage = get_stage("so101")
+    start(sim, stage)
     sim.step(10)
     sim.forward()
-    data = mujoco.MjData(context.model)
+    data = mujoco.MjData(stage.model)
     for k in range(N):
-        data.qpos, data.qvel, data.ctrl = (
-            v[k].double().cpu().numpy() for v in (sim.qpos, sim.qvel, sim.ctrl)
-        )
-        mujoco.mj_forward(context.model, data)
+        for name in ("qpos", "qvel", "ctrl"):
+            setattr(data, name, getattr(sim, name)[k].double().cpu().numpy())
+        mujoco.mj_forward(stage.model, data)
         for name, tolerance in (*((name, 1e-5) for name in POSES), ("qfrc_actuator", 5e-3)):
-            np.testing.assert_allclose(
-                getattr(sim, name)[k].double().cpu(),
-                getattr(data, name),
-                atol=tolerance,
-                err_msg=name,
-            )
+            got = getattr(sim, name)[k].double().cpu()
+            np.testing.assert_allclose(got, getattr(data, name), atol=tolerance, err_msg=name)
         assert int(sim.contact_count[k]) == data.ncon
 
 
 def test_options_as_uploaded(backend: str, make_sim: Make) -> None:
     options = make_sim(backend, N).option_values()
+    names = {"integrator": "mjINT_IMPLICITFAST", "cone": "mjCONE_ELLIPTIC", "box_box": "primitive"}
+    numbers = {"impratio": 100.0, "tolerance": 1e-6, "iterations": 100, "ls_iterations": 50}
     assert options["timestep"] == pytest.approx(0.002, rel=1e-6)
-    assert options["iterations"] == 100
-    assert options["ls_iterations"] == 50
-    assert options["impratio"] == pytest.approx(100.0, rel=1e-5)
-    assert options["tolerance"] == pytest.approx(1e-6, rel=1e-5)
-    assert options["integrator"] == "mjINT_IMPLICITFAST"
-    assert options["cone"] == "mjCONE_ELLIPTIC"
-    assert options["box_box"] == "primitive"
+    assert {name: options[name] for name in names} == names
+    assert {name: options[name] for name in numbers} == pytest.approx(numbers, rel=1e-5, abs=0.0)
 
 
 @pytest.mark.full
@@ -388,11 +360,11 @@ def test_worlds_whose_solver_stops_at_its_limit_are_told() -> None:
     assert told == [[0, 0], 2 * [int(SolverLimit.ITERATIONS)]]
 
 
-def test_captured_and_uncaptured_steps_agree(make_sim: Make, stage: Stage) -> None:
+def test_captured_and_uncaptured_steps_agree(make_sim: Make, get_stage: GetStage) -> None:
     finals = []
     for overrides in ((), ("graph=off",)):
         sim = make_sim("mjwarp", N, *overrides)
-        start(sim, stage("so101"))
+        start(sim, get_stage("so101"))
         sim.step(5)
         sim.step(5)
         finals.append([getattr(sim, name).clone() for name in (*VIEWS, *COUNTS, "step_count")])
@@ -400,10 +372,10 @@ def test_captured_and_uncaptured_steps_agree(make_sim: Make, stage: Stage) -> No
         assert torch.equal(a, b)
 
 
-def test_native_does_not_reset_a_diverged_world(make_sim: Make, stage: Stage) -> None:
+def test_native_does_not_reset_a_diverged_world(make_sim: Make, get_stage: GetStage) -> None:
     """MuJoCo would put it back to qpos0, which looks like a world that never moved."""
     sim = make_sim("native", N)
-    start(sim, stage("so101"))
+    start(sim, get_stage("so101"))
     sim.qvel[1, 0] = 1e12  # beyond what MuJoCo calls a good velocity
     sim.step(10)
     assert not sim.qvel[1].abs().max() < 1e6
@@ -413,7 +385,7 @@ def test_native_does_not_reset_a_diverged_world(make_sim: Make, stage: Stage) ->
     for name in (*POSES, "qfrc_actuator"):
         assert torch.isnan(getattr(sim, name)[1]).all(), name
     assert torch.isfinite(sim.qpos[[0, 2]]).all()
-    assert not mujoco.mjtDisableBit.mjDSBL_AUTORESET & stage("so101").model.opt.disableflags
+    assert not mujoco.mjtDisableBit.mjDSBL_AUTORESET & get_stage("so101").model.opt.disableflags
 
 
 # 435 pairs of balls, all of which MuJoCo calls contacts, in memory for some 170.
@@ -454,74 +426,42 @@ def test_native_worlds_that_mujoco_warns_of_take_every_step(
         assert torch.equal(one.nan_to_num(7.0), other.nan_to_num(7.0))
 
 
-def test_native_threads_do_not_matter(make_sim: Make, stage: Stage) -> None:
+def test_native_threads_do_not_matter(make_sim: Make, get_stage: GetStage) -> None:
     from mjstack.sim.native import NativeSimulation
 
     finals = []
     for nthread in (1, 3):
-        sim = NativeSimulation(stage("so101").model, 5, nthread=nthread)
-        start(sim, stage("so101"))
+        sim = NativeSimulation(get_stage("so101").model, 5, nthread=nthread)
+        start(sim, get_stage("so101"))
         sim.step(20)
         finals.append(sim.qpos.clone())
         sim.close()
     assert torch.equal(*finals)
 
 
-def test_a_model_that_sleeps_is_refused() -> None:
-    spec = mujoco.MjSpec()
-    spec.worldbody.add_body().add_geom(size=[0.1, 0, 0])
+def sleeping(spec: mujoco.MjSpec) -> None:
     spec.option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
-    with pytest.raises(UnsupportedModel, match=r"many worlds of this model: sleep and IPC .*\.$"):
-        make_simulation(spec.compile(), load_config([]), 1, backend=Backend.native)
 
 
-@pytest.mark.full
-def test_unsupported_model_says_so_in_one_line() -> None:
-    spec = mujoco.MjSpec()
-    spec.worldbody.add_body(name="b").add_geom(size=[0.1, 0, 0])
-    spec.bodies[1].add_joint()
+def by_pgs(spec: mujoco.MjSpec) -> None:
     spec.option.solver = mujoco.mjtSolver.mjSOL_PGS
-    with pytest.raises(UnsupportedModel) as caught:
-        make_simulation(spec.compile(), load_config([]), 1, backend=Backend.mjwarp, device="cpu")
-    message = str(caught.value)
-    assert "\n" not in message
-    assert "MJWarp does not support this model: " in message
-    assert "sim=native" in message
-    assert caught.value.exit_code == 2
 
 
 @pytest.mark.full
-def test_random_stacks_come_to_rest_on_mjwarp() -> None:
-    """A few stacks on the CPU device. Only the hundreds of tests/test_resting_stacks.py tell the
-    two box colliders apart.
-    """
-    cfg = load_config([])
-    n = 16
-    cfg.robot.jaw_bodies = []  # a scene without a robot
-    model = build_scene(mujoco.MjSpec(), cfg)
-    sim = make_simulation(model, cfg, n, backend=Backend.mjwarp, device="cpu")
-    rng = np.random.default_rng(7)
-    top = cfg.scene.table_top
-    pose = np.zeros((n, 2, 7))
-    for cube, height in ((0, 0.0665), (1, 0.0222)):
-        yaw = rng.uniform(-np.pi, np.pi, n)
-        pose[:, cube, :2] = cfg.scene.table_center[:2] + rng.uniform(-0.006, 0.006, (n, 2))
-        pose[:, cube, 2] = top + height
-        pose[:, cube, 3] = np.cos(yaw / 2)
-        pose[:, cube, 6] = np.sin(yaw / 2)
-    sim.qpos.copy_(torch.from_numpy(pose.reshape(n, 14)))
-    sim.forward()
-    quats = []
-    speeds = []
-    for step in range(110):
-        sim.step(10)
-        if step >= 60:
-            quats.append(sim.qpos.view(n, 2, 7)[..., 3:].clone())
-            v = sim.qvel.view(n, 2, 6)
-            speeds.append(v[..., :3].norm(dim=-1) + 3**0.5 * 0.022 * v[..., 3:].norm(dim=-1))
-    assert torch.stack(speeds).max() < 0.05
-    spread = max(float(quat_angle(a, b).max()) for i, a in enumerate(quats) for b in quats[i + 1 :])
-    assert np.degrees(spread) < 0.5
-    last = sim.qpos.view(n, 2, 7)
-    dz = last[:, 0, 2] - last[:, 1, 2]
-    assert ((dz > 0.043) & (dz < 0.045)).all()
+@pytest.mark.parametrize(
+    ("edit", "backend", "message"),
+    [
+        (sleeping, Backend.native, "MuJoCo cannot step many worlds of this model: sleep and IPC "),
+        (by_pgs, Backend.mjwarp, "MJWarp does not support this model: .* or run sim=native"),
+    ],
+)
+def test_an_unsupported_model_is_refused_in_one_line(
+    edit: Callable[[mujoco.MjSpec], None], backend: Backend, message: str
+) -> None:
+    spec = mujoco.MjSpec()
+    body = spec.worldbody.add_body()
+    body.add_geom(size=[0.1, 0, 0])
+    body.add_joint()
+    edit(spec)
+    make = partial(make_simulation, spec.compile(), load_config([]), 1, backend=backend)
+    assert re.search(rf"{message}.*\.$", refusal(partial(make, device="cpu")))

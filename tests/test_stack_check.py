@@ -187,22 +187,15 @@ def blue_sunk_into_the_table(w: World) -> None:
     w.pose[w.window, BLUE, 2] -= 0.012
 
 
-@CASES.case("SUPPORTED")
-def both_off_the_table_edge(w: World) -> None:
-    reach = w.rec.cfg.scene.table_half[1] - w.rec.cfg.scene.objects["red"].half_height
-    w.pose[w.window, :, 1] = w.rec.cfg.scene.table_center[1] + reach + HAIR
+def _edge(w: World, axis: int, side: float, by: float) -> None:
+    scene = w.rec.cfg.scene
+    reach = scene.table_half[axis] - scene.objects["red"].half_height + by
+    w.pose[w.window, :, axis] = scene.table_center[axis] + side * reach
 
 
-@CASES.case()
-def both_at_the_table_edge(w: World) -> None:
-    reach = w.rec.cfg.scene.table_half[1] - w.rec.cfg.scene.objects["red"].half_height
-    w.pose[w.window, :, 1] = w.rec.cfg.scene.table_center[1] + reach - HAIR
-
-
-@CASES.case("SUPPORTED")
-def both_off_the_far_edge(w: World) -> None:
-    reach = w.rec.cfg.scene.table_half[0] - w.rec.cfg.scene.objects["red"].half_height
-    w.pose[w.window, :, 0] = w.rec.cfg.scene.table_center[0] - reach - HAIR
+CASES.add("both_off_the_table_edge", {"SUPPORTED"}, lambda w: _edge(w, 1, 1.0, HAIR))
+CASES.add("both_at_the_table_edge", set(), lambda w: _edge(w, 1, 1.0, -HAIR))
+CASES.add("both_off_the_far_edge", {"SUPPORTED"}, lambda w: _edge(w, 0, -1.0, HAIR))
 
 
 @CASES.case("SUPPORTED")
@@ -220,16 +213,19 @@ def drift_there_and_back(w: World) -> None:
     w.pose[w.window, :, 1] += (0.0026 * np.sin(np.linspace(0.0, 2.0 * np.pi, 50)))[:, None]
 
 
+def _turn(w: World, cube: int, degrees: np.ndarray) -> None:
+    half = 0.5 * np.radians(degrees)
+    w.pose[w.window, cube, 3:] = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], 1)
+
+
 @CASES.case("REST_ROTATION")
 def slow_turn_of_blue(w: World) -> None:
-    half = 0.5 * np.radians(np.linspace(0.0, 3.1, 50))
-    w.pose[w.window, BLUE, 3:] = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], 1)
+    _turn(w, BLUE, np.linspace(0.0, 3.1, 50))
 
 
 @CASES.case("REST_ROTATION")
 def turn_between_the_middle_and_the_ends(w: World) -> None:
-    half = 0.5 * np.radians(1.6 * np.sin(np.linspace(0.0, 2.0 * np.pi, 50)))
-    w.pose[w.window, RED, 3:] = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], 1)
+    _turn(w, RED, 1.6 * np.sin(np.linspace(0.0, 2.0 * np.pi, 50)))
 
 
 @CASES.case()
@@ -259,10 +255,7 @@ def never_lifted(w: World) -> None:
 
 @CASES.case("LIFT", "CARRY")
 def airborne_runs_of_nine_steps(w: World) -> None:
-    steps = range(w.steps("lift_red").start, w.steps("above_blue").stop)
-    for k, step in enumerate(steps):
-        if k % 10 == 0:
-            w.pose[step, RED, 2] = w.pose[0, RED, 2]
+    w.pose[w.steps("lift_red").start : w.steps("above_blue").stop : 10, RED, 2] = w.pose[0, RED, 2]
 
 
 @CASES.case("CARRY")
@@ -272,9 +265,8 @@ def dragged_in_above_blue(w: World) -> None:
 
 @CASES.case("CARRY")
 def carried_in_hops_of_nine_steps(w: World) -> None:
-    for k, step in enumerate(range(w.steps("above_blue").start, w.steps("above_blue").stop)):
-        if k % 10 == 0:
-            w.pose[step, RED, 2] = w.pose[0, RED, 2]
+    flight = w.steps("above_blue")
+    w.pose[flight.start : flight.stop : 10, RED, 2] = w.pose[0, RED, 2]
 
 
 @CASES.case("CARRY")
@@ -329,45 +321,58 @@ def held_to_the_end(w: World) -> None:
         w.jaw(jaw)[w.steps("release").start :] = w.jaw(jaw)[w.steps("place_stack").stop - 1]
 
 
-def hair(name: str, amount: Callable[[World, float], None], *broken: str) -> None:
-    """Registers both sides of a threshold."""
-    CASES.add(f"{name}_inside", set(), lambda w: amount(w, -HAIR))
-    CASES.add(f"{name}_outside", {*broken}, lambda w: amount(w, HAIR))
+def hair(name: str, *broken: str) -> Callable[[Callable[[World, float], None]], None]:
+    """Registers both sides of a threshold, from which the decorated function goes away."""
+
+    def register(alter: Callable[[World, float], None]) -> None:
+        CASES.add(f"{name}_inside", set(), lambda w: alter(w, -HAIR))
+        CASES.add(f"{name}_outside", {*broken}, lambda w: alter(w, HAIR))
+
+    return register
 
 
+@hair("xy_err", "STACKED")
 def _xy(w: World, by: float) -> None:
     w.pose[w.window, RED, 0] = w.pose[w.window, BLUE, 0] + w.t.xy_err + by
 
 
+@hair("dz_min", "STACKED")
 def _dz_min(w: World, by: float) -> None:
     w.pose[w.window, RED, 2] = w.pose[w.window, BLUE, 2] + w.t.dz_min - by
 
 
+@hair("dz_max", "STACKED")
 def _dz_max(w: World, by: float) -> None:
     w.pose[w.window, RED, 2] = w.pose[w.window, BLUE, 2] + w.t.dz_max + by
 
 
+@hair("gap_above", "SUPPORTED")
 def _gap_above(w: World, by: float) -> None:
     w.pose[w.window, :, 2] += w.t.support_gap + by
 
 
+@hair("gap_below", "SUPPORTED")
 def _gap_below(w: World, by: float) -> None:
     w.pose[w.window, :, 2] -= w.t.support_gap + by
 
 
+@hair("rest_speed", "REST_SPEED")
 def _speed(w: World, by: float) -> None:
     w.velocity[w.window, RED, 1] = w.t.rest_speed + by
 
 
+@hair("rest_position", "REST_POSITION")
 def _position(w: World, by: float) -> None:
     w.pose[-30, :, 1] += w.t.rest_position + by
 
 
+@hair("rest_rotation", "REST_ROTATION")
 def _rotation(w: World, by: float) -> None:
     half = 0.5 * (math.radians(w.t.rest_rotation_deg) + by)
     w.pose[-30, RED, 3:] = [math.cos(half), 0.0, 0.0, math.sin(half)]
 
 
+@hair("airborne_height", "LIFT", "CARRY")
 def _height(w: World, by: float) -> None:
     top = w.rec.cfg.scene.table_center[2] + w.rec.cfg.scene.table_half[2]
     flight = slice(w.steps("lift_red").start, w.steps("above_blue").stop)
@@ -375,27 +380,16 @@ def _height(w: World, by: float) -> None:
     w.pose[flight, RED, 2] = top + 0.022 + w.t.airborne_height - by
 
 
+@hair("carry_distance", "CARRY")
 def _carry_distance(w: World, by: float) -> None:
     w.pose[w.steps("above_blue"), RED, :2] = w.pose[0, RED, :2]
     w.pose[w.steps("above_blue").stop - 1, RED, 0] += w.t.carry_distance - by
 
 
+@hair("open_fraction", "RELEASED")
 def _opening(w: World, by: float) -> None:
     closed, opened = (w.rec.cfg.robot.gripper_closed[0], w.rec.cfg.robot.gripper_open[0])
     w.gripper[-7] = closed + w.t.open_fraction * (opened - closed) - by
-
-
-hair("open_fraction", _opening, "RELEASED")
-hair("xy_err", _xy, "STACKED")
-hair("dz_min", _dz_min, "STACKED")
-hair("dz_max", _dz_max, "STACKED")
-hair("gap_above", _gap_above, "SUPPORTED")
-hair("gap_below", _gap_below, "SUPPORTED")
-hair("rest_speed", _speed, "REST_SPEED")
-hair("rest_position", _position, "REST_POSITION")
-hair("rest_rotation", _rotation, "REST_ROTATION")
-hair("carry_distance", _carry_distance, "CARRY")
-hair("airborne_height", _height, "LIFT", "CARRY")
 
 
 @pytest.fixture(scope="module")

@@ -100,15 +100,12 @@ def test_home_jitter_and_noise_stay_within_their_widths(robot: str) -> None:
     off = noisy.sim.qpos[:, columns] - start
     assert torch.equal(noisy.sim.qpos[:, columns], noisy.sim.ctrl[:, ctrl])
     assert off[:, :n_arm].abs().max() <= 0.02 + 1e-12
-    limits = torch.from_numpy(noisy.index.ctrl_range)
-    assert (
-        (noisy.sim.ctrl[:, ctrl] >= limits[:, 0]) & (noisy.sim.ctrl[:, ctrl] <= limits[:, 1])
-    ).all()
+    low, high = torch.from_numpy(noisy.index.ctrl_range).T
+    assert (noisy.sim.ctrl[:, ctrl] >= low).all()
+    assert (noisy.sim.ctrl[:, ctrl] <= high).all()
     assert not off[:, n_arm:].any()
-    for j in range(n_arm):
-        assert len(torch.unique(off[:, j])) > MANY // 3, (
-            j
-        )  # home may lie on a limit, as the SO-101's does not
+    for j in range(n_arm):  # home may lie on a limit, as the SO-101's does not
+        assert len(torch.unique(off[:, j])) > MANY // 3, j
     for a in noisy.index.object_qpos:
         off = noisy.sim.qpos[:, a : a + 2] - qpos0[a : a + 2]
         yaw = 2.0 * torch.atan2(noisy.sim.qpos[:, a + 6], noisy.sim.qpos[:, a + 3])
@@ -117,9 +114,8 @@ def test_home_jitter_and_noise_stay_within_their_widths(robot: str) -> None:
         assert (off.amax(0) > 0.7 * half).all()
         assert (off.amin(0) < -0.7 * half).all()  # some places are taken by the arm
         # Whole turns: every quarter of them is taken.
-        assert (
-            torch.histc(torch.remainder(yaw, 2 * math.pi), 4, 0.0, 2 * math.pi).min() > MANY // 10
-        )
+        quarters = torch.histc(torch.remainder(yaw, 2 * math.pi), 4, 0.0, 2 * math.pi)
+        assert quarters.min() > MANY // 10
 
 
 def test_masses_friction_and_gains_are_drawn_anew_from_the_models_own(robot: str) -> None:
@@ -142,23 +138,14 @@ def test_masses_friction_and_gains_are_drawn_anew_from_the_models_own(robot: str
             1.0 / ratio["dof_invweight0"][:, dofs],
         ):
             torch.testing.assert_close(other, mass[..., None].expand_as(other), rtol=1e-6, atol=0)
-        gain = (
-            fields["actuator_gainprm"][:, servos, 0]
-            / torch.from_numpy(m.actuator_gainprm)[servos, 0]
-        )
-        bias = (
-            fields["actuator_biasprm"][:, servos, 1:3]
-            / torch.from_numpy(m.actuator_biasprm)[servos, 1:3]
-        )
+        gain = ratio["actuator_gainprm"][:, servos, 0]
+        bias = ratio["actuator_biasprm"][:, servos, 1:3]
         finite = torch.isfinite(bias)  # no damping stays no damping
-        torch.testing.assert_close(
-            bias[finite], gain[..., None].expand_as(bias)[finite], rtol=1e-6, atol=0
-        )
+        expected = gain[..., None].expand_as(bias)[finite]
+        torch.testing.assert_close(bias[finite], expected, rtol=1e-6, atol=0)
         assert finite[..., 0].all()
-        partners = [m.geom("table").id]
-        partners += [
-            g for g in range(m.ngeom) if m.body(m.geom_bodyid[g]).name in env.cfg.robot.jaw_bodies
-        ]
+        jaws = [m.body(name).id for name in env.cfg.robot.jaw_bodies]
+        partners = [m.geom("table").id, *np.flatnonzero(np.isin(m.geom_bodyid, jaws)).tolist()]
         seen["mass"].append(mass)
         seen["friction"].append(fields["geom_friction"][:, geoms, 0])
         seen["gain"].append(gain)
@@ -198,21 +185,12 @@ def test_a_masked_reset_draws_for_its_worlds_alone(robot: str) -> None:
     mask = torch.rand(MANY, generator=torch.Generator().manual_seed(0)) < 0.3
     env.reset(mask=mask)
     after = state_of(env)
-    changed = (
-        "qpos",
-        "ctrl",
-        "episode",
-        "fields.body_mass",
-        "fields.geom_friction",
-        "fields.actuator_gainprm",
-    )
     for name in before:
         assert torch.equal(after[name][~mask], before[name][~mask]), name
-    for name in changed:
-        differs = (after[name][mask] != before[name][mask]).flatten(
-            1 if before[name].dim() > 1 else 0
-        )
-        assert (differs.any(1) if differs.dim() > 1 else differs).all(), name
+    fields = ("body_mass", "geom_friction", "actuator_gainprm")
+    for name in ("qpos", "ctrl", "episode", *(f"fields.{field}" for field in fields)):
+        differs = after[name][mask] != before[name][mask]
+        assert differs.view(len(differs), -1).any(1).all(), name
 
 
 # SHA-256 of joints and positions at commit 29170ca.

@@ -4,25 +4,23 @@ file.
 
 from __future__ import annotations
 
-import csv
 import re
-from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-import mujoco
 import numpy as np
 import pytest
 import torch
-from environments import at_double_speed, configure, mask_of, on_shared_sim
+from environments import at_double_speed, configure, mask_of, on_shared_sim, quats, stack_starts
 
 from mjstack.cli import run
 from mjstack.config.schema import Config
 from mjstack.envs import Env
 from mjstack.errors import ArgumentError, ConfigError
-from mjstack.mdp.starts.starts_file import _yaw, write_starts
+from mjstack.mdp.starts.starts_file import write_starts
 
 N = 4
-Rows = list[dict[str, str]]
+Starts = dict[str, np.ndarray]
 
 
 def started(backend: str, cfg: Config, seed: int = 0) -> Env:
@@ -46,34 +44,11 @@ def from_file(path: Path, *overrides: str, robot: str = "so101") -> Config:
     return cfg
 
 
-def rows_of(path: Path) -> Rows:
-    with path.open() as file:
-        return list(csv.DictReader(file))
-
-
-def write_rows(path: Path, rows: Rows) -> Path:
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
-    return path
-
-
-def plain_rows(cfg: Config, n: int = N) -> Rows:
+def plain_starts(cfg: Config, **others: np.ndarray) -> Starts:
     """Worlds with the cubes near their places, as a person would write them."""
     (red_x, red_y), (blue_x, blue_y) = cfg.scene.objects["red"].xy, cfg.scene.objects["blue"].xy
-    return [
-        {
-            "world": str(w),
-            "red_x_m": str(red_x),
-            "red_y_m": f"{red_y + 0.001 * w:.3f}",
-            "red_yaw_rad": "0",
-            "blue_x_m": str(blue_x),
-            "blue_y_m": str(blue_y),
-            "blue_yaw_rad": "-2.5",
-        }
-        for w in range(n)
-    ]
+    red = [(red_x, red_y + 0.001 * w, 0.0) for w in range(N)]
+    return stack_starts(red, [(blue_x, blue_y, -2.5)] * N, **others)
 
 
 @pytest.mark.full
@@ -84,96 +59,79 @@ def test_what_was_written_starts_alike_to_the_last_float32_digit(
     for seed in range(2):
         env = started(backend, configure(f"reset={reset}", robot=robot), seed)
         before = state(env)
-        write_starts(env, tmp_path / "worlds.csv")
-        env = started(backend, from_file(tmp_path / "worlds.csv", robot=robot), seed=99)
+        write_starts(env, tmp_path / "worlds.npz")
+        env = started(backend, from_file(tmp_path / "worlds.npz", robot=robot), seed=99)
         after = state(env)
         for name in before:
             assert torch.equal(before[name], after[name]), (seed, name)
         assert not torch.equal(before["qpos"][0], before["qpos"][1])
-        if backend != "native":  # whose float64 angle may differ in the last of 16 digits
-            write_starts(env, tmp_path / "again.csv")
-            assert (tmp_path / "again.csv").read_text() == (tmp_path / "worlds.csv").read_text()
+        write_starts(env, tmp_path / "again.npz")
+        assert (tmp_path / "again.npz").read_bytes() == (tmp_path / "worlds.npz").read_bytes()
 
 
 def test_one_file_gives_both_backends_the_same_worlds(robot: str, tmp_path: Path) -> None:
-    write_starts(
-        started("mjwarp", configure("reset=randomized", robot=robot)), tmp_path / "worlds.csv"
-    )
-    cfg = from_file(tmp_path / "worlds.csv", robot=robot)
+    env = started("mjwarp", configure("reset=randomized", robot=robot))
+    write_starts(env, tmp_path / "worlds.npz")
+    cfg = from_file(tmp_path / "worlds.npz", robot=robot)
     native = state(started("native", cfg))
     warp = state(started("mjwarp", cfg))
     for name in native:
         torch.testing.assert_close(native[name], warp[name], rtol=3e-7, atol=0.0, msg=name)
 
 
-def test_the_columns_say_what_is_in_the_worlds(robot: str, tmp_path: Path) -> None:
+def test_the_arrays_have_what_is_in_the_worlds(robot: str, tmp_path: Path) -> None:
     env = started("native", configure("reset=randomized", robot=robot))
-    write_starts(env, tmp_path / "worlds.csv")
-    rows = rows_of(tmp_path / "worlds.csv")
+    write_starts(env, tmp_path / "worlds.npz")
+    with np.load(tmp_path / "worlds.npz") as file:
+        starts = dict(file)
     m = env.sim.model
-    assert [row["world"] for row in rows] == ["0", "1", "2", "3"]
-    assert ("grip_friction" in rows[0]) is (
-        robot == "so101"
-    )  # the reBot's pads have the cubes' priority
-    for w, row in enumerate(rows):
-        value = {name: float(text) for name, text in row.items()}
-        for cube in ("red", "blue"):
-            address = int(m.joint(f"{cube}").qposadr[0])
-            pose = env.sim.qpos[w, address : address + 7].numpy()
-            np.testing.assert_array_equal(pose[:2], [value[f"{cube}_x_m"], value[f"{cube}_y_m"]])
-            turned = np.empty(4)
-            mujoco.mju_axisAngle2Quat(turned, np.array([0.0, 0.0, 1.0]), value[f"{cube}_yaw_rad"])
-            np.testing.assert_allclose(pose[3:], turned, atol=1e-12)
-            assert env.sim.fields["body_mass"][w, m.body(f"{cube}").id] == value[f"{cube}_mass_kg"]
-            assert (
-                env.sim.fields["geom_friction"][w, m.geom(f"{cube}").id, 0]
-                == value[f"{cube}_friction"]
-            )
-        for name in (*env.cfg.robot.arm_joints, *env.cfg.robot.gripper_joints):
-            assert env.sim.qpos[w, m.joint(name).qposadr[0]] == value[f"joint_{name}"]
-            gain = (
-                env.sim.fields["actuator_gainprm"][w, m.actuator(name).id, 0]
-                / m.actuator(name).gainprm[0]
-            )
-            assert gain == pytest.approx(value[f"gain_{name}"], rel=1e-15)
+    fields = {name: field.numpy() for name, field in env.sim.fields.items()}
+    assert {array.dtype for array in starts.values()} == {np.dtype(np.float64)}
+    # the reBot's pads have the cubes' priority
+    assert ("grip_friction" in starts) is (robot == "so101")
+    for cube in ("red", "blue"):
+        address = int(m.joint(cube).qposadr[0])
+        pose = env.sim.qpos[:, address : address + 7].numpy()
+        np.testing.assert_array_equal(starts[f"{cube}_xy"], pose[:, :2])
+        np.testing.assert_array_equal(starts[f"{cube}_quat"], pose[:, 3:])
+        mass = fields["body_mass"][:, m.body(cube).id]
+        np.testing.assert_array_equal(starts[f"{cube}_mass_kg"], mass)
+        friction = fields["geom_friction"][:, m.geom(cube).id, 0]
+        np.testing.assert_array_equal(starts[f"{cube}_friction"], friction)
+    for name in env.cfg.robot.joints:
+        joint = env.sim.qpos[:, m.joint(name).qposadr[0]].numpy()
+        np.testing.assert_array_equal(starts[f"joint_{name}"], joint)
+        servo = m.actuator(name)
+        gain = fields["actuator_gainprm"][:, servo.id, 0] / servo.gainprm[0]
+        np.testing.assert_allclose(starts[f"gain_{name}"], gain, rtol=1e-15)
 
 
 @pytest.mark.full
-def test_absent_columns_leave_the_models_own(backend: str, robot: str, tmp_path: Path) -> None:
-    cfg = from_file(tmp_path / "worlds.csv", robot=robot)
-    rows = plain_rows(cfg)
-    write_rows(tmp_path / "worlds.csv", rows)
+def test_absent_arrays_leave_the_models_own(backend: str, robot: str, tmp_path: Path) -> None:
+    cfg = from_file(tmp_path / "worlds.npz", robot=robot)
+    starts = plain_starts(cfg)
+    np.savez(tmp_path / "worlds.npz", **starts)
     env = started(backend, cfg)
     for name, field in env.sim.fields.items():
-        assert torch.equal(
-            field, torch.from_numpy(getattr(env.sim.model, name)).to(field).expand_as(field)
-        ), name
+        nominal = torch.from_numpy(getattr(env.sim.model, name)).to(field)
+        assert torch.equal(field, nominal.expand_as(field)), name
     start = torch.tensor(cfg.robot.start, dtype=torch.float64).to(env.sim.qpos)
     assert (env.sim.qpos[:, env.index.robot_qpos.tolist()] == start).all()
     assert (env.sim.ctrl[:, env.index.ctrl.tolist()] == start).all()
-    for w in range(N):  # the world's own row, in whatever order they stand
-        assert float(env.sim.qpos[w, env.index.object_qpos[0] + 1]) == pytest.approx(
-            float(rows[w]["red_y_m"]), rel=1e-6
-        )
-    backwards = started(
-        backend, from_file(write_rows(tmp_path / "b.csv", rows[::-1]), robot=robot)
-    ).sim.qpos.clone()
-    assert torch.equal(backwards, started(backend, cfg).sim.qpos)
+    y = env.sim.qpos[:, env.index.object_qpos[0] + 1].cpu().numpy()
+    assert y == pytest.approx(starts["red_xy"][:, 1], rel=1e-6)  # each world's own row
 
 
-def test_some_columns_of_a_kind_are_enough(backend: str, tmp_path: Path) -> None:
-    cfg = from_file(tmp_path / "worlds.csv")
-    rows = [
-        row | {"red_mass_kg": "0.1", "gain_gripper": "1.05", "joint_gripper": "0.5"}
-        for row in plain_rows(cfg)
-    ]
-    write_rows(tmp_path / "worlds.csv", rows)
+def test_some_arrays_of_a_kind_are_enough(backend: str, tmp_path: Path) -> None:
+    cfg = from_file(tmp_path / "worlds.npz")
+    values = {"red_mass_kg": 0.1, "gain_gripper": 1.05, "joint_gripper": 0.5}
+    others = {name: np.full(N, value, np.float32) for name, value in values.items()}
+    np.savez(tmp_path / "worlds.npz", **plain_starts(cfg, **others))
     env = started(backend, cfg)
     m = env.sim.model
     red, blue = (m.body(name).id for name in ("red", "blue"))
-    assert env.sim.fields["body_mass"][:, [red, blue]].cpu().numpy() == pytest.approx(
-        np.tile([0.1, 0.08], (N, 1))
-    )
+    mass = env.sim.fields["body_mass"][:, [red, blue]].cpu().numpy()
+    assert mass == pytest.approx(np.tile([0.1, 0.08], (N, 1)))
     inertia = env.sim.fields["body_inertia"][0, red].cpu().numpy()
     assert inertia == pytest.approx(m.body_inertia[red] * 0.1 / 0.08, rel=1e-6)
     gains = env.sim.fields["actuator_gainprm"][0, :, 0].cpu().numpy() / m.actuator_gainprm[:, 0]
@@ -182,8 +140,8 @@ def test_some_columns_of_a_kind_are_enough(backend: str, tmp_path: Path) -> None
 
 
 def test_a_masked_reset_writes_its_worlds_alone(backend: str, tmp_path: Path) -> None:
-    write_starts(started(backend, configure("reset=randomized")), tmp_path / "worlds.csv")
-    env = started(backend, from_file(tmp_path / "worlds.csv"))
+    write_starts(started(backend, configure("reset=randomized")), tmp_path / "worlds.npz")
+    env = started(backend, from_file(tmp_path / "worlds.npz"))
     first = state(env)
     for view in (*env.sim.fields.values(), env.sim.qpos, env.sim.ctrl):
         view *= 1.01
@@ -200,8 +158,8 @@ def test_a_masked_reset_writes_its_worlds_alone(backend: str, tmp_path: Path) ->
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 def test_a_captured_step_starts_worlds_from_the_file(tmp_path: Path) -> None:
-    write_starts(started("mjwarp-cuda", configure("reset=randomized")), tmp_path / "worlds.csv")
-    cfg = from_file(tmp_path / "worlds.csv", "task=reach", "action=joint_delta", "graph=require")
+    write_starts(started("mjwarp-cuda", configure("reset=randomized")), tmp_path / "worlds.npz")
+    cfg = from_file(tmp_path / "worlds.npz", "task=reach", "action=joint_delta", "graph=require")
     cfg.termination["time_out"].params["steps"] = 3
     env = started("mjwarp-cuda", cfg)
     first = state(env)
@@ -212,220 +170,138 @@ def test_a_captured_step_starts_worlds_from_the_file(tmp_path: Path) -> None:
         assert torch.equal(value, first[name]), name
 
 
-def test_an_angle_is_found_for_every_float32_rotation() -> None:
-    for scale in (1e-7, 1e-3, 0.05, 3.14159):
-        yaw = (
-            scale * (2.0 * torch.rand(2000, generator=torch.Generator().manual_seed(1)) - 1.0)
-        ).double()
-        w, z = (f(0.5 * yaw).float().numpy() for f in (torch.cos, torch.sin))
-        found = _yaw(w, z)
-        np.testing.assert_array_equal(np.cos(0.5 * found).astype(np.float32), w)
-        np.testing.assert_array_equal(np.sin(0.5 * found).astype(np.float32), z)
-
-
 def test_writing_is_refused_where_worlds_have_moved_on(tmp_path: Path) -> None:
     env = on_shared_sim("native", N, configure("reset=randomized"))
     with pytest.raises(ArgumentError, match="reset"):
-        write_starts(env, tmp_path / "worlds.csv")
+        write_starts(env, tmp_path / "worlds.npz")
     env.reset(seed=0)
     with pytest.raises(FileNotFoundError, match="/no/"):
-        write_starts(env, tmp_path / "no" / "worlds.csv")
+        write_starts(env, tmp_path / "no" / "worlds.npz")
     env.sim.qpos[1, env.index.object_qpos[0] + 2] += 0.1
     with pytest.raises(ArgumentError, match="red of world 1 off the table"):
-        write_starts(env, tmp_path / "worlds.csv")
+        write_starts(env, tmp_path / "worlds.npz")
     env.reset(seed=0)
     env.step(torch.zeros((N, env.action_manager.action_dim)))
     with pytest.raises(ArgumentError, match="moved on"):
-        write_starts(env, tmp_path / "worlds.csv")
+        write_starts(env, tmp_path / "worlds.npz")
     assert not list(tmp_path.iterdir())
 
 
-def change(row_number: int, **cells: str) -> Callable[[Rows], Rows]:
-    def edit(rows: Rows) -> Rows:
-        return [row | (cells if w == row_number else {}) for w, row in enumerate(rows)]
-
-    return edit
-
-
-def column(name: str, value: str) -> Callable[[Rows], Rows]:
-    return lambda rows: [row | {name: value} for row in rows]
-
-
-BAD: dict[str, tuple[Callable[[Rows], Rows], str]] = {
-    "missing column": (
-        lambda rows: [{k: v for k, v in row.items() if k != "blue_y_m"} for row in rows],
-        (
-            ", line 1: expected columns world, red_x_m, red_y_m, red_yaw_rad, blue_x_m, blue_y_m,"
-            " blue_yaw_rad; blue_y_m missing."
-        ),
-    ),
-    "unknown column": (
-        column("red_friktion", "1"),
-        (
-            ", line 1: expected columns separated by commas, each once; 'red_friktion' is wrong."
-            " Did you mean 'red_friction'?"
-        ),
-    ),
-    "nameless column": (
-        column("", "1"),
-        ", line 1: expected columns separated by commas, each once; '' is wrong.",
-    ),
-    "no number": (
-        change(1, red_x_m="left"),
-        ", line 3, column red_x_m: expected a finite number, 'left' is none.",
-    ),
-    "two lines in a cell": (
-        change(1, red_x_m="le\nft"),
-        ", line 4, column red_x_m: expected a finite number, 'le\\nft' is none.",
-    ),
-    "decimal comma": (
-        change(1, red_x_m="0,33"),
-        ", line 3, column red_x_m: expected a finite number, '0,33' is none.",
-    ),
-    "empty cell": (
-        change(1, red_x_m=""),
-        ", line 3, column red_x_m: expected a finite number, '' is none.",
-    ),
-    "not finite": (
-        change(2, red_yaw_rad="nan"),
-        ", line 4, column red_yaw_rad: expected a finite number, 'nan' is none.",
-    ),
-    "world twice": (
-        change(2, world="1"),
-        ", column world: expected worlds numbered from 0, a row each; 2 is missing.",
-    ),
-    "world missing": (
-        change(3, world="7"),
-        ", column world: expected worlds numbered from 0, a row each; 3 is missing.",
-    ),
-    "half a world": (
-        change(3, world="0.5"),
-        ", column world: expected worlds numbered from 0, a row each; 3 is missing.",
-    ),
-    "too few": (
-        lambda rows: rows[:3],
-        ": expected at least 4 worlds, it has 3. Add rows, or set nworld=3.",
-    ),
-    "none": (
-        lambda rows: [],
-        ", column world: expected worlds numbered from 0, a row each; 0 is missing.",
-    ),
-    "off the table": (
-        change(1, red_x_m="0.2", red_yaw_rad="0.785"),
-        ", line 3, column red_x_m: expected all of red above the table, 21.1 mm are not. Move it.",
-    ),
-    "over the edge": (
-        change(0, blue_y_m="0.3"),
-        ", line 2, column blue_y_m: expected all of blue above the table, 110.8 mm are not.",
-    ),
-    "touching": (
-        change(3, blue_x_m="0.33", blue_y_m="-0.09", blue_yaw_rad="0.8"),
-        (
-            ", line 5, columns red_x_m, red_y_m, blue_x_m, blue_y_m: expected objects that touch"
-            " nothing but the table; red and blue touch in world 3. Move them apart."
-        ),
-    ),
-    "in the arm": (
-        change(2, red_x_m="0.215", red_y_m="0"),
-        ", line 4, columns red_x_m, red_y_m: expected objects that touch nothing but the table; ",
-    ),
-    "out of reach": (
-        change(1, red_x_m="0.47", red_y_m="-0.2"),
-        (
-            ", line 3, columns red_x_m, red_y_m: expected a place that the arm reaches; with"
-            " red at (0.470, -0.200) m"
-        ),
-    ),
-    "too light": (
-        column("red_mass_kg", "0.05"),
-        ", line 2, column red_mass_kg: expected 0.056 to 0.104, it is 0.05.",
-    ),
-    "too slippery": (
-        column("blue_friction", "0.7"),
-        ", line 2, column blue_friction: expected 0.8 to 1.4, it is 0.7.",
-    ),
-    "too strong": (
-        column("gain_elbow_flex", "1.2"),
-        ", line 2, column gain_elbow_flex: expected 0.9 to 1.1, it is 1.2.",
-    ),
-    "beyond a joint": (
-        column("joint_elbow_flex", "1.8"),
-        ", line 2, column joint_elbow_flex: expected -1.69 to 1.69, it is 1.8.",
-    ),
+UPRIGHT = "expected w, 0, 0, z of length 1, a rotation about z, it is"
+TOUCH = "expected objects that touch nothing but the table;"
+# The message, by arrays or rows that take the place of good ones
+BAD: dict[str, dict[str, Any]] = {
+    ": expected arrays red_xy, red_quat, blue_xy, blue_quat; blue_xy missing. Add the missing": {
+        "blue_xy": None
+    },
+    ": expected known names of arrays; 'red_friktion' is none. Did you mean 'red_friction'?": {
+        "red_friktion": np.ones(N)
+    },
+    ", red_friction: expected numbers of shape (4,), not <U1 of shape (4,).": {
+        "red_friction": ["1"] * N
+    },
+    ", red_xy: expected numbers of shape (4, 2), not float64 of shape (4, 3).": {
+        "red_xy": np.zeros((N, 3))
+    },
+    ", red_friction: expected numbers of shape (4,), not float64 of shape (3,).": {
+        "red_friction": np.ones(N - 1)
+    },
+    ", world 2, red_xy: expected 0.19 to 0.51, it is nan. Correct it;": {"red_xy": {2: np.nan}},
+    f", world 1, red_quat: {UPRIGHT} [0.8 0.6": {"red_quat": {1: [0.8, 0.6, 0.0, 0.0]}},
+    f", world 1, red_quat: {UPRIGHT} [0.8 0. ": {"red_quat": {1: [0.8, 0.0, 0.0, 0.7]}},
+    ", world 3, blue_xy: expected -0.3 to 0.22, it is 0.3. Correct it; ranges of mass,": {
+        "blue_xy": {3: [0.33, 0.3]}
+    },
+    ", world 1, red_xy: expected all of red above the table, 21.1 mm are not. Move it.": {
+        "red_xy": {1: [0.2, -0.13]},
+        "red_quat": {1: quats(np.array(0.785))},
+    },
+    f", world 3, red_xy, blue_xy: {TOUCH} red and blue touch. Move them apart.": {
+        "blue_xy": {3: [0.33, -0.11]}
+    },
+    # With the jaw low over the table
+    f", world 2, red_xy: {TOUCH} ": {"red_xy": {2: [0.215, 0.0]}, "pose": "home"},
+    ", world 1, red_xy: expected a place that the arm reaches; with red at (0.470, -0.200) m": {
+        "red_xy": {1: [0.47, -0.2]}
+    },
+    ", world 1, red_mass_kg: expected 0.056 to 0.104, it is 0.05.": {
+        "red_mass_kg": [0.08, 0.05, 0.08, 0.08]
+    },
+    ", world 0, blue_friction: expected 0.8 to 1.4, it is 0.7.": {"blue_friction": [0.7] * N},
+    ", world 0, gain_elbow_flex: expected 0.9 to 1.1, it is 1.2.": {"gain_elbow_flex": [1.2] * N},
+    ", world 0, joint_elbow_flex: expected -1.69 to 1.69, it is 1.8.": {
+        "joint_elbow_flex": [1.8] * N
+    },
 }
 
 
-@pytest.mark.parametrize("name", BAD)
-def test_a_bad_file_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
-    edit, says = BAD[name]
-    cfg = from_file(tmp_path / "worlds.csv")
-    if name == "in the arm":  # with the jaw low over the table
-        cfg.reset["starts"].params["pose"] = "home"
-    good = plain_rows(cfg)
-    write_rows(tmp_path / "worlds.csv", edit(good) or good[:1])
-    if name == "none":
-        text = (tmp_path / "worlds.csv").read_text()
-        (tmp_path / "worlds.csv").write_text(text.splitlines()[0] + "\n\n")
+def refusal(cfg: Config) -> str:
+    """The one line that an environment is refused with."""
     with pytest.raises(ConfigError) as caught:
         on_shared_sim("native", N, cfg)
     message = str(caught.value)
-    assert message.startswith(f"starts={tmp_path}/worlds.csv{says}")
     assert "\n" not in message
-    assert re.search(r"\. [A-Z].*\.$", message)  # what to do
+    assert re.search(r"\. [A-Z].*[.?]$", message)  # what to do
     assert caught.value.exit_code == 2
+    return message
 
 
-HEADER = "world,red_x_m,red_y_m,red_yaw_rad,blue_x_m,blue_y_m,blue_yaw_rad\n"
+@pytest.mark.parametrize("message", BAD)
+def test_a_bad_file_is_refused_in_one_line(message: str, tmp_path: Path) -> None:
+    path = tmp_path / "worlds.npz"
+    cfg = from_file(path)
+    changes = dict(BAD[message])
+    cfg.reset["starts"].params["pose"] = changes.pop("pose", "start")
+    starts = plain_starts(cfg)
+    for name, values in changes.items():
+        if isinstance(values, dict):
+            for world, row in values.items():
+                starts[name][world] = row
+        else:
+            starts[name] = values
+    np.savez(path, **{name: values for name, values in starts.items() if values is not None})
+    assert refusal(cfg).startswith(f"starts={path}{message}")
 
 
-@pytest.mark.parametrize(
-    ("content", "says"),
-    [
-        (
-            b"",
-            f", line 1: expected columns {', '.join(HEADER.strip().split(','))}; world, red_x_m,",
-        ),
-        (b"\xff\xfe\x00", "it cannot be read ('utf-8' codec can't decode"),
-        (b"world,red_x_m,red_x_m\n", ", line 1: expected columns separated by commas, each once; "),
-        (f"{HEADER}0,1\n".encode(), ", line 2: expected 7 cells as in the header, it has 2."),
-        (
-            f"{HEADER}0,0,33,-0,13,0,0,33,0,06,0\n".encode(),
-            ", line 2: expected 7 cells as in the header, it has 11. Correct it; the decimal mark",
-        ),
-        (f'{HEADER}0,"1\n1,1\n'.encode(), ", line 3: expected 7 cells as in the header"),
-        (HEADER.replace(",", ";").encode(), "columns separated by commas, each once; 'world;red_"),
-        (
-            HEADER.replace(",", "\t").encode(),
-            "columns separated by commas, each once; 'world\\tred",
-        ),
-        (b"0,0.33,-0.13,0,0.33,0.06,0\n", "columns separated by commas, each once; '0' is wrong."),
-        (None, "it cannot be read (No such file or directory). Name a file: starts=worlds.csv"),
-    ],
-)
-def test_no_layout_file_at_all(content: bytes | None, says: str, tmp_path: Path) -> None:
-    path = tmp_path / "worlds.csv"
-    if content is not None:
+@pytest.mark.parametrize("rows", [0, 3])
+def test_a_file_with_too_few_rows_is_refused(rows: int, tmp_path: Path) -> None:
+    path = tmp_path / "worlds.npz"
+    cfg = from_file(path)
+    np.savez(path, **{name: values[:rows] for name, values in plain_starts(cfg).items()})
+    fix = "Add rows, or set nworld=3." if rows else "Add rows."
+    assert refusal(cfg) == f"starts={path}: expected at least 4 worlds, it has {rows}. {fix}"
+
+
+def test_no_starts_file_at_all(tmp_path: Path) -> None:
+    """Damaged, of another format, without numbers, missing, or of version 0.1."""
+    path = tmp_path / "worlds.npz"
+    cfg = from_file(path)
+    missing = "it cannot be read (No such file or directory). Name a file: starts=worlds.npz"
+    assert missing in refusal(cfg)
+    np.savez(path, **plain_starts(cfg, red_mass_kg=np.array([{}] * N)))  # a pickle inside
+    whole = path.read_bytes()
+    for content in (whole, whole[:200], b"", b"world,red_x_m\n"):
         path.write_bytes(content)
-    with pytest.raises(ConfigError) as caught:
-        on_shared_sim("native", N, from_file(path))
-    message = str(caught.value)
-    assert message.startswith(f"starts={path}")
-    assert says in message
-    assert "\n" not in message
+        assert "it cannot be read (damaged, or of another format)" in refusal(cfg)
+    np.savez(path)
+    assert ": expected arrays red_xy, " in refusal(cfg)
+    cfg = from_file(tmp_path / "starts_seed0.csv")
+    assert refusal(cfg).endswith(
+        "expected an npz file; CSV is of version 0.1 and is not read any more. Make a new one with"
+        " write_starts or numpy.savez."
+    )
 
 
 def test_a_file_that_the_term_alone_names_is_called_by_its_key(tmp_path: Path) -> None:
-    cfg = from_file(tmp_path / "worlds.csv")
+    cfg = from_file(tmp_path / "worlds.npz")
     cfg.starts = None
-    with pytest.raises(
-        ConfigError, match=r"^reset\.starts\.params\.path=.*/worlds\.csv: expected a CSV file"
-    ):
-        on_shared_sim("native", N, cfg)
+    key = "reset.starts.params.path"
+    assert refusal(cfg).startswith(f"{key}={tmp_path}/worlds.npz: expected an npz file")
 
 
 def test_values_within_the_configured_ranges_alone(tmp_path: Path) -> None:
-    cfg = from_file(tmp_path / "worlds.csv")
-    write_rows(tmp_path / "worlds.csv", column("red_mass_kg", "0.05")(plain_rows(cfg)))
+    cfg = from_file(tmp_path / "worlds.npz")
+    np.savez(tmp_path / "worlds.npz", **plain_starts(cfg, red_mass_kg=np.full(N, 0.05)))
     cfg.reset["starts"].params["mass"] = [0.5, 1.5]
     env = started("native", cfg)
     assert float(env.sim.fields["body_mass"][0, env.index.bodies["red"]]) == 0.05
@@ -433,30 +309,27 @@ def test_values_within_the_configured_ranges_alone(tmp_path: Path) -> None:
 
 @pytest.mark.full
 @pytest.mark.parametrize(
-    ("args", "says"),
+    ("args", "message"),
     [
-        (["starts=worlds.csv"], "Add reset=starts_file"),
-        (["reset=starts_file"], "starts=null: expected a file with one row per world"),
-        (
-            ["reset=starts_file", "starts=worlds.csv", "nworld=5"],
-            "at least 5 worlds, it has 4. Add rows, or set nworld=4",
-        ),
+        ("starts=worlds.npz", "Add reset=starts_file"),
+        ("reset=starts_file", "starts=null: expected a file with one row per world"),
+        ("reset=starts_file starts=worlds.npz nworld=5", "at least 5 worlds, it has 4. Add rows,"),
     ],
 )
 def test_the_command_line_refuses_before_anything_is_written(
-    args: list[str],
-    says: str,
+    args: str,
+    message: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    write_rows(tmp_path / "worlds.csv", plain_rows(configure()))
-    assert run([*args, "gates=[batch]", "sim=native"]) == 2
+    np.savez(tmp_path / "worlds.npz", **plain_starts(configure()))
+    assert run([*args.split(), "gates=[batch]", "sim=native"]) == 2
     err = capsys.readouterr().err
-    assert says in err
+    assert message in err
     assert len(err.strip().splitlines()) == 1
-    assert [path.name for path in tmp_path.iterdir()] == ["worlds.csv"]
+    assert [path.name for path in tmp_path.iterdir()] == ["worlds.npz"]
 
 
 @pytest.mark.full
@@ -464,17 +337,9 @@ def test_a_batch_plays_the_worlds_of_a_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    write_rows(tmp_path / "worlds.csv", plain_rows(configure()))
-    args = [
-        "reset=starts_file",
-        "starts=worlds.csv",
-        "nworld=4",
-        "sim=native",
-        "gates=[batch]",
-        *at_double_speed(),
-        "hydra.run.dir=out",
-    ]
-    assert run(args) == 0
+    np.savez(tmp_path / "worlds.npz", **plain_starts(configure()))
+    args = "reset=starts_file starts=worlds.npz nworld=4 sim=native gates=[batch] hydra.run.dir=out"
+    assert run([*args.split(), *at_double_speed()]) == 0
     assert "4 of 4 worlds succeeded" in capsys.readouterr().out
     record = np.load(next((tmp_path / "out").glob("worlds_seed0.npz")))
     assert len(np.unique(record["qpos"], axis=0)) == N

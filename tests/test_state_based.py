@@ -12,18 +12,18 @@ from compositions import load_config
 from mjstack.drivers.roles import Role, find_roles
 from mjstack.drivers.state_based import StateBasedDriver
 from mjstack.envs import Env
-from mjstack.episodes.context import RunContext
+from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError
 from mjstack.scene.phases import build_phases
 
-Stage = Callable[..., RunContext]
+GetStage = Callable[..., Stage]
 EXPERT = "controller=state_based"
 
 
-def started(stage: Stage, robot: str, *overrides: str, nworld: int) -> tuple[RunContext, Env]:
-    """Worlds that have started, and their context."""
-    context = stage(robot, EXPERT, "sim=native", "reset=jitter", *overrides)
-    return context, context.start(context.batch_simulation(nworld), context.cfg.reset)
+def started(get_stage: GetStage, robot: str, *overrides: str, nworld: int) -> tuple[Stage, Env]:
+    """Worlds that have started, and their stage."""
+    stage = get_stage(robot, EXPERT, "sim=native", "reset=jitter", *overrides)
+    return stage, stage.start(stage.batch_simulation(nworld), stage.cfg.reset)
 
 
 @pytest.mark.parametrize(
@@ -35,21 +35,21 @@ def started(stage: Stage, robot: str, *overrides: str, nworld: int) -> tuple[Run
         pytest.param("rebot", "box", 400, marks=pytest.mark.full),
     ],
 )
-def test_episodes_are_accepted(stage: Stage, robot: str, task: str, steps: int) -> None:
+def test_episodes_are_accepted(get_stage: GetStage, robot: str, task: str, steps: int) -> None:
     """The episode is as long as the expert needs, and the window of rest."""
-    own = stage(robot, f"task={task}", EXPERT, "sim=native", "reset=randomized")
+    own = get_stage(robot, f"task={task}", EXPERT, "sim=native", "reset=randomized")
     cfg = replace(own.cfg, task=replace(own.cfg.task, episode_steps=steps))
-    context = replace(own, cfg=cfg)
-    episode = context.play(context.batch_simulation(4), cfg.reset)
-    assert not episode.failed.any(), context.check.rules.failing(episode.failed)
+    stage = own.with_config(cfg)
+    episode = stage.play(stage.batch_simulation(4), cfg.reset)
+    assert not episode.failed.any(), stage.check.rules.failing(episode.failed)
 
 
-def test_a_command_is_a_function_of_the_state(stage: Stage) -> None:
+def test_a_command_is_a_function_of_the_state(get_stage: GetStage) -> None:
     """A driver that has never been asked gives the same command, in whatever step it is asked."""
-    context, env = started(stage, "so101", nworld=2)
-    driver = context.driver(env)
-    other = context.start(context.batch_simulation(2), context.cfg.reset, seed=7)
-    fresh = context.driver(other)
+    stage, env = started(get_stage, "so101", nworld=2)
+    driver = stage.driver(env)
+    other = stage.start(stage.batch_simulation(2), stage.cfg.reset, seed=7)
+    fresh = stage.driver(other)
     assert isinstance(driver, StateBasedDriver)
     seen = set()
     for step in range(84):

@@ -11,113 +11,78 @@ from environments import configure
 from mjstack.config.schema import Backend
 from mjstack.scene import SceneIndex, build_model
 from mjstack.sim import make_simulation
+from mjstack.sim.fused.step import StepPlan, can_rearrange
 from mjstack.sim.mjwarp import MjwarpSimulation
+from mjstack.sim.mujoco_warp import mjw
 from mjstack.sim.sizes import resolve_env_sizes
-from mjstack.sim.substep import ARRANGEMENTS, can_rearrange
-from mjstack.sim.warp_setup import mjw
 
 CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 DEVICES = ["cpu", pytest.param("cuda:0", marks=[pytest.mark.gpu, CUDA])]
 
 
-def worlds(robot: str, device: str, *overrides: str) -> MjwarpSimulation:
-    cfg = configure(*overrides, robot=robot)
+def worlds(robot: str, device: str, step: str) -> MjwarpSimulation:
+    cfg = configure(robot=robot)
     sizes = resolve_env_sizes(cfg)
     sim = make_simulation(
         build_model(cfg), cfg, 3, backend=Backend.mjwarp, device=device, sizes=sizes
     )
     assert isinstance(sim, MjwarpSimulation)
+    assert sim.plan == StepPlan("fused", smooth=True)
+    if step != "fused":
+        sim.plan = StepPlan(step)
     return sim
 
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("robot", ["so101", "rebot"])
-def test_a_rearranged_step_is_mjwarps_own(robot: str, device: str) -> None:
-    """Random commands, cubes thrown about: on the CPU device bit for bit, sensors included."""
-    ours = worlds(robot, device)
-    plain = worlds(robot, device)
-    ours.arrange(ARRANGEMENTS["arranged"])
-    plain.arrange(ARRANGEMENTS["stock"])
-    low, high = torch.from_numpy(ours.model.actuator_ctrlrange).float().unbind(1)
-    generator = torch.Generator().manual_seed(0)
-    most = 0
-    touched = False
-    cfg = configure(robot=robot)
-    index = SceneIndex(ours.model, cfg.robot, cfg.scene)
-    red = index.object_qpos[0]
-    for step in range(40):
-        command = low + (high - low) * torch.rand((3, len(low)), generator=generator)
-        between = ours.site_xpos[:, index.grasp_sites].mean(1)
-        if device != "cpu":  # where runs differ by rounding, each step starts from the same state
-            plain.qpos[:] = ours.qpos
-            plain.qvel[:] = ours.qvel
-        for sim in (ours, plain):
-            if step == 20:  # a cube between the jaws, for the contact sensors
-                sim.qpos[:, red : red + 3] = between
-            sim.ctrl[:] = command.to(device)
-            sim.step(5, kinematics=step % 2 == 0)
-            sim.synchronize()
-        for name in (
-            "qpos",
-            "qvel",
-            "site_xpos",
-            "sensordata",
-            "qfrc_actuator",
-            "contact_count",
-            "constraint_count",
-        ):
-            a = getattr(ours, name)
-            b = getattr(plain, name)
-            if device == "cpu":
-                assert torch.equal(a, b), (step, name)
-            elif name in ("qpos", "site_xpos"):
-                torch.testing.assert_close(a, b, rtol=0.0, atol=2e-3)
-        assert torch.equal(ours.step_count, plain.step_count)
-        most = max(most, int(ours.contact_count.max()))
-        touched |= bool((ours.sensordata != 0.0).any())
-    assert most >= 8
-    assert touched
-    if device == "cpu":
-        assert torch.equal(ours.peak_contacts, plain.peak_contacts)
-        assert torch.equal(ours.peak_constraints, plain.peak_constraints)
-        assert torch.equal(ours.peak_pool, plain.peak_pool)
-
-
-@pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("robot", ["so101", "rebot"])
-def test_a_fused_step_ends_where_mjwarps_own_does(robot: str, device: str) -> None:
-    """Steps from equal states, sensors included: a cube between the jaws, then random commands."""
-    ours = worlds(robot, device)
-    plain = worlds(robot, device)
-    assert ours.arrangement == ARRANGEMENTS["fused"]
-    plain.arrange(ARRANGEMENTS["stock"])
-    low, high = torch.from_numpy(ours.model.actuator_ctrlrange).float().to(device).unbind(1)
+@pytest.mark.parametrize("step", ["arranged", "fused"])
+def test_a_step_ends_where_mjwarps_own_does(step: str, robot: str, device: str) -> None:
+    """Random commands, cubes thrown about, one between the jaws, for the sensors. Arranged on the
+    CPU device this is bit for bit so over many steps; else every step starts from the same state.
+    """
+    exact = step == "arranged" and device == "cpu"
+    sim = worlds(robot, device, step)
+    stock = worlds(robot, device, "stock")
+    low, high = torch.from_numpy(sim.model.actuator_ctrlrange).float().to(device).unbind(1)
     generator = torch.Generator(device).manual_seed(0)
     cfg = configure(robot=robot)
-    index = SceneIndex(ours.model, cfg.robot, cfg.scene)
+    index = SceneIndex(sim.model, cfg.robot, cfg.scene)
     red = index.object_qpos[0]
-    sensed = torch.zeros(ours.sensordata.shape[1], device=device)
-    for step in range(12):
-        if step == 4:
-            plain.qpos[:, red : red + 3] = plain.site_xpos[:, index.grasp_sites].mean(1)
+    sensed = torch.zeros(sim.sensordata.shape[1], device=device)
+    most = 0
+    for number in range(40 if exact else 12):
+        between = stock.site_xpos[:, index.grasp_sites].mean(1)
+        if number == (20 if exact else 4):
+            stock.qpos[:, red : red + 3] = between
+            sim.qpos[:, red : red + 3] = between
+        if not exact:
+            sim.qpos[:] = stock.qpos
+            sim.qvel[:] = stock.qvel
+            wp.copy(sim._d.qacc_warmstart, stock._d.qacc_warmstart)
         command = low + (high - low) * torch.rand((3, len(low)), generator=generator, device=device)
-        ours.qpos[:] = plain.qpos
-        ours.qvel[:] = plain.qvel
-        wp.copy(ours._d.qacc_warmstart, plain._d.qacc_warmstart)
-        for sim in (ours, plain):
-            sim.ctrl[:] = command
-            sim.step(1 + step % 3, kinematics=True)
-            sim.synchronize()
-        for name in ("contact_count", "constraint_count", "step_count", "solver_limits"):
-            assert torch.equal(getattr(ours, name), getattr(plain, name)), (step, name)
-        for name, size in (("qpos", 1e-5), ("site_xpos", 1e-5), ("qvel", 5e-3)):
-            torch.testing.assert_close(
-                getattr(ours, name), getattr(plain, name), rtol=0.0, atol=size
+        for world_batch in (sim, stock):
+            world_batch.ctrl[:] = command
+            world_batch.step(
+                5 if exact else 1 + number % 3, kinematics=not exact or number % 2 == 0
             )
-        scale = float(plain.sensordata.abs().max()) + 1.0
-        torch.testing.assert_close(ours.sensordata, plain.sensordata, rtol=0.0, atol=0.01 * scale)
-        sensed += plain.sensordata.abs().sum(0)
+            world_batch.synchronize()
+        for name in ("contact_count", "constraint_count", "step_count", "solver_limits"):
+            assert torch.equal(getattr(sim, name), getattr(stock, name)), (number, name)
+        scale = float(stock.sensordata.abs().max()) + 1.0
+        sizes = {"qpos": 1e-5, "site_xpos": 1e-5, "qvel": 5e-3, "sensordata": 0.01 * scale}
+        for name, size in {**sizes, "qfrc_actuator": 1.0}.items():
+            a = getattr(sim, name)
+            b = getattr(stock, name)
+            if exact:
+                assert torch.equal(a, b), (number, name)
+            elif name in sizes:
+                torch.testing.assert_close(a, b, rtol=0.0, atol=size)
+        sensed += stock.sensordata.abs().sum(0)
+        most = max(most, int(sim.contact_count.max()))
     assert bool((sensed > 0.0).any())
+    assert most >= 8 or not exact
+    for name in ("peak_contacts", "peak_constraints", "peak_pool", "overflow"):
+        assert torch.equal(getattr(sim, name), getattr(stock, name)) or not exact, name
 
 
 @pytest.mark.full
@@ -128,36 +93,32 @@ def test_branches_count_and_sense_what_one_after_the_other_does(robot: str) -> N
     """Cubes at rest, red between the jaws: a few decimation from one state, where rounding has no
     time to grow.
     """
-    ours = worlds(robot, "cuda:0")
-    plain = worlds(robot, "cuda:0")
-    ours.arrange(ARRANGEMENTS["arranged"])
-    plain.arrange(ARRANGEMENTS["stock"])
+    sim = worlds(robot, "cuda:0", "arranged")
+    stock = worlds(robot, "cuda:0", "stock")
     cfg = configure(robot=robot)
-    index = SceneIndex(ours.model, cfg.robot, cfg.scene)
-    home = torch.tensor(configure(robot=robot).robot.start, device="cuda:0")
-    for sim in (ours, plain):
-        sim.qpos[:, torch.as_tensor(index.robot_qpos, device="cuda:0")] = home
-        sim.ctrl[:, torch.as_tensor(index.ctrl, device="cuda:0")] = home
-        sim.step(50, kinematics=True)
-    between = plain.site_xpos[:, index.grasp_sites].mean(1)
+    index = SceneIndex(sim.model, cfg.robot, cfg.scene)
+    home = torch.tensor(cfg.robot.start, device="cuda:0")
+    for world_batch in (sim, stock):
+        world_batch.qpos[:, torch.as_tensor(index.robot_qpos, device="cuda:0")] = home
+        world_batch.ctrl[:, torch.as_tensor(index.ctrl, device="cuda:0")] = home
+        world_batch.step(50, kinematics=True)
     red = index.object_qpos[0]
-    plain.qpos[:, red : red + 3] = between
+    stock.qpos[:, red : red + 3] = stock.site_xpos[:, index.grasp_sites].mean(1)
     for n in (1, 1, 2, 3, 1, 2):
-        ours.qpos[:] = plain.qpos
-        ours.qvel[:] = plain.qvel
-        for sim in (ours, plain):
-            sim.step(n, kinematics=True)
+        sim.qpos[:] = stock.qpos
+        sim.qvel[:] = stock.qvel
+        sim.step(n, kinematics=True)
+        stock.step(n, kinematics=True)
         for name in ("contact_count", "constraint_count"):
-            assert torch.equal(getattr(ours, name), getattr(plain, name)), name
-        for name, size in (("qpos", 1e-4), ("qvel", 2e-2), ("site_xpos", 1e-4)):
+            assert torch.equal(getattr(sim, name), getattr(stock, name)), name
+        scale = float(stock.sensordata.abs().max()) + 1.0
+        sizes = {"qpos": 1e-4, "qvel": 2e-2, "site_xpos": 1e-4, "sensordata": 0.05 * scale}
+        for name, size in sizes.items():
             torch.testing.assert_close(
-                getattr(ours, name), getattr(plain, name), rtol=0.0, atol=size
+                getattr(sim, name), getattr(stock, name), rtol=0.0, atol=size
             )
-        scale = float(plain.sensordata.abs().max()) + 1.0
-        torch.testing.assert_close(ours.sensordata, plain.sensordata, rtol=0.0, atol=0.05 * scale)
-    assert torch.equal(ours.peak_contacts, plain.peak_contacts)
-    assert torch.equal(ours.peak_constraints, plain.peak_constraints)
-    assert torch.equal(ours.overflow, plain.overflow)
+    for name in ("peak_contacts", "peak_constraints", "overflow"):
+        assert torch.equal(getattr(sim, name), getattr(stock, name))
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from compositions import load_config
 
 from mjstack.cli import run
 from mjstack.distributed import Ranks
-from mjstack.episodes.context import RunContext
+from mjstack.episodes.stage import Progress, Stage
 from mjstack.errors import MjstackError
 from mjstack.jobs.train import check_train
 from mjstack.train import clone
@@ -28,13 +27,8 @@ from mjstack.train.trainer import observed_group
 
 REACH = ("task=reach", "sim=native", "nworld=3")
 TRAIN = (
-    "job=train",
-    *REACH,
-    "job.hidden=[16]",
-    "job.batches=4",
-    "job.batch_size=32",
-    "job.save_every=2",
-    "gate.success.rate=0.0",
+    *("job=train", *REACH, "job.hidden=[16]", "job.batches=4", "job.batch_size=32"),
+    *("job.save_every=2", "gate.success.rate=0.0"),
 )
 
 
@@ -51,17 +45,16 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_dataset_has_what_the_expert_would_show(dataset: Path) -> None:
     """The same starts, so the same steps; torchrun's processes share the episodes."""
     cfg = load_config([*TRAIN, "job.episodes=3", "job.noisy_episodes=0"])
-    context = RunContext(cfg)
-    sizes = clone.resolve_sizes(cfg.job, "cpu")
-    group = observed_group(cfg.job, sizes.leave_out)
-    played = play_expert(context, sizes, group)
-    read = read_demonstrations(dataset, context, group, played.widths)
+    stage = Stage(cfg)
+    group = observed_group(cfg.job)
+    played = play_expert(stage, group)
+    read = read_demonstrations(dataset, stage, group, played.widths)
     assert torch.equal(read.ends, played.ends)
     torch.testing.assert_close(read.seen, played.seen)
     torch.testing.assert_close(read.labels, played.labels)
     parts = [
-        read_demonstrations(dataset, replace(context, ranks=Ranks(rank, 2)), group, played.widths)
-        for rank in range(2)
+        read_demonstrations(dataset, part, group, played.widths)
+        for part in (stage.with_config(cfg, ranks=Ranks(rank, 2)) for rank in range(2))
     ]
     assert [len(part.ends) for part in parts] == [2, 1]
     assert torch.equal(parts[1].seen, read.seen[150:300])
@@ -139,13 +132,12 @@ def test_without_a_success_all_episodes_count(dataset: Path, tmp_path: Path) -> 
 def read(folder: Path, lines: list[str] | None = None) -> Demonstrations:
     """What the training reads."""
     cfg = load_config([*TRAIN, f"job.dataset={folder}"])
-    context = RunContext(cfg, print_line=(lines if lines is not None else []).append)
-    sizes = clone.resolve_sizes(cfg.job, "cpu")
-    group = observed_group(cfg.job, sizes.leave_out)
-    with clone._started_world(context) as env:
+    stage = Stage(cfg, progress=Progress((lines if lines is not None else []).append))
+    group = observed_group(cfg.job)
+    with clone._started_world(stage) as env:
         widths = clone.ObservationManager(env, {"policy": group}).term_dims["policy"]
     assert check_train(cfg)
-    return read_demonstrations(folder, context, group, widths)
+    return read_demonstrations(folder, stage, group, widths)
 
 
 def copied(

@@ -21,7 +21,7 @@ from mjstack.config.session import is_trusted, search_path
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.errors import MjstackError
 from mjstack.jobs import check_job
-from mjstack.jobs.scaling_run import new_row, run_process
+from mjstack.process import Child
 
 ROOT = Path(__file__).parents[1]
 SHELL = {"func": "pydoc.pipepager", "params": {"cmd": "id > PWNED"}}
@@ -70,16 +70,14 @@ def refused(call: Callable[[], object]) -> str:
     return str(caught.value)
 
 
-def test_a_run_has_values(own: Path) -> None:
-    assert "${" not in (own / ".hydra" / "config.yaml").read_text()
-
-
 @pytest.mark.full
-def test_a_run_of_a_sweep_has_values(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_runs_have_values(own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a sweep too."""
     monkeypatch.chdir(tmp_path)
     args = ["gates=[batch]", "sim=native", "nworld=1", *one_second_episode()]
     assert run([*args, "-m", "seed=1,2", "hydra.sweep.dir=all"]) == 1
-    assert "${" not in (tmp_path / "all" / "1" / ".hydra" / "config.yaml").read_text()
+    for folder in (own, tmp_path / "all" / "1"):
+        assert "${" not in (folder / ".hydra" / "config.yaml").read_text()
 
 
 UNUSED = ("observation.policy.terms.evil", "reward.evil", "termination.evil", "task.success")
@@ -120,7 +118,7 @@ def test_only_what_declares_itself_is_called(
 @pytest.mark.full
 def test_a_gate_declares_itself(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["gate.batch.func=os.system", "gates=[batch]"]) == 2
-    assert "first parameter is named context" in capsys.readouterr().err
+    assert "first parameter is named run" in capsys.readouterr().err
 
 
 @pytest.mark.full
@@ -172,7 +170,7 @@ def test_a_package_that_the_folder_lies_in_is_not_trusted(
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("start", ["-m mjstack", "scaling"])
+@pytest.mark.parametrize("start", ["-m mjstack", "a job of a sweep"])
 def test_the_working_folder_is_not_imported_from(
     start: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -180,15 +178,17 @@ def test_the_working_folder_is_not_imported_from(
     for name in ("hydra", "omegaconf", "rich", "json", "difflib", "pathlib", "platform"):
         Path(f"{name}.py").write_text(PAYLOAD)
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    if start == "scaling":
-        row = new_row(1, "native")
-        run_process(tmp_path / "case", row, ["--version"], run_seconds=60, job_seconds=90)
-        told = (tmp_path / "case" / "output.log").read_text()
+    args = ["--cfg", "job", "-p", "nworld"]
+    if start == "a job of a sweep":
+        log = tmp_path / "output.log"
+        with log.open("wb") as output:
+            Child(args, output).follow()
+        text = log.read_text()
     else:
-        done = [sys.executable, *start.split(), "--cfg", "job", "-p", "nworld"]
-        told = subprocess.run(done, capture_output=True, text=True).stdout
+        command = [sys.executable, *start.split(), *args]
+        text = subprocess.run(command, capture_output=True, text=True).stdout
     assert not Path("PWNED").exists()
-    assert told.split()[-1] == ("0.1.0" if start == "scaling" else "256")
+    assert text.split()[-1] == "256"
 
 
 FOLLOWED = {
@@ -221,46 +221,43 @@ def test_aliases_are_refused_at_once(stranger: Path) -> None:
 
 
 def damage_record(**changes: Any) -> Callable[[Path], object]:
-    def write(folder: Path) -> None:
+    def apply(folder: Path) -> None:
         path = folder / "worlds_seed0.npz"
         with np.load(path) as held:
             arrays = dict(held)
         arrays.update({k: f(arrays[k]) if callable(f) else f for k, f in changes.items()})
         np.savez(path, **arrays)
 
-    return write
+    return apply
 
 
-def damage_report(text: str) -> Callable[[Path], object]:
-    return lambda folder: (folder / "report.json").write_text(text)
+RECORD = "worlds_seed0.npz: cannot be read"
+CONFIG = ".hydra/config.yaml"
 
 
-DEEP = 100_000
+def write(name: str, content: bytes) -> Callable[[Path], object]:
+    return lambda folder: (folder / name).write_bytes(content)
+
+
+def damage_hydra(folder: Path) -> None:
+    edit(folder, "task.check.func", "os.system")
+    write(".hydra/hydra.yaml", b"hydra: [3]")(folder)
+
+
+DEEP = b"[" * 100_000
 DAMAGE = {
-    "backend": (damage_record(backend="evil"), "worlds_seed0.npz: cannot be read"),
-    "device": (damage_record(device="cuda:x"), "worlds_seed0.npz: cannot be read"),
-    "scalar": (damage_record(failed=np.int32(0)), "worlds_seed0.npz: cannot be read"),
-    "rows": (damage_record(start_qpos=lambda x: x[:1]), "worlds_seed0.npz: cannot be read"),
-    "text": (damage_record(start_qpos=lambda x: x.astype(str)), "worlds_seed0.npz: cannot be read"),
-    "flat": (damage_record(qpos=lambda x: x.ravel()), "worlds_seed0.npz: cannot be read"),
-    "deep report": (damage_report("[" * DEEP), "report.json: cannot be read (RecursionError"),
-    "list": (damage_report('{"provenance": []}'), "report.json: cannot be read"),
-    "versions": (damage_report('{"provenance": {"versions": 3}}'), "report.json: cannot be read"),
-    "deep configuration": (
-        lambda folder: (folder / ".hydra" / "config.yaml").write_text("[" * DEEP),
-        "config.yaml: cannot be read (RecursionError",
-    ),
-    "bytes": (
-        lambda folder: (folder / ".hydra" / "config.yaml").write_bytes(bytes(range(256))),
-        "config.yaml: cannot be read",
-    ),
-    "hydra": (
-        lambda folder: (
-            edit(folder, "task.check.func", "os.system"),
-            (folder / ".hydra" / "hydra.yaml").write_text("hydra: [3]"),
-        ),
-        "add --config-dir DIR.",
-    ),
+    "backend": (damage_record(backend="evil"), RECORD),
+    "device": (damage_record(device="cuda:x"), RECORD),
+    "scalar": (damage_record(failed=np.int32(0)), RECORD),
+    "rows": (damage_record(start_qpos=lambda x: x[:1]), RECORD),
+    "text": (damage_record(start_qpos=lambda x: x.astype(str)), RECORD),
+    "flat": (damage_record(qpos=lambda x: x.ravel()), RECORD),
+    "deep report": (write("report.json", DEEP), "report.json: cannot be read (RecursionError"),
+    "list": (write("report.json", b'{"provenance": []}'), "report.json: cannot be read"),
+    "versions": (write("report.json", b'{"provenance": {"versions": 3}}'), "json: cannot be read"),
+    "deep configuration": (write(CONFIG, DEEP), "config.yaml: cannot be read (ParserError"),
+    "bytes": (write(CONFIG, bytes(range(256))), "config.yaml: cannot be read"),
+    "hydra": (damage_hydra, "add --config-dir DIR."),
 }
 
 

@@ -91,9 +91,9 @@ class GymnasiumVectorEnv(VectorEnv):
         Raises:
             MjstackError: The seed or an option cannot be used.
         """
-        others = dict(options or {})
-        mask = others.pop("reset_mask", None)
-        for name in others:
+        rest = dict(options or {})
+        mask = rest.pop("reset_mask", None)
+        for name in rest:
             raise UnknownName("reset option", name, ("reset_mask",))
         if mask is not None:
             mask = torch.as_tensor(mask, device=self.inner.device)
@@ -127,17 +127,10 @@ class GymnasiumVectorEnv(VectorEnv):
             rows = np.full(self.num_envs, None, dtype=object)
             for world in np.flatnonzero(done).tolist():
                 rows[world] = _row(final, world)
-            infos["final_obs"] = rows
+            infos |= {"final_obs": rows, "_final_obs": done.copy(), "_final_info": done.copy()}
             infos["final_info"] = {"success": success & done, "_success": done.copy()}
-            infos["_final_obs"] = done.copy()
-            infos["_final_info"] = done.copy()
-        return (
-            _numpy(obs, self.group),
-            reward.cpu().numpy(),
-            terminated.cpu().numpy(),
-            truncated.cpu().numpy(),
-            infos,
-        )
+        values = [value.cpu().numpy() for value in (reward, terminated, truncated)]
+        return _numpy(obs, self.group), values[0], values[1], values[2], infos
 
     def close_extras(self, **kwargs: Any) -> None:
         """Give the simulation's threads and buffers back."""
@@ -161,12 +154,8 @@ class GymnasiumEnv(gymnasium.Env):
             MjstackError: It has more worlds than one, or no such observation group.
         """
         if env.nworld != 1:
-            raise ArgumentError(
-                "env",
-                f"{env.nworld} worlds",
-                "one",
-                "Build it with nworld=1, or use GymnasiumVectorEnv",
-            )
+            fix = "Build it with nworld=1, or use GymnasiumVectorEnv"
+            raise ArgumentError("env", f"{env.nworld} worlds", "one", fix)
         self.inner = env
         self.group = group
         self._worlds = GymnasiumVectorEnv(env, group=group)
@@ -217,17 +206,16 @@ class GymnasiumEnv(gymnasium.Env):
                 in the world.
         """
         if self._first is not None:
-            raise ArgumentError(
-                "env", "step() after the end of an episode", "reset() first", "Call env.reset()"
-            )
+            value = "step() after the end of an episode"
+            raise ArgumentError("env", value, "reset() first", "Call env.reset()")
         actions = _array(action, self.action_space)[None]
         obs, reward, terminated, truncated, infos = self._worlds.step(actions)
-        info = {"success": bool(infos["success"])}
-        ended = bool(terminated), bool(truncated)
-        if any(ended):
+        seen = _row(obs, 0)
+        if "final_obs" in infos:
             self._first = obs
-            return infos["final_obs"][0], float(reward[0]), *ended, info
-        return _row(obs, 0), float(reward[0]), *ended, info
+            seen = infos["final_obs"][0]
+        info = {"success": bool(infos["success"])}
+        return seen, float(reward[0]), bool(terminated), bool(truncated), info
 
     def close(self) -> None:
         """Give the simulation's threads and buffers back."""

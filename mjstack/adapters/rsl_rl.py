@@ -75,9 +75,8 @@ class RslRlVecEnv(VecEnv):
         Returns:
             Every group, each ``(num_envs, dim)``, float32.
         """
-        return self._tensordict(
-            {name: group.clone() for name, group in self.env.observation_manager.groups.items()}
-        )
+        groups = self.env.observation_manager.groups
+        return self._tensordict({name: group.clone() for name, group in groups.items()})
 
     def step(
         self, actions: torch.Tensor
@@ -99,16 +98,14 @@ class RslRlVecEnv(VecEnv):
             MjstackError: The actions cannot be used, or something went wrong in the worlds.
         """
         self.env.action_manager.check(actions)
-        obs, rewards, terminated, truncated, _ = self.env.step(
-            torch.clamp(actions, self._low, self._high)
-        )
+        actions = torch.clamp(actions, self._low, self._high)
+        obs, rewards, terminated, truncated, _ = self.env.step(actions)
         extras: dict[str, Any] = {"time_outs": truncated}
         self._steps += 1
         if self._steps % self._log_interval == 0:
             # The slash keeps the runner's logger from putting other names in front.
-            extras["log"] = {
-                f"episode/{name}": value for name, value in self.env.read_statistics().items()
-            }
+            statistics = self.env.read_statistics()
+            extras["log"] = {f"episode/{name}": statistics[name] for name in statistics}
         return self._tensordict(obs), rewards, (terminated | truncated).long(), extras
 
     def close(self) -> None:

@@ -1,1 +1,1 @@
-"""Benchmarks: what the throughput gate and the scripts measure, and with what."""
+"""Benchmarks: the measurements of gate *throughput*."""

@@ -19,7 +19,9 @@ With cameras, the images of all worlds and cameras are timed too, however slow a
 
 from collections.abc import Sequence
 from functools import partial
+from math import inf
 
+import numpy as np
 import torch
 
 from mjstack.bench.timing import (
@@ -47,9 +49,9 @@ def measure_env_step(
     *,
     steps: int,
     repetitions: int,
-    seconds: float | None = None,
+    seconds: float = inf,
     meter: EnergyMeter = NO_METER,
-    advance: Advance | None = None,
+    advance: Advance = lambda what, done, total: None,
     share: float = 1.0,
     name: str = "env_step",
 ) -> Measurement:
@@ -61,8 +63,8 @@ def measure_env_step(
         repetitions: Measured repetitions; one before them warms up.
         seconds: Shortens the repetitions so that all of them take about this long [s].
         meter: Measures the energy of the whole steps.
-        advance: Told about progress.
-        share: Share of the action range from which actions are drawn evenly, about its middle.
+        advance: Shows progress.
+        share: Share of the action range from which actions are sampled uniformly, about its middle.
         name: The measurement's name.
 
     Returns:
@@ -78,11 +80,10 @@ def measure_env_step(
     decimation = env.cfg.timing.decimation
     parts = _Parts(env, share)
     step_seconds = parts.warm_up()
-    if seconds is not None:
-        steps = steps_that_fit(steps, seconds, _COST * (repetitions + 1) * step_seconds)
+    steps = steps_that_fit(steps, seconds, _COST * (repetitions + 1) * step_seconds)
 
     # The repetitions
-    times: list[tuple[float, float, float, float]] = []
+    times: list[list[float]] = []
     ended = 0.0
     start = snapshot(sim)
     for repetition in range(repetitions + 1):
@@ -92,46 +93,40 @@ def measure_env_step(
             continue
         ended += episodes
         times.append(spent)
-        if advance is not None:
-            advance(f"{name}, repetitions", repetition, repetitions)
+        advance(f"{name}, repetitions", repetition, repetitions)
 
     # The result
     out = Measurement(name=name)
-    whole = [env_seconds for env_seconds, *_ in times]
+    whole, physics, managers, images = np.array(times).T
     graph = env.graph if parts.on_cuda else sim.graph_of(decimation, kinematics=True)
-    captured = env.graph.captured and parts.captured
-    out.add_repetitions(sim, env.cfg, whole, steps, meter, graph, captured=captured)
+    captured = env.graph.captured and all(part.captured for part in parts.graphs)
+    out.add_repetitions(sim, env.cfg, whole.tolist(), steps, meter, graph, captured=captured)
     ms = 1e3 / steps
-    out.samples |= {
-        "physics_ms_per_step": [ms * p for _, p, _, _ in times],
-        "managers_ms_per_step": [ms * m for _, _, m, _ in times],
-        "managers_alone_over_physics": [m / p for _, p, m, _ in times],
-        "residual_ms_per_step": [ms * (e - p - m - i) for e, p, m, i in times],
+    samples = {
+        "physics_ms_per_step": ms * physics,
+        "managers_ms_per_step": ms * managers,
+        "managers_alone_over_physics": managers / physics,
+        "residual_ms_per_step": ms * (whole - physics - managers - images),
     }
     out.facts["episodes_ended"] = int(ended)
     out.problem = describe_lost(parts.lost) or parts.problem or out.problem
-    if env.cameras is not None:
-        cameras = env.cameras.cameras
-        images = len(cameras) * env.nworld * steps
-        out.samples |= {
-            "images_ms_per_step": [ms * i for _, _, _, i in times],
-            "images_per_s": [images / i for _, _, _, i in times],
-            "images_over_physics": [i / p for _, p, _, i in times],
-        }
-        mjwarp = sim.backend == "mjwarp"
-        size = image_bytes(sim.model, cameras, env.nworld, mjwarp=mjwarp)
+    cameras = env.cameras.cameras if env.cameras is not None else {}
+    out.headline = f"{out.median('env_steps_per_s'):,.0f} env-steps/s"
+    if cameras:
+        samples["images_ms_per_step"] = ms * images
+        samples["images_per_s"] = rate = len(cameras) * env.nworld * steps / images
+        samples["images_over_physics"] = images / physics
+        size = image_bytes(sim.model, cameras, env.nworld, mjwarp=sim.backend == "mjwarp")
         out.facts["images_mb"] = size / 1e6
-        out.headline = (
-            f"{out.median('env_steps_per_s'):,.0f} env-steps/s with images,"
-            f" {out.median('images_per_s'):,.0f} images/s"
+        out.headline += f" with images, {np.median(rate):,.0f} images/s"
+    else:
+        samples["managers_over_physics"] = whole / physics - 1.0
+        over, alone = (
+            100.0 * np.median(samples[f"managers_{name}"])
+            for name in ("over_physics", "alone_over_physics")
         )
-        return out
-    out.samples["managers_over_physics"] = [e / p - 1.0 for e, p, *_ in times]
-    out.headline = (
-        f"{out.median('env_steps_per_s'):,.0f} env-steps/s, managers"
-        f" {100.0 * out.median('managers_over_physics'):+.1f} % (alone"
-        f" {100.0 * out.median('managers_alone_over_physics'):.1f} %)"
-    )
+        out.headline += f", managers {over:+.1f} % (alone {alone:.1f} %)"
+    out.samples |= {key: values.tolist() for key, values in samples.items()}
     return out
 
 
@@ -139,12 +134,13 @@ class _Parts:
     """Plays the parts of a repetition, each from the same state.
 
     Attributes:
+        graphs: Physics, managers and, with cameras, images, as `Env.parts` has them.
         lost: Worlds whose physics was lost or not stepped, shape ``(nworld,)``, bool.
         problem: The terminations by which physics was lost in the whole steps; empty where none.
     """
 
     def __init__(self, env: Env, share: float) -> None:
-        """Prepare random actions, with a generator that no one else uses."""
+        """Prepare random actions, by a generator of this measurement."""
         manager = env.action_manager
         self._env = env
         self._generator = torch.Generator().manual_seed(0)
@@ -155,11 +151,6 @@ class _Parts:
         self.lost = torch.zeros(env.nworld, dtype=torch.bool, device=env.device)
         self.problem = ""
 
-    @property
-    def captured(self) -> bool:
-        """Whether the parts were replayed."""
-        return all(part.captured for part in self._parts)
-
     def warm_up(self) -> float:
         """Start worlds at random ages, compile and capture; return the seconds of a step."""
         env = self._env
@@ -167,16 +158,16 @@ class _Parts:
         ages = torch.randint(env.max_episode_steps, (env.nworld,), generator=self._generator)
         env.episode_step.copy_(ages)
         seconds = [timed(env.sim, partial(env.step, action)) for action in self._actions(WARM_UP)]
-        self._parts: Sequence[StepGraph] = env.parts() if env.images else env.parts()[:2]
+        self.graphs: Sequence[StepGraph] = env.parts() if env.images else env.parts()[:2]
         if self.on_cuda:  # a repetition may be too short to warm them up
-            for part in self._parts:
+            for graph in self.graphs:
                 for _ in range(WARM_UP):
-                    part()
+                    graph()
         return seconds[-1]
 
     def play(
         self, start: State, steps: int, meter: EnergyMeter
-    ) -> tuple[State, tuple[float, float, float, float], float]:
+    ) -> tuple[State, list[float], float]:
         """Play one repetition.
 
         Returns:
@@ -185,71 +176,73 @@ class _Parts:
         """
         env = self._env
         sim = env.sim
+        ages = (env.episode_step, env.episode)
+        physics, managers, *images = self.graphs
         actions = self._actions(steps)
         targets = [torch.empty_like(sim.ctrl) for _ in actions]
-        ages = self._ages()
+
+        def play_whole() -> None:
+            for action, target in zip(actions, targets, strict=True):
+                env.step(action)
+                # One small copy; where a world was reset it is the new episode's.
+                target.copy_(sim.ctrl)
+
+        def play_physics() -> None:
+            for target in targets:
+                sim.ctrl.copy_(target)
+                physics()
+
+        def play_managers() -> None:
+            for action in actions:
+                env.action_manager.process(action)
+                managers()
+
+        def play_images() -> None:
+            for graph in images * steps:
+                graph()
 
         # The whole step
         restore(sim, start)
+        start_ages = [age.clone() for age in ages]
         env.read_statistics()
-        whole = timed(sim, partial(self._whole, actions, targets), meter)
+        times = [timed(sim, play_whole, meter)]
         counted = env.read_statistics()
         self._find_losses(counted)
         end = snapshot(sim)
-        later_ages = self._ages()
+        end_ages = [age.clone() for age in ages]
 
         # Physics alone, with the same joint targets
         restore(sim, start)
-        physics = timed(sim, lambda: self._physics(targets))
+        times.append(timed(sim, play_physics))
         self.lost |= lost_worlds(sim, steps * env.cfg.timing.decimation)
 
         # The managers alone
         restore(sim, start)
-        self._set_ages(*ages)
-        managers = timed(sim, lambda: self._managers(actions))
-        env.raise_faults()
-        self._set_ages(*later_ages)
-        images = timed(sim, lambda: self._images(steps)) if env.images else 0.0
-        return end, (whole, physics, managers, images), counted["episodes"]
+        _set_ages(ages, start_ages)
+        times.append(timed(sim, play_managers))
+        env.faults.raise_first()
+        _set_ages(ages, end_ages)
+        times.append(timed(sim, play_images) if images else 0.0)
+        return end, times, counted["episodes"]
 
     def _actions(self, count: int) -> list[torch.Tensor]:
         shape = (count, self._env.nworld, len(self._span))
         noise = torch.rand(shape, generator=self._generator)
         return list((self._low + self._span * noise).to(self._env.device).unbind())
 
-    def _whole(self, actions: list[torch.Tensor], targets: list[torch.Tensor]) -> None:
-        for action, target in zip(actions, targets, strict=True):
-            self._env.step(action)
-            # One small copy; where a world was reset it is the new episode's.
-            target.copy_(self._env.sim.ctrl)
-
-    def _physics(self, targets: list[torch.Tensor]) -> None:
-        for target in targets:
-            self._env.sim.ctrl.copy_(target)
-            self._parts[0]()
-
-    def _managers(self, actions: list[torch.Tensor]) -> None:
-        for action in actions:
-            self._env.action_manager.process(action)
-            self._parts[1]()
-
-    def _images(self, steps: int) -> None:
-        for _ in range(steps):
-            self._parts[2]()
-
-    def _ages(self) -> tuple[torch.Tensor, torch.Tensor]:
-        return self._env.episode_step.clone(), self._env.episode.clone()
-
-    def _set_ages(self, step: torch.Tensor, episode: torch.Tensor) -> None:
-        self._env.episode_step.copy_(step)
-        self._env.episode.copy_(episode)
-
     def _find_losses(self, counted: dict[str, float]) -> None:
-        terms = self._env.cfg.termination.items()
-        losses = [n for n, term in terms if offered(term.func, "ends_on")]
-        ended = [name for name in losses if counted.get(f"termination/{name}", 0.0) > 0.0]
+        ended = [
+            name
+            for name, term in self._env.cfg.termination.items()
+            if offered(term.func, "ends_on") and counted.get(f"termination/{name}", 0.0) > 0.0
+        ]
         if ended:
             self.problem = (
                 f"worlds ended by {', '.join(ended)}: raise batch.nconmax or batch.njmax, or act"
                 " more gently"
             )
+
+
+def _set_ages(ages: Sequence[torch.Tensor], values: Sequence[torch.Tensor]) -> None:
+    for age, value in zip(ages, values, strict=True):
+        age.copy_(value)

@@ -16,8 +16,9 @@ from mjstack.bench.timing import (
     lost_worlds,
 )
 from mjstack.drivers.driver import Recorded
-from mjstack.episodes.context import RunContext
-from mjstack.episodes.rollout import FEEDBACK, CommandRecorder, Episode, Observer, rollout
+from mjstack.episodes.recorder import CommandRecorder
+from mjstack.episodes.rollout import FEEDBACK, Episode, Observer, rollout
+from mjstack.episodes.stage import Stage
 from mjstack.errors import name_worlds
 from mjstack.sim import Simulation
 
@@ -26,8 +27,9 @@ if TYPE_CHECKING:
 
 
 def measure_episode(
-    context: RunContext,
+    stage: Stage,
     sim: Simulation,
+    before: Episode | None = None,
     *,
     seconds: float,
     repetitions: int,
@@ -41,18 +43,18 @@ def measure_episode(
     only as often as the time allows, and not at all where even one would not fit.
 
     Args:
-        context: Scene and planner.
+        stage: Scene and planner.
         sim: The worlds.
+        before: The episode of gate *batch*, if it was timed.
         seconds: Time budget [s].
         repetitions: Most repetitions.
         meter: Measures the energy.
         step_seconds: About how long a control step takes [s].
     """
-    cfg = context.cfg
+    cfg = stage.cfg
     mjwarp = sim.backend == "mjwarp"
     out = Measurement(name="episode")
-    steps = context.episode_steps
-    before = context.artifacts.timed_episode
+    steps = stage.episode_steps
     if before is not None and (before.description, len(before.start)) != (
         sim.description,
         sim.nworld,
@@ -77,9 +79,9 @@ def measure_episode(
         if time.perf_counter() - began + estimate > seconds:
             break
         repetition_began = time.perf_counter()
-        played.append(_play(context, sim, meter, out))
+        played.append(_play(stage, sim, meter, out))
         estimate = time.perf_counter() - repetition_began
-        context.advance("episode, repetitions", number + 1, rounds)
+        stage.progress.advance("episode, repetitions", number + 1, rounds)
     if not played:
         key = "max_seconds" if sim.device.type == "cuda" else "cpu_max_seconds"
         out.missing = (
@@ -111,7 +113,7 @@ def measure_episode(
 
 
 def play_bare(
-    context: RunContext, sim: "MjwarpSimulation", recorded: Recorded | None = None
+    stage: Stage, sim: "MjwarpSimulation", recorded: Recorded | None = None
 ) -> tuple[float, str]:
     """Play the same commands from the same start with bare steps.
 
@@ -122,14 +124,14 @@ def play_bare(
     Returns:
         Seconds, and why they do not count: empty where they do.
     """
-    cfg = context.cfg
+    cfg = stage.cfg
     step = sim.bare_step()
     for _ in range(WARM_UP):  # none of it is timed
         step()
     if sim.device.type == "cuda" and cfg.graph != "off" and not step.captured:
         return math.nan, "the bare steps could not be captured"
-    env = context.start(sim, cfg.reset)
-    driver = context.driver(env) if recorded is None else recorded.rewind()
+    env = stage.start(sim, cfg.reset)
+    driver = stage.driver(env) if recorded is None else recorded
 
     def physics() -> None:
         for _ in range(cfg.timing.decimation):
@@ -139,25 +141,25 @@ def play_bare(
     sim.latch()
     if lost := int(lost_worlds(sim).sum()):
         return seconds, f"{lost} worlds overflowed or diverged with bare steps"
-    end = context.check.view(env).step()
-    fallen = int((~context.check.placed(end).all(1)).sum())
+    end = stage.check.view(env).step()
+    fallen = int((~stage.check.placed(end).all(1)).sum())
     return seconds, f"{fallen} worlds did not do the task with bare steps" if fallen else ""
 
 
-def _play(context: RunContext, sim: Simulation, meter: EnergyMeter, out: Measurement) -> Episode:
+def _play(stage: Stage, sim: Simulation, meter: EnergyMeter, out: Measurement) -> Episode:
     """Play one repetition: the episode and, on MJWarp, the bare steps.
 
     Joint trajectories can be evaluated again; the commands of a driver with feedback are recorded.
     """
-    cfg = context.cfg
+    cfg = stage.cfg
     mjwarp = sim.backend == "mjwarp"
     commands = CommandRecorder()
     keep = mjwarp and cfg.controller.name in FEEDBACK
     recorders: list[Observer] = [commands] if keep else []
-    episode = context.play(sim, cfg.reset, [*recorders, EnergyObserver(meter)])
+    episode = stage.play(sim, cfg.reset, [*recorders, EnergyObserver(meter)])
     if mjwarp:
         recorded = commands.recorded if keep else None
-        bare, problem = play_bare(context, cast("MjwarpSimulation", sim), recorded)
+        bare, problem = play_bare(stage, cast("MjwarpSimulation", sim), recorded)
         out.problem = out.problem or problem
         out.samples.setdefault("bare_seconds", []).append(bare)
         out.samples.setdefault("bare_ratio", []).append(episode.timing.seconds / bare)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from functools import partial
 
 import torch
+from typing_extensions import override
 
 from mjstack.config.schema import Config
 from mjstack.episodes.rollout import Observer, RolloutTiming
@@ -21,8 +22,7 @@ SHORTEST = 0.5  # s, of a stretch of work on average: the counter moves some ten
 
 
 class EnergyMeter:
-    """Adds up what the GPU's energy counter moves from `start` to `stop`. It counts the whole GPU,
-    for every process on it.
+    """Adds up the GPU's energy from `start` to `stop`, of all processes on it.
 
     Attributes:
         reason: Why there is no figure; empty where there is one.
@@ -30,12 +30,11 @@ class EnergyMeter:
 
     def __init__(self, device: str) -> None:
         """Open the counter of ``cpu`` or ``cuda:N``."""
-        self._counter: Callable[[], float] = lambda: 0.0  # [mJ]
+        self._counter: Callable[[], float] | None = None  # [mJ]
         self._began = self._first = 0.0
         self.clear()
         self.reason = ""
-        self._cpu = device == "cpu"
-        if self._cpu:
+        if device == "cpu":
             return
         try:
             import pynvml
@@ -51,32 +50,33 @@ class EnergyMeter:
             self._counter = partial(pynvml.nvmlDeviceGetTotalEnergyConsumption, handle)
 
     def clear(self) -> None:
-        """Clear what was added up."""
+        """Start from zero."""
         self._joules = self._seconds = 0.0
         self._stretches = 0
 
     def start(self) -> None:
         """Begin a stretch of work, the device idle."""
-        self._first = self._counter()
+        self._first = self._counter() if self._counter else 0.0
         self._began = time.perf_counter()
 
     def stop(self) -> None:
         """End it, the device idle again, and add it."""
         self._seconds += time.perf_counter() - self._began
-        self._joules += 1e-3 * (self._counter() - self._first)
+        if self._counter:
+            self._joules += 1e-3 * (self._counter() - self._first)
         self._stretches += 1
 
     @property
     def missing(self) -> str:
         """Why there is no figure; empty where there is one, and on a CPU."""
-        each = self._seconds / max(self._stretches, 1)
-        if self._cpu or self.reason or each >= SHORTEST:
+        mean = self._seconds / max(self._stretches, 1)
+        if self._counter is None or mean >= SHORTEST:
             return self.reason
-        return f"stretches of {each:.2g} s are too short for NVML's counter"
+        return f"stretches of {mean:.2g} s are too short for NVML's counter"
 
     def metrics(self) -> dict[str, float]:
         """Energy and mean power of the stretches; nothing where they are missing."""
-        if self._cpu or self.missing:
+        if self._counter is None or self.missing:
             return {}
         return {"gpu_power_mean_w": self._joules / self._seconds, "gpu_energy_j": self._joules}
 
@@ -94,16 +94,16 @@ class EnergyObserver(Observer):
     def __init__(self, meter: EnergyMeter) -> None:
         self._meter = meter
 
+    @override
     def after_step(self, step: int) -> None:
-        """See `Observer`."""
         if step == _EAGER - 1:
             self.env.sim.synchronize()
             reading = time.perf_counter()
             self._meter.start()
             self.aside = time.perf_counter() - reading
 
+    @override
     def finish(self) -> None:
-        """See `Observer`."""
         self._meter.stop()
 
 
@@ -176,38 +176,32 @@ class Measurement:
             self.facts["gpu_memory_arrays_mib"] = used[0] / 2**20
             self.facts["gpu_memory_whole_gpu_mib"] = used[1] / 2**20
 
-        # The capture. On Warp's CPU device, whole steps are never captured: whether their physics
-        # was
-        graphs = [one for one in work if one is not None]
+        # The capture. On Warp's CPU device physics alone is captured
+        graphs = [graph for graph in work if graph is not None]
         cuda = sim.device.type == "cuda"
         self.facts |= {
             "steps_per_repetition": steps,
             "repetitions": len(seconds),
-            "warm_up_s": max((one.warm_up_seconds for one in graphs), default=0.0),
-            "capture_s": max((one.capture_seconds for one in graphs), default=0.0),
+            "warm_up_s": max([0.0, *(graph.warm_up_seconds for graph in graphs)]),
+            "capture_s": max([0.0, *(graph.capture_seconds for graph in graphs)]),
             "captured": captured,
         }
-        graph = None if cuda else sim.graph_of(decimation, kinematics=True)
-        if graph is not None:
-            self.facts["physics_captured"] = graph.captured
+        physics = None if cuda else sim.graph_of(decimation, kinematics=True)
+        if physics is not None:
+            self.facts["physics_captured"] = physics.captured
         if cuda and not captured and cfg.graph != "off":
-            self.problem = self.problem or (
-                "it was not captured and ran eagerly (run.log says why); graph=off measures it like"
-                " that"
-            )
+            eager = "it was not captured and ran eagerly (run.log says why)"
+            self.problem = self.problem or f"{eager}; graph=off measures it like that"
 
     def metrics(self) -> dict[str, float]:
         """All numbers that count, under the measurement's name: median and range of samples."""
-        shown = dict(self.facts)
+        figures = dict(self.facts)
         if not self.problem:
             for name, values in self.samples.items():
-                shown |= {
-                    f"{name}.median": statistics.median(values),
-                    f"{name}.min": min(values),
-                    f"{name}.max": max(values),
-                }
-            shown |= self.totals
-        return {f"{self.name}.{key}": value for key, value in shown.items()}
+                ends = {"median": statistics.median(values), "min": min(values), "max": max(values)}
+                figures |= {f"{name}.{end}": value for end, value in ends.items()}
+            figures |= self.totals
+        return {f"{self.name}.{key}": value for key, value in figures.items()}
 
     def named_notes(self) -> dict[str, str]:
         """The notes, under the measurement's name."""
@@ -246,4 +240,4 @@ def describe_lost(lost: torch.Tensor) -> str:
 
 def steps_that_fit(most: int, budget: float, seconds_per_step: float) -> int:
     """As many steps as a time budget [s] allows, from 1 to most."""
-    return max(1, min(most, int(budget / max(seconds_per_step, 1e-9))))
+    return max(1, int(min(most, budget / max(seconds_per_step, 1e-9))))

@@ -1,7 +1,7 @@
 """Complete a composed configuration: terms as dataclasses, and what follows from other values."""
 
-from dataclasses import asdict, fields
-from functools import cache
+from dataclasses import fields
+from functools import cache, reduce
 from pathlib import Path
 from typing import Any, cast
 
@@ -10,15 +10,11 @@ from omegaconf.errors import OmegaConfBaseException
 
 from mjstack.config.fields import accepted, check_fields
 from mjstack.config.schema import (
-    CloneJobCfg,
     Config,
     ObservationGroupCfg,
     ObservationTermCfg,
-    PpoJobCfg,
     RewardTermCfg,
     RobotCfg,
-    SolverCfg,
-    StudyJobCfg,
     TermCfg,
     TerminationTermCfg,
 )
@@ -35,12 +31,13 @@ _TERMS = {
     "termination": TerminationTermCfg,
     "reward": RewardTermCfg,
     "observation": ObservationGroupCfg,
+    "job.observation": ObservationGroupCfg,
 }
 
 
 def complete(cfg: Config) -> None:
-    """Give every term and every variant of the solver its type, and fill in the robot and the
-    phases that gates name, in place. A term that is null is left out.
+    """Give every term its type, and fill in the robot and the phases that gates name, in place. A
+    term that is null is left out.
 
     Raises:
         MjstackError: A term has an unknown key, lacks one, or a value has the wrong type; or
@@ -51,22 +48,10 @@ def complete(cfg: Config) -> None:
     for name in vars(cfg.gate).keys() - known:
         cfg.gate.added[name] = vars(cfg.gate).pop(name)
     for key, kind in _TERMS.items():
-        parent: Any = cfg
         *path, last = key.split(".")
-        for name in path:
-            parent = getattr(parent, name)
-        setattr(parent, last, _typed_all(key, getattr(parent, last), kind))
-    _complete_groups("observation", cfg.observation)
-    if isinstance(cfg.job, StudyJobCfg):
-        variants = {
-            name: asdict(cfg.solver) | node if isinstance(node, dict) else node
-            for name, node in cfg.job.variants.items()
-        }
-        cfg.job.variants = _typed_all("job.variants", variants, SolverCfg)
-    if isinstance(cfg.job, CloneJobCfg | PpoJobCfg):
-        seen = _typed_all("job.observation", cfg.job.observation, ObservationGroupCfg)
-        _complete_groups("job.observation", seen)
-        cfg.job.observation = seen
+        parent = reduce(getattr, path, cfg)
+        if hasattr(parent, last):  # not every job has observations
+            setattr(parent, last, _typed_all(key, getattr(parent, last), kind))
     _complete_robot(cfg.robot)
     for camera in cfg.scene.cameras.values():
         camera.pose = camera.pose or cfg.robot.wrist_camera
@@ -74,14 +59,13 @@ def complete(cfg: Config) -> None:
 
 
 def _typed_all(key: str, nodes: dict[str, Any], kind: type) -> dict[str, Any]:
-    return {
+    values = {
         name: typed(f"{key}.{name}", node, kind) for name, node in nodes.items() if node is not None
     }
-
-
-def _complete_groups(key: str, groups: dict[str, ObservationGroupCfg]) -> None:
-    for name, group in groups.items():
-        group.terms = _typed_all(f"{key}.{name}.terms", group.terms, ObservationTermCfg)
+    if kind is ObservationGroupCfg:
+        for name, group in values.items():
+            group.terms = _typed_all(f"{key}.{name}.terms", group.terms, ObservationTermCfg)
+    return values
 
 
 def typed(key: str, node: Any, kind: type) -> Any:
@@ -97,7 +81,11 @@ def typed(key: str, node: Any, kind: type) -> Any:
         if name not in items:
             raise UnknownName(f"{key}: key", str(name), items)
     # OmegaConf would copy what has no types, to and fro.
-    untyped = {k: v for k, v in node.items() if k in ("params", "terms") and _is_mapping(v)}
+    untyped = {
+        name: node[name]
+        for name in ("params", "terms")
+        if isinstance(node.get(name), dict) and all(isinstance(k, str) for k in node[name])
+    }
     try:
         typed = OmegaConf.merge(_schema(kind), {k: node[k] for k in node if k not in untyped})
     except OmegaConfBaseException as error:
@@ -106,15 +94,11 @@ def typed(key: str, node: Any, kind: type) -> Any:
     missing = sorted(OmegaConf.missing_keys(typed))
     if missing:
         raise TermError(key, f"'{missing[0]}' is missing: set {key}.{missing[0]}")
-    found = OmegaConf.to_object(typed)
+    value = OmegaConf.to_object(typed)
     for name, mapping in untyped.items():
-        setattr(found, name, mapping)
-    check_fields(key, found)
-    return found
-
-
-def _is_mapping(value: object) -> bool:
-    return isinstance(value, dict) and all(isinstance(name, str) for name in value)
+        setattr(value, name, mapping)
+    check_fields(key, value)
+    return value
 
 
 @cache
@@ -134,11 +118,11 @@ def _complete_robot(robot: RobotCfg) -> None:
         return
     tried = [*(folder / "robot" / robot.file for folder in config_folders()), Path(robot.file)]
     paths = list(dict.fromkeys(path.resolve() for path in tried))
-    found = next((path for path in paths if path.is_file()), None)
-    if found is None:
+    file = next((path for path in paths if path.is_file()), None)
+    if file is None:
         expected = f"an MJCF file; there is no {' and no '.join(map(str, paths))}"
         raise ConfigError("robot.file", robot.file, expected)
-    robot.file = str(found)
+    robot.file = str(file)
 
 
 def _choose_phases(cfg: Config) -> None:
@@ -150,9 +134,9 @@ def _choose_phases(cfg: Config) -> None:
     grasps = [k for k, phase in enumerate(phases) if phase.grasps is not None]
     closed = [k for k, phase in enumerate(phases) if phase.gripper == "closed"]
     # A grasped object is in the hand after its grasp, a pushed one at the jaws until they open.
-    held = grasps[0] + 1 if grasps else max(closed, default=0)
-    contact = names[min(held, len(names) - 1)]
-    loaded = names[min(held if grasps else held + 1, len(names) - 1)]
+    in_hand = grasps[0] + 1 if grasps else max(closed, default=0)
+    contact = names[min(in_hand, len(names) - 1)]
+    loaded = names[min(in_hand if grasps else in_hand + 1, len(names) - 1)]
     parity = cfg.gate.parity
     parity.states = parity.states or {
         "before_contact": names[0],

@@ -104,13 +104,16 @@ def field_range(item: Field) -> Range:
 
 
 def find_field(owner: type, key: str) -> tuple[type, Field] | None:
-    """The dataclass and the field of a dotted key below a dataclass; None if there is none."""
+    """The dataclass and the field of a dotted key below a dataclass or one that derives from it;
+    None if there is none.
+    """
     name, _, rest = key.partition(".")
     item = next((item for item in fields(owner) if item.name == name), None)
     if item is None:
-        return None
+        derived: list[type] = owner.__subclasses__()
+        return next(filter(None, (find_field(child, key) for child in derived)), None)
     kind, holders = _kind(_hints(owner)[name])
-    if not (isinstance(kind, type) and is_dataclass(kind)) or not rest:
+    if not (isinstance(kind, type) and is_dataclass(kind)):
         return owner, item
     below = rest.partition(".")[2] if holders else rest  # several are by name
     return find_field(kind, below) if below else (owner, item)

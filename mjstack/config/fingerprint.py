@@ -15,7 +15,7 @@ from mjstack.config.session import list_items
 from mjstack.errors import ConfigError
 
 CONTENT = "sha256:"  # in front of what stands for a file
-_OF_THE_CALL = ("resume", "devices", "web")  # they change no result
+_OF_THE_CALL = ("resume", "devices", "sweep", "web")  # they change no result
 POLICY_FILE = "policy.json"  # of a policy's folder; it names the weights by their SHA-256
 MOST_TEXT = 2**24  # bytes of it; a stranger's may ask for more
 
@@ -53,21 +53,21 @@ def config_hash(config: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()
 
 
-def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> str:
+def differences(earlier: Mapping[str, Any], current: Mapping[str, Any]) -> str:
     """The first keys in which two configurations differ, such as ``seed=1, expected 2``, and how
     many more do; empty if they are equal.
     """
     before, now = (
-        {key: value for key, value in list_items(one) if value == {} or not isinstance(value, dict)}
-        for one in (theirs, ours)
+        {k: value for k, value in list_items(config) if value == {} or not isinstance(value, dict)}
+        for config in (earlier, current)
     )
-    found = [
+    different = [
         f"{key}={before.get(key, 'missing')}, expected {now.get(key, 'none')}"
         for key in before | now
         if before.get(key) != now.get(key)
     ]
-    more = f", and {len(found) - 3} more keys" if len(found) > 3 else ""
-    return "; ".join(found[:3]) + more
+    more = f", and {len(different) - 3} more keys" if len(different) > 3 else ""
+    return "; ".join(different[:3]) + more
 
 
 def _content(key: str, path: str) -> str:

@@ -7,6 +7,7 @@ the name of their first parameter, or by their base class.
 import importlib
 import inspect
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 from mjstack.errors import MissingExtra, TermError, first_line, suggest
@@ -28,23 +29,17 @@ def resolve_func(
             here.
     """
     func = find_object(label, path)
+    declared = False
     expected = f"a function or class whose first parameter is named {first}"
     if base is None:
-        declared = _first_parameter(func) == first
+        with suppress(TypeError, ValueError):  # functions in C have no names
+            declared = next(iter(inspect.signature(func).parameters), "") == first
     else:
         expected = f"a subclass of {base.__module__}.{base.__name__}"
         declared = isinstance(func, type) and issubclass(func, base)
     if not declared:
         raise TermError(label, f"func={path}: expected {expected}")
     return func
-
-
-def _first_parameter(func: Any) -> str:
-    """Name of the first parameter of a call; empty if there is none, or it cannot be called."""
-    try:
-        return next(iter(inspect.signature(func).parameters), "")
-    except (TypeError, ValueError):  # functions in C have no names
-        return ""
 
 
 def find_object(label: str, path: str) -> Any:

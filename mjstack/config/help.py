@@ -6,7 +6,7 @@ Groups and choices are those of the search path; units, ranges and words are tho
 import json
 import re
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from typing import Any, NamedTuple
 
@@ -17,42 +17,53 @@ from mjstack.config.schema import Config
 from mjstack.config.session import CONFIG_FOLDER, list_choices
 from mjstack.errors import UnknownName
 
-_GROUP = re.compile(r"  - (?P<name>\w+): (?P<default>\[.*\]|\S+) # (?P<words>.+)")
-_EXAMPLES = (
-    ("robot=rebot nworld=64", "all gates this machine can run"),
-    ("-m robot=so101,rebot timing=default,fine", "a sweep with a summary table"),
-    ("'gates=[success]' nworld=64", "how often does it work from random starts?"),
-    (
-        "job=replay run=outputs/DATE/TIME world=17",
-        "one world of an earlier run again: why did it fail?",
-    ),
-    ("job=collect job.episodes=20", "demonstrations of the expert, as a dataset; resumes"),
-    (
-        "job=train job.folder=outputs/mine",
-        "a policy that imitates the expert, judged by gate success; resumes",
-    ),
-    (
-        "controller=policy policy=outputs/mine/last 'gates=[success]'",
-        "the policy in the expert's place, in any gate",
-    ),
-    (
-        "job=play policy=outputs/mine/last",
-        "four worlds of the policy as a video; view=true: in MuJoCo's viewer",
-    ),
-)
-_FLAGS = (
-    ("--help gate.batch", "keys below one, with unit, range and meaning"),
-    ("--cfg job", "print the whole configuration as the other arguments make it, and run nothing"),
-    (
-        "--cfg job -p gate.batch",
-        "print a part of it; job=collect --cfg job -p job has the keys of a job",
-    ),
-    ("-m", "a sweep over comma-separated values"),
-    ("--config-dir DIR", "a folder of your own with more choices, such as DIR/task/push.yaml"),
-    ("--hydra-help", "Hydra's own flags"),
-    ("--version", "mjstack's version"),
-)
-_STATUSES = "Exit status: 0 passed, 1 a gate failed, 2 bad configuration or input, 130 interrupted."
+_GROUP = re.compile(r"^  - (\w+): (\[.*\]|\S+) # (.+)$", re.MULTILINE)  # name, default, words
+_TEXT = """\
+mjstack: a task of a robot arm, from native MuJoCo to thousands of MuJoCo Warp worlds,\
+ verified in gates.
+
+Usage: mjstack [group=choice ...] [key=value ...] [flags]
+In a checkout: python scripts/run.py ...
+
+Examples:
+  mjstack robot=rebot nworld=64
+    all gates this machine can run
+  mjstack -m robot=so101,rebot timing=default,fine
+    a sweep with a summary table
+  mjstack 'gates=[success]' nworld=64
+    how often does it work from random starts?
+  mjstack job=replay run=outputs/DATE/TIME world=17
+    one world of an earlier run again: why did it fail?
+  mjstack job=collect job.episodes=20
+    demonstrations of the expert, as a dataset; resumes
+  mjstack job=train job.folder=outputs/mine
+    a policy that imitates the expert, judged by gate success; resumes
+  mjstack controller=policy policy=outputs/mine/last 'gates=[success]'
+    the policy in the expert's place, in any gate
+  mjstack job=play policy=outputs/mine/last
+    four worlds of the policy as a video; view=true: in MuJoCo's viewer
+
+Groups, to be set as group=choice, and their choices, the default first:
+{groups}
+
+Keys, to be set as key=value, and their defaults:
+{keys}
+
+Keys below a group can be set too: gate.batch.seeds=10. ~reward.success leaves a term out,\
+ +reward.mine=... adds one.
+
+Flags:
+  --help gate.batch        keys below one, with unit, range and meaning
+  --cfg job                print the whole configuration as the other arguments make it,\
+ and run nothing
+  --cfg job -p gate.batch  print a part of it; job=collect --cfg job -p job has the keys of a job
+  -m                       a sweep over comma-separated values
+  --config-dir DIR         a folder of your own with more choices, such as DIR/task/push.yaml
+  --hydra-help             Hydra's own flags
+  --version                mjstack's version
+
+Exit status: 0 passed, 1 a gate failed, 2 bad configuration or input, 130 interrupted.
+"""
 
 
 class Group(NamedTuple):
@@ -77,15 +88,13 @@ class Key(NamedTuple):
 def list_groups() -> list[Group]:
     """The groups of the whole search path, mjstack's in the order of composition first."""
     choices = list_choices()
-    lines = (CONFIG_FOLDER / "config.yaml").read_text(encoding="utf-8").splitlines()
-    found = filter(None, map(_GROUP.fullmatch, lines))
-    known = {match["name"]: (match["default"], match["words"]) for match in found}
-    groups = []
-    for name in [*known, *(name for name in choices if name not in known)]:
-        default, words = known.get(name, ("", "added by the search path"))
-        ordered = sorted(choices[name], key=default.__ne__)
-        groups.append(Group(name, ordered, words))
-    return groups
+    text = (CONFIG_FOLDER / "config.yaml").read_text(encoding="utf-8")
+    groups = dict.fromkeys(choices, ("", "added by the search path"))
+    known = {name: (default, words) for name, default, words in _GROUP.findall(text)}
+    return [
+        Group(name, sorted(choices[name], key=default.__ne__), words)
+        for name, (default, words) in (known | groups | known).items()
+    ]
 
 
 def list_keys(value: object, name: str = "", *, named: bool = True) -> Iterator[Key]:
@@ -106,8 +115,8 @@ def list_keys(value: object, name: str = "", *, named: bool = True) -> Iterator[
                     part[entry], f"{key}.{entry if named else 'NAME'}", named=named
                 )
         else:
-            shown = "" if ".NAME" in key else _yaml(part)
-            yield Key(key, shown, accepted(type(value), item), docs.get(item.name, ""))
+            text = "" if ".NAME" in key else _yaml(part)
+            yield Key(key, text, accepted(type(value), item), docs.get(item.name, ""))
 
 
 def key_help(cfg: Config, prefix: str, width: int) -> str:
@@ -122,14 +131,14 @@ def key_help(cfg: Config, prefix: str, width: int) -> str:
     keys = [key for key in list_keys(cfg) if key.name not in ("gate.added", *nodes)]
     for name, (node, attribute) in nodes.items():
         keys += _declared_keys(name, node, attribute)
-    found = [key for key in keys if f"{key.name}.".startswith(f"{prefix}.")]
-    if not found:
+    matching = [key for key in keys if f"{key.name}.".startswith(f"{prefix}.")]
+    if not matching:
         parent = prefix.rpartition(".")[0]
         depth = prefix.count(".") + 1
-        beside = [key.name for key in keys if f".{key.name}".startswith(f".{parent}")]
-        raise UnknownName("key", prefix, {".".join(name.split(".")[:depth]) for name in beside})
+        beside = [key.name.split(".") for key in keys if f".{key.name}".startswith(f".{parent}")]
+        raise UnknownName("key", prefix, {".".join(names[:depth]) for names in beside})
     lines = []
-    for key in found:
+    for key in matching:
         words = textwrap.wrap(f"{key.words} Accepts {key.accepts}.".strip(), width - 2)
         lines += [f"{key.name}={key.value}", *(f"  {line}" for line in words)]
     return "\n".join(lines)
@@ -143,45 +152,20 @@ def _declared_keys(key: str, node: dict[str, Any], attribute: str) -> Iterator[K
         accepts = "a dotted name" if name == "func" else "the values of its function"
         yield Key(f"{key}.{name}", _yaml(node[name]), accepts, "")
     if kind:
-        given = {name: value for name, value in node.items() if name in names}
-        yield from list_keys(typed(key, given, kind), key)
+        values = {name: value for name, value in node.items() if name in names}
+        yield from list_keys(typed(key, values, kind), key)
 
 
 def help_text(cfg: Config, width: int) -> str:
     """The whole text, in lines that are not longer than ``width``, with a configuration's
     values.
     """
-    groups = [(group.name, f"{group.words}: {', '.join(group.choices)}") for group in list_groups()]
-    keys = [(k.name, f"{k.words} ({k.value})") for k in list_keys(cfg) if "." not in k.name]
-    keys = [(name, words) for name, words in keys if name not in {g for g, _ in groups}]
-    parts = [
-        [
-            "mjstack: a task of a robot arm, from native MuJoCo to thousands of MuJoCo Warp worlds,"
-            " verified in gates."
-        ],
-        [
-            "Usage: mjstack [group=choice ...] [key=value ...] [flags]",
-            "In a checkout: python scripts/run.py ...",
-        ],
-        [
-            "Examples:",
-            *(line for made, words in _EXAMPLES for line in (f"  mjstack {made}", f"    {words}")),
-        ],
-        [
-            "Groups, to be set as group=choice, and their choices, the default first:",
-            *_table(groups, width),
-        ],
-        ["Keys, to be set as key=value, and their defaults:", *_table(keys, width)],
-        [
-            "Keys below a group can be set too: gate.batch.seeds=10. ~reward.success leaves a term"
-            " out, +reward.mine=... adds one."
-        ],
-        ["Flags:", *_table(_FLAGS, width)],
-        [_STATUSES],
-    ]
-    return "\n\n".join(
-        "\n".join(line for text in part for line in textwrap.wrap(text, width)) for part in parts
-    )
+    groups = {group.name: f"{group.words}: {', '.join(group.choices)}" for group in list_groups()}
+    keys = {key.name: f"{key.words} ({key.value})" for key in list_keys(cfg) if "." not in key.name}
+    for name in groups:
+        keys.pop(name, None)
+    text = _TEXT.format(groups=_table(groups), keys=_table(keys))
+    return "\n".join(line for row in text.splitlines() for line in _wrapped(row, width) or [""])
 
 
 def _yaml(value: object) -> str:
@@ -191,12 +175,13 @@ def _yaml(value: object) -> str:
     return json.dumps(value).replace(", ", ",").replace('"', "")
 
 
-def _table(rows: Sequence[tuple[str, str]], width: int) -> list[str]:
-    """Two columns as lines, of which the second is wrapped."""
-    indent = max(len(name) for name, _ in rows) + 4
-    lines = []
-    for name, words in rows:
-        lines += textwrap.wrap(
-            words, width, initial_indent=f"  {name}".ljust(indent), subsequent_indent=" " * indent
-        )
-    return lines
+def _table(rows: Mapping[str, str]) -> str:
+    """Two columns, a line for each row."""
+    indent = max(map(len, rows)) + 4
+    return "\n".join(f"  {name}".ljust(indent) + words for name, words in rows.items())
+
+
+def _wrapped(row: str, width: int) -> list[str]:
+    """A row as lines; the second column of a table is wrapped."""
+    column = re.match(r"  \S.*?  +", row)
+    return textwrap.wrap(row, width, subsequent_indent=" " * len(column[0] if column else ""))

@@ -3,13 +3,13 @@
 import json
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
-from hydra._internal.hydra import Hydra
 from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
@@ -18,21 +18,22 @@ from yaml import YAMLError  # type: ignore[import-untyped]
 
 from mjstack.config.check import validate
 from mjstack.config.complete import complete
-from mjstack.config.explain import check_added, check_overrides, explain, parse
+from mjstack.config.explain import check_added, check_overrides, explain, own_overrides, parse
 from mjstack.config.fingerprint import MOST_TEXT, POLICY_FILE
-from mjstack.config.schema import JOB_SCHEMAS, TRAINER_SCHEMAS, Config
+from mjstack.config.schema import JOB_SCHEMAS, TRAINER_SCHEMAS, Backend, Config
 from mjstack.config.session import (
     CONFIG_NAME,
     add_folder,
     check_beside,
     check_trusted,
+    compose_raw,
     hydra_session,
     list_choices,
     read_yaml,
     search_path,
     without_hydra,
 )
-from mjstack.errors import CompositionError, ConfigError
+from mjstack.errors import ConfigError, MjstackError
 from mjstack.files import read_inside, reading
 
 _schema = OmegaConf.structured(Config)
@@ -48,7 +49,33 @@ def _control_steps(seconds: float, *, _root_: DictConfig) -> int:
     return round(seconds / step_dt) if step_dt > 0.0 else 1  # what is wrong is told later
 
 
-OmegaConf.register_new_resolver("steps", _control_steps)
+def _by_device(cuda: Any, cpu: Any, *, _root_: DictConfig) -> Any:
+    """The value for the device of the run, which ``${by_device:CUDA,CPU}`` stands for."""
+    device = _root_.sim.device
+    if _is_native(_root_):
+        device = "cpu"
+    elif device == "auto":
+        from torch.cuda import is_available  # takes a second
+
+        device = "cuda" if is_available() else "cpu"
+    return cuda if device.startswith("cuda") else cpu
+
+
+def _is_native(root: DictConfig) -> bool:
+    return root.sim.backend == Backend.native
+
+
+# Interpolations: ${NAME:ARGUMENT,...} is the value of a function of these and of the configuration.
+_RESOLVERS: dict[str, Callable] = {
+    "steps": _control_steps,
+    "by_device": _by_device,
+    "if_native": lambda native, mjwarp, *, _root_: native if _is_native(_root_) else mjwarp,
+    # A random network, or a policy to go on from
+    "by_start": lambda new, policy, *, _root_: new if _root_.job.start_from is None else policy,
+    "at_most": lambda value, limit, small, large: small if value <= limit else large,
+}
+for _name, _function in _RESOLVERS.items():
+    OmegaConf.register_new_resolver(_name, _function)
 
 
 def load_config(
@@ -67,8 +94,8 @@ def load_config(
     Raises:
         MjstackError: An override does not fit; the message says which and what would.
     """
-    with extended_search_path(overrides, config_dir) as own, hydra_session() as hydra:
-        return to_config(compose(hydra, own))
+    with extended_search_path(overrides, config_dir) as composed, hydra_session():
+        return to_config(compose(composed))
 
 
 @contextmanager
@@ -82,19 +109,16 @@ def extended_search_path(
         The other overrides, and what the policy that they name was trained for.
     """
     entries = [] if config_dir is None else [str(config_dir)]
-    others = []
-    for override in overrides:
-        if override.lstrip("+").startswith("hydra.searchpath="):
-            value = parse(override).value()
-            if not isinstance(value, list):
-                raise CompositionError(
-                    f"{override}: expected a list, such as 'hydra.searchpath=[file://DIR]'."
-                )
-            entries += map(str, value)
-        else:
-            others.append(override)
+    remaining = [o for o in overrides if not o.lstrip("+").startswith("hydra.searchpath=")]
+    for override in [override for override in overrides if override not in remaining]:
+        value = parse(override).value()
+        if not isinstance(value, list):
+            raise MjstackError(
+                f"{override}: expected a list, such as 'hydra.searchpath=[file://DIR]'."
+            )
+        entries += map(str, value)
     with search_path(entries):
-        yield [*others, *_policy_choices(others)]
+        yield [*remaining, *_policy_choices(remaining)]
 
 
 def _policy_choices(overrides: Sequence[str]) -> list[str]:
@@ -121,63 +145,59 @@ def _policy_choices(overrides: Sequence[str]) -> list[str]:
 
 
 def compose(
-    hydra: Hydra,
-    overrides: Sequence[str],
-    run_mode: RunMode = RunMode.RUN,
-    sweep: DictConfig | None = None,
+    overrides: Sequence[str], run_mode: RunMode = RunMode.RUN, sweep: DictConfig | None = None
 ) -> DictConfig:
-    """Compose without validating values, as a job of a sweep if there is one; Hydra's part is in
-    it, and errors are one line each.
+    """Compose in a `hydra_session` without validating values, as a job of a sweep if there is one;
+    Hydra's part is in it, and errors are one line each.
     """
+    loader = GlobalHydra.instance().config_loader()
     if run_mode is RunMode.RUN:
         check_overrides(overrides)
     try:
         if sweep is None:
-            cfg = hydra.compose_config(CONFIG_NAME, list(overrides), run_mode, from_shell=False)
+            cfg = loader.load_configuration(
+                config_name=CONFIG_NAME, overrides=list(overrides), run_mode=run_mode
+            )
         else:
-            cfg = hydra.config_loader.load_sweep_config(sweep, list(overrides))
+            cfg = loader.load_sweep_config(sweep, list(overrides))
         if run_mode is RunMode.RUN:
             check_added(without_hydra(cfg), overrides)
-            _drop_inherited(hydra, cfg, overrides)
+            _drop_inherited(cfg, overrides)
     except (HydraException, OmegaConfBaseException, AssertionError, TypeError, ValueError) as error:
         raise explain(error, overrides) from error
     except YAMLError as error:
-        raise CompositionError(f"{' '.join(str(error).split())}.") from error
+        raise MjstackError(f"{' '.join(str(error).split())}.") from error
     return cfg
 
 
-def _drop_inherited(hydra: Hydra, cfg: DictConfig, overrides: Sequence[str]) -> None:
+def _drop_inherited(cfg: DictConfig, overrides: Sequence[str]) -> None:
     """Leave a term whose ``func`` an override swaps with the parameters that overrides give it:
     those of the other function are not its own.
     """
-    swapped = {}
-    for override in overrides:
-        key, _, value = override.lstrip("+").partition("=")
-        # Other keys of a job or a gate are no parameters of its function.
-        if "func" not in override or re.match(r"job\.|gate\.(?!.*\.reset\.)", key):
-            continue
-        if key.endswith(".func"):
-            swapped[override] = key.removesuffix(".func")
-        elif value.startswith("{") and "func" in cast(dict, parse(override).value()):
-            swapped[override] = key
-    if not swapped:
+    if not any("func" in override for override in overrides):
         return
-    others = [override for override in overrides if override not in swapped]
-    before = hydra.compose_config(CONFIG_NAME, others, RunMode.RUN, from_shell=False)
-    for term in swapped.values():
+    values = {o.key_or_group: o.value() for o in map(parse, own_overrides(overrides))}
+    # Other keys of a job or a gate are no parameters of its function.
+    terms = {
+        key: key.removesuffix(".func")
+        for key, value in values.items()
+        if (key.endswith(".func") or (isinstance(value, dict) and "func" in value))
+        and not re.match(r"job\.|gate\.(?!.*\.reset\.)", key)
+    }
+    before = compose_raw([o for o in overrides if o.lstrip("+").partition("=")[0] not in terms])
+    for term in terms.values():
         old = OmegaConf.select(before, f"{term}.func")
         if old is None or old == OmegaConf.select(cfg, f"{term}.func"):
             continue
         section = term if term == "task.check" else f"{term}.params"
-        given = OmegaConf.create()
-        for override in overrides:
-            name = override.lstrip("+").partition("=")[0]
-            if f"{name}.".startswith(f"{term}."):
-                OmegaConf.update(given, name, parse(override).value())
-        kept = {"func", *(OmegaConf.select(given, section) or ())}
+        changes = OmegaConf.create()
+        for key, value in values.items():
+            if f"{key}.".startswith(f"{term}."):
+                OmegaConf.update(changes, key, value)
+        params = {"func", *(OmegaConf.select(changes, section) or ())}
         node = OmegaConf.select(cfg, section) or {}
         with open_dict(cfg):
-            for name in [name for name in node if name not in kept]:
+            for name in node.keys() - params:
                 del node[name]
 
 
@@ -189,20 +209,20 @@ def load_saved(path: Path) -> Config:
         MjstackError: The file cannot be read, is no configuration of this version, or names
             functions or a robot that are not in the search path.
     """
-    with reading(path, CompositionError, "Name another folder"):
+    with reading(path, "Name another folder"):
         plain = read_yaml(path)
         if "${" in str(plain):
             raise ValueError("it has ${...}")
         merged = cast(DictConfig, OmegaConf.merge(_schema, plain))
         if missing := sorted(OmegaConf.missing_keys(merged)):
-            raise CompositionError(f"{missing[0]} is missing, expected every key of this version.")
+            raise MjstackError(f"{missing[0]} is missing, expected every key of this version.")
         check_trusted(merged, path)
         try:
             cfg = to_config(merged)
         except ConfigError as error:
             if error.key != "robot.file":
                 raise
-            raise CompositionError(f"{error} {add_folder(path)}") from error
+            raise MjstackError(f"{error} {add_folder(path)}") from error
         check_beside(cfg.robot.file)
     return cfg
 

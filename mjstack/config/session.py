@@ -10,31 +10,28 @@ import functools
 import os
 import shlex
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import yaml  # type: ignore[import-untyped]
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
-from hydra._internal.config_repository import ConfigRepository
-from hydra._internal.hydra import Hydra
-from hydra._internal.utils import create_config_search_path
+from hydra import compose, initialize_config_dir
 from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.object_type import ObjectType
+from hydra.core.plugins import Plugins
 from hydra.core.singleton import Singleton
-from hydra.plugins.config_source import ConfigResult
+from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.types import RunMode
-from hydra.version import setbase
-from omegaconf import DictConfig, OmegaConf
-from omegaconf._utils import get_yaml_loader
+from omegaconf import DictConfig, OmegaConf, open_dict
+from typing_extensions import override
 
 from mjstack.config.functions import find_object
-from mjstack.errors import CompositionError
+from mjstack.errors import MjstackError
 
 _PACKAGE_FOLDER = Path(__file__).parents[1]
 # In a checkout the configuration lies beside the package, in a wheel inside of it.
@@ -61,12 +58,12 @@ def search_path(entries: Sequence[str | os.PathLike]) -> Iterator[None]:
         entries: Folders, also as Hydra writes them: ``file://...``.
 
     Raises:
-        CompositionError: There is no such folder, or it has a file of mjstack's name.
+        MjstackError: There is no such folder, or it has a file of mjstack's name.
     """
-    found = [_checked_folder(str(entry)) for entry in entries]
-    token = _added.set(tuple(dict.fromkeys((*_added.get(), *found))))
+    folders = [_checked_folder(str(entry)) for entry in entries]
+    token = _added.set(tuple(dict.fromkeys((*_added.get(), *folders))))
     # The folder beside a configuration folder is importable.
-    for folder in found:
+    for folder in folders:
         if str(folder.parent) not in sys.path:
             sys.path.insert(0, str(folder.parent))
     try:
@@ -114,9 +111,14 @@ def read_yaml(path: Path) -> Any:
     """Read YAML of a run's folder, which may be a stranger's: interpolations stay text.
 
     Raises:
-        Exception: It cannot be read.
+        Exception: It cannot be read, or has aliases: a few stand for any number of values.
     """
-    return yaml.load(path.read_text(), _Reader)
+    text = path.read_text()
+    # libyaml, where PyYAML has it: the other parser takes minutes for brackets nested very deep.
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, Loader=loader)):
+        raise yaml.YAMLError("an alias")
+    return OmegaConf.to_container(OmegaConf.create(text))
 
 
 def config_folders() -> list[Path]:
@@ -141,14 +143,14 @@ def check_trusted(cfg: DictConfig, saved: Path) -> None:
         saved: Its file.
 
     Raises:
-        CompositionError: A function is elsewhere; names it.
+        MjstackError: A function is elsewhere; names it.
         TermError: There is no such function.
     """
     for key, name in list_items(cfg):
         if not (key.startswith(_REPLAYED) and key.endswith(".func")):
             continue
         if not is_trusted_function(key.removesuffix(".func"), str(name), saved):
-            raise CompositionError(
+            raise MjstackError(
                 f"{key}={name}: expected a name of mjstack, of a package registered under"
                 f" {ENTRY_POINTS}, or beside a folder of the search path. {add_folder(saved)}"
             )
@@ -179,20 +181,20 @@ def is_trusted(dotted: str, saved: Path) -> bool:
     if package in {"mjstack", *(name.partition(".")[0] for name in _registered())}:
         return True
     try:
-        found = find_spec(package)
+        module = find_spec(package)
     except ValueError:  # no name of a module, or __main__
         return False
     # A package may have several places, and a module of them may come from any. The origin of a
     # module of Python's own is a word, such as frozen.
-    places = [*(found.submodule_search_locations or (found.origin or "",))] if found else []
+    places = [*(module.submodule_search_locations or (module.origin or "",))] if module else []
     beside = [folder.parent for folder in _added.get()]
-    own = {saved.resolve(), Path(os.path.abspath(saved))}  # it may be a link
+    files = {saved.resolve(), Path(os.path.abspath(saved))}  # it may be a link
     return bool(places) and all(
         Path(place).is_absolute()
         and Path(place).resolve().parent in beside
         and not any(
             file.is_relative_to(folder)
-            for file in own
+            for file in files
             for folder in (Path(place), Path(place).resolve())
         )
         for place in places
@@ -203,11 +205,11 @@ def check_beside(file: str | None) -> None:
     """Check that a robot's file, if a saved run names one, lies beside a folder of the search path.
 
     Raises:
-        CompositionError: It lies elsewhere.
+        MjstackError: It lies elsewhere.
     """
     folders = [folder.parent for folder in config_folders()]
     if file is not None and not any(map(Path(file).is_relative_to, folders)):
-        raise CompositionError(
+        raise MjstackError(
             f"robot.file={file}: expected a file beside a folder of the search path. If you trust"
             f" it, add {shlex.join(search_path_args([Path(file).parent]))}."
         )
@@ -223,39 +225,64 @@ def list_items(node: object, prefix: str = "") -> Iterator[tuple[str, object]]:
 
 
 @contextmanager
-def hydra_session() -> Iterator[Hydra]:
-    """A Hydra on the current search path, also inside a Hydra application of the caller's, whose
-    state comes back afterwards.
+def hydra_session() -> Iterator[Any]:
+    """Hydra's application object on the current search path, also inside a Hydra application of the
+    caller's, whose state comes back afterwards. It composes each list of overrides once, so that
+    Hydra runs the composition that was checked.
     """
     outer = Singleton.get_state()
     GlobalHydra.instance().clear()
     try:
-        setbase("1.3")
-        path = create_config_search_path(f"{_FILE}{CONFIG_FOLDER}")
-        path.get_path().pop()  # the schema, which Hydra wants last
-        for folder in config_folders():
-            path.append(PROVIDER, f"{_FILE}{folder}")
-        path.append("schema", "structured://")
-        hydra = Hydra(task_name="run", config_loader=_Loader(path))
-        GlobalHydra.instance().initialize(hydra)
+        Plugins.instance().register(_Folders)
+        # All gates of the search path are composed, as mjstack's are.
+        added = [
+            n for n in list_choices()["gate"] if not (CONFIG_FOLDER / f"gate/{n}.yaml").exists()
+        ]
+        defaults = [{f"/gate@gate.{name}": name} for name in added]
+        ConfigStore.instance().store("added_gates", {"defaults": defaults}, provider="mjstack")
+        initialize_config_dir(str(CONFIG_FOLDER), "run", version_base="1.3")
+        hydra: Any = GlobalHydra.instance().hydra
+        loader = hydra.config_loader
+        loader.load_configuration = _once(loader.load_configuration)
         yield hydra
     finally:
         Singleton.set_state(outer)
 
 
+class _Folders(SearchPathPlugin):
+    """Lets Hydra find the folders of the current search path."""
+
+    @override
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        for folder in config_folders():
+            search_path.append(PROVIDER, f"{_FILE}{folder}")
+
+
+def _once(load: Callable[..., DictConfig]) -> Callable[..., DictConfig]:
+    """Return the composition of an earlier call with the same overrides."""
+    composed: dict[tuple, DictConfig] = {}
+
+    def load_once(*, overrides: list[str], run_mode: RunMode, **options: Any) -> DictConfig:
+        key = (*overrides, run_mode)
+        if key not in composed:
+            composed[key] = load(overrides=overrides, run_mode=run_mode, **options)
+        return composed[key]
+
+    return load_once
+
+
 def compose_raw(overrides: Sequence[str]) -> DictConfig:
     """Compose on the current search path, with Hydra's own errors."""
-    with hydra_session() as hydra:
-        cfg = hydra.compose_config(CONFIG_NAME, list(overrides), RunMode.RUN, from_shell=False)
-    return without_hydra(cfg)
+    with hydra_session():
+        return compose(CONFIG_NAME, list(overrides))
 
 
 def without_hydra(cfg: DictConfig) -> DictConfig:
-    """A composition without Hydra's own part. It shares the others."""
-    own = DictConfig({})
-    shared = {name: cfg._get_node(name) for name in cfg if name != "hydra"}
-    vars(own).update(vars(cfg) | {"_content": shared})
-    return own
+    """A copy of a composition without Hydra's own part."""
+    rest = copy.deepcopy(cfg)
+    with open_dict(rest):
+        rest.pop("hydra", None)
+    return rest
 
 
 def list_choices() -> dict[str, list[str]]:
@@ -268,98 +295,28 @@ def list_choices() -> dict[str, list[str]]:
     return choices
 
 
-class _Repository(ConfigRepository):
-    """Parses a file once in a process, which is a quarter of the time of a composition."""
-
-    _parsed: ClassVar[dict[tuple, ConfigResult | None]] = {}
-
-    def load_config(self, config_path: str) -> ConfigResult | None:
-        """Load a file, or return what an earlier composition loaded, as long as it is unchanged."""
-        source = self._find_object_source(config_path, ObjectType.CONFIG)
-        if source is None or source.scheme() == "structured":
-            return super().load_config(config_path)
-        file = Path(source.path, f"{config_path.removesuffix('.yaml')}.yaml")
-        changed = file.stat().st_mtime_ns if source.scheme() == "file" else 0
-        key = (source.provider, file, changed)
-        if key not in self._parsed:
-            self._parsed[key] = super().load_config(config_path)
-        return self._parsed[key]
-
-
-class _Reader(get_yaml_loader()):  # type: ignore[misc]
-    """Reads YAML as OmegaConf does, but no aliases: a few stand for any number of values."""
-
-    def fetch_alias(self) -> None:
-        """Refuse an alias."""
-        raise yaml.YAMLError("an alias")
-
-
-class _Loader(ConfigLoaderImpl):
-    """Composes each list of overrides once: Hydra then runs the composition that was checked."""
-
-    _merged: ClassVar[dict[str, DictConfig]] = {}
-
-    def __init__(self, config_search_path: ConfigSearchPath) -> None:
-        super().__init__(config_search_path)
-        self.repository = _Repository(config_search_path)
-        self._composed: dict[tuple, DictConfig] = {}
-
-    def load_configuration(
-        self,
-        config_name: str | None,
-        overrides: list[str],
-        run_mode: RunMode,
-        from_shell: bool = True,
-        validate_sweep_overrides: bool = True,
-    ) -> DictConfig:
-        """Compose, or return the composition of an earlier call."""
-        key = (config_name, *overrides, run_mode)
-        if key not in self._composed:
-            # All gates of the search path are composed, as mjstack's are.
-            own = {path.stem for path in CONFIG_FOLDER.glob("gate/*.yaml")}
-            names = {p.stem for folder in config_folders() for p in folder.glob("gate/*.yaml")}
-            gates = [f"+gate@gate.{name}={name}" for name in sorted(names - own)]
-            cfg = super().load_configuration(
-                config_name, [*gates, *overrides], run_mode, from_shell, validate_sweep_overrides
-            )
-            said = cfg.hydra.overrides.task
-            cfg.hydra.overrides.task = [override for override in said if override not in gates]
-            self._composed[key] = cfg
-        return self._composed[key]
-
-    def _compose_config_from_defaults_list(self, defaults: list, repo: Any) -> DictConfig:
-        """Merge files, or copy what an earlier composition merged of the same content."""
-        key = str([(default, repo.load_config(default.config_path)) for default in defaults])
-        if key not in self._merged:
-            repo.cache = copy.deepcopy(repo.cache)  # the composition takes its nodes over
-            self._merged[key] = super()._compose_config_from_defaults_list(defaults, repo)
-        merged = copy.deepcopy(self._merged[key])
-        OmegaConf.clear_cache(merged)  # of ${now:...}
-        return merged
-
-
 def _checked_folder(text: str) -> Path:
     """A folder with configuration files, absolute."""
     folder = Path(text.removeprefix(_FILE)).absolute()
     if text.startswith("pkg://"):
-        raise CompositionError(
+        raise MjstackError(
             f"hydra.searchpath: found {text}, expected a folder, such as file://DIR. An installed"
             f" package registers its folder as an entry point of {ENTRY_POINTS}."
         )
     if not folder.is_dir():
-        raise CompositionError(
+        raise MjstackError(
             f"configuration folder {folder}: there is no such folder, expected one with YAML files"
             " in folders such as task/. Name an existing one."
         )
     if (folder / "conf").is_dir() and not any(folder.glob("*/*.yaml")):
-        raise CompositionError(
+        raise MjstackError(
             f"configuration folder {folder}: has no group such as task/, and its folder conf may."
             f" Name {folder / 'conf'}."
         )
     for path in sorted(folder.rglob("*.yaml")):
         name = path.relative_to(folder)
         if (CONFIG_FOLDER / name).exists():
-            raise CompositionError(
+            raise MjstackError(
                 f"{path}: {name} is mjstack's own, expected a name that mjstack does not have."
                 " Rename the file."
             )

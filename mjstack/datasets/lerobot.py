@@ -66,8 +66,8 @@ def columns_of(spec: DatasetSpec) -> dict[str, tuple[str, int]]:
     """Type and dimension of every column of the frames, in the order of info.json and of
     the files.
     """
-    own = {name: (feature.dtype, feature.dim) for name, feature in spec.features.items()}
-    return own | {name: (dtype, 1) for name, dtype in INDICES.items()}
+    columns = {name: (feature.dtype, feature.dim) for name, feature in spec.features.items()}
+    return columns | {name: (dtype, 1) for name, dtype in INDICES.items()}
 
 
 def statistics_of(spec: DatasetSpec) -> dict[str, list[int]]:
@@ -110,12 +110,10 @@ def make_info(
     ``provenance`` is that of each writer that differed from the one before, with its first episode.
     Files with numbers from ``shards`` on do not count.
     """
+    names = {name: list(feature.names) for name, feature in spec.features.items()}
     features: dict[str, Any] = {
-        name: {"dtype": feature.dtype, "shape": [feature.dim], "names": list(feature.names)}
-        for name, feature in spec.features.items()
-    }
-    features |= {
-        name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in INDICES.items()
+        name: {"dtype": dtype, "shape": [dim], "names": names.get(name)}
+        for name, (dtype, dim) in columns_of(spec).items()
     }
     features |= {name: _video_feature(video, spec.fps) for name, video in spec.videos.items()}
     return {
@@ -230,40 +228,39 @@ def image_statistics(images: np.ndarray) -> np.ndarray:
     if side >= 300:  # LeRobot leaves pixels of large images out
         images = images[:, :: side // 150, :: side // 150]
     values = np.arange(256.0)
-    found = []
+    statistics = []
     for channel in range(3):
         pixels = torch.from_numpy(np.ascontiguousarray(images[..., channel]))
         counts = torch.bincount(pixels.flatten(), minlength=256).numpy()  # NumPy's: six times it
-        seen = np.flatnonzero(counts)
+        present = np.flatnonzero(counts)
         mean = np.average(values, weights=counts)
         std = math.sqrt(np.average((values - mean) ** 2, weights=counts))
         ranks = np.cumsum(counts) / counts.sum()
         quantiles = np.searchsorted(ranks, list(QUANTILES.values()))
-        found.append([seen[0], seen[-1], mean, std, *quantiles])
-    return np.array(found).T / 255.0
+        statistics.append([present[0], present[-1], mean, std, *quantiles])
+    return np.array(statistics).T / 255.0
 
 
-def merge_statistics(
-    parts: Sequence[np.ndarray], counts: Sequence[int] | Sequence[np.ndarray]
-) -> np.ndarray:
-    """Statistics of all frames, exact but for the quantiles.
+def merge_statistics(*parts: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Statistics of all frames, exact but for the quantiles, and the number of frames of each
+    number, shape ``(dim,)``.
 
-    Those are the parts' quantiles weighted by frames, as LeRobot has them: those of all frames
-    would need all frames.
+    The quantiles are the parts' quantiles weighted by frames, as LeRobot has them: those of all
+    frames would need all frames.
 
     Args:
-        parts: Statistics of each part, as `episode_statistics` returns them.
-        counts: Frames of each, or frames of each number, each shape ``(dim,)``.
+        parts: Statistics of each part, as `episode_statistics` returns them, and frames of each
+            number, shape ``(dim,)``.
     """
-    stacked = np.stack(parts)
-    frames = np.stack([np.broadcast_to(count, stacked.shape[2]) for count in counts])
+    stacked = np.stack([statistics for statistics, _ in parts])
+    frames = np.stack([counts for _, counts in parts])
     weights = frames / frames.sum(0)
     merged = (weights[:, None] * stacked).sum(0)
     lows, highs, means, stds = stacked[:, :4].swapaxes(0, 1)
     merged[0] = lows.min(0)
     merged[1] = highs.max(0)
     merged[3] = np.sqrt((weights * (stds**2 + (means - merged[2]) ** 2)).sum(0))
-    return merged
+    return merged, frames.sum(0)
 
 
 def name_statistics(
@@ -272,14 +269,13 @@ def name_statistics(
     """Statistics ``(statistics, dim)`` by feature and name, and the number of frames that they are
     of, shape ``(dim,)``: the content of stats.json.
     """
-    named = {}
+    named: dict[str, dict[str, list]] = {}
     start = 0
     for name, shape in statistics_of(spec).items():
-        dim = shape[0]
-        values = statistics[:, start : start + dim].reshape(-1, *shape).tolist()
-        count = {"count": [int(counts[start])]}
-        named[name] = dict(zip(STATISTICS, values, strict=True)) | count
-        start += dim
+        values = statistics[:, start : start + shape[0]].reshape(-1, *shape).tolist()
+        named[name] = dict(zip(STATISTICS, values, strict=True))
+        named[name]["count"] = [int(counts[start])]
+        start += shape[0]
     return named
 
 
@@ -291,16 +287,11 @@ def row_statistics(spec: DatasetSpec, row: Mapping[str, Any]) -> tuple[np.ndarra
         Exception: The row has others.
     """
     shapes = statistics_of(spec)
-    found = np.array(
-        [
-            np.concatenate([np.ravel(row[f"stats/{name}/{kind}"]) for name in shapes])
-            for kind in STATISTICS
-        ],
-        dtype=float,
-    )
+    rows = [[np.ravel(row[f"stats/{name}/{kind}"]) for name in shapes] for kind in STATISTICS]
+    statistics = np.array([np.concatenate(values) for values in rows], dtype=float)
     counts = np.concatenate([row[f"stats/{name}/count"] * shapes[name][0] for name in shapes])
     dims = sum(shape[0] for shape in shapes.values())
-    whole = found.shape == (len(STATISTICS), dims) and counts.shape == (dims,)
-    if not whole or not np.isfinite(found).all() or counts.min() < 1:
+    whole = statistics.shape == (len(STATISTICS), dims) and counts.shape == (dims,)
+    if not whole or not np.isfinite(statistics).all() or counts.min() < 1:
         raise ValueError(f"statistics of episode {row['episode_index']}")
-    return found, counts
+    return statistics, counts

@@ -121,10 +121,10 @@ class PartWriter:
         # float64 holds every type's values exactly, but int64's beyond 2^53.
         joined = np.concatenate([columns[name] for name in table.column_names], axis=1, dtype=float)
         named = self._statistics(joined, episode)
-        shown = sum(row["length"] for row in self.part.rows)  # frames before it in the videos
+        before = sum(row["length"] for row in self.part.rows)  # frames before it in the videos
         times = {
-            "from_timestamp": shown / self._spec.fps,
-            "to_timestamp": (shown + length) / self._spec.fps,
+            "from_timestamp": before / self._spec.fps,
+            "to_timestamp": (before + length) / self._spec.fps,
         }
         place = lerobot.shard_indices(0)  # the commit knows it
         self.part.rows.append(
@@ -158,8 +158,8 @@ class PartWriter:
         for name in self._spec.videos:
             statistics.append(lerobot.image_statistics(episode.images[name][sampled]))
             counts += [len(sampled)] * 3
-        every = np.concatenate(statistics, axis=1)
-        return lerobot.name_statistics(self._spec, every, np.array(counts))
+        joined = np.concatenate(statistics, axis=1)
+        return lerobot.name_statistics(self._spec, joined, np.array(counts))
 
     def complete(self) -> Part:
         """Close the files; they are on the disk then."""

@@ -12,7 +12,7 @@ import numpy as np
 from mjstack.datasets import lerobot
 from mjstack.datasets.spec import DatasetSpec, Video
 from mjstack.datasets.video import decode
-from mjstack.errors import DatasetError, UnknownName
+from mjstack.errors import FolderError, UnknownName
 from mjstack.files import reading
 
 
@@ -44,14 +44,16 @@ class StoredDataset:
 
         Raises:
             UnknownName: There are no such images.
-            DatasetError: There is no such episode, or a file is missing or damaged.
+            FolderError: There is no such episode, or a file is missing or damaged.
         """
         videos = _videos(self.info)
         if name not in videos:
             raise UnknownName("video", name, videos)
         if not 0 <= episode < len(self.episodes):
-            found = f"{self.folder} has {len(self.episodes)} episodes"
-            raise DatasetError(f"{found}, expected one with number {episode}. Give a smaller one")
+            raise FolderError(
+                f"{self.folder} has {len(self.episodes)} episodes, expected one with number"
+                f" {episode}. Give a smaller one"
+            )
         row = self.episodes[episode]
         place = {key: row[f"videos/{name}/{key}"] for key in ("chunk_index", "file_index")}
         path = self.folder / lerobot.VIDEO.format(video_key=name, **place)
@@ -71,12 +73,12 @@ class StoredDataset:
 
         Raises:
             UnknownName: There is no such column.
-            DatasetError: A file is missing or damaged.
+            FolderError: A file is missing or damaged.
         """
         videos = _videos(self.info)
-        features = {k: each for k, each in self.info["features"].items() if k not in videos}
-        if name not in features:
-            raise UnknownName("feature", name, features)
+        features = self.info["features"]
+        if name not in features or name in videos:
+            raise UnknownName("feature", name, features.keys() - videos.keys())
         dtype = features[name]["dtype"]
         shape = features[name]["shape"]
         parts = [np.empty((0, *shape), dtype)]
@@ -85,8 +87,7 @@ class StoredDataset:
             with readable(path):
                 column = _read_table(path, [name])[name]
                 values = column.combine_chunks()
-                if shape != [1]:
-                    values = values.flatten()
+                values = values if shape == [1] else values.flatten()
                 part = values.to_numpy(zero_copy_only=False).reshape(len(column), *shape)
                 if part.dtype != dtype:
                     raise ValueError(f"{name} is {part.dtype}")
@@ -98,13 +99,13 @@ def read_dataset(folder: Path | str) -> StoredDataset:
     """Open a dataset to read from it.
 
     Raises:
-        DatasetError: There is none, or a file is missing or damaged.
+        FolderError: There is none, or a file is missing or damaged.
     """
     lerobot.require_pyarrow()
     folder = Path(folder)
     info = read_info(folder)
     if info is None:
-        raise DatasetError(f"{folder} has no {lerobot.INFO}, expected a dataset. Give its folder")
+        raise FolderError(f"{folder} has no {lerobot.INFO}, expected a dataset. Give its folder")
     rows = [
         {name: value for name, value in row.items() if not name.startswith("stats/")}
         for row in read_rows(folder, info)
@@ -116,17 +117,17 @@ def read_info(folder: Path) -> dict[str, Any] | None:
     """The content of info.json, or None where no dataset has been begun.
 
     Raises:
-        DatasetError: It cannot be read, was not written by mjstack, or is missing beside other
+        FolderError: It cannot be read, was not written by mjstack, or is missing beside other
             files.
     """
     path = folder / lerobot.INFO
     if not path.is_file():
         begun = f".{path.name}."
-        for found in folder.rglob("*"):
-            if found.is_file() and not found.name.startswith(begun):
-                raise DatasetError(
-                    f"{folder} has {found.relative_to(folder)} and no {lerobot.INFO}, expected a"
-                    " dataset or an empty folder. Give another"
+        for file in folder.rglob("*"):
+            if file.is_file() and not file.name.startswith(begun):
+                raise FolderError(
+                    f"{folder} has {file.relative_to(folder)} and no {lerobot.INFO}, expected a"
+                    " dataset or an empty folder. Give anfile"
                 )
         return None
     with readable(path):
@@ -138,11 +139,11 @@ def read_info(folder: Path) -> dict[str, Any] | None:
 def _check_types(info: Any) -> None:
     """Raise an error of any kind where info.json is not what `make_info` makes."""
     empty = lerobot.make_info(DatasetSpec(robot_type="", fps=1, features={}, config_sha256=""))
-    for found, wanted in ((info, empty), (info["mjstack"], empty["mjstack"])):
-        for name, value in wanted.items():
+    for block, model in ((info, empty), (info["mjstack"], empty["mjstack"])):
+        for name, value in model.items():
             kinds = type(value) if name != "video_path" else str | None
-            if not isinstance(found[name], kinds) or isinstance(found[name], bool):
-                raise ValueError(f"{name} is {found[name]!r:.60}")
+            if not isinstance(block[name], kinds) or isinstance(block[name], bool):
+                raise ValueError(f"{name} is {block[name]!r:.60}")
     _videos(info)
     for feature in info["features"].values():
         dtype = "uint8" if feature["dtype"] == "video" else feature["dtype"]
@@ -165,28 +166,28 @@ def check_same(folder: Path, info: dict[str, Any], spec: DatasetSpec) -> None:
     """Raise where a dataset is not the one that a spec describes.
 
     Raises:
-        DatasetError: It has another configuration, or other columns.
+        FolderError: It has another configuration, or other columns.
     """
-    theirs = _identity(info)
-    ours = _identity(lerobot.make_info(spec))
-    for key in theirs | ours:
-        if theirs.get(key) != ours.get(key):
-            raise DatasetError(
-                f"{folder} has {key}={theirs.get(key)}, expected {ours.get(key)}. Give another"
+    stored = _identity(info)
+    expected = _identity(lerobot.make_info(spec))
+    for key in stored | expected:
+        if stored.get(key) != expected.get(key):
+            raise FolderError(
+                f"{folder} has {key}={stored.get(key)}, expected {expected.get(key)}. Give another"
                 " folder, or what it was begun with"
             )
 
 
 def _identity(info: dict[str, Any]) -> dict[str, Any]:
     """Everything of info.json that stays while a dataset grows."""
-    own = info["mjstack"]
+    block = info["mjstack"]
     keys = ("codebase_version", "robot_type", "fps", "chunks_size")
     return {
-        "config_sha256": own["config_sha256"],
+        "config_sha256": block["config_sha256"],
         **{key: info[key] for key in keys},
         **{f"features['{name}']": feature for name, feature in info["features"].items()},
-        **{f"units['{name}']": units for name, units in own["units"].items()},
-        "values": own["values"],
+        **{f"units['{name}']": units for name, units in block["units"].items()},
+        "values": block["values"],
     }
 
 
@@ -194,7 +195,7 @@ def read_tasks(folder: Path, info: dict[str, Any]) -> list[str]:
     """Texts of the tasks that count, by index.
 
     Raises:
-        DatasetError: The file is missing or damaged.
+        FolderError: The file is missing or damaged.
     """
     count = info["total_tasks"]
     if not count:
@@ -211,7 +212,7 @@ def read_rows(folder: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
     """Rows of every episode that counts, in order.
 
     Raises:
-        DatasetError: A file is missing or damaged, or has other episodes or frames than it should.
+        FolderError: A file is missing or damaged, or has other episodes or frames than it should.
     """
     rows: list[dict[str, Any]] = []
     frames = 0
@@ -234,38 +235,33 @@ def read_rows(folder: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
                 images.stat()
         with readable(path):
             frames += lerobot.require_pyarrow()[1].read_metadata(path).num_rows
-    found = (len(rows), frames)
-    expected = (info["total_episodes"], info["total_frames"])
-    if found != expected:
-        raise DatasetError(
-            f"{folder} has {found[0]} episodes and {found[1]} frames, expected {expected[0]} and"
-            f" {expected[1]} as {lerobot.INFO} says. Restore its files, or give another folder"
+    episodes = info["total_episodes"]
+    if (len(rows), frames) != (episodes, info["total_frames"]):
+        raise FolderError(
+            f"{folder} has {len(rows)} episodes and {frames} frames, expected {episodes} and"
+            f" {info['total_frames']} as {lerobot.INFO} says. Restore its files, or give another"
+            " folder"
         )
     return rows
 
 
 def uncommitted(folder: Path, shards: int) -> list[Path]:
     """Files that an interrupted writer left: shards from this number on, and hidden ones."""
+    videos = [(lerobot.VIDEO, video.name) for video in folder.glob("videos/*")]
     counted = {
-        lerobot.shard_path(folder, files, shard)
-        for files in (lerobot.DATA, lerobot.EPISODES)
+        lerobot.shard_path(folder, files, shard, video)
+        for files, video in [(lerobot.DATA, ""), (lerobot.EPISODES, ""), *videos]
         for shard in range(shards)
     }
-    counted |= {
-        lerobot.shard_path(folder, lerobot.VIDEO, shard, video.name)
-        for video in folder.glob("videos/*")
-        for shard in range(shards)
-    }
-    places = [
+    places = {"data": "parquet", "meta/episodes": "parquet", "videos/*": "mp4"}
+    patterns = [
         f"{place}/chunk-*/{name}"
-        for place in ("data", "meta/episodes")
-        for name in ("file-*.parquet", ".file-*.parquet*")
+        for place, ending in places.items()
+        for name in (f"file-*.{ending}", f".file-*.{ending}*")
     ]
-    places += [f"videos/*/chunk-*/{name}" for name in ("file-*.mp4", ".file-*.mp4*")]
-    places += [
-        f"meta/.{Path(name).name}.*" for name in (lerobot.INFO, lerobot.STATS, lerobot.TASKS)
-    ]
-    return [path for place in places for path in folder.glob(place) if path not in counted]
+    totals = (lerobot.INFO, lerobot.STATS, lerobot.TASKS)
+    patterns += [f"meta/.{Path(name).name}.*" for name in totals]
+    return [path for name in patterns for path in folder.glob(name) if path not in counted]
 
 
 def _read_table(path: Path, columns: Sequence[str] | None = None) -> Any:
@@ -273,5 +269,5 @@ def _read_table(path: Path, columns: Sequence[str] | None = None) -> Any:
 
 
 def readable(path: Path) -> AbstractContextManager[None]:
-    """Raise a `DatasetError` for whatever goes wrong with a file inside."""
-    return reading(path, DatasetError, "Restore it, or give another folder")
+    """Raise a `FolderError` for whatever goes wrong with a file inside."""
+    return reading(path, "Restore it, or give another folder")

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mjstack.errors import ArgumentError, DatasetError
+from mjstack.errors import ArgumentError, FolderError
 
 CODECS = ("h264", "av1")
 DTYPES = ("float32", "float64", "int32", "int64", "bool")
@@ -115,9 +115,9 @@ class DatasetSpec:
             if video.codec not in CODECS:
                 raise ArgumentError(f"{label}.codec", video.codec, f"one of {', '.join(CODECS)}")
             if min(video.height, video.width) < 2 or video.height % 2 or video.width % 2:
-                found = f"{video.height}x{video.width}"
+                size = f"{video.height}x{video.width}"
                 expected = "even numbers of pixels, because a video halves the resolution of colour"
-                raise ArgumentError(label, found, expected)
+                raise ArgumentError(label, size, expected)
         for name, dtype in self.values.items():
             if dtype not in VALUE_DTYPES:
                 raise ArgumentError(f"values['{name}']", dtype, f"one of {', '.join(VALUE_DTYPES)}")
@@ -172,76 +172,65 @@ def typed_episode(
     its frames, each ``(frames, dim)``, in the order of the features.
 
     Raises:
-        DatasetError: A value, a feature or images are missing, unknown, of another shape or type,
+        FolderError: A value, a feature or images are missing, unknown, of another shape or type,
             or not finite.
     """
     where = f"episode of seed {episode.seed}, world {episode.world}"
-    values = _typed_values(where, spec, episode)
-    arrays = _typed_arrays(where, spec, episode)
-    _check_images(where, spec, episode, len(next(iter(arrays.values()))))
-    return values, arrays
+    for noun, names, expected in (
+        ("value", episode.values, spec.values),
+        ("feature", episode.arrays, spec.features),
+        ("video", episode.images, spec.videos),
+    ):
+        if names.keys() != expected.keys():
+            raise FolderError(
+                f"{where}: {noun} names are {', '.join(names) or 'missing'}, expected"
+                f" {', '.join(expected)}. Give these, or change the DatasetSpec"
+            )
 
+    # Values of the row
+    values = {name: getattr(episode, name) for name in OWN_VALUES} | dict(episode.values)
+    row = {}
+    for name, dtype in {**OWN_VALUES, **spec.values}.items():
+        kinds, convert = VALUE_DTYPES[dtype]
+        if not isinstance(values[name], kinds):
+            raise FolderError(
+                f"{where}: {name} is {values[name]!r}, expected {dtype}. Convert it, or change the"
+                " DatasetSpec"
+            )
+        row[name] = convert(values[name])
 
-def _typed_arrays(where: str, spec: DatasetSpec, episode: EpisodeData) -> dict[str, np.ndarray]:
-    _check_names(where, "feature", episode.arrays, spec.features)
+    # Frames
     frames = len(episode.arrays[next(iter(spec.features))])
     typed = {}
     for name, feature in spec.features.items():
         array = np.asarray(episode.arrays[name])
         rows = array[:, None] if array.ndim == feature.dim == 1 else array
         if rows.shape != (frames, feature.dim) or not frames:
-            raise DatasetError(
+            raise FolderError(
                 f"{where}: {name} has shape {array.shape}, expected ({frames or 'frames'},"
                 f" {feature.dim}). Give every frame's {name}"
             )
         if not np.can_cast(rows.dtype, feature.dtype, "same_kind"):
-            raise DatasetError(
+            raise FolderError(
                 f"{where}: {name} is {rows.dtype}, expected {feature.dtype}. Convert it, or change"
                 " the feature"
             )
         with np.errstate(over="ignore"):
             typed[name] = np.ascontiguousarray(rows, dtype=feature.dtype)
-        bad = np.flatnonzero(~np.isfinite(typed[name]).all(axis=1))
-        if len(bad):
-            raise DatasetError(
-                f"{where}: {name} is not finite in {len(bad)} of {frames} frames (first: {bad[0]}),"
-                f" expected finite {feature.dtype}. Leave the episode out"
+        infinite = np.flatnonzero(~np.isfinite(typed[name]).all(axis=1))
+        if len(infinite):
+            raise FolderError(
+                f"{where}: {name} is not finite in {len(infinite)} of {frames} frames (first:"
+                f" {infinite[0]}), expected finite {feature.dtype}. Leave the episode out"
             )
-    return typed
 
-
-def _check_images(where: str, spec: DatasetSpec, episode: EpisodeData, frames: int) -> None:
-    _check_names(where, "video", episode.images, spec.videos)
+    # Images
     for name, video in spec.videos.items():
         images = episode.images[name]
         shape = (frames, video.height, video.width, 3)
         if images.shape != shape or images.dtype != np.uint8:
-            raise DatasetError(
+            raise FolderError(
                 f"{where}: {name} is {images.dtype} of shape {images.shape}, expected uint8 of"
                 f" {shape}. Give an image for every frame"
             )
-
-
-def _typed_values(where: str, spec: DatasetSpec, episode: EpisodeData) -> dict[str, Any]:
-    _check_names(where, "value", episode.values, spec.values)
-    values = {name: getattr(episode, name) for name in OWN_VALUES} | dict(episode.values)
-    row = {}
-    for name, dtype in {**OWN_VALUES, **spec.values}.items():
-        kinds, convert = VALUE_DTYPES[dtype]
-        if not isinstance(values[name], kinds):
-            raise DatasetError(
-                f"{where}: {name} is {values[name]!r}, expected {dtype}. Convert it, or change the"
-                " DatasetSpec"
-            )
-        row[name] = convert(values[name])
-    return row
-
-
-def _check_names(
-    where: str, what: str, found: Mapping[str, Any], expected: Mapping[str, Any]
-) -> None:
-    if found.keys() != expected.keys():
-        raise DatasetError(
-            f"{where}: {what} names are {', '.join(found) or 'missing'}, expected"
-            f" {', '.join(expected)}. Give these, or change the DatasetSpec"
-        )
+    return row, typed

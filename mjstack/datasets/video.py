@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from mjstack.datasets.spec import Video
-from mjstack.errors import DatasetError, MissingExtra, first_line
+from mjstack.errors import FolderError, MissingExtra, first_line
 
 # Settings of each codec. One thread for each encoder: there are as many as cores, and the result is
 # the same everywhere.
@@ -42,9 +42,9 @@ def encode(images: np.ndarray, fps: int, codec: str, path: Path | None = None) -
     """
     height, width = images.shape[1:3]
     size = ["-s", f"{width}x{height}", "-r", str(fps)]
-    kept = ["-f", "null", "-"] if path is None else ["-f", "mp4", str(path)]
+    output = ["-f", "null", "-"] if path is None else ["-f", "mp4", str(path)]
     encoder = ["-c:v", *_ENCODERS[codec], *_GROUP, "-pix_fmt", "yuv420p"]
-    _ffmpeg([*_PIXELS, *size, "-i", "-", *encoder, *kept], np.ascontiguousarray(images).data)
+    _ffmpeg([*_PIXELS, *size, "-i", "-", *encoder, *output], np.ascontiguousarray(images).data)
 
 
 def join(paths: Sequence[Path], path: Path) -> None:
@@ -54,7 +54,8 @@ def join(paths: Sequence[Path], path: Path) -> None:
         OSError: The file cannot be written.
     """
     listed = path.with_name(f"{path.name}.txt")
-    listed.write_text("".join(f"file '{os.path.relpath(each, path.parent)}'\n" for each in paths))
+    lines = [f"file '{os.path.relpath(part, path.parent)}'\n" for part in paths]
+    listed.write_text("".join(lines))
     source = ["-f", "concat", "-safe", "0", "-i", str(listed)]
     _ffmpeg([*source, "-c", "copy", "-f", "mp4", str(path)])
     listed.unlink()
@@ -77,8 +78,7 @@ def decode(path: Path, video: Video, start: float, frames: int, fps: int) -> np.
         OSError: The file cannot be read.
     """
     seek = ["-ss", f"{max(0.0, start - 0.5 / fps):.6f}"]
-    taken = ["-frames:v", str(frames), *_PIXELS, "-"]
-    content = _ffmpeg([*seek, "-i", str(path), *taken])
+    content = _ffmpeg([*seek, "-i", str(path), "-frames:v", str(frames), *_PIXELS, "-"])
     shape = (frames, video.height, video.width, 3)
     if len(content) != np.prod(shape):
         raise OSError(errno.EIO, f"{len(content)} bytes of images, expected {np.prod(shape)}")
@@ -90,14 +90,14 @@ def check_encoder(videos: Mapping[str, Video], fps: int) -> None:
 
     Raises:
         MissingExtra: The package with the encoder is not installed.
-        DatasetError: It cannot encode them.
+        FolderError: It cannot encode them.
     """
     for name, video in videos.items():
         images = np.zeros((4, video.height, video.width, 3), np.uint8)
         try:
             encode(images, fps, video.codec)
         except OSError as error:
-            raise DatasetError(
+            raise FolderError(
                 f"{name}: {video.height}x{video.width} pixels in {video.codec} cannot be encoded"
                 f" ({error.strerror or first_line(error)}), expected an encoder for them."
                 " Choose another codec or size, or unset IMAGEIO_FFMPEG_EXE"
@@ -112,22 +112,19 @@ def _ffmpeg(arguments: Sequence[str], content: memoryview | None = None) -> byte
         program = imageio_ffmpeg.get_ffmpeg_exe()
     except (ImportError, RuntimeError) as error:  # the package, or the program inside
         raise MissingExtra("a dataset with images", "imageio-ffmpeg", "video") from error
-    command = [program, "-nostdin", "-loglevel", "error", "-y", *arguments]
-    quiet = {"SVT_LOG": "1"}
     done = subprocess.run(
-        command,
-        input=content,
-        stdin=subprocess.DEVNULL if content is None else None,
+        [program, "-nostdin", "-loglevel", "error", "-y", *arguments],
+        input=content or b"",
         capture_output=True,
         start_new_session=True,
-        env=os.environ | quiet,
+        env=os.environ | {"SVT_LOG": "1"},  # quiet
     )
     if done.returncode:
-        lines = done.stderr.decode(errors="replace").strip().splitlines()
-        full = any(os.strerror(errno.ENOSPC) in line for line in lines)
-        said = lines[0] if lines else f"status {done.returncode}"
-        reason = os.strerror(errno.ENOSPC) if full else f"ffmpeg: {said}"
-        raise OSError(errno.ENOSPC if full else errno.EIO, reason)
+        text = done.stderr.decode(errors="replace").strip()
+        if os.strerror(errno.ENOSPC) in text:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        line = text.splitlines()[0] if text else f"status {done.returncode}"
+        raise OSError(errno.EIO, f"ffmpeg: {line}")
     return done.stdout
 
 
@@ -157,8 +154,7 @@ class VideoEncoder:
         self._most = most
         self._pool = ThreadPoolExecutor(os.cpu_count() or 1, "encoder")
         self._parts: dict[str, list[Path]] = {name: [] for name in videos}
-        self._running: deque[tuple[Future[None], int]] = deque()
-        self._waiting = 0  # bytes
+        self._running: deque[tuple[Future[None], int]] = deque()  # with bytes of images
 
     def add(self, images: Mapping[str, np.ndarray]) -> None:
         """Begin to encode an episode. Waits while too many images are there.
@@ -173,8 +169,9 @@ class VideoEncoder:
             parts.append(whole.with_name(f"{whole.name}.{len(parts):06d}"))
             work = self._pool.submit(encode, images[name], self._fps, video.codec, parts[-1])
             self._running.append((work, images[name].nbytes))
-            self._waiting += images[name].nbytes
-        while self._running and (self._waiting > self._most or self._running[0][0].done()):
+        while self._running and (
+            sum(size for _, size in self._running) > self._most or self._running[0][0].done()
+        ):
             self._finish_one()
 
     def megabytes(self) -> float:
@@ -208,8 +205,7 @@ class VideoEncoder:
                 path.unlink(missing_ok=True)
 
     def _finish_one(self) -> None:
-        work, size = self._running.popleft()
+        work, _ = self._running.popleft()
         began = time.perf_counter()
         work.result()
         self.waited += time.perf_counter() - began
-        self._waiting -= size

@@ -23,7 +23,7 @@ from mjstack.datasets.reader import (
     uncommitted,
 )
 from mjstack.datasets.spec import DatasetSpec, EpisodeData, typed_episode
-from mjstack.errors import DatasetError, UnwrittenError
+from mjstack.errors import FolderError
 from mjstack.files import lock_folder, write_atomic
 
 
@@ -67,9 +67,9 @@ class DatasetWriter:
             images_gib: Images that may wait for being encoded [GiB].
 
         Raises:
-            DatasetError: Something else is there, or a dataset of another configuration.
+            FolderError: Something else is there, or a dataset of another configuration.
             FolderError: Another process is writing it.
-            UnwrittenError: The folder cannot be written.
+            FolderError: The folder cannot be written.
         """
         self._pa, self._parquet = lerobot.require_pyarrow()
         self.folder = Path(folder)
@@ -83,17 +83,25 @@ class DatasetWriter:
         self._shards = 0
         self._provenance: list[dict[str, Any]] = []
         self._tasks: dict[str, int] = {}
-        self._statistics = np.empty(0)  # of the committed frames
-        self._counts = np.zeros(0, dtype=int)  # frames that each of them is of
+        # Statistics of the committed frames, and the number of frames of each number
+        self._statistics: tuple[np.ndarray, np.ndarray] | None = None
         self._part: PartWriter | None = None  # since the last commit
         if self.folder.exists() and not self.folder.is_dir():
-            raise DatasetError(f"{folder} is a file, expected a folder. Give another")
+            raise FolderError(f"{folder} is a file, expected a folder. Give another")
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             self._unlock = weakref.finalize(self, os.close, lock_folder(self.folder))
             self._resume()
         except OSError as error:
-            raise UnwrittenError(str(folder), error, len(self.committed)) from error
+            raise self._unwritten(error) from error
+
+    def _unwritten(self, error: OSError) -> FolderError:
+        """The error of a dataset that cannot be written any further, such as on a full disk."""
+        return FolderError(
+            f"{self.folder}: cannot be written ({error.strerror or error}): {len(self.committed)}"
+            " committed episodes are kept, those added since are not. Make room or correct it, and"
+            " do the same again: it goes on after the last one kept."
+        )
 
     def __enter__(self) -> "DatasetWriter":
         return self
@@ -109,12 +117,6 @@ class DatasetWriter:
         """Episodes that were added and are not committed yet."""
         return len(self._part.part.rows) if self._part is not None else 0
 
-    @property
-    def added(self) -> list[tuple[int, int]]:
-        """Seed and world of every episode that was added, committed or not."""
-        rows = self._part.part.rows if self._part is not None else []
-        return self.committed + [(row["seed"], row["world"]) for row in rows]
-
     def add(self, episodes: Sequence[EpisodeData]) -> None:
         """Add finished episodes; a batch that does not fit is refused as a whole.
 
@@ -122,18 +124,19 @@ class DatasetWriter:
             episodes: One or many; all of them are checked before the first is written.
 
         Raises:
-            DatasetError: An episode does not fit the spec, or has a number that is not finite.
-            UnwrittenError: It cannot be written; the writer is closed, and what was committed is
+            FolderError: An episode does not fit the spec, or has a number that is not finite.
+            FolderError: It cannot be written; the writer is closed, and what was committed is
                 kept.
         """
         self._check_open()
         checked = [typed_episode(self.spec, episode) for episode in episodes]
         for episode, (facts, columns) in zip(episodes, checked, strict=True):
-            with self._guarded():
+            with self.guarded():
                 if self._part is None:
                     name = f"{self._shards:06d}"
-                    room = self._images_gib
-                    self._part = PartWriter(self.folder, self.spec, name, images_gib=room)
+                    self._part = PartWriter(
+                        self.folder, self.spec, name, images_gib=self._images_gib
+                    )
                 rows = self._part.part.rows
                 number = len(self.committed) + len(rows)
                 start = rows[-1]["dataset_to_index"] if rows else self.frames
@@ -146,30 +149,29 @@ class DatasetWriter:
         """Commit what was added.
 
         Raises:
-            UnwrittenError: It cannot be written; the writer is closed, and what was committed
+            FolderError: It cannot be written; the writer is closed, and what was committed
                 before is kept.
         """
-        self._check_open()
-        if self._part is not None and self.pending:
-            with self._guarded():
-                self._commit([self._part.complete()])
-                self._part = None
+        self.commit([])
 
     def number_task(self, task: str) -> int:
         """The number of a task in the dataset; a new one gets the next."""
         return self._tasks.setdefault(task, len(self._tasks))
 
     def commit(self, parts: Sequence[Part]) -> None:
-        """Commit files that other writers have completed, whose episodes follow the committed ones
-        and one another.
+        """Commit what was added, and files that other writers have completed, whose episodes follow
+        those and one another.
 
         Raises:
-            UnwrittenError: As of `flush`.
+            FolderError: As of `flush`.
         """
         self._check_open()
-        self.flush()
-        with self._guarded():
-            self._commit(parts)
+        with self.guarded():
+            if self._part is not None:
+                parts = [self._part.complete(), *parts]
+                self._part = None
+            if parts:
+                self._commit(parts)
 
     def close(self) -> None:
         """Commit what was added, and let another writer in."""
@@ -182,14 +184,13 @@ class DatasetWriter:
 
     def _resume(self) -> None:
         """Count what is committed, and clear away what is not."""
-        own = ("data", "data/*", "meta", "meta/*", "meta/episodes/*")
-        for pattern in (*own, "videos", "videos/*", "videos/*/*"):
-            for path in self.folder.glob(pattern):
-                if path.is_symlink():
-                    raise DatasetError(
-                        f"{path} is a link, expected a folder or file of the dataset's own",
-                        "Write into another folder",
-                    )
+        patterns = "data data/* meta meta/* meta/episodes/* videos videos/* videos/*/*"
+        for path in [path for name in patterns.split() for path in self.folder.glob(name)]:
+            if path.is_symlink():
+                raise FolderError(
+                    f"{path} is a link, expected a folder or file of the dataset's own",
+                    "Write into another folder",
+                )
         info = read_info(self.folder)
         if info is not None:
             check_same(self.folder, info, self.spec)
@@ -242,21 +243,18 @@ class DatasetWriter:
 
     def _count(self, row: dict[str, Any]) -> None:
         """Count an episode by its row."""
-        statistics, counts = lerobot.row_statistics(self.spec, row)
-        if self.frames:
-            parts = (self._statistics, statistics)
-            statistics = lerobot.merge_statistics(parts, (self._counts, counts))
-            counts = self._counts + counts
+        statistics = lerobot.row_statistics(self.spec, row)
+        if self._statistics is not None:
+            statistics = lerobot.merge_statistics(self._statistics, statistics)
         self._statistics = statistics
-        self._counts = counts
         self.frames += row["length"]
         self.committed.append((row["seed"], row["world"]))
 
     def _write_totals(self) -> None:
         """Write statistics, and last the file that says what counts."""
         (self.folder / "meta").mkdir(exist_ok=True)
-        if self.committed:
-            stats = lerobot.name_statistics(self.spec, self._statistics, self._counts)
+        if self._statistics is not None:
+            stats = lerobot.name_statistics(self.spec, *self._statistics)
             write_atomic(self.folder / lerobot.STATS, lerobot.to_json(stats))
         info = lerobot.make_info(
             self.spec,
@@ -271,15 +269,15 @@ class DatasetWriter:
 
     def _check_open(self) -> None:
         if not self._open:
-            raise DatasetError(
+            raise FolderError(
                 f"{self.folder}: the writer is closed, expected an open one. Make another, which"
                 " goes on"
             )
 
     @contextlib.contextmanager
-    def _guarded(self) -> Iterator[None]:
+    def guarded(self) -> Iterator[None]:
         """If something goes wrong, close the writer and remove what is not committed."""
-        kept = len(self.committed)
+        episodes = len(self.committed)
         frames = self.frames
         try:
             yield
@@ -288,11 +286,11 @@ class DatasetWriter:
             if self._part is not None:
                 self._part.abandon()
                 self._part = None
-            del self.committed[kept:]
+            del self.committed[episodes:]
             self.frames = frames
             info = read_info(self.folder)
             for path in uncommitted(self.folder, info["mjstack"]["shards"] if info else 0):
                 path.unlink()
             if isinstance(error, OSError):
-                raise UnwrittenError(str(self.folder), error, kept) from error
+                raise self._unwritten(error) from error
             raise

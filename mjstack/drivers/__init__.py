@@ -1,1 +1,3 @@
-"""Drivers: they give the joint targets of every step."""
+"""Drivers: they give the actions of every step."""
+
+import mjstack.report.gl  # noqa: F401  (before mujoco)

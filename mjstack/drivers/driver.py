@@ -1,19 +1,20 @@
-"""Drivers give the joint targets of every world, step by step, and the phase of each world."""
+"""Drivers give the actions of every world, step by step, and the phase of each world."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 
-from mjstack.config.schema import Config
+from mjstack.config.schema import Config, TermCfg
 from mjstack.drivers.open_loop import JointTrajectory
 from mjstack.errors import ArgumentError
 from mjstack.scene.phases import Phase
 
 
 class Driver(ABC):
-    """Gives the joint targets of every world, one step at a time. Fixed shapes, no host read: a
-    captured graph may hold it.
+    """Gives the actions of every world, one step at a time. Fixed shapes, no host read: a captured
+    graph may hold it. The actions are those of its environment's terms: joint targets of an expert
+    or a plan.
 
     Attributes:
         phases: The phases, laid out as a world without a retry goes through them. Empty for a
@@ -37,62 +38,46 @@ class Driver(ABC):
 
     @abstractmethod
     def command(self) -> torch.Tensor:
-        """Commands of the next step, shape ``(nworld, nu)``."""
+        """Actions of the next step, shape ``(nworld, action_dim)``."""
 
 
-def require_joint_targets(cfg: Config, expected: str) -> None:
-    """Check that an environment takes absolute joint targets in every control step.
+def require_actions(cfg: Config, terms: Mapping[str, TermCfg], expected: str) -> None:
+    """Check that an environment takes a driver's actions in every control step.
 
     Args:
         cfg: Its configuration.
+        terms: The driver's action terms.
         expected: Words for such actions.
 
     Raises:
-        ArgumentError: It takes other actions, or holds them.
+        ArgumentError: It has other action terms, or repeats an action.
     """
-    if list(cfg.action.values()) != list(cfg.controller.action.values()):
-        fix = "Build it with action=joint_absolute"
-        raise ArgumentError("env", "other actions", expected, fix)
-    held = cfg.timing.policy_decimation
-    if held > 1:
+    if list(cfg.action.values()) != list(terms.values()):
+        targets = terms == cfg.controller.action
+        fix = "action=joint_absolute" if targets else "the action terms of its policy.json"
+        raise ArgumentError("env", "other actions", expected, f"Build it with {fix}")
+    repeats = cfg.timing.policy_decimation
+    if repeats > 1:
         expected = "one for each, which a driver gives"
         fix = "Build it with timing.policy_decimation=1"
-        raise ArgumentError("env", f"actions for {held} control steps", expected, fix)
+        raise ArgumentError("env", f"actions for {repeats} control steps", expected, fix)
 
 
 class Recorded(Driver):
-    """Joint targets of an episode of another driver, to be given again.
+    """Joint targets of an episode of another driver, given again.
 
     Memory: ``steps * nworld * (4 * nu + 2)`` bytes on the device, 0.85 GB for 2,000 steps of 16,384
     worlds with six joint targets. ``job=replay`` needs none of it: it plays a world from its seed.
     """
 
-    def __init__(self, source: Driver, nu: int) -> None:
-        """Allocate for the worlds and steps of a driver, whose commands are nu wide; NaN until they
-        are written.
-        """
-        nworld = len(source.phase)
-        device = source.phase.device
-        super().__init__(nworld, source.steps, device, source.phases)
+    def __init__(self, source: Driver, commands: torch.Tensor, phases: torch.Tensor) -> None:
+        """Take the driver, its commands ``(steps, nworld, nu)`` and phases ``(steps, nworld)``."""
+        super().__init__(len(source.phase), source.steps, source.phase.device, source.phases)
         self.error = source.error
         self.retries = source.retries
-        shape = (self.steps, nworld, nu)
-        self._commands = torch.full(shape, torch.nan, dtype=torch.float32, device=device)
-        self._phases = torch.zeros((self.steps, nworld), dtype=torch.int16, device=device)
-        self._next = torch.zeros(1, dtype=torch.int64, device=device)
-
-    def append(self, command: torch.Tensor, phase: torch.Tensor) -> None:
-        """Take the next step's command, ``(nworld, nu)``, and phase, ``(nworld,)``. No
-        host read.
-        """
-        self._commands.index_copy_(0, self._next, command[None].float())
-        self._phases.index_copy_(0, self._next, phase[None].to(torch.int16))
-        self._next.add_(1)
-
-    def rewind(self) -> "Recorded":
-        """Repeat from the first step on; returns itself."""
-        self._next.zero_()
-        return self
+        self._commands = commands
+        self._phases = phases
+        self._next = torch.zeros(1, dtype=torch.int64, device=source.phase.device)
 
     def command(self) -> torch.Tensor:
         """Commands of the next step, shape ``(nworld, nu)``."""
@@ -113,10 +98,8 @@ class OpenLoopDriver(Driver):
         super().__init__(len(trajectory.knots), trajectory.steps, device, phases)
         self.error = torch.as_tensor(trajectory.waypoint_error, device=device)
         self._trajectory = trajectory
-        numbers = [
-            number for number, phase in enumerate(phases) for _ in range(phase.start, phase.stop)
-        ]
-        self._phase_at = torch.tensor(numbers, device=device)
+        lengths = torch.tensor([phase.stop - phase.start for phase in phases], device=device)
+        self._phase_at = torch.arange(len(phases), device=device).repeat_interleave(lengths)
         self._next = torch.zeros(1, dtype=torch.int64, device=device)
 
     def command(self) -> torch.Tensor:

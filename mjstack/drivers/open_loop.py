@@ -147,31 +147,30 @@ class OpenLoopPlanner:
         _, first, kind = np.unique(flat, axis=0, return_index=True, return_inverse=True)
         twin = first[kind.reshape(-1)]
         worlds = sorted(first.tolist())
-        done = np.cumsum(np.bincount(twin)[worlds])
-        found: dict[int, tuple] = {}
-
-        def take(world: int, *plan: Any) -> None:
-            found[world] = plan
-            if progress is not None:
-                progress(int(done[len(found) - 1]))
-
+        done = np.cumsum(np.bincount(twin)[worlds]).tolist()
+        plans: dict[int, list[Any]] = {}
         try:
             with self.processes(len(worlds)):
-                if self._pool is not None:
-                    plan_in_parallel(self._pool, worlds, sources_xy, take)
-                else:
-                    for world in worlds:
-                        take(world, *self.plan_world(world, sources_xy[world]))
+                batch = self._plans(worlds, sources_xy)
+                for count, (world, *plan) in zip(done, batch, strict=True):
+                    plans[world] = plan
+                    if progress is not None:
+                        progress(count)
         except Unreachable as unreachable:
             unreachable.world = numbers[unreachable.world]
             raise
-        knots, error = (
-            np.array(parts) for parts in zip(*(found[world] for world in twin), strict=True)
-        )
+        parts = zip(*(plans[world] for world in twin), strict=True)
+        knots, error = (np.array(part) for part in parts)
         trajectory = JointTrajectory(torch.from_numpy(knots), self._weights, self._numbers, error)
         if nworld > 1:
             self._last = (sources_xy.copy(), trajectory)
         return trajectory
+
+    def _plans(self, worlds: Sequence[int], sources_xy: np.ndarray) -> Iterator[Plan]:
+        """The plan of each world, in their order."""
+        if self._pool is not None:
+            return plan_in_parallel(self._pool, worlds, sources_xy)
+        return ((world, *self.plan_world(world, sources_xy[world])) for world in worlds)
 
     @contextmanager
     def processes(self, worlds: int) -> Iterator[None]:
@@ -240,12 +239,12 @@ class OpenLoopPlanner:
         """Start and end of each phase: the grasp point [m] and then the gripper's command."""
         robot = self._cfg.robot
         where = xy.copy()  # of each object after the phases so far
-        held = -1
+        in_hand = -1
         out: list[tuple[np.ndarray, np.ndarray]] = []
         for phase in self.phases:
-            if held >= 0 and phase.carried < 0:  # let go where the last target was
-                where[held] = out[-1][1][:2]
-            held = phase.carried
+            if in_hand >= 0 and phase.carried < 0:  # let go where the last target was
+                where[in_hand] = out[-1][1][:2]
+            in_hand = phase.carried
             target = phase.target
             point = out[-1][1][:3] if target is None else [*target_xy(target, where), target.z]
             end = np.array([*point, *robot.grips[phase.spec.gripper]])
@@ -268,24 +267,19 @@ class OpenLoopPlanner:
         n = len(self._nodes)
         bary = (-1.0) ** np.arange(n)
         bary[[0, -1]] *= 0.5
-        rows = []
-        numbers = []
-        for number, s in self._progress():
-            gap = s - self._nodes
-            hit = np.abs(gap) < 1e-12
-            rows.append(hit.astype(float) if hit.any() else (bary / gap) / (bary / gap).sum())
-            numbers.append(range(number * n, number * n + n))
-        return torch.from_numpy(np.array(rows)), torch.tensor(numbers)
+        phase, s = (np.array(part)[:, None] for part in zip(*self._progress(), strict=True))
+        gap = s - self._nodes
+        hit = np.abs(gap) < 1e-12
+        share = bary / np.where(hit, 1.0, gap)
+        rows = np.where(hit.any(1, keepdims=True), hit, share / share.sum(1, keepdims=True))
+        return torch.from_numpy(rows), torch.from_numpy(phase * n + np.arange(n))
 
 
 def plan_in_parallel(
-    pool: ProcessPoolExecutor,
-    worlds: Sequence[int],
-    sources_xy: np.ndarray,
-    take: Callable[..., None],
-) -> None:
-    """Plan worlds, their numbers ascending, in processes. ``take`` gets each `Plan`, in that order;
-    ``sources_xy`` as of `OpenLoopPlanner.plan`.
+    pool: ProcessPoolExecutor, worlds: Sequence[int], sources_xy: np.ndarray
+) -> Iterator[Plan]:
+    """Plan worlds, their numbers ascending, in processes; ``sources_xy`` as of
+    `OpenLoopPlanner.plan`.
 
     Raises:
         Unreachable: A target is out of reach; of several such worlds it names the first, as one
@@ -300,8 +294,7 @@ def plan_in_parallel(
         for job in jobs:
             while not wait([job], _POLL).done:
                 check_interrupt()
-            for plan in job.result():
-                take(*plan)
+            yield from job.result()
     except BrokenProcessPool:
         raise MjstackError(
             "a planning process was killed or ended before every world was planned",
@@ -316,7 +309,7 @@ def plan_in_parallel(
 @contextmanager
 def _start_processes(cfg: Config, count: int) -> Iterator[ProcessPoolExecutor]:
     """Processes that plan, which are gone when this has ended in any way."""
-    theirs = active_children()
+    before = active_children()
     # Processes are not forks: this one may hold a CUDA context and threads.
     with _as_programs():
         pool = ProcessPoolExecutor(count, get_context("spawn"), _start_process, (cfg,))
@@ -326,7 +319,7 @@ def _start_processes(cfg: Config, count: int) -> Iterator[ProcessPoolExecutor]:
                 pool.submit(int)
         yield pool
     finally:
-        for process in set(active_children()).difference(theirs):
+        for process in set(active_children()).difference(before):
             process.kill()  # it may still be loading
         pool.shutdown(cancel_futures=True)
 

@@ -38,8 +38,8 @@ def find_roles(
     if not goals:
         moves = [k for k, phase in enumerate(phases) if phase.target is not None]
         anchor = str(phases[moves[0]].spec.anchor) if moves else ""
-        others = {(phase.spec.anchor or anchor, phase.spec.gripper) for phase in phases}
-        if len(others) != 1 or anchor not in things:
+        targets = {(phase.spec.anchor or anchor, phase.spec.gripper) for phase in phases}
+        if len(targets) != 1 or anchor not in things:
             raise _refusal(cfg, "has no goals")
         return [anchor], [[moves[0]] + [moves[-1]] * (len(Role) - 1)]
     sources = source_names(cfg.scene)

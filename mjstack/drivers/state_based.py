@@ -3,19 +3,18 @@ asked in any state that somebody else has brought about.
 """
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
-import mujoco
 import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import override
 
-from mjstack.drivers.closed_loop import STAY, ClosedLoopDriver
+from mjstack.drivers.feedback import STAY, FeedbackDriver, State, servo_lag
 from mjstack.drivers.roles import Role, find_roles, follows_anchor
 from mjstack.managers.view import EnvView
 from mjstack.math import quat_to_matrix
-from mjstack.mdp.geometry import gripper_opening, objects_in_hand, pose_w, robot
+from mjstack.mdp.geometry import pose_w, robot
 from mjstack.tasks.check import make_check
 
 # How fast
@@ -52,33 +51,17 @@ _LEFT = 0.08  # m: so near an object that was let go of, the gripper keeps its t
 _OFF_CENTER = (0.015, 0.015, 0.010)  # m: so far from the grasp point, an object is made up for
 
 
-class _State(NamedTuple):
-    """The measured state: joints; speed of the fastest joint of the arm; grasp point, closing and
-    approach axis; opening of the gripper; position of every object, and whether all jaws press on
-    it.
-    """
-
-    q: Tensor
-    speed: Tensor
-    point: Tensor
-    closing: Tensor
-    approach: Tensor
-    opening: Tensor
-    pos: Tensor
-    in_hand: Tensor
-
-
 class _Due(NamedTuple):
     """The next thing to do: the role, the phases of the object's roles, the object's number,
-    whether it is held, whether the grasp point is led along with it, whether the way is a funnel,
-    how far the roll is off, and whether objects were let go of before, and the gripper is still
-    beside one.
+    whether it is grasped, whether the grasp point is led along with it, whether the way is a
+    funnel, how far the roll is off, and whether objects were let go of before, and the gripper is
+    still beside one.
     """
 
     role: Tensor
     phases: Tensor
     object: Tensor
-    held: Tensor
+    grasped: Tensor
     led: Tensor
     funnel: Tensor
     turn: Tensor
@@ -86,7 +69,7 @@ class _Due(NamedTuple):
     beside: Tensor
 
 
-class StateBasedDriver(ClosedLoopDriver):
+class StateBasedDriver(FeedbackDriver):
     """Joint targets that are a function of the simulation's state: no clock, no memory.
 
     The objects that `EpisodeCheck.goals` names go to their goals one after the other, as far as
@@ -107,17 +90,15 @@ class StateBasedDriver(ClosedLoopDriver):
     """
 
     def __init__(self, env: EnvView, nominal: np.ndarray) -> None:
-        """Allocate for the environment's worlds; arguments as of `ClosedLoopDriver`.
+        """Allocate for the environment's worlds; arguments as of `FeedbackDriver`.
 
         Raises:
-            MjstackError: As of `ClosedLoopDriver`, or the task has no goals.
+            MjstackError: As of `FeedbackDriver`, or the task has no goals.
         """
-        super().__init__(env, nominal)
+        super().__init__(env, nominal, clock=False)
         cfg = env.cfg
         device = env.device
-        plan = self.phases
-        self.phases = []
-        self.steps = cfg.task.episode_steps
+        plan = self._plan
         self.due = torch.zeros_like(self.phase)
 
         # The task: objects and the phases that bring each to its goal
@@ -135,19 +116,15 @@ class StateBasedDriver(ClosedLoopDriver):
         targets = [phase.target for phase in plan]
         above = [0.0 if target is None else target.above for target in targets]
         self._above = torch.tensor(above, device=device)
-        self._follows = torch.tensor(
-            [follows_anchor(phase, things) for phase in plan], device=device
-        )
+        follows = [follows_anchor(phase, things) for phase in plan]
+        self._follows = torch.tensor(follows, device=device)
         self._off_center = torch.tensor(_OFF_CENTER, device=device)
 
         # The robot
         names = cfg.robot.joints
-        aligned = cfg.robot.roll_joint if cfg.controller.yaw_alignment > 0.0 else None
-        self._locked = [
-            (names.index(name), value)
-            for name, value in cfg.robot.locked.items()
-            if name != aligned
-        ]
+        aligned = cfg.robot.roll_joint if self._aligns else None
+        locked = cfg.robot.locked.items()
+        self._locked = [(names.index(name), value) for name, value in locked if name != aligned]
         tensors = robot(env)
         rolls = tensors.ctrl_range[self._roll_column].float()
         self._rolls = (rolls - self._nominal[0, self._roll_column]).unbind(0)
@@ -156,12 +133,12 @@ class StateBasedDriver(ClosedLoopDriver):
         lag = servo_lag(env.sim.model, env.index.ctrl[: self._n_arm].tolist())
         # A servo that lags has to be led by more than it is to move in a step.
         self._lead = 1.0 / (1.0 - math.exp(-cfg.timing.step_dt / lag))
-        self._every = torch.ones_like(self.unreachable)
+        self._always = torch.ones((env.nworld, len(things)), dtype=torch.bool, device=device)
 
+    @override
     def command(self) -> Tensor:
-        """See `Driver`."""
         cfg = self._cfg.controller
-        self._observe(self._every, self._every)
+        self._observe(self._always)
         state = self._measure()
         due = self._decide(state)
         target, phase = self._lead_point(state, due)
@@ -172,7 +149,7 @@ class StateBasedDriver(ClosedLoopDriver):
         start = q.clone()
         for column, value in self._locked:
             start[:, column] = value
-        if cfg.yaw_alignment > 0.0:
+        if self._aligns:
             start[:, self._roll_column] += due.turn.clamp(-_ROLL, _ROLL) * (due.role == Role.down)
         approach = None if self._tilt is None else self._tilted(state, due, phase)
         posture = self._nominal[phase] if cfg.posture_gain > 0.0 else None
@@ -190,28 +167,12 @@ class StateBasedDriver(ClosedLoopDriver):
         now = q[:, self._n_arm :]
         grip = (self._grip[phase] - now).clamp(-self._grip_lead, self._grip_lead)
         command[:, self._n_arm :] = now + grip
-        # A world whose state is not finite keeps its command, and the check fails it.
-        self._command.copy_(torch.where(torch.isfinite(command), command, self._command))
-        return self._command
+        return self._keep_finite(command)
 
-    def _measure(self) -> _State:
-        """The state now."""
-        env = self._env
-        q = robot(env).qpos.read(env.sim.qpos).float()
-        pos = [pose_w(env, name)[:, :3].float() for name in self._cfg.scene.objects]
-        return _State(
-            q,
-            robot(env).qvel.read(env.sim.qvel)[:, : self._n_arm].float().abs().amax(1),
-            *self._ik.forward(q),
-            opening=gripper_opening(env).float().amin(1),
-            pos=torch.stack(pos, dim=1),
-            in_hand=objects_in_hand(env.index, env.sim),
-        )
-
-    def _decide(self, state: _State) -> _Due:
+    def _decide(self, state: State) -> _Due:
         """The next thing to do in every world."""
         # The first object that is not done
-        delivered, held, between = self._find_delivered(state)
+        delivered, grasped, between = self._find_delivered(state)
         letting_go = delivered & between & (state.opening < _OPEN)[:, None]
         done = delivered & ~letting_go
         number = done.long().cumprod(1).sum(1)
@@ -219,74 +180,63 @@ class StateBasedDriver(ClosedLoopDriver):
         number = number.clamp(max=done.shape[1] - 1)
         phases = self._roles[number]
         thing = self._moved[number]
-        pick = number[:, None]
-        held = held.gather(1, pick)[:, 0] & ~all_done
-        letting_go = letting_go.gather(1, pick)[:, 0]
+        grasped = grasped[self._worlds, number] & ~all_done
+        letting_go = letting_go[self._worlds, number]
 
         # Its role
-        own = state.in_hand.gather(1, thing[:, None])[:, 0]
-        other = (state.in_hand.sum(1) > own) & ~held & ~letting_go
+        in_jaws = state.in_hand[self._worlds, thing]
+        foreign = (state.in_hand.sum(1) > in_jaws) & ~grasped & ~letting_go
         offset = state.point - self._point(state, phases[:, Role.close])
         near = _NEAR_CLOSED + (_NEAR - _NEAR_CLOSED) * state.opening.clamp(0.0, 1.0)
         there = torch.linalg.vector_norm(offset[:, :2], dim=1) <= near
         stuck = _STUCK * (1.0 - state.speed / _STILL).clamp(min=0.0)
         there &= (offset[:, 2] >= -_DEPTH) & (offset[:, 2] <= _DEPTH + stuck)
         role = torch.where(there, Role.close, Role.down)
-        for value, mask in (
-            (Role.place, held),
-            (Role.open, letting_go | other),
-            (Role.retreat, all_done),
-        ):
-            role = role.masked_fill(mask, value)
-        gap = torch.linalg.vector_norm(
-            state.point[:, None] - state.pos.index_select(1, self._moved), dim=2
-        )
+        role.masked_fill_(grasped, Role.place)
+        role.masked_fill_(letting_go | foreign, Role.open)
+        role.masked_fill_(all_done, Role.retreat)
         return _Due(
             role,
             phases,
             thing,
-            held,
-            led=held | letting_go | other,
+            grasped,
+            led=grasped | letting_go | foreign,
             funnel=(role == Role.down) | (role == Role.place) | (role == Role.retreat),
             turn=self._turn_left(state, thing),
             later=number > 0,
-            beside=(done & (gap <= _LEFT)).any(1),
+            beside=(done & (self._gap(state) <= _LEFT)).any(1),
         )
 
-    def _find_delivered(self, state: _State) -> tuple[Tensor, Tensor, Tensor]:
-        """Whether each object is where it is let go of, is held, and is between the jaws, each
+    def _find_delivered(self, state: State) -> tuple[Tensor, Tensor, Tensor]:
+        """Whether each object is where it is let go of, is grasped, and is between the jaws, each
         ``(nworld, objects)``, bool.
         """
         pos = state.pos.index_select(1, self._moved)
-        gap = torch.linalg.vector_norm(state.point[:, None] - pos, dim=2)
-        between = gap <= self._reach
-        held = state.in_hand.index_select(1, self._moved) & between
+        between = self._gap(state) <= self._reach
+        grasped = state.in_hand.index_select(1, self._moved) & between
         if not self._goals:
-            return torch.zeros_like(held), torch.zeros_like(held), between
+            return torch.zeros_like(grasped), torch.zeros_like(grasped), between
         step = self._view.step()
         placed = self._view.columns(self._goals).read(self._check.placed(step))
         goals = torch.stack(list(self._check.goals(step).values()), dim=1).float()
-        let_go = torch.stack(
-            [
-                self._point(state, row[Role.place].expand(len(pos))) - self._grasp_offset(row)
-                for row in self._roles
-            ],
-            dim=1,
-        )
-        offset = pos - let_go
+        releases = [
+            self._point(state, row[Role.place].expand(len(pos))) - self._grasp_offset(row)
+            for row in self._roles
+        ]
+        offset = pos - torch.stack(releases, dim=1)
         across = torch.linalg.vector_norm(offset[..., :2], dim=2)
         low = (offset[..., 2] <= _ABOVE) & (pos[..., 2] >= goals[..., 2] - _BELOW)
-        return (across <= _AT_GOAL) & low | placed & ~held, held, between
+        return (across <= _AT_GOAL) & low | placed & ~grasped, grasped, between
 
-    def _lead_point(self, state: _State, due: _Due) -> tuple[Tensor, Tensor]:
+    def _lead_point(self, state: State, due: _Due) -> tuple[Tensor, Tensor]:
         """Where the grasp point is led in this step [m], shape ``(nworld, 3)``, and the number of
         the phase, shape ``(nworld,)``.
         """
         point = state.point
 
         # Where it goes: an object in the jaws is what arrives, one of another goal is let go here
-        phase = due.phases.gather(1, due.role[:, None])[:, 0]
-        thing = state.pos.gather(1, due.object[:, None, None].expand(-1, 1, 3))[:, 0]
+        phase = due.phases[self._worlds, due.role]
+        thing = state.pos[self._worlds, due.object]
         off = point - thing - self._grasp_offset(due.phases)
         far = torch.linalg.vector_norm(point - thing, dim=1) > self._reach.amax()
         off = torch.minimum(torch.maximum(off, -self._off_center), self._off_center)
@@ -294,11 +244,11 @@ class StateBasedDriver(ClosedLoopDriver):
         end = torch.where((due.led & far)[:, None], point, end)
 
         # How high on the way there
-        before = torch.where(due.held, Role.carry, Role.over)
-        before = due.phases.gather(1, before[:, None])[:, 0]
+        before = torch.where(due.grasped, Role.carry, Role.over)
+        before = due.phases[self._worlds, before]
         clear = self._point(state, self._roles[0, Role.retreat].expand_as(phase))[:, 2]
         most = torch.maximum(self._point(state, before)[:, 2], end[:, 2])
-        most = torch.where(due.later & ~due.held, torch.maximum(most, clear), most)
+        most = torch.where(due.later & ~due.grasped, torch.maximum(most, clear), most)
         across = torch.linalg.vector_norm((end - point)[:, :2], dim=1)
         higher = _FUNNEL * (across - _NEAR).clamp(min=0.0)
         ready = _ROLL_FUNNEL * (due.turn.abs() - _TURNED).clamp(min=0.0)
@@ -310,14 +260,14 @@ class StateBasedDriver(ClosedLoopDriver):
         # How far in this step
         move = torch.cat(((end - point)[:, :2] * level[:, None], (way - point[:, 2])[:, None]), 1)
         distance = torch.linalg.vector_norm(move, dim=1)
-        speed = torch.where(due.held, _CARRY_SPEED, _SPEED) * self._cfg.timing.step_dt
+        speed = torch.where(due.grasped, _CARRY_SPEED, _SPEED) * self._cfg.timing.step_dt
         lead = self._lead * torch.minimum(speed, _SLOWING * distance)
         # Fingers that touch the table are not pressed onto it.
         lead = torch.where(due.role == Role.close, distance.clamp(max=_DEPTH), lead)
         target = point + move * (lead / distance.clamp(min=1e-6))[:, None]
         return target, torch.where(due.funnel & (higher > _HIGH), before, phase)
 
-    def _tilted(self, state: _State, due: _Due, phase: Tensor) -> Tensor:
+    def _tilted(self, state: State, due: _Due, phase: Tensor) -> Tensor:
         """Desired approach axis, shape ``(nworld, 3)``: as the object's goal needs it; with the
         object in the jaws, the one with which it is upright; beside one that was let go of, as it
         is.
@@ -330,10 +280,8 @@ class StateBasedDriver(ClosedLoopDriver):
         # The turn of the object's axis that points up most, to the vertical, by Rodrigues' formula
         env = self._env
         quat = torch.stack([pose_w(env, name)[:, 3:] for name in self._cfg.scene.objects], dim=1)
-        quat = quat.float().gather(1, due.object[:, None, None].expand(-1, 1, 4))[:, 0]
-        axes = quat_to_matrix(quat)
-        most = axes[:, 2].abs().argmax(1)
-        up = axes.gather(2, most[:, None, None].expand(-1, 3, 1))[..., 0]
+        axes = quat_to_matrix(quat.float()[self._worlds, due.object])
+        up = axes[self._worlds, :, axes[:, 2].abs().argmax(1)]
         up = up * torch.sign(up[:, 2:])
         x, y, z = up.unbind(1)
         turn = torch.stack((y, -x, torch.zeros_like(x)), dim=1)  # up x vertical
@@ -342,14 +290,14 @@ class StateBasedDriver(ClosedLoopDriver):
         upright = a * z[:, None] + torch.linalg.cross(turn, a) + turn * along
         return torch.where(due.led[:, None], upright, tilt)
 
-    def _turn_left(self, state: _State, thing: Tensor) -> Tensor:
+    def _turn_left(self, state: State, thing: Tensor) -> Tensor:
         """How far the open jaws have to roll to the nearer face of an object [rad], shape
         ``(nworld,)``.
         """
-        if self._cfg.controller.yaw_alignment == 0.0:
+        if not self._aligns:
             return torch.zeros_like(state.opening)
         roll = state.q[:, self._roll_column] - self._nominal[0, self._roll_column]
-        yaw = self._seen.gather(1, thing[:, None, None].expand(-1, 1, 3))[:, 0, 2]
+        yaw = self._seen[self._worlds, thing, 2]
 
         # The closing axis as it would be at a roll of zero degrees about the approach axis:
         # horizontal. From there on the way to a face does not depend on the roll now. So the face
@@ -357,23 +305,28 @@ class StateBasedDriver(ClosedLoopDriver):
         x, y, z = state.approach.unbind(1)
         level = torch.where(torch.hypot(x, y) > _UPRIGHT, torch.atan2(x, -y), 0.0)
         axis = torch.stack((torch.cos(level), torch.sin(level), torch.zeros_like(z)), dim=1)
-        other = torch.linalg.cross(state.approach, axis)
-        now = torch.atan2((state.closing * other).sum(1), (state.closing * axis).sum(1))
+        side = torch.linalg.cross(state.approach, axis)
+        now = torch.atan2((state.closing * side).sum(1), (state.closing * axis).sum(1))
         faces = (yaw - level) + self._quarters
         there = torch.atan2(-torch.sin(faces), torch.cos(faces) * (-z).clamp(min=0.2))
         change = there - now
         change = -self._roll_sign * torch.atan2(torch.sin(change), torch.cos(change))
-        wanted = roll + change
+        rolls = roll + change
         low, high = self._rolls
-        beyond = (low - wanted).clamp(min=0.0) + (wanted - high).clamp(min=0.0)
-        nearest = ((wanted - STAY * roll).abs() + _BEYOND * beyond).argmin(0, keepdim=True)
-        return self._cfg.controller.yaw_alignment * wanted.gather(0, nearest)[0] - roll
+        beyond = (low - rolls).clamp(min=0.0) + (rolls - high).clamp(min=0.0)
+        nearest = ((rolls - STAY * roll).abs() + _BEYOND * beyond).argmin(0, keepdim=True)
+        return self._cfg.controller.yaw_alignment * rolls.gather(0, nearest)[0] - roll
 
-    def _point(self, state: _State, phase: Tensor) -> Tensor:
+    def _gap(self, state: State) -> Tensor:
+        """Distance of the grasp point from each object with a goal [m], ``(nworld, objects)``."""
+        pos = state.pos.index_select(1, self._moved)
+        return torch.linalg.vector_norm(state.point[:, None] - pos, dim=2)
+
+    def _point(self, state: State, phase: Tensor) -> Tensor:
         """Target of each world's phase, from where its anchor is [m], shape ``(nworld, 3)``."""
         aim = self._aim(phase)
         source = self._source[phase].clamp(max=state.pos.shape[1] - 1)
-        height = state.pos[..., 2].gather(1, source[:, None])[:, 0] + self._above[phase]
+        height = state.pos[self._worlds, source, 2] + self._above[phase]
         z = torch.where(self._follows[phase], height, aim[:, 2])
         return torch.cat((aim[:, :2], z[:, None]), dim=1)
 
@@ -384,10 +337,3 @@ class StateBasedDriver(ClosedLoopDriver):
         above = self._above[phases[..., Role.close]]
         zero = torch.zeros_like(above)
         return torch.stack((zero, zero, above), dim=-1)
-
-
-def servo_lag(model: mujoco.MjModel, actuators: Sequence[int]) -> float:
-    """Longest time constant of some position servos [s]: damping over stiffness."""
-    dof = model.jnt_dofadr[model.actuator_trnid[actuators, 0]]
-    damping = model.dof_damping[dof] - model.actuator_biasprm[actuators, 2]
-    return max(1e-6, float((damping / model.actuator_gainprm[actuators, 0]).max()))

@@ -1,15 +1,13 @@
 """Approach tilt of a grasp, so that an object arrives upright."""
 
-import math
 from collections.abc import Sequence
 
 import mujoco
 import torch
 
 from mjstack.config.schema import Config
-from mjstack.errors import ConfigError
 from mjstack.kinematics.batched_ik import BatchedIk
-from mjstack.scene.index import find
+from mjstack.scene.index import turn_sign
 from mjstack.scene.phases import Phase
 
 
@@ -60,13 +58,13 @@ class CarryTilt:
             iterations=c.step_iterations,
             approach_gain=c.approach_gain,
         )
-        self._sign = turn_sign(model, cfg)
+        self._sign = turn_sign(model, cfg.robot)
         self._keeps = torch.tensor(_keeps(phases), device=device)
         self._grasps = torch.tensor([phase.grasped >= 0 for phase in phases], device=device)
         self.place = torch.tensor(_places(phases), device=device)
         self._there = nominal.new_zeros((ik.nworld, nominal.shape[1]))
-        self._kept = nominal.new_zeros((ik.nworld, 3))
-        self._kept_turn = nominal.new_zeros(ik.nworld)
+        self._last_axis = nominal.new_zeros((ik.nworld, 3))
+        self._last_turn = nominal.new_zeros(ik.nworld)
 
     def desired_approach(
         self, command: torch.Tensor, phase: torch.Tensor, there: torch.Tensor, fresh: torch.Tensor
@@ -89,11 +87,12 @@ class CarryTilt:
         self._there.copy_(self._there_ik.solve(start, there)[0])
         grasps = self._grasps[phase]
         keeps = self._keeps[phase]
-        self._kept.copy_(torch.where(grasps[:, None], self._ik.forward(command)[2], self._kept))
-        self._kept_turn.copy_(torch.where(grasps, command[:, 0], self._kept_turn))
+        approach = self._ik.forward(command)[2]
+        self._last_axis.copy_(torch.where(grasps[:, None], approach, self._last_axis))
+        self._last_turn.copy_(torch.where(grasps, command[:, 0], self._last_turn))
         axis = self._there_ik.forward(self._there)[2]
-        axis = torch.where(keeps[:, None], self._kept, axis)
-        since = torch.where(keeps, self._kept_turn, self._there[:, 0])
+        axis = torch.where(keeps[:, None], self._last_axis, axis)
+        since = torch.where(keeps, self._last_turn, self._there[:, 0])
         return self._turned(axis, command[:, 0] - since)
 
     def release_approach(
@@ -108,35 +107,25 @@ class CarryTilt:
 
     def _turned(self, axis: torch.Tensor, turn: torch.Tensor) -> torch.Tensor:
         """Axes, shape ``(nworld, 3)``, turned with the first joint [rad], shape ``(nworld,)``."""
-        x, y, z = axis.unbind(1)
-        cos = torch.cos(self._sign * turn)
-        sin = torch.sin(self._sign * turn)
-        return torch.stack((cos * x - sin * y, sin * x + cos * y, z), dim=1)
+        return turn_about_z(axis, self._sign * turn)
 
 
-def turn_sign(model: mujoco.MjModel, cfg: Config) -> float:
-    """1.0 where the arm's first joint turns to the left, seen from above; -1.0 where to the right.
-
-    Raises:
-        ConfigError: It does not turn about the vertical.
-    """
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    up = float(data.xaxis[find(model, "joint", cfg.robot.arm_joints[0])][2])
-    if abs(up) < 0.999:
-        expected = f"0, because joint {cfg.robot.arm_joints[0]} does not turn about the vertical"
-        raise ConfigError("robot.approach_gain", cfg.robot.approach_gain, expected)
-    return math.copysign(1.0, up)
+def turn_about_z(vectors: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
+    """Vectors, shape ``(n, 2)`` or ``(n, 3)``, turned about the vertical [rad], shape ``(n,)``."""
+    x, y, *z = vectors.unbind(1)
+    cos = torch.cos(angle)
+    sin = torch.sin(angle)
+    return torch.stack((cos * x - sin * y, sin * x + cos * y, *z), dim=1)
 
 
 def _keeps(phases: Sequence[Phase]) -> list[bool]:
     """Whether the tilt of the last grasp is kept in each phase."""
     out = []
-    kept = False
+    fixed = False
     for phase in phases:
-        kept = kept and not (phase.spec.observe and phase.spec.gripper == "open")
-        out.append(kept and phase.grasped < 0)
-        kept = kept or phase.grasped >= 0
+        fixed = fixed and not (phase.spec.observe and phase.spec.gripper == "open")
+        out.append(fixed and phase.grasped < 0)
+        fixed = fixed or phase.grasped >= 0
     return out
 
 

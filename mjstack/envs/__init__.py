@@ -1,5 +1,6 @@
 """The environment over both backends, and how it is built."""
 
+import mjstack.report.gl  # noqa: F401  (before mujoco)
 from mjstack.envs.build import (
     build_env,
     decided_every_step,

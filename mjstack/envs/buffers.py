@@ -7,7 +7,7 @@ import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import partial
 
 import mujoco
 import numpy as np
@@ -30,6 +30,7 @@ ROWS = int(Overflow.NEFC | Overflow.NJMAX_NNZ)
 SIZED = ROWS | POOL | int(Overflow.CCD)
 _GROWTHS = 3  # of the room to measure in, each by 2
 _STEP = 8  # sizes are multiples of this
+_POOLS = ("contacts", "pairs", "ccd_pairs")  # as the simulation counts them
 
 Advance = Callable[[str, int, int], None]
 """Reports progress: the work in progress, how much is done, and of how much."""
@@ -40,65 +41,54 @@ class Peaks:
     """The most that worlds used over all physics steps of a run, and what they lost.
 
     Worlds that start anew in between are counted on: the simulation keeps what a masked reset
-    erases (``most_contacts``, ``most_constraints``, ``overflow_ever``). So nothing is read while
+    erases (`Simulation.lasting_peaks`). So nothing is read while
     the run goes on.
 
     Attributes:
-        nworld: Number of worlds.
         contacts: Contacts of each world, shape ``(nworld,)``.
         rows: Constraint rows of each world, shape ``(nworld,)``.
         overflow: Bits of `Overflow` raised in each world, shape ``(nworld,)``.
-        pool_contacts: Contacts of all worlds at once. Native MuJoCo has no pool: the sum of the
-            worlds' peaks, which bounds it.
-        pool_pairs: Broad-phase pairs of all worlds at once, which the pool must hold too; None
-            where they are not counted.
-        pool_ccd_pairs: Convex pairs of one combination of geom types, of all worlds at once; None
-            where they are not counted.
+        pools: Of all worlds at once by name: contacts, broad-phase pairs, which the contact pool
+            must hold too, and convex pairs of one combination of geom types. Native MuJoCo has no
+            pool and counts no pairs: contacts alone, the sum of the worlds' peaks, which bounds
+            them.
     """
 
-    nworld: int
     contacts: np.ndarray
     rows: np.ndarray
     overflow: np.ndarray
-    pool_contacts: int
-    pool_pairs: int | None = None
-    pool_ccd_pairs: int | None = None
+    pools: dict[str, int]
 
     @property
-    def pool(self) -> int:
-        """Entries that the contact pool must have."""
-        return max(self.pool_contacts, self.pool_pairs or 0)
+    def share(self) -> float:
+        """Entries that the contact pool must have, per world."""
+        return max(self.pools["contacts"], self.pools.get("pairs", 0)) / len(self.rows)
+
+    @property
+    def convex_share(self) -> float | None:
+        """Convex pairs that must fit, per world; None where they are not counted."""
+        return self.pools["ccd_pairs"] / len(self.rows) if "ccd_pairs" in self.pools else None
 
 
 def read_peaks(sim: Simulation) -> Peaks:
     """The peaks since the simulation's last full reset. Waits for the device."""
-    contacts = sim.most_contacts.cpu().numpy().astype(np.int64)
-    counted = sim.peak_pool
-    pool: list[Any] = [int(contacts.sum()), None, None] if counted is None else counted.tolist()
+    contacts, rows, bits = (peaks.cpu().numpy().astype(np.int64) for peaks in sim.lasting_peaks())
+    pools = [int(contacts.sum())] if sim.peak_pool is None else sim.peak_pool.tolist()
     return Peaks(
-        nworld=sim.nworld,
         contacts=contacts,
-        rows=sim.most_constraints.cpu().numpy().astype(np.int64),
-        overflow=sim.overflow_ever.cpu().numpy() & LOST_PHYSICS,
-        pool_contacts=pool[0],
-        pool_pairs=pool[1],
-        pool_ccd_pairs=pool[2],
+        rows=rows,
+        overflow=bits & LOST_PHYSICS,
+        pools=dict(zip(_POOLS, pools, strict=False)),
     )
 
 
 def join_peaks(a: Peaks, b: Peaks) -> Peaks:
     """The larger of the peaks of two runs of the same worlds."""
-
-    def larger(name: str) -> Any:
-        counts = getattr(a, name), getattr(b, name)
-        return None if None in counts else max(counts)
-
     return Peaks(
-        nworld=a.nworld,
         contacts=np.maximum(a.contacts, b.contacts),
         rows=np.maximum(a.rows, b.rows),
         overflow=a.overflow | b.overflow,
-        **{name: larger(name) for name in ("pool_contacts", "pool_pairs", "pool_ccd_pairs")},
+        pools={name: max(peak, b.pools[name]) for name, peak in a.pools.items()},
     )
 
 
@@ -106,17 +96,18 @@ def recommend_sizes(peaks: Peaks, margin: float, source: str) -> BatchSizes:
     """Sizes with a margin over the peaks, in multiples of 8.
 
     Pools are shared: what all worlds had at once, divided by their number, is what each needs.
-    Where convex pairs are not counted, their room stays MJWarp's default, as much as there is for
-    contacts.
+    Where convex pairs are not counted, their room stays as much as there is for contacts.
     """
-    nconmax = _with_margin(peaks.pool / peaks.nworld, margin)
-    convex = peaks.pool_ccd_pairs
+
+    def size(peak: float) -> int:
+        return max(_STEP, _STEP * math.ceil(margin * peak / _STEP))
+
+    nconmax = size(peaks.share)
+    convex = peaks.convex_share
     return BatchSizes(
         nconmax=nconmax,
-        njmax=_with_margin(float(peaks.rows.max()), margin),
-        nccdmax=(
-            None if convex is None else min(nconmax, _with_margin(convex / peaks.nworld, margin))
-        ),
+        njmax=size(float(peaks.rows.max())),
+        nccdmax=None if convex is None else min(nconmax, size(convex)),
         source=source,
     )
 
@@ -139,6 +130,18 @@ class Workload:
     final: np.ndarray
     failed: np.ndarray
     description: str
+
+    @property
+    def loss(self) -> str:
+        """The physics that was lost although there was room to spare, and what to do; empty if none
+        was.
+        """
+        loss, keys = describe_loss(self.peaks.overflow, self.sizes)
+        if not loss:
+            return ""
+        fix = f"Set {' and '.join(f'batch.{key}' for key in keys)} higher still" if keys else NO_KEY
+        room = f" even with {self.sizes.as_overrides()}" if self.sizes is not None else ""
+        return f"{loss}{room}. {fix}"
 
 
 def play_workload(
@@ -167,7 +170,7 @@ def play_workload(
         sim = make(room)
         try:
             failed = play(sim)
-            done = Workload(
+            run = Workload(
                 peaks=read_peaks(sim),
                 sizes=sim.sizes,
                 final=sim.qpos.cpu().numpy().copy(),
@@ -178,8 +181,8 @@ def play_workload(
             sim.close()
             del sim
             gc.collect()  # an environment and its managers refer to each other, and hold the worlds
-        bits = int(np.bitwise_or.reduce(done.peaks.overflow)) & SIZED
-        if sizes or done.sizes is None or not (bits and growths_left):
+        bits = int(np.bitwise_or.reduce(run.peaks.overflow)) & SIZED
+        if sizes or run.sizes is None or not (bits and growths_left):
             break
         # In this room convex pairs have as much as contacts, so they grow together.
         room = replace(
@@ -188,68 +191,47 @@ def play_workload(
             nconmax=room.nconmax * (2 if bits & ~ROWS else 1),
         )
         log.info("%s overflow while measuring: again with %s", Overflow(bits), room.as_overrides())
-    return done
-
-
-def describe_run_loss(run: Workload) -> str:
-    """The physics that a run lost although there was room to spare, and what to do; empty if it
-    lost none.
-    """
-    loss, keys = describe_loss(run.peaks.overflow, run.sizes)
-    if not loss:
-        return ""
-    fix = f"Set {' and '.join(f'batch.{key}' for key in keys)} higher still" if keys else NO_KEY
-    room = f" even with {run.sizes.as_overrides()}" if run.sizes is not None else ""
-    return f"{loss}{room}. {fix}"
+    return run
 
 
 def measured_sizes(cfg: Config, what: str, run: Workload, source: str) -> BatchSizes:
     """Sizes for ``batch=auto`` from one run, such as of ``the driven task``, with the configured
-    margin and their source in words.
+    margin and their source in words; sizes that the configuration sets win.
 
     Raises:
         FaultError: A world lost physics; names the worlds and what to do.
     """
-    if loss := describe_run_loss(run):
-        raise FaultError(f"batch=auto: what {what} needs cannot be measured: {loss}")
+    if run.loss:
+        raise FaultError(f"batch=auto: what {what} needs cannot be measured: {run.loss}")
     margin = cfg.gate.capacity.margin
-    return recommend_sizes(run.peaks, margin, f"batch=auto: {source}, times {margin:g}")
+    how = f"batch=auto: {source}, times {margin:g}"
+    return apply_configured(cfg, recommend_sizes(run.peaks, margin, how))
 
 
-def play_random_actions(env: Env, steps: int, advance: Advance | None = None) -> None:
+def play_random_actions(
+    env: Env, steps: int, advance: Advance = lambda what, done, total: None
+) -> None:
     """Step worlds that have started with actions drawn evenly from the action range; worlds that
     end start anew.
-
-    Args:
-        env: The environment.
-        steps: How long.
-        advance: Told how many steps are done.
     """
-    low = env.action_manager.low
-    high = env.action_manager.high
+    actions = env.action_manager
     for step in range(steps):
-        draw = random_uniform(
-            env, "probe.action", env.action_manager.action_dim, 0.0, 1.0, step=env.episode_step
+        share = random_uniform(
+            env, "probe.action", actions.action_dim, 0.0, 1.0, step=env.episode_step
         )
-        env.step(low + (high - low) * draw)
-        if advance is not None:
-            advance("random actions", step + 1, steps)
+        env.step(actions.low + (actions.high - actions.low) * share)
+        advance("random actions", step + 1, steps)
 
 
-def random_actions(
-    cfg: Config, steps: int, advance: Advance | None = None
-) -> Callable[[Simulation], np.ndarray]:
-    """Random actions for `play_workload`; arguments as of `play_random_actions`."""
-
-    def play(sim: Simulation) -> np.ndarray:
-        # A lack of room is what this looks for.
-        index = SceneIndex(sim.model, cfg.robot, cfg.scene)
-        env = Env(sim, index, without_images(cfg), check_faults=False)
-        env.reset(seed=cfg.seed)
-        play_random_actions(env, steps, advance)
-        return np.zeros(sim.nworld, dtype=np.int64)
-
-    return play
+def random_actions(cfg: Config, steps: int, sim: Simulation, **options: Advance) -> np.ndarray:
+    """Random actions for `play_workload`, of which no world breaks a rule; options as of
+    `play_random_actions`.
+    """
+    index = SceneIndex(sim.model, cfg.robot, cfg.scene)
+    env = Env(sim, index, without_images(cfg), check_faults=False)  # a lack of room is looked for
+    env.reset(seed=cfg.seed)
+    play_random_actions(env, steps, **options)
+    return np.zeros(sim.nworld, dtype=np.int64)
 
 
 def probe_env_sizes(cfg: Config, model: mujoco.MjModel, nworld: int, device: str) -> BatchSizes:
@@ -275,13 +257,8 @@ def probe_env_sizes(cfg: Config, model: mujoco.MjModel, nworld: int, device: str
         )
 
     with torch.no_grad():
-        probe = play_workload(cfg, make, random_actions(cfg, c.probe_steps))
+        probe = play_workload(cfg, make, partial(random_actions, cfg, c.probe_steps))
     source = f"{c.probe_steps} steps of random actions in {worlds} worlds"
-    found = measured_sizes(cfg, f"an environment of {worlds} worlds", probe, source)
-    sizes = apply_configured(cfg, found)
+    sizes = measured_sizes(cfg, f"an environment of {worlds} worlds", probe, source)
     log.info("%s", sizes)
     return sizes
-
-
-def _with_margin(peak: float, margin: float) -> int:
-    return max(_STEP, _STEP * math.ceil(margin * peak / _STEP))

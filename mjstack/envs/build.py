@@ -50,11 +50,11 @@ def make_env(
         MjstackError: An override or a term cannot be used; the message says which and what to do.
     """
     several = isinstance(overrides, Sequence) and not isinstance(overrides, str)
-    if not several or not all(isinstance(each, str) for each in overrides):
+    if not several or not all(isinstance(item, str) for item in overrides):
         expected = "a list of strings, such as ['task=reach', 'robot=rebot']"
         raise ArgumentError("overrides", reprlib.repr(overrides), expected)
-    given = {"nworld": nworld, "seed": seed, "sim.device": device}
-    more = [f"{key}={value}" for key, value in given.items() if value is not None]
+    arguments = {"nworld": nworld, "seed": seed, "sim.device": device}
+    more = [f"{key}={value}" for key, value in arguments.items() if value is not None]
     cfg = load_config([*overrides, *more], config_dir=config_dir)
     return build_env(cfg, first_world=first_world)
 
@@ -109,16 +109,20 @@ def decided_every_step(cfg: Config) -> Config:
     return replace(cfg, timing=replace(cfg.timing, policy_decimation=1))
 
 
-def driven_config(cfg: Config, reset: dict[str, TermCfg] | None = None) -> Config:
+def driven_config(
+    cfg: Config,
+    reset: dict[str, TermCfg] | None = None,
+    action: dict[str, TermCfg] | None = None,
+) -> Config:
     """The configuration of an environment in which a driver plays one whole episode.
 
-    The driver's action terms take the place of the configured ones, and ``reset`` that of the
-    configured reset terms, and it acts in every control step. Nothing ends an episode early or
-    rewards it: the check judges the whole. Nothing is drawn.
+    The driver's action terms take the place of the configured ones, those of an expert or a plan if
+    None, and ``reset`` that of the configured reset terms. The driver acts in every control step.
+    Nothing ends an episode early or rewards it: the check judges the whole. Nothing is drawn.
     """
     return replace(
         without_images(decided_every_step(cfg)),
-        action=cfg.controller.action,
+        action=cfg.controller.action if action is None else action,
         observation={},
         termination={},
         reward={},
@@ -127,10 +131,9 @@ def driven_config(cfg: Config, reset: dict[str, TermCfg] | None = None) -> Confi
     )
 
 
-def demonstration_config(cfg: Config) -> Config:
+def demonstration_config(cfg: Config, action: dict[str, TermCfg] | None = None) -> Config:
     """The configuration of an environment whose driven episodes are kept: observations, rewards and
-    success are computed as configured.
+    success are computed as configured. Action terms as of `driven_config`.
     """
-    return replace(
-        driven_config(cfg), observation=cfg.observation, reward=cfg.reward, task=cfg.task
-    )
+    driven = driven_config(cfg, action=action)
+    return replace(driven, observation=cfg.observation, reward=cfg.reward, task=cfg.task)

@@ -28,7 +28,7 @@ class CameraSchedule:
         cameras = {name: camera for name, camera in cameras.items() if camera.outputs}
         self._env = env
         timing = env.cfg.timing
-        self._held = timing.policy_decimation
+        self._decimation = timing.policy_decimation
         self.cameras: Cameras | None = env.sim.make_cameras(cameras) if cameras else None
         self._terminal = [name for name, camera in cameras.items() if camera.terminal]
         # Control steps from one image to the next
@@ -52,8 +52,8 @@ class CameraSchedule:
         """Draw the cameras that are due after a step and its resets."""
         step = self._env.episode_step
         masks = {
-            name: None if every <= self._held else step % every < self._held
-            for name, every in self._steps.items()
+            name: None if period <= self._decimation else step % period < self._decimation
+            for name, period in self._steps.items()
         }
         self._draw(self.images, masks)
 

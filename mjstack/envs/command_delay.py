@@ -18,23 +18,23 @@ class CommandDelay:
             steps: Control steps by which they are late; with 0 nothing is held.
         """
         self._ctrl = ctrl
-        self._held = ctrl.new_zeros((steps, *ctrl.shape))
+        self._waiting = ctrl.new_zeros((steps, *ctrl.shape))
 
     @contextmanager
     def late(self) -> Iterator[None]:
         """Take in the current command, and have the late one in its place inside."""
-        if not len(self._held):
+        if not len(self._waiting):
             yield
             return
-        given = self._ctrl.clone()
-        self._ctrl.copy_(self._held[0])
-        self._held.copy_(torch.cat((self._held[1:], given[None])))
+        command = self._ctrl.clone()
+        self._ctrl.copy_(self._waiting[0])
+        self._waiting.copy_(torch.cat((self._waiting[1:], command[None])))
         yield
-        self._ctrl.copy_(given)
+        self._ctrl.copy_(command)
 
     def reset(self, mask: Tensor) -> None:
         """Let the start's command hold in the masked worlds; the mask is of shape ``(nworld,)``,
         bool.
         """
-        if len(self._held):
-            torch.where(mask[:, None], self._ctrl, self._held, out=self._held)
+        if len(self._waiting):
+            torch.where(mask[:, None], self._ctrl, self._waiting, out=self._waiting)

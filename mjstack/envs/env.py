@@ -1,7 +1,6 @@
 """The environment: one step order over any simulation."""
 
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -10,7 +9,7 @@ from mjstack.config.schema import Config
 from mjstack.envs.camera_schedule import CameraSchedule
 from mjstack.envs.command_delay import CommandDelay
 from mjstack.envs.faults import FaultLatch
-from mjstack.envs.outputs import Outputs, StepResult
+from mjstack.envs.outputs import Outputs, ResetResult, StepResult
 from mjstack.envs.statistics import EpisodeStatistics
 from mjstack.envs.threads import few_threads
 from mjstack.errors import ArgumentError
@@ -63,6 +62,7 @@ class Env:
         reset_manager: How episodes start.
         termination_manager: How they end.
         reward_manager: What they are worth.
+        faults: What went wrong on the device; `FaultLatch.raise_first` raises it.
         graph: What `step` repeats, captured or not.
         images: What the cameras have drawn last, by output and camera, such as ``images.front``;
             see `Cameras.allocate`. It is their own memory, which every step writes.
@@ -86,8 +86,7 @@ class Env:
             index: Addresses in the simulation's model.
             cfg: The configuration: action, observation, reset, termination, reward and task.success
                 are used.
-            check_faults: Raise when physics was lost. Gates, which judge such worlds themselves, do
-                without.
+            check_faults: Raise when physics was lost. Gates judge such worlds themselves.
             first_world: Number of the first world, where other processes have the ones before: a
                 world's random numbers depend on its number.
 
@@ -108,45 +107,41 @@ class Env:
         self.success = torch.zeros(sim.nworld, dtype=torch.bool, device=sim.device)
         self._all_worlds = torch.ones_like(self.success)
         self._version = 0
-        self._started = self._closed = False
+        self._started = False
+        self._closed = False
         self._delay = CommandDelay(sim.ctrl, cfg.timing.command_delay)
 
         # Terms are checked on worlds that have started, because a term may read anything.
         self.reset_manager = ResetManager(self, cfg.reset)
-        self.episode.zero_()
         self._start_worlds(self._all_worlds)
         self.action_manager = ActionManager(self, cfg.action)
         self.action = self.action_manager.action
         self.previous_action = self.action_manager.previous_action
-        success = cfg.task.success
-        self._success = Term("task.success", success, self) if success is not None else None
-        if self._success is not None:
+        self._success: Term | None = None
+        if cfg.task.success is not None:
+            self._success = Term("task.success", cfg.task.success, self)
             first_value(self._success, self, boolean=True)
         self.termination_manager = ends = TerminationManager(self, cfg.termination)
         self.reward_manager = rewards = RewardManager(self, cfg.reward)
-        self.observation_manager = seen = ObservationManager(self, cfg.observation)
+        self.observation_manager = ObservationManager(self, cfg.observation)
         self.statistics = EpisodeStatistics(rewards.names, ends.names, sim.device)
         self._reset_managers(self._all_worlds)
         self._draws = CameraSchedule(self, cfg.scene.cameras)
         self.images = self._draws.images
         self.cameras = self._draws.cameras
         self.episode.fill_(-1)
-        self._outputs = Outputs(rewards, ends, seen, self.success)
-        self._faults = FaultLatch(self, self._outputs.numbers, check=check_faults)
+        self._outputs = Outputs(rewards, ends, self.observation_manager, self.success)
+        self.faults = FaultLatch(self, check=check_faults)
         self.graph = self.captured(self.advance, "env.step")
 
     @property
     def max_episode_steps(self) -> int:
-        """Control step after which an episode times out: the time-out term's, or the task's where
-        there is none.
-        """
+        """Control step after which an episode times out: the time-out term's, else the task's."""
         terms = self.cfg.termination.values()
         limits = [t.params["steps"] for t in terms if t.time_out and "steps" in t.params]
         return min(limits, default=self.cfg.task.episode_steps)
 
-    def reset(
-        self, *, seed: int | None = None, mask: Tensor | None = None
-    ) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, mask: Tensor | None = None) -> ResetResult:
         """Start new episodes.
 
         Args:
@@ -161,8 +156,8 @@ class Env:
             ArgumentError: The seed or the mask cannot be used.
         """
         if self._closed:
-            found = "reset() after close()"
-            raise ArgumentError("env", found, "an open environment", "Make a new one")
+            expected = "an open environment"
+            raise ArgumentError("env", "reset() after close()", expected, "Make a new one")
         if mask is not None:
             self.sim.check_mask(mask)
             if not self._started:
@@ -172,17 +167,14 @@ class Env:
             self.seed = check_seed(seed, masked=mask is not None)
             self.key.fill_(self.seed)
             self.episode.fill_(-1)
-        everywhere = mask is None
-        mask = self._all_worlds if mask is None else mask
-        self.episode += mask
-        self.episode_step.masked_fill_(mask, 0)
-        self._start_worlds(mask)
-        if everywhere:
-            self._faults.clear()
+        worlds = self._all_worlds if mask is None else mask
+        self._start_worlds(worlds)
+        if mask is None:
+            self.faults.clear()
             self._started = True
-        self._reset_managers(mask)
-        observed = self.observation_manager.refresh(mask)
-        self._draws.draw_started(None if everywhere else mask)
+        self._reset_managers(worlds)
+        observed = self.observation_manager.refresh(worlds)
+        self._draws.draw_started(mask)
         return {name: group.clone() for name, group in observed.items()} | self.images, {}
 
     def step(self, action: Tensor) -> StepResult:
@@ -209,19 +201,17 @@ class Env:
                 200 steps.
         """
         if not self._started:
-            found = "step() before reset(), or after close()"
-            raise ArgumentError("env", found, "reset() first", "Call env.reset()")
+            call = "step() before reset(), or after close()"
+            raise ArgumentError("env", call, "reset() first", "Call env.reset()")
         with few_threads(self.device, self.nworld):
             self.action_manager.process(action)
             self.graph()
-            self._faults.after_step()
+            self.faults.after_step()
             return self._outputs.returned(self.images, self._draws.final_images)
 
     def advance(self) -> None:
         """The part of `step` that is the same at every step: it acts on the action that was
-        processed last, and returns nothing.
-
-        On CUDA it has fixed shapes and no host read, so that a larger graph may hold it.
+        processed last. On CUDA it has no host read, so that a larger graph may hold it.
         """
         ended: Tensor | None = None
         for left in reversed(range(self.cfg.timing.policy_decimation)):
@@ -232,11 +222,8 @@ class Env:
         self._draws.draw_step()
 
     def captured(self, work: Callable[[], None], name: str) -> StepGraph:
-        """Work of this environment as a graph on CUDA; elsewhere as it is.
-
-        Args:
-            work: `advance`, and everything that is to be captured along with it.
-            name: Its name in messages.
+        """Work of this environment as a graph on CUDA; elsewhere as it is. It is `advance`, and
+        everything that is to be captured along with it; messages use its name.
         """
         return StepGraph(
             few_threads(self.device, self.nworld)(work),
@@ -265,19 +252,9 @@ class Env:
         return physics, self.captured(managers, "the managers"), images
 
     def read_statistics(self) -> dict[str, float]:
-        """Means over the episodes that ended since the last call; see `EpisodeStatistics.read`.
-        Waits for the device.
-        """
-        self.raise_faults()
+        """Means over the episodes that ended since the last call; see `EpisodeStatistics.read`."""
+        self.faults.raise_first()
         return self.statistics.read()
-
-    def raise_faults(self) -> None:
-        """Look at what went wrong on the device. Waits for it.
-
-        Raises:
-            FaultError: Something did; names the worlds and what to do.
-        """
-        self._faults.raise_first()
 
     def close(self) -> None:
         """Give the simulation's threads and buffers back. Nothing can be stepped afterwards."""
@@ -289,13 +266,11 @@ class Env:
         self.sim.close()
 
     def __str__(self) -> str:
+        managers = [self.action_manager, self.observation_manager, self.reset_manager]
+        managers += [self.termination_manager, self.reward_manager]
         worlds = f"{self.nworld} worlds, {self.sim.description}"
-        lines = (
-            f"{self.cfg.task.name} with {self.cfg.robot.title}: {worlds}",
-            *(self.action_manager, self.observation_manager, self.reset_manager),
-            *(self.termination_manager, self.reward_manager),
-        )
-        return "\n".join(map(str, lines))
+        title = f"{self.cfg.task.name} with {self.cfg.robot.title}: {worlds}"
+        return "\n".join(map(str, [title, *managers]))
 
     def _step_physics(self) -> None:
         current_term.label = ""
@@ -303,16 +278,12 @@ class Env:
             self.sim.step(self.cfg.timing.decimation, kinematics=True)
 
     def _evaluate(self, ended: Tensor | None = None, *, last: bool = True) -> Tensor | None:
-        """Success, terminations and rewards of the new state; after the last control step of a
+        """Success, terminations and rewards of the new state; after the ``last`` control step of a
         decision observations and resets.
 
-        Args:
-            ended: Worlds whose episode ended in an earlier control step of the decision, shape
-                ``(nworld,)``, bool; None in the first one.
-            last: Whether it is the last one.
-
-        Returns:
-            The worlds that have ended now, for the next control step; None after the last.
+        Takes the worlds whose episode ended in an earlier control step of the decision, shape
+        ``(nworld,)``, bool, None in the first one, and returns those for the next; None after the
+        last.
         """
         self.episode_step += 1 if ended is None else ~ended
 
@@ -331,16 +302,14 @@ class Env:
             broken = lost if lost.is_cuda or bool(lost.any()) else None
             if self._success is not None:
                 achieved = self._success(self)
-                if ended is not None:  # theirs stays
+                if ended is not None:  # their success stays
                     achieved = torch.where(ended, self.success, achieved)
-                if broken is not None:
-                    achieved = achieved & ~broken
-                self.success.copy_(achieved)
+                self.success.copy_(achieved if broken is None else achieved & ~broken)
             # A held step is seen by what remembers it alone.
             observes = last or self.observation_manager.remembers
             side_by_side(self.device, reward, *([observe] if observes else []))
         current_term.label = ""
-        self._faults.look(lost, broken)
+        self.faults.look(lost, broken)
         ends = self.termination_manager
         done = ends.terminated | ends.truncated
         if last:
@@ -348,13 +317,9 @@ class Env:
         return None if last else done
 
     def _reset_ended(self, done: Tensor, broken: Tensor | None) -> None:
-        """The terminal observation, the statistics, the reset of the worlds that ended, and the
-        observation to go on with.
-
-        Args:
-            done: Worlds that end, shape ``(nworld,)``, bool.
-            broken: Worlds whose state is not finite, shape ``(nworld,)``, bool; None if there are
-                none.
+        """The terminal observation, the statistics, the reset of the worlds that are ``done``, and
+        the observation to go on with. ``broken`` are worlds whose state is not finite, None if
+        there are none; both of shape ``(nworld,)``, bool.
         """
         ended_by = self.termination_manager.values
         # On CUDA, where looking would stop the device, worlds are always reset: those of an empty
@@ -372,12 +337,10 @@ class Env:
 
         def record() -> None:
             if done.is_cuda and broken is not None:
-                self._faults.record(broken)
+                self.faults.record(broken)
 
         side_by_side(self.device, keep, count, record)
         if ending:
-            self.episode += done
-            self.episode_step.masked_fill_(done, 0)
             self._start_worlds(done)
             self._reset_managers(done)
             with step_cache():
@@ -386,7 +349,11 @@ class Env:
             self._outputs.restore_observations()
 
     def _start_worlds(self, mask: Tensor) -> None:
-        """Start states of the masked worlds; a function of seed, world and episode alone."""
+        """Start states of the masked worlds' next episode; a function of seed, world and episode
+        alone.
+        """
+        self.episode += mask
+        self.episode_step.masked_fill_(mask, 0)
         self.reset_manager.reset(mask)
         self.sim.kinematics(mask)
         self._delay.reset(mask)

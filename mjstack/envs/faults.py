@@ -32,16 +32,14 @@ _FIXES = {
 class FaultLatch:
     """Keeps the faults of every world of an environment until it is cleared."""
 
-    def __init__(self, env: "Env", numbers: Tensor, *, check: bool) -> None:
+    def __init__(self, env: "Env", *, check: bool) -> None:
         """Allocate for the worlds of an environment whose managers are there.
 
         Args:
             env: The environment.
-            numbers: The memory of its reward and observations, float32.
             check: Whether faults of its steps are recorded.
         """
         self._env = env
-        self._numbers = numbers
         self._check = check
         self._steps = 0
         self._any = False  # latched since `clear`, on the CPU
@@ -56,16 +54,15 @@ class FaultLatch:
 
     def look(self, lost: Tensor, broken: Tensor | None) -> None:
         """Record the faults of a step and raise the first, on the CPU; a short look at all numbers
-        shows that there are none.
-
-        Args:
-            lost: Worlds whose state is not finite, shape ``(nworld,)``, bool.
-            broken: The same, or None if there are none.
+        shows that there are none. Takes worlds whose state is not finite, shape ``(nworld,)``,
+        bool; ``broken`` is None if there are none.
         """
         if lost.is_cuda or not self._check:
             return
-        fine = broken is None and not self._any and all_finite(self._numbers)
-        if not fine or bool(self._env.sim.overflow.any()):
+        env = self._env
+        numbers = (env.reward_manager.reward, *env.observation_manager.groups.values())
+        fine = broken is None and not self._any and all_finite(*numbers)
+        if not fine or bool(env.sim.overflow.any()):
             self.record(lost)
             self.raise_first()
 
@@ -76,10 +73,8 @@ class FaultLatch:
             self.raise_first()
 
     def record(self, broken: Tensor) -> None:
-        """Add the faults of a step, before a reset can erase them.
-
-        Args:
-            broken: Worlds whose state is not finite, shape ``(nworld,)``, bool.
+        """Add the faults of a step, before a reset can erase them, with the worlds whose state is
+        not finite, shape ``(nworld,)``, bool.
         """
         if not self._check:
             return
@@ -130,10 +125,9 @@ class FaultLatch:
         """
         rewards = self._env.reward_manager
         if "reward" in what:
-            bad = (~torch.isfinite(rewards.values[world])).tolist()
-            return [
-                f"reward.{name}" for name, is_bad in zip(rewards.names, bad, strict=True) if is_bad
-            ]
+            finite = torch.isfinite(rewards.values[world]).tolist()
+            pairs = zip(rewards.names, finite, strict=True)
+            return [f"reward.{name}" for name, is_finite in pairs if not is_finite]
         observations = self._env.observation_manager
         return observations.not_finite_terms(world) if "observation" in what else []
 
@@ -148,13 +142,9 @@ def describe_loss(overflow: np.ndarray, sizes: BatchSizes | None) -> tuple[str, 
     bits = int(np.bitwise_or.reduce(overflow))
     if not bits:
         return "", []
-    # The sizes of whole pools take precedence where they are set. By default convex pairs have as
-    # much room as contacts.
-    contacts = "nconmax" if sizes is None or sizes.naconmax is None else "naconmax"
-    convex = contacts
-    for key in ("nccdmax", "naccdmax"):
-        convex = key if getattr(sizes, key, None) is not None else convex
-    by_key = {"njmax": Overflow.NEFC | Overflow.NJMAX_NNZ, contacts: POOL}
+    # By default convex pairs have as much room as contacts.
+    convex = "nconmax" if sizes is None or sizes.nccdmax is None else "nccdmax"
+    by_key = {"njmax": Overflow.NEFC | Overflow.NJMAX_NNZ, "nconmax": POOL}
     by_key[convex] = by_key.get(convex, 0) | Overflow.CCD
     worlds = np.flatnonzero(overflow).tolist()
     what = f"{describe_overflow(bits)} overflow in {name_worlds(worlds, len(overflow))}"
@@ -165,10 +155,10 @@ def _capacity_hint(sim: Simulation, keys: list[str]) -> str:
     """How much to raise the sizes of overflowed buffers."""
     if not keys:
         return NO_KEY
-    held = ", ".join(f"{key}={getattr(sim.sizes, key)}" for key in keys)
+    sizes = ", ".join(f"{key}={getattr(sim.sizes, key)}" for key in keys)
     peak = f"; up to {int(sim.peak_constraints.max())} rows were needed" if "njmax" in keys else ""
     pool = sim.peak_pool
-    if {"nconmax", "naconmax"} & set(keys) and pool is not None:
+    if "nconmax" in keys and pool is not None:
         most = max(pool.tolist())
         peak += f"; all worlds together needed {most}, {-(-most // sim.nworld)} per world"
-    return f"Raise {' and '.join(f'batch.{key}' for key in keys)} ({held}{peak})"
+    return f"Raise {' and '.join(f'batch.{key}' for key in keys)} ({sizes}{peak})"

@@ -7,12 +7,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mjstack.config.check import reads_starts_file
 from mjstack.config.load import load_saved
 from mjstack.config.schema import Config, TermCfg
 from mjstack.config.session import read_yaml
 from mjstack.episodes.record import EpisodeRecord
-from mjstack.errors import MjstackError, RunError
+from mjstack.errors import FolderError, MjstackError
 from mjstack.files import reading, write_atomic
 
 REPORT = "report.json"
@@ -38,31 +40,33 @@ class EarlierRun:
         """Read a run's folder, which a configuration key names.
 
         Raises:
-            RunError: There is no such run; the message says what is missing.
+            FolderError: There is no such run; the message says what is missing.
         """
         folder = Path(name)
         saved = folder / ".hydra" / "config.yaml"
         report = folder / REPORT
         for path in (saved, report):
             if not path.is_file():
-                raise RunError(
+                raise FolderError(
                     f"{key}={name}: has no {path.relative_to(folder)}, expected the folder of a"
                     " run, such as outputs/2026-11-21/04-02-05 (of a sweep: one of its jobs'). Name"
                     " another folder."
                 )
-        job = _named_job(saved)  # before the rest, which has keys of that job alone
-        if job not in (None, "gates"):
-            raise RunError(
+        job = "gates"
+        with suppress(Exception):  # `load_saved` says what is wrong with it
+            job = str(read_yaml(saved)["job"]["name"]).partition("\n")[0]
+        if job != "gates":  # before the rest, which has keys of that job alone
+            raise FolderError(
                 f"{key}={name}: is a run of job={job}, expected one of job=gates. Name that run's"
                 " folder."
             )
         try:
             cfg = load_saved(saved)
         except MjstackError as error:
-            raise RunError(
+            raise FolderError(
                 f"{key}={name}: .hydra/config.yaml is no configuration of this mjstack: {error}"
             ) from error
-        with reading(report, RunError, "Name another folder"):
+        with reading(report, "Name another folder"):
             provenance = dict(json.loads(report.read_text())["provenance"])
             provenance["versions"] = dict(provenance["versions"])
         return cls(folder=folder, cfg=cfg, provenance=provenance)
@@ -71,17 +75,34 @@ class EarlierRun:
         """The record of a gate under a seed.
 
         Raises:
-            RunError: The gate did not get there, or the record cannot be read or is of another
+            FolderError: The gate did not get there, or the record cannot be read or is of another
                 number of worlds.
         """
         record = EpisodeRecord.read(self.folder, seed, gate)
-        found = "no record" if record is None else f"a record of {len(record.failed)} worlds"
+        left = "no record" if record is None else f"a record of {len(record.failed)} worlds"
         if record is None or len(record.failed) != self.cfg.nworld:
-            raise RunError(
-                f"run={self.folder}: gate {gate} has left {found} of seed {seed}, expected one of"
+            raise FolderError(
+                f"run={self.folder}: gate {gate} has left {left} of seed {seed}, expected one of"
                 f" {self.cfg.nworld} worlds. Run that gate again."
             )
         return record
+
+    def failing(self, gate: str) -> tuple[dict[int, dict[int, int]], int]:
+        """The bits of the rules that each failing world of a gate broke, by seed and world, and the
+        number of episodes of the seeds that it has finished.
+
+        Raises:
+            FolderError: A record cannot be read.
+        """
+        bits = {}
+        episodes = 0
+        for seed in range(self.cfg.seed, self.cfg.seed + self.cfg.gate[gate].seeds):
+            record = EpisodeRecord.read(self.folder, seed, gate)
+            if record is not None:
+                episodes += len(record.failed)
+                worlds = np.flatnonzero(record.failed).tolist()
+                bits[seed] = {world: int(record.failed[world]) for world in worlds}
+        return {seed: worlds for seed, worlds in bits.items() if worlds}, episodes
 
 
 def archive_starts(cfg: Config, folder: Path) -> Config:
@@ -97,26 +118,35 @@ def archive_starts(cfg: Config, folder: Path) -> Config:
     Raises:
         OSError: A file cannot be read, or a copy cannot be written.
     """
-    names = copy_names(cfg)
-    for path, name in names.items():
+    for path, name in copy_names(cfg).items():
         write_atomic(folder / name, Path(path).read_bytes())
-    return _from_copies(cfg, folder, names)
+    return archived_starts(cfg, folder)
 
 
 def archived_starts(cfg: Config, folder: Path) -> Config:
-    """An earlier run's configuration, with the copies in its folder as its terms' files.
+    """A run's configuration, with the copies in its folder as its terms' files.
 
     Raises:
-        RunError: A copy is missing.
+        FolderError: A copy is missing.
     """
-    names = copy_names(cfg)
-    for path, name in names.items():
-        if not (folder / name).is_file():
-            raise RunError(
-                f"run={folder}: has no {name}, expected a copy of the starts file that it started"
-                f" from, {path}. Put one there, unchanged."
+    copies = {path: folder.resolve() / name for path, name in copy_names(cfg).items()}
+    for path, copy in copies.items():
+        if not copy.is_file():
+            raise FolderError(
+                f"run={folder}: has no {copy.name}, expected a copy of the starts file that it"
+                f" started from, {path}. Put one there, unchanged."
             )
-    return _from_copies(cfg, folder.resolve(), names)
+
+    def swap(reset: Mapping[str, TermCfg]) -> dict[str, TermCfg]:
+        return {
+            key: term
+            if (copy := copies.get(term.params.get("path", ""))) is None
+            else replace(term, params=term.params | {"path": str(copy)})
+            for key, term in reset.items()
+        }
+
+    success = replace(cfg.gate.success, reset=swap(cfg.gate.success.reset))
+    return replace(cfg, reset=swap(cfg.reset), gate=replace(cfg.gate, success=success))
 
 
 def copy_names(cfg: Config) -> dict[str, str]:
@@ -126,23 +156,8 @@ def copy_names(cfg: Config) -> dict[str, str]:
         reset = cfg.gate.success.reset
     files = [term.params.get("path") for term in reset.values() if reads_starts_file({"": term})]
     paths = dict.fromkeys(path for path in files if path is not None)
-    return {path: f"{STEM}{f'_{n}' if n > 1 else ''}.csv" for n, path in enumerate(paths, 1)}
-
-
-def _from_copies(cfg: Config, folder: Path, names: Mapping[str, str]) -> Config:
-    def swap(reset: Mapping[str, TermCfg]) -> dict[str, TermCfg]:
-        out = dict(reset)
-        for key, term in reset.items():
-            if (name := names.get(term.params.get("path", ""))) is not None:
-                out[key] = replace(term, params=term.params | {"path": str(folder / name)})
-        return out
-
-    success = replace(cfg.gate.success, reset=swap(cfg.gate.success.reset))
-    return replace(cfg, reset=swap(cfg.reset), gate=replace(cfg.gate, success=success))
-
-
-def _named_job(saved: Path) -> str | None:
-    """The job of a saved configuration; None if the file does not name one."""
-    with suppress(Exception):  # `load_saved` says what is wrong with it
-        return str(read_yaml(saved)["job"]["name"]).partition("\n")[0]
-    return None
+    # With its ending, by which a term knows a file of version 0.1
+    return {
+        path: f"{STEM}{f'_{n}' if n > 1 else ''}{Path(path).suffix}"
+        for n, path in enumerate(paths, 1)
+    }

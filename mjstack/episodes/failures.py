@@ -125,8 +125,8 @@ class FailureMonitor(Observer):
             Sign.EMPTY: empty,
             Sign.PHYSICS: lost,
         }
-        for sign, found in signs.items():
-            seen.masked_fill_(found, sign)
+        for sign, worlds in signs.items():
+            seen.masked_fill_(worlds, sign)
         first = (self.sign == 0) & (seen > 0)
         ended = (seen == Sign.EMPTY) | (seen == Sign.MISSED)  # what the phase before has left
         self.sign.copy_(torch.where(first, seen, self.sign))

@@ -3,23 +3,22 @@ first, each beside its copy on native MuJoCo.
 """
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
+from torch import Tensor
 
 from mjstack.config.schema import Backend
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
-from mjstack.episodes.context import RunContext
-from mjstack.episodes.rollout import Observer, WorldRecorder
-from mjstack.errors import RunError
+from mjstack.episodes.recorder import Channels, Read, Recorder
+from mjstack.episodes.stage import Stage
 from mjstack.files import reading, write_npz
 from mjstack.interrupt import check_interrupt
-from mjstack.report.web import MOST, World, frame_stride, lacks_viser
+from mjstack.report.page import MOST_WORLDS, Page, World, frame_stride
 from mjstack.report.write import safely_write
 
 log = logging.getLogger(__name__)
@@ -29,122 +28,96 @@ _MARKS = ("label", "failed", "twin")  # of a world, in the file beside its posit
 _TWINS = 8  # failing worlds that native MuJoCo plays too
 
 
-class MotionRecorder(Observer):
-    """Records positions at the frames of a page, in as many of the first worlds as 64 MiB hold. A
-    frame is a copy on the device.
+def _read_first(env: Env, driver: Driver) -> Read:
+    """Positions of as many of the first worlds as `_BYTES` hold."""
+    qpos = env.sim.qpos
+    frames = len(_frames(env.cfg.timing.step_dt)(driver.steps))
+    first = qpos[: max(1, _BYTES // (frames * qpos[0].nbytes))]
+    return lambda: {"qpos": first}
+
+
+def _frames(step_dt: float) -> Callable[[int], range]:
+    """The step ends that a page shows, for a number of steps."""
+    return lambda steps: range(0, steps + 1, frame_stride(step_dt))
+
+
+def motion_recorder(step_dt: float) -> Recorder:
+    """Records the first worlds at the frames of a page, ``qpos`` of shape ``(frames, worlds, nq)``.
+
+    ``step_dt`` is the control interval [s].
     """
-
-    def start(self, env: Env, driver: Driver) -> None:
-        """See `Observer`."""
-        super().start(env, driver)
-        qpos = env.sim.qpos
-        self._stride = frame_stride(env.cfg.timing.step_dt)
-        frames = driver.steps // self._stride + 1
-        row = frames * qpos.shape[1] * qpos.element_size()
-        self._count = max(1, min(len(qpos), _BYTES // row))
-        shape = (frames, self._count, qpos.shape[1])
-        self._frames = torch.full(shape, torch.nan, dtype=qpos.dtype, device=qpos.device)
-        self._frames[0].copy_(qpos[: self._count])
-
-    def after_step(self, step: int) -> None:
-        """See `Observer`."""
-        frame, rest = divmod(step + 1, self._stride)
-        if rest == 0:
-            self._frames[frame].copy_(self.env.sim.qpos[: self._count])
-
-    @property
-    def recorded(self) -> int:
-        """Number of worlds."""
-        return self._count
-
-    def positions(self, worlds: Sequence[int]) -> np.ndarray:
-        """Recorded positions of some worlds, shape ``(worlds, frames, nq)``."""
-        return self._frames[:, list(worlds)].swapaxes(0, 1).double().cpu().numpy()
-
-
-def records_motion(context: RunContext) -> bool:
-    """Whether the run leaves a 3-D page."""
-    return context.folder is not None and context.cfg.web.episode and not lacks_viser()
-
-
-def show_world(
-    context: RunContext, part: str, label: str, recorder: WorldRecorder, *, failed: bool
-) -> None:
-    """Add a world that was played alone to the page."""
-    if records_motion(context):
-        qpos = recorder.qpos[:: frame_stride(context.cfg.timing.step_dt)]
-        context.page.worlds3d[part] = [World(label=label, qpos=qpos, failed=failed)]
+    return Recorder(Channels(_read_first, _frames(step_dt)))
 
 
 def show_batch(
-    context: RunContext, gate: str, recorder: MotionRecorder, failed: np.ndarray
+    stage: Stage, page: Page, path: Path, gate: str, qpos: Tensor, failed: np.ndarray
 ) -> None:
     """Add a gate's worlds to the page: failing ones, each beside its copy on native MuJoCo where
     that was not the backend, and then others. A file keeps them for a resumed run.
 
     Args:
-        context: The gate's run.
-        gate: Its name.
-        recorder: Has seen the episode of the configured seed.
+        stage: On which the gate has played.
+        page: The run's page.
+        path: The file.
+        gate: The gate's name.
+        qpos: Positions that `motion_recorder` has recorded of the configured seed.
         failed: Bits of the task's rules, shape ``(nworld,)``.
     """
-    rules = context.check.rules
-    failing = [world for world in np.flatnonzero(failed).tolist() if world < recorder.recorded]
-    twins = _play_twins(context, failing[:_TWINS])
-    others = [world for world in range(recorder.recorded) if not failed[world]]
-    chosen = [*failing, *others][: MOST - len(twins)]
-    shown: list[World] = []
-    motions = recorder.positions(chosen).astype(np.float32)
-    for world, qpos in zip(chosen, motions, strict=True):
+    rules = stage.check.rules
+    recorded = qpos.shape[1]
+    failing = np.flatnonzero(failed[:recorded]).tolist()
+    twins = _play_twins(stage, failing[:_TWINS])
+    succeeded = np.flatnonzero(failed[:recorded] == 0).tolist()
+    chosen = [*failing, *succeeded][: MOST_WORLDS - len(twins)]
+    moving: list[World] = []
+    motions = qpos[:, chosen].float().swapaxes(0, 1).cpu().numpy()
+    for world, motion in zip(chosen, motions, strict=True):
         bits = int(failed[world])
-        shown.append(
-            World(label=_label(str(world), rules.broken(bits)), qpos=qpos, failed=bits > 0)
-        )
+        label = _label(str(world), rules.broken(bits))
+        moving.append(World(label=label, qpos=motion, failed=bits > 0))
         if world in twins:
-            shown.append(twins[world])
-    context.page.worlds3d[gate] = shown
-    arrays: dict[str, Any] = {name: [getattr(world, name) for world in shown] for name in _MARKS}
-    arrays["qpos"] = [world.qpos for world in shown]
-    if problem := safely_write(_path(context, gate), write_npz, arrays, stops=False):
-        context.print_line(problem)
+            moving.append(twins[world])
+    page.worlds3d[gate] = moving
+    arrays: dict[str, Any] = {name: [getattr(world, name) for world in moving] for name in _MARKS}
+    arrays["qpos"] = [world.qpos for world in moving]
+    if problem := safely_write(path, write_npz, arrays, stops=False):
+        stage.progress.print_line(problem)
 
 
-def restore_batch(context: RunContext, gate: str) -> None:
+def restore_batch(page: Page, path: Path, gate: str) -> None:
     """Add the worlds to the page that an earlier call of the run has shown, if it has.
 
     Raises:
-        RunError: Their file cannot be read.
+        FolderError: Their file cannot be read.
     """
-    path = _path(context, gate)
     if path.exists():
-        with reading(path, RunError, "Remove it"), np.load(path) as held:
-            labels, failed, twin = (held[name].tolist() for name in _MARKS)
-            rows = zip(labels, held["qpos"], failed, twin, strict=True)
-            context.page.worlds3d[gate] = [
-                World(label=label, qpos=qpos, failed=lost, twin=copy)
-                for label, qpos, lost, copy in rows
+        with reading(path, "Remove it"), np.load(path) as arrays:
+            marks = [arrays[name].tolist() for name in _MARKS]
+            page.worlds3d[gate] = [
+                World(label=label, qpos=qpos, failed=failed, twin=twin)
+                for label, failed, twin, qpos in zip(*marks, arrays["qpos"], strict=True)
             ]
 
 
-def _path(context: RunContext, gate: str) -> Path:
-    assert context.folder is not None
-    return context.folder / f"motion_{gate}.npz"
+def motion_path(folder: Path, gate: str) -> Path:
+    """The file of a gate's worlds in motion."""
+    return folder / f"motion_{gate}.npz"
 
 
-def _play_twins(context: RunContext, worlds: Sequence[int]) -> dict[int, World]:
+def _play_twins(stage: Stage, worlds: Sequence[int]) -> dict[int, World]:
     """Some worlds on native MuJoCo, by number; none if that was the backend, or where it fails."""
-    if not worlds or context.backend[0] is Backend.native:
+    if not worlds or stage.backend[0] is Backend.native:
         return {}
-    recorder = MotionRecorder()
+    recorder = motion_recorder(stage.cfg.timing.step_dt)
     try:
-        with closing(context.simulation(len(worlds), Backend.native, "cpu")) as sim:
-            episode = context.play(sim, context.cfg.reset, [recorder], worlds=worlds)
-        positions = recorder.positions(range(len(worlds))).astype(np.float32)
+        with closing(stage.simulation(len(worlds), Backend.native, "cpu")) as sim:
+            episode = stage.play(sim, stage.cfg.reset, [recorder], worlds=worlds)
+        positions = recorder.rows["qpos"].float().swapaxes(0, 1).cpu().numpy()
     except Exception:
         check_interrupt()
         log.exception("no copies of failing worlds on native MuJoCo")
         return {}
-    broken = [context.check.rules.broken(bits) for bits in episode.failed.tolist()]
+    broken = [stage.check.rules.broken(bits) for bits in episode.failed.tolist()]
     return {
         world: World(label=_label(f"{world}, native", rules), qpos=qpos, twin=True)
         for world, qpos, rules in zip(worlds, positions, broken, strict=True)

@@ -5,15 +5,16 @@ as a table, a file and a picture.
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
+from pathlib import Path
 
 import numpy as np
 
 from mjstack.config.schema import Config
-from mjstack.episodes.context import RunContext
 from mjstack.episodes.record import PICTURE, REGIONS
 from mjstack.episodes.tally import EpisodeTally, rate_cells
 from mjstack.files import to_csv, write_atomic
 from mjstack.math import wilson_interval
+from mjstack.report.page import Page
 from mjstack.report.picture import save_places
 from mjstack.report.table import Table
 from mjstack.report.write import safely_write
@@ -53,10 +54,8 @@ class Region:
         """The cell in words."""
         parts = []
         if self.x_min_m is not None:
-            parts.append(
-                f"x {self.x_min_m:.3f} to {self.x_max_m:.3f} m, y {self.y_min_m:.3f} to"
-                f" {self.y_max_m:.3f} m"
-            )
+            parts.append(f"x {self.x_min_m:.3f} to {self.x_max_m:.3f} m")
+            parts.append(f"y {self.y_min_m:.3f} to {self.y_max_m:.3f} m")
         if self.yaw_min_deg is not None:
             parts.append(f"turned {self.yaw_min_deg:g} to {self.yaw_max_deg:g} deg")
         return f"{self.object}: {', '.join(parts)}"
@@ -96,9 +95,8 @@ def find_regions(
     """
     out = []
     for number, name in enumerate(objects):
-        mine = places[:, number]
-        x, y = np.floor(mine[:, :2] / cell + _EDGE).T
-        yaw = np.floor(radial_yaw_deg(mine) / yaw_cell_deg + _EDGE)
+        x, y = np.floor(places[:, number, :2] / cell + _EDGE).T
+        yaw = np.floor(radial_yaw_deg(places[:, number]) / yaw_cell_deg + _EDGE)
         yaw[yaw * yaw_cell_deg >= 90.0] = 0.0  # on the edge of 90, which is 0
         # Each axis: the cell of every episode, the width and the unit of a cell, and the last edge.
         axes = {
@@ -109,12 +107,12 @@ def find_regions(
         for chosen in (("x", "y"), ("yaw",), ("x", "y", "yaw")):
             keys = np.stack([axes[axis][0] for axis in chosen], axis=1)
             cells, which = np.unique(keys, axis=0, return_inverse=True)
-            for place, key in enumerate(cells.tolist()):
-                good = succeeded[which.ravel() == place]
-                n = len(good)
+            for row, key in enumerate(cells.tolist()):
+                outcomes = succeeded[which.ravel() == row]
+                n = len(outcomes)
                 if n < episodes:
                     continue
-                k = int(good.sum())
+                k = int(outcomes.sum())
                 bounds = {}
                 for axis, at in zip(chosen, key, strict=True):
                     _, width, unit, last = axes[axis]
@@ -141,13 +139,12 @@ def regions_table(cfg: Config, regions: list[Region]) -> list[Table]:
     failing = [r for r in regions if r.succeeded < r.episodes]
     if not failing:
         return []
-    shown = failing[: t.worst_regions]
     rows = [
         [r.where, str(r.episodes), str(r.succeeded), *rate_cells(r.succeeded, r.episodes)]
-        for r in shown
+        for r in failing[: t.worst_regions]
     ]
     title = (
-        f"Worst regions of at least {t.cell_episodes} episodes ({len(shown)} of {len(failing)} with"
+        f"Worst regions of at least {t.cell_episodes} episodes ({len(rows)} of {len(failing)} with"
         " a failure)"
     )
     header = ["where the object started", "episodes", "succeeded", "rate", "95 % interval"]
@@ -155,26 +152,25 @@ def regions_table(cfg: Config, regions: list[Region]) -> list[Table]:
 
 
 def save_regions(
-    context: RunContext, regions: list[Region], starts: np.ndarray, tally: EpisodeTally
+    cfg: Config,
+    folder: Path,
+    page: Page,
+    regions: list[Region],
+    starts: np.ndarray,
+    tally: EpisodeTally,
 ) -> list[str]:
     """Write the table of regions and the picture of all starts. A failure takes no result back.
 
     Returns:
         The files that could not be written, a line each.
     """
-    folder = context.folder
-    if folder is None:
-        return []
     rows = to_csv([asdict(region) for region in regions], [f.name for f in fields(Region)])
-    scene = context.cfg.scene
+    unwritten = safely_write(folder / REGIONS, write_atomic, rows)
+    scene = cfg.scene
     table = (scene.table_center[:2], scene.table_half[:2])
-    title = f"{context.cfg.robot.title}: {tally.summary}"
+    title = f"{cfg.robot.title}: {tally.summary}"
     colors = {name: thing.color for name, thing in scene.free.items()}
-    drawn = (starts, np.concatenate(tally.succeeded), table, title, colors)
-    problems = [
-        safely_write(folder / REGIONS, write_atomic, rows),
-        safely_write(folder / PICTURE, save_places, *drawn),
-    ]
-    if not problems[-1]:
-        context.page.pictures.append(PICTURE)
-    return [problem for problem in problems if problem]
+    places = (starts, np.concatenate(tally.succeeded), table, title, colors)
+    if not (problem := safely_write(folder / PICTURE, save_places, *places)):
+        page.pictures.append(PICTURE)
+    return list(filter(None, [unwritten, problem]))

@@ -3,15 +3,16 @@ judged episode.
 """
 
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from typing_extensions import override
 
 from mjstack.config.schema import TermCfg
-from mjstack.drivers.driver import Driver, Recorded
+from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.envs.buffers import Advance
 from mjstack.sim import Simulation
@@ -150,7 +151,7 @@ def rollout(
 
     # Its time
     warm_up, capture = (
-        now if now != then else 0.0 for now, then in zip(graph_seconds(), before, strict=True)
+        end if end != start else 0.0 for end, start in zip(graph_seconds(), before, strict=True)
     )
     captured = play.captured
     play.drop()  # its memory, which only the collector would find otherwise
@@ -265,87 +266,19 @@ class Judge(Observer):
 
     result: CheckResult
 
+    @override
     def start(self, env: Env, driver: Driver) -> None:
-        """See `Observer`."""
         super().start(env, driver)
         self._check = make_check(env.cfg)
         self._check.start(env, driver.steps, driver.phases)
 
+    @override
     def update(self) -> None:
-        """See `Observer`."""
         self._check.update(self.driver.phase)
 
+    @override
     def finish(self) -> None:
-        """See `Observer`."""
         self.result = self._check.result()
-
-
-class WorldRecorder(Observer):
-    """Records world 0.
-
-    Attributes:
-        qpos: Positions at every step end, shape ``(steps, nq)``; NaN in steps not made.
-        phase: Number of the phase in every step, shape ``(steps,)``; -1 in steps not made.
-    """
-
-    qpos: np.ndarray
-    phase: np.ndarray
-
-    def start(self, env: Env, driver: Driver) -> None:
-        """See `Observer`."""
-        super().start(env, driver)
-        self.qpos = np.full((driver.steps, env.sim.qpos.shape[1]), np.nan)
-        self.phase = np.full(driver.steps, -1)
-
-    def after_step(self, step: int) -> None:
-        """See `Observer`."""
-        self.qpos[step] = self.env.sim.qpos[0].cpu().numpy()
-        self.phase[step] = int(self.driver.phase[0])
-
-
-class Snapshots(Observer):
-    """Keeps the state of all worlds after some steps.
-
-    Attributes:
-        states: By step.
-    """
-
-    def __init__(self, steps: Collection[int]) -> None:
-        """``steps`` after which the state is kept."""
-        self._steps = steps
-        self.states: dict[int, State] = {}
-
-    def start(self, env: Env, driver: Driver) -> None:
-        """See `Observer`."""
-        super().start(env, driver)
-        self.aside = 0.0
-
-    def after_step(self, step: int) -> None:
-        """See `Observer`."""
-        if step in self._steps:
-            self.env.sim.synchronize()
-            began = time.perf_counter()
-            self.states[step] = snapshot(self.env.sim)
-            self.aside += time.perf_counter() - began
-
-
-class CommandRecorder(Observer):
-    """Records the commands of all worlds, on the device.
-
-    Attributes:
-        recorded: A driver that repeats them.
-    """
-
-    recorded: Recorded
-
-    def start(self, env: Env, driver: Driver) -> None:
-        """See `Observer`."""
-        super().start(env, driver)
-        self.recorded = Recorded(driver, env.action_manager.action_dim)
-
-    def update(self) -> None:
-        """See `Observer`."""
-        self.recorded.append(self.env.action_manager.action, self.driver.phase)
 
 
 class Hook(Observer):
@@ -355,6 +288,6 @@ class Hook(Observer):
         """``function`` gets the step's number and the simulation."""
         self._function = function
 
+    @override
     def after_step(self, step: int) -> None:
-        """See `Observer`."""
         self._function(step, self.env.sim)

@@ -4,33 +4,34 @@ import itertools
 import logging
 import socket
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from contextlib import closing
 from functools import partial
 
 import numpy as np
 
-from mjstack.episodes.context import RunContext
+from mjstack.episodes.batches import Batch, BatchPlan, play_batches
 from mjstack.episodes.failures import FailureMonitor
-from mjstack.episodes.motion import MotionRecorder, records_motion, restore_batch, show_batch
-from mjstack.episodes.record import FAILING, SUCCESS_FAILING, Circumstances, EpisodeRecord
-from mjstack.episodes.rollout import Episode, Observer
+from mjstack.episodes.motion import motion_path, motion_recorder, restore_batch, show_batch
+from mjstack.episodes.record import FAILING, SUCCESS_FAILING, EpisodeRecord, circumstances
+from mjstack.episodes.rollout import Observer
+from mjstack.episodes.run import Run
+from mjstack.episodes.stage import Stage
 from mjstack.episodes.tally import EpisodeTally
-from mjstack.errors import RunError, first_line
+from mjstack.errors import FolderError, first_line
 from mjstack.interrupt import check_interrupt
-from mjstack.report.html import Worlds
-from mjstack.report.svg import Map
+from mjstack.report.page import Map, Worlds
 from mjstack.sim import Simulation
 
 log = logging.getLogger(__name__)
 
 
 def play_seeds(
-    context: RunContext,
+    run: Run,
     gate: str,
     *,
     count: int,
     noun: str,
-    circumstances: bool = False,
+    signs: bool = False,
     observers: Callable[[int], Sequence[Observer]],
 ) -> EpisodeTally:
     """Play seed after seed in as many worlds as are configured, and record each.
@@ -38,111 +39,129 @@ def play_seeds(
     A seed that breaks ends it, and those before it still count; the first one's error is raised.
 
     Args:
-        context: The run.
+        run: The run.
         gate: The gate, which names the files.
         count: Number of seeds, from the configured one on.
         noun: The things that are counted, such as ``worlds``.
-        circumstances: Whether starts and signs of failure are recorded too.
+        signs: Whether starts and signs of failure are recorded too.
         observers: More observers, by seed.
     """
-    cfg = context.cfg
-    folder = context.folder
+    cfg = run.cfg
+    folder = run.folder
     name = SUCCESS_FAILING if gate != "batch" and "batch" in cfg.gates else FAILING
     tally = EpisodeTally(
         gate=gate,
         noun=noun,
         several=count > 1,
-        check=context.check,
+        check=run.stage.check,
         path=None if folder is None else folder / name,
         replayed=cfg.job.name == "gates",
     )
-    sim = context.batch_simulation(len(context.worlds))
-    tally.notes = {
-        "backend": sim.description,
-        "sizes": str(sim.sizes or "native MuJoCo has no fixed buffers"),
-    }
-    player = _Player(context, tally, sim, circumstances, observers)
-    try:
-        player.play(range(cfg.seed, cfg.seed + count))
-    finally:
-        sim.close()
-        tally.write_failing()  # once: its rows grow with the seeds
+    with closing(run.stage.batch_simulation(len(run.stage.worlds))) as sim:
+        tally.notes = {
+            "backend": sim.description,
+            "sizes": str(sim.sizes or "native MuJoCo has no fixed buffers"),
+        }
+        player = _Player(run, tally, signs, observers)
+        try:
+            player.play(range(cfg.seed, cfg.seed + count), sim)
+        finally:
+            tally.write_failing()  # once: its rows grow with the seeds
     if tally.again:
-        seeds = ", ".join(_runs(tally.again))
+        seeds = ", ".join(_ranges(tally.again))
         tally.details.append(f"an earlier call has played seeds {seeds}")
     if cfg.nworld > 1:
-        context.page.worlds[gate] = _worlds(tally, context)
+        run.page.worlds[gate] = _worlds(tally, run)
     return tally
 
 
-@dataclass(eq=False, slots=True)
 class _Player:
-    """Plays seeds into a tally; fields as the arguments of `play_seeds`."""
+    """Plays seeds into a tally."""
 
-    context: RunContext
-    tally: EpisodeTally
-    sim: Simulation
-    circumstances: bool
-    observers: Callable[[int], Sequence[Observer]]
+    def __init__(
+        self,
+        run: Run,
+        tally: EpisodeTally,
+        signs: bool,
+        observers: Callable[[int], Sequence[Observer]],
+    ) -> None:
+        """Arguments as of `play_seeds`."""
+        self._run = run
+        self._tally = tally
+        self._signs = signs
+        self._observers = observers
+        folder = run.folder
+        self._motion_path = folder and motion_path(folder, tally.gate) if run.page.motion else None
 
-    def play(self, seeds: range) -> None:
+    def play(self, seeds: range, sim: Simulation) -> None:
         """Play or read back seed after seed, and count them."""
-        tally = self.tally
-        for seed in seeds:
-            try:
-                record = self._play_or_read(seed)
-                tally.add(record)
-            except Exception as error:
-                check_interrupt()
-                if not tally.seeds or self.context.ranks.size > 1:
-                    raise
-                log.exception("seed %d broke", seed)
-                why = first_line(error)
-                left = f"seed {seed}" if seed == seeds[-1] else f"seeds {seed} to {seeds[-1]}"
-                tally.problems.append(f"{left} not played: {why} (run.log has the traceback)")
-                break
-            if tally.several:
-                self.context.print_line(
-                    f"{tally.gate}, seed {seed}: {int(record.succeeded.sum())} of"
-                    f" {len(record.failed)} worlds succeeded, {tally.good} of {tally.episodes}"
-                    " so far"
-                )
+        run = self._run
+        tally = self._tally
+        missing = self._missing(seeds)
+        try:
+            for batch in play_batches(run.stage, missing, sim=sim, observers=self._observe):
+                tally.first = tally.first or batch.episode
+                part = _record(run.stage, batch, self._monitor)
+                record = EpisodeRecord.join(run.stage.ranks.gather(part))
+                self._write(record)
+                if self._motion is not None and self._motion_path is not None:
+                    qpos = self._motion.rows["qpos"]
+                    show_batch(
+                        run.stage, run.page, self._motion_path, tally.gate, qpos, record.failed
+                    )
+                self._count(record)
+        except Exception as error:
+            check_interrupt()
+            if not tally.seeds or run.stage.ranks.size > 1:
+                raise
+            seed = seeds[len(tally.seeds)]
+            log.exception("seed %d broke", seed)
+            why = first_line(error)
+            left = f"seed {seed}" if seed == seeds[-1] else f"seeds {seed} to {seeds[-1]}"
+            tally.problems.append(f"{left} not played: {why} (run.log has the traceback)")
 
-    def _play_or_read(self, seed: int) -> EpisodeRecord:
-        """A seed's record: an earlier call's, or played, written and shown now."""
-        context = self.context
-        tally = self.tally
-        shows = records_motion(context) and seed == context.cfg.seed
-        record = context.ranks.from_first(partial(self._read, seed))
-        if record is not None:
-            tally.again.append(seed)
-            if shows:
-                restore_batch(context, tally.gate)
-            return record
-        monitors = [FailureMonitor()] if self.circumstances else []
-        recorders = [MotionRecorder()] if shows else []
-        looking = [*monitors, *self.observers(seed), *recorders, *context.spectators]
-        episode = context.play(
-            self.sim, context.cfg.reset, looking, seed=seed, worlds=context.worlds
-        )
-        if tally.first is None:
-            tally.first = episode
-        part = _record(context, self.sim, seed, episode, monitors)
-        record = EpisodeRecord.join(context.ranks.gather(part))
-        self._write(record)
-        for recorder in recorders:
-            show_batch(context, tally.gate, recorder, record.failed)
-        return record
+    def _missing(self, seeds: range) -> Iterator[BatchPlan]:
+        """The seeds that no earlier call of the run has played; its records are counted."""
+        run = self._run
+        for seed in seeds:
+            record = run.stage.ranks.from_first(partial(self._read, seed))
+            if record is None:
+                yield BatchPlan(seed, run.stage.worlds)
+                continue
+            self._tally.again.append(seed)
+            if self._motion_path is not None and seed == run.cfg.seed:
+                restore_batch(run.page, self._motion_path, self._tally.gate)
+            self._count(record)
+
+    def _observe(self, plan: BatchPlan) -> list[Observer]:
+        """The observers of a seed."""
+        cfg = self._run.cfg
+        in_motion = self._motion_path is not None and plan.seed == cfg.seed
+        self._monitor = FailureMonitor() if self._signs else None
+        self._motion = motion_recorder(cfg.timing.step_dt) if in_motion else None
+        watchers = [self._monitor, *self._observers(plan.seed), self._motion]
+        return [watcher for watcher in watchers if watcher is not None]
+
+    def _count(self, record: EpisodeRecord) -> None:
+        """Count a seed, and print where there are several."""
+        tally = self._tally
+        tally.add(record)
+        if tally.several:
+            self._run.print_line(
+                f"{tally.gate}, seed {record.seed}: {int(record.succeeded.sum())} of"
+                f" {len(record.failed)} worlds succeeded, {tally.successes} of {tally.episodes}"
+                " so far"
+            )
 
     def _read(self, seed: int) -> EpisodeRecord | None:
         """The results of a seed that an earlier call of the run has left."""
-        cfg = self.context.cfg
-        folder = self.context.folder
+        cfg = self._run.cfg
+        folder = self._run.folder
         if cfg.resume is None or folder is None:
             return None
-        record = EpisodeRecord.read(folder, seed, self.tally.gate, whole=True)
+        record = EpisodeRecord.read(folder, seed, self._tally.gate, whole=True)
         if record is not None and len(record.failed) != cfg.nworld:
-            raise RunError(
+            raise FolderError(
                 f"resume={folder}: has {len(record.failed)} worlds of seed {seed}, expected"
                 f" {cfg.nworld}. Name another folder."
             )
@@ -152,7 +171,7 @@ class _Player:
         """Write the seed's record, before the next one can break or be stopped. A full disk takes
         no result back.
         """
-        tally = self.tally
+        tally = self._tally
         if tally.path is None:
             return
         try:
@@ -165,66 +184,64 @@ class _Player:
             )
 
 
-def _worlds(tally: EpisodeTally, context: RunContext) -> Worlds:
+def _worlds(tally: EpisodeTally, run: Run) -> Worlds:
     """The episodes as the run's page plots them."""
-    scene = context.cfg.scene
+    scene = run.cfg.scene
     table = (scene.table_center[:2], scene.table_half[:2])
     rules = tally.check.rules
-    held = {
-        name: np.concatenate([values[name] for _, _, values in tally.shown])
-        for name in tally.shown[0][2]
+    arrays = {
+        name: np.concatenate([values[name] for _, _, values in tally.plotted])
+        for name in tally.plotted[0][2]
     }
-    start = held.pop("start")
-    bits = held.pop("failed").tolist()
+    start = arrays.pop("start")
+    bits = arrays.pop("failed").tolist()
     if len(bits) < tally.episodes:
         tally.details.append(
             f"report.html shows {len(bits):,} of the {tally.episodes:,} {tally.noun}: the first"
             " ones, and all that failed"
         )
     worlds = Worlds(
-        names=[n for seed, which, _ in tally.shown for n in tally.names(seed, which.tolist())],
+        names=[n for seed, worlds, _ in tally.plotted for n in tally.names(seed, worlds.tolist())],
         broken=[rules.broken(failed) if failed else [] for failed in bits],
         rules=rules.texts,
-        values=held,
+        values=arrays,
     )
-    moving = [world for world in context.page.worlds3d.get(tally.gate, []) if not world.twin]
-    for name, (at, _) in context.index.objects.items():
+    moving = [world for world in run.page.worlds3d.get(tally.gate, []) if not world.twin]
+    for name, (at, _) in run.stage.index.objects.items():
         xy = slice(at, at + 2)
         ways = [(world.label, world.failed, world.qpos[:, xy]) for world in moving]
         worlds.maps.append(Map(title=name, xy=start[:, xy], table=table, ways=ways))
     return worlds
 
 
-def _record(
-    context: RunContext,
-    sim: Simulation,
-    seed: int,
-    episode: Episode,
-    monitors: Sequence[FailureMonitor],
-) -> EpisodeRecord:
+def _record(stage: Stage, batch: Batch, monitor: FailureMonitor | None) -> EpisodeRecord:
     """The record of this rank's worlds."""
-    place = f"rank {context.ranks.rank}: {socket.gethostname()}, {sim.device}"
+    sim = batch.env.sim
+    episode = batch.episode
+    place = f"rank {stage.ranks.rank}: {socket.gethostname()}, {sim.device}"
     return EpisodeRecord(
-        seed=seed,
+        seed=batch.plan.seed,
         backend=sim.backend,
         device=str(sim.device),
-        failed=episode.failed,
-        values=episode.values,
-        qpos=sim.qpos.cpu().numpy().copy(),
-        start=episode.start,
-        circumstances=Circumstances.of(episode, monitors[0]) if monitors else None,
-        measured={
-            "waypoint_error_m": episode.waypoint_error,
-            "peak_contacts": sim.peak_contacts.cpu().numpy().copy(),
-            "peak_constraint_rows": sim.peak_constraints.cpu().numpy().copy(),
+        worlds={
+            "failed": episode.failed,
+            "qpos": sim.qpos.cpu().numpy().copy(),
+            "start_qpos": episode.start,
+            **{f"value.{name}": values for name, values in episode.values.items()},
+            "measured.waypoint_error_m": episode.waypoint_error,
+            "measured.peak_contacts": sim.peak_contacts.cpu().numpy().copy(),
+            "measured.peak_constraint_rows": sim.peak_constraints.cpu().numpy().copy(),
+            **(circumstances(episode, monitor) if monitor else {}),
         },
+        object_names=list(stage.index.objects) if monitor else [],
+        phase_names=[phase.name for phase in monitor.driver.phases] if monitor else [],
         seconds=episode.timing.seconds,
         steps=int(sim.step_count.sum()),
-        ranks={context.worlds.start: place} if context.ranks.size > 1 else {},
+        ranks={stage.worlds.start: place} if stage.ranks.size > 1 else {},
     )
 
 
-def _runs(numbers: Sequence[int]) -> Iterator[str]:
+def _ranges(numbers: Sequence[int]) -> Iterator[str]:
     """Ascending numbers in words, neighbours as ``3 to 7``."""
     for _, group in itertools.groupby(enumerate(numbers), lambda pair: pair[1] - pair[0]):
         run = [number for _, number in group]

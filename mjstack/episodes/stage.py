@@ -1,50 +1,336 @@
-"""Scene, plan and policy of a run."""
+"""The stage: scene, plan and policy, and the simulations, environments and drivers that are made of
+them. All that a trainer or a benchmark needs of a run.
+"""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 
 import mujoco
 
-from mjstack.config.schema import Config
+from mjstack.config.schema import Backend, Config, TermCfg
+from mjstack.distributed import Ranks, current_ranks
+from mjstack.drivers.driver import Driver, OpenLoopDriver
 from mjstack.drivers.open_loop import OpenLoopPlanner
+from mjstack.drivers.policy import PolicyDriver
+from mjstack.envs import Env, driven_config
+from mjstack.envs.buffers import Advance, Workload, measured_sizes, play_workload
+from mjstack.episodes.assets import Assets
+from mjstack.episodes.rollout import (
+    CLOSED_LOOP,
+    PHASELESS,
+    POLICY,
+    STATE_BASED,
+    Episode,
+    Observer,
+    Reset,
+    play_episode,
+    reset_worlds,
+)
 from mjstack.errors import ConfigError
-from mjstack.policy import Policy, load_policy
-from mjstack.scene import SceneIndex, build_model
-from mjstack.sim import StateRenderer
-from mjstack.sim.cameras import color_cameras
+from mjstack.managers.episode import required_fields
+from mjstack.mdp.geometry import source_xy
+from mjstack.scene import SceneIndex
+from mjstack.scene.phases import Phase
+from mjstack.sim import (
+    BatchSizes,
+    Simulation,
+    StateRenderer,
+    make_simulation,
+    resolve_backend,
+    resolve_sizes,
+)
+from mjstack.sim.cameras import with_outputs
+from mjstack.sim.sizes import apply_configured
+from mjstack.tasks.check import EpisodeCheck, make_check
+
+TextHook = Callable[[str], None]
 
 
-@dataclass(eq=False)
-class Stage:
-    """Scene, plan and policy of a run, each built once when it is first needed.
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """Where a run prints. By default nowhere.
 
     Attributes:
-        cfg: The configuration of scene, robot and phases.
+        print_line: Prints a line, which has no markup.
+        advance: Shows how much of a part is done.
     """
 
-    cfg: Config
+    print_line: TextHook = lambda line: None
+    advance: Advance = lambda what, done, total: None
 
-    @cached_property
+
+@dataclass(eq=False, slots=True)
+class MeasuredSizes:
+    """Buffer sizes that were measured, with a margin.
+
+    Attributes:
+        task: Those that the driven task needs, from *capacity* or from ``batch=auto``.
+        env: Those that environments need, from *capacity*.
+    """
+
+    task: BatchSizes | None = None
+    env: BatchSizes | None = None
+
+
+class Stage:
+    """Makes the simulations, environments and drivers of a configuration.
+
+    Attributes:
+        cfg: The configuration.
+        assets: Scene, plan and policy, which several configurations may share.
+        ranks: The processes of the run.
+        measured: Buffer sizes that were measured.
+        progress: Where the run prints.
+        observers: Look on at every rollout of many worlds, such as the live view.
+    """
+
+    def __init__(
+        self,
+        cfg: Config,
+        assets: Assets | None = None,
+        *,
+        ranks: Ranks | None = None,
+        measured: MeasuredSizes | None = None,
+        progress: Progress | None = None,
+        observers: Sequence[Observer] = (),
+    ) -> None:
+        """Take the attributes; by default the assets are those of the configuration."""
+        self.cfg = cfg
+        self.assets = assets or Assets(cfg)
+        self.ranks = ranks or current_ranks()
+        self.measured = measured or MeasuredSizes()
+        self.progress = progress or Progress()
+        self.observers = observers
+
+    def with_config(
+        self,
+        cfg: Config,
+        *,
+        assets: Assets | None = None,
+        ranks: Ranks | None = None,
+        measured: MeasuredSizes | None = None,
+    ) -> "Stage":
+        """A stage for another configuration, which shares scene and plan unless there are others.
+        It measures sizes itself: other starts, say, have other peaks.
+        """
+        return Stage(
+            cfg,
+            assets or self.assets,
+            ranks=ranks or self.ranks,
+            measured=measured,
+            progress=self.progress,
+            observers=self.observers,
+        )
+
+    # What is built once
+
+    @property
     def model(self) -> mujoco.MjModel:
         """The scene for physics."""
-        return build_model(self.cfg)
+        return self.assets.model
 
-    @cached_property
-    def visual_model(self) -> mujoco.MjModel:
-        """The same scene with everything that only pictures need."""
-        return build_model(self.cfg, visuals=True)
-
-    @cached_property
+    @property
     def index(self) -> SceneIndex:
         """Addresses in the model."""
-        return SceneIndex(self.model, self.cfg.robot, self.cfg.scene)
+        return self.assets.index
 
-    @cached_property
+    @property
     def planner(self) -> OpenLoopPlanner:
         """The planner, its nominal plan made."""
-        return OpenLoopPlanner(self.cfg)
+        return self.assets.planner
+
+    @cached_property
+    def check(self) -> EpisodeCheck:
+        """The task's check, for its rules, thresholds and report."""
+        return make_check(self.cfg)
+
+    @cached_property
+    def backend(self) -> tuple[Backend, str]:
+        """Backend and device of batch, capacity and throughput."""
+        return resolve_backend(self.cfg)
+
+    # The driven episode
+
+    @property
+    def worlds(self) -> range:
+        """Numbers of the worlds that this rank plays."""
+        return self.ranks.share(self.cfg.nworld)
+
+    @property
+    def phases(self) -> list[Phase]:
+        """Those of the driver: a policy and the state-based expert have none."""
+        return [] if self.cfg.controller.name in PHASELESS else self.planner.phases
+
+    @property
+    def episode_steps(self) -> int:
+        """Length of a driven episode."""
+        return self.phases[-1].stop if self.phases else self.cfg.task.episode_steps
+
+    def phase(self, name: str) -> Phase:
+        """A phase of the scripted motion by its name."""
+        return next(phase for phase in self.planner.phases if phase.name == name)
+
+    @cached_property
+    def action(self) -> dict[str, TermCfg]:
+        """Action terms of the driver: a policy's own, or joint targets.
+
+        Raises:
+            MjstackError: The policy cannot be read, or was trained for something else.
+        """
+        if self.cfg.controller.name != POLICY:
+            return self.cfg.controller.action
+        policy = self.assets.policy
+        policy.check_fit(self.cfg)
+        return policy.action
+
+    def driven(self, reset: Reset) -> Config:
+        """The configuration of a driven episode. The live view also shows rewards and success."""
+        cfg = driven_config(self.cfg, reset, self.action)
+        if self.cfg.view == "web":
+            cfg = replace(cfg, reward=self.cfg.reward, task=self.cfg.task)
+        return cfg
+
+    def start(
+        self,
+        sim: Simulation,
+        reset: Reset,
+        *,
+        seed: int | None = None,
+        worlds: Sequence[int] | None = None,
+    ) -> Env:
+        """Build the environment of a driven episode, whose action terms are the driver's, and reset
+        every world.
+
+        Args:
+            sim: The worlds.
+            reset: How worlds differ at the start.
+            seed: Seed, if not the configured one.
+            worlds: Their numbers, which random numbers depend on: ``[17]`` starts one world as
+                world 17 of any batch starts. By default they are numbered from 0 on.
+        """
+        cfg = self.driven(reset)
+        env = Env(sim, self.index, cfg, check_faults=False)
+        return reset_worlds(env, cfg.seed if seed is None else seed, worlds)
+
+    def driver(self, env: Env) -> Driver:
+        """The configured driver, for worlds that have started."""
+        name = env.cfg.controller.name
+        if name == POLICY:
+            return PolicyDriver(env, self.assets.policy, self.cfg.scene.cameras)
+        if name == CLOSED_LOOP:  # loads Warp, which a native open-loop run does not need
+            from mjstack.drivers.closed_loop import ClosedLoopDriver
+
+            return ClosedLoopDriver(env, self.planner.nominal)
+        if name == STATE_BASED:
+            from mjstack.drivers.state_based import StateBasedDriver
+
+            return StateBasedDriver(env, self.planner.nominal)
+        sim = env.sim
+        trajectory = self.planner.plan(
+            source_xy(env).double().cpu().numpy(),
+            lambda done: self.progress.advance("planning", done, sim.nworld),
+            names=env.world.tolist(),
+        )
+        return OpenLoopDriver(trajectory.to(sim.device, sim.ctrl.dtype), self.planner.phases)
+
+    def play(
+        self,
+        sim: Simulation,
+        reset: Reset,
+        observers: Sequence[Observer] = (),
+        *,
+        seed: int | None = None,
+        worlds: Sequence[int] | None = None,
+    ) -> Episode:
+        """Roll out one judged episode, at which the observers look on; other arguments as of
+        `start`.
+        """
+        env = self.start(sim, reset, seed=seed, worlds=worlds)
+        return play_episode(env, self.driver(env), observers, advance=self.progress.advance)
+
+    # Simulations
+
+    def batch_simulation(self, nworld: int) -> Simulation:
+        """Worlds on the backend of the batch."""
+        return self.simulation(nworld, *self.backend)
+
+    def simulation(
+        self,
+        nworld: int,
+        backend: Backend,
+        device: str,
+        *,
+        reset: Reset | None = None,
+        sizes: BatchSizes | None = None,
+    ) -> Simulation:
+        """Worlds that can start as the configuration says.
+
+        Args:
+            nworld: How many.
+            backend: Native or MJWarp.
+            device: ``cpu`` or ``cuda:N``.
+            reset: How they start, if not as configured.
+            sizes: Buffer sizes, if not those of the batch.
+        """
+        if sizes is None and backend is Backend.mjwarp:
+            sizes = self.sizes
+        return make_simulation(
+            self.model,
+            self.cfg,
+            nworld,
+            backend=backend,
+            device=device,
+            fields=required_fields(self.cfg.reset if reset is None else reset),
+            sizes=sizes,
+        )
+
+    @property
+    def sizes(self) -> BatchSizes:
+        """Buffer sizes of the batch; with ``batch=auto`` they are measured first, unless *capacity*
+        has done so.
+        """
+        # Native MuJoCo has no fixed buffers.
+        if not self.cfg.batch.auto or self.backend[0] is Backend.native:
+            return resolve_sizes(self.cfg)
+        sizes = self.measured.task
+        if sizes is None:
+            what = "the driven task"
+            source = f"{what} in {self.measuring_nworld} worlds"
+            task = self.play_task(self.cfg.reset)
+            sizes = self.measured.task = measured_sizes(self.cfg, what, task, source)
+            self.progress.print_line(str(sizes))
+        return apply_configured(self.cfg, sizes)
+
+    @property
+    def env_sizes(self) -> BatchSizes | None:
+        """Buffer sizes of environments with ``batch=auto``, if *capacity* has measured them; None
+        leaves it to `build_env`.
+        """
+        sizes = self.measured.env
+        return apply_configured(self.cfg, sizes) if self.cfg.batch.auto and sizes else None
+
+    @property
+    def measuring_nworld(self) -> int:
+        """How many worlds size the buffers."""
+        most = self.cfg.gate.capacity.cpu_nworld
+        on_cuda = self.backend[1].startswith("cuda")
+        return self.cfg.nworld if on_cuda else min(self.cfg.nworld, most)
+
+    def measuring_simulation(self, sizes: BatchSizes, reset: Reset | None = None) -> Simulation:
+        """Worlds that size the buffers."""
+        return self.simulation(self.measuring_nworld, *self.backend, reset=reset, sizes=sizes)
+
+    def play_task(self, reset: Reset, sizes: BatchSizes | None = None) -> Workload:
+        """Play the driven task once, in worlds of exactly these sizes; without, with room to
+        spare.
+        """
+        return play_workload(
+            self.cfg,
+            lambda sizes: self.measuring_simulation(sizes, reset),
+            lambda sim: self.play(sim, reset).failed,
+            sizes,
+        )
 
     def color_renderer(
         self, count: int, fields: Sequence[str], cameras: Sequence[str] | None = None
@@ -57,18 +343,26 @@ class Stage:
             cameras: Names of the cameras; all if None.
         """
         scene = self.cfg.scene
-        chosen = color_cameras(scene.cameras, cameras)
+        chosen = with_outputs(scene.cameras, ["rgb"], cameras)
         cfg = replace(self.cfg, scene=replace(scene, cameras=chosen))
         return StateRenderer(self.model, cfg, count, fields=fields)
 
-    @cached_property
-    def policy(self) -> Policy:
-        """The policy of ``controller=policy``.
 
-        Raises:
-            MjstackError: There is none, or it cannot be read.
-        """
-        if self.cfg.policy is None:
-            expected = "the folder of a trained policy, which controller=policy plays"
-            raise ConfigError("policy", None, expected)
-        return load_policy(Path(self.cfg.policy))
+def lacks_episode(cfg: Config) -> str:
+    """Why no driver can play a judged episode of the task; empty if one can."""
+    if not cfg.controller.phases and cfg.controller.name != POLICY:
+        return f"task {cfg.task.name} has no phases: no open- or closed-loop driver"
+    if cfg.task.check is None:
+        return f"task {cfg.task.name} has no check"
+    return ""
+
+
+def require_episode(cfg: Config) -> None:
+    """Refuse a job that plays episodes of a task that has none.
+
+    Raises:
+        ConfigError: The task has no phases, or no check.
+    """
+    if reason := lacks_episode(cfg):
+        expected = f"a task with phases and a check, which job={cfg.job.name} plays ({reason})"
+        raise ConfigError("task", cfg.task.name, expected, "Train it: mjstack.make_env")

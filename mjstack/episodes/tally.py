@@ -10,18 +10,19 @@ import numpy as np
 
 from mjstack.config.session import search_path_args
 from mjstack.episodes.failures import describe_sign
-from mjstack.episodes.record import FAILING, Circumstances, EpisodeRecord
+from mjstack.episodes.record import CIRCUMSTANCES, FAILING, EpisodeRecord
 from mjstack.episodes.rollout import Episode
 from mjstack.errors import name_worlds
 from mjstack.files import to_csv
 from mjstack.math import wilson_interval
 from mjstack.report.record import GateResult, Status
 from mjstack.report.table import Table
-from mjstack.report.write import format_percent, safely_write
+from mjstack.report.text import format_percent
+from mjstack.report.write import safely_write
 from mjstack.tasks.check import EpisodeCheck
 
-_SHOWN = 20_000  # episodes on the page; of more, the failing ones
-_NAMED = 100  # episodes a line in report.md; the table of failing ones has all
+_MOST_PLOTTED = 20_000  # episodes on the page; of more, the failing ones
+_MOST_NAMED = 100  # episodes a line in report.md; the table of failing ones has all
 
 
 @dataclass(eq=False, kw_only=True, slots=True)
@@ -37,8 +38,10 @@ class EpisodeTally:
         replayed: Whether job=replay takes the run.
         seeds: Those that were played.
         succeeded: For each seed, which worlds succeeded, shape ``(nworld,)``, bool.
-        circumstances: For each seed, if they were recorded.
-        shown: Episodes that the run's page shows: seed, worlds, and their bits, values and starts.
+        circumstances: For each seed, if they were recorded, by name.
+        object_names: Names of the objects of circumstances.
+        phase_names: Names of the phases of circumstances.
+        plotted: Episodes that the run's page plots: seed, worlds, their bits, values and starts.
         failed: Names of the failing episodes.
         broken: The same by the name of the rule that was broken.
         unreachable: Names of the episodes with a target out of reach.
@@ -64,8 +67,10 @@ class EpisodeTally:
     replayed: bool
     seeds: list[int] = field(default_factory=list)
     succeeded: list[np.ndarray] = field(default_factory=list)
-    circumstances: list[Circumstances] = field(default_factory=list)
-    shown: list[tuple[int, np.ndarray, dict[str, np.ndarray]]] = field(default_factory=list)
+    circumstances: list[dict[str, np.ndarray]] = field(default_factory=list)
+    object_names: list[str] = field(default_factory=list)
+    phase_names: list[str] = field(default_factory=list)
+    plotted: list[tuple[int, np.ndarray, dict[str, np.ndarray]]] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
     broken: dict[str, list[str]] = field(default_factory=dict)
     unreachable: list[str] = field(default_factory=list)
@@ -88,7 +93,7 @@ class EpisodeTally:
         return sum(len(succeeded) for succeeded in self.succeeded)
 
     @property
-    def good(self) -> int:
+    def successes(self) -> int:
         """Number of episodes that succeeded."""
         return self.episodes - len(self.failed)
 
@@ -110,17 +115,19 @@ class EpisodeTally:
         for rule, worlds in self.check.rules.failing(record.failed).items():
             self.broken.setdefault(rule, []).extend(self.names(record.seed, worlds))
         self.rows += record.failing_rows(self.check.rules)
-        room = max(0, _SHOWN - sum(len(worlds) for _, worlds, _ in self.shown))
-        shown = np.flatnonzero((record.failed != 0) | (np.arange(len(record.failed)) < room))
-        held = {"failed": record.failed, "start": record.start, **record.values}
-        self.shown.append((record.seed, shown, {k: v[shown] for k, v in held.items()}))
-        if record.circumstances is not None:
-            self.circumstances.append(record.circumstances)
-            out = np.flatnonzero(record.circumstances.unreachable).tolist()
-            self.unreachable += self.names(record.seed, out)
-        for name, values in (
-            record.values | record.measured
-        ).items():  # NaN, which a diverged world has, is handed on
+        room = max(0, _MOST_PLOTTED - sum(len(worlds) for _, worlds, _ in self.plotted))
+        plotted = np.flatnonzero((record.failed != 0) | (np.arange(len(record.failed)) < room))
+        measured = record.named("value")
+        arrays = {"failed": record.failed, "start": record.start, **measured}
+        self.plotted.append((record.seed, plotted, {k: v[plotted] for k, v in arrays.items()}))
+        if "sign" in record.worlds:
+            self.object_names = record.object_names
+            self.phase_names = record.phase_names
+            self.circumstances.append({name: record.worlds[name] for name in CIRCUMSTANCES})
+            unreachable = np.flatnonzero(record.worlds["unreachable"]).tolist()
+            self.unreachable += self.names(record.seed, unreachable)
+        # NaN, which a diverged world has, is handed on
+        for name, values in (measured | record.named("measured")).items():
             self.low[name] = float(np.minimum(self.low.get(name, math.inf), values.min()))
             self.high[name] = float(np.maximum(self.high.get(name, -math.inf), values.max()))
         # Rounded: on CUDA even identical worlds differ in the last digits. Adding 0 makes -0 the
@@ -148,7 +155,7 @@ class EpisodeTally:
             "worlds": len(self.succeeded[0]),
             "seeds": len(self.seeds),
             "episodes": self.episodes,
-            **rate_metrics(self.good, self.episodes),
+            **rate_metrics(self.successes, self.episodes),
         }
         for metric, (value, side) in self.check.summaries.items():
             metrics[metric] = (self.low if side == "min" else self.high)[value]
@@ -163,10 +170,10 @@ class EpisodeTally:
     @property
     def summary(self) -> str:
         """The success rate in words."""
-        low, high = wilson_interval(self.good, self.episodes)
-        rate = format_percent(self.good / self.episodes)
+        low, high = wilson_interval(self.successes, self.episodes)
+        rate = format_percent(self.successes / self.episodes)
         return (
-            f"{self.good} of {self.episodes} {self.noun} succeeded ({rate}, 95 % interval"
+            f"{self.successes} of {self.episodes} {self.noun} succeeded ({rate}, 95 % interval"
             f" {format_percent(low, '')} to {format_percent(high)})"
         )
 
@@ -185,7 +192,7 @@ class EpisodeTally:
         named = [("target out of reach", self.unreachable)] if self.unreachable else []
         named += [(self.check.rules.texts[rule], names) for rule, names in self.broken.items()]
         return [
-            f"{text}: {name_worlds(names, self.episodes, _NAMED, self.noun)}"
+            f"{text}: {name_worlds(names, self.episodes, _MOST_NAMED, self.noun)}"
             for text, names in named
         ] + self.details
 
@@ -202,7 +209,7 @@ class EpisodeTally:
         self,
         parts: Sequence[str],
         *,
-        good: bool,
+        passed: bool,
         metrics: dict[str, float],
         thresholds: dict[str, float],
         tables: Sequence[Table] = (),
@@ -211,14 +218,14 @@ class EpisodeTally:
 
         Args:
             parts: The result in words, before failures and problems.
-            good: Whether enough episodes succeeded.
+            passed: Whether enough episodes succeeded.
             metrics: More of them than `metrics`.
             thresholds: More of them than the check's.
             tables: More of them than `tables`.
         """
         return GateResult(
             name=self.gate,
-            status=Status.passed if good and not self.problems else Status.failed,
+            status=Status.passed if passed and not self.problems else Status.failed,
             reason="; ".join(filter(None, [*parts, self.failures, *self.problems]))
             + self.way_to_look,
             thresholds=self.check.thresholds() | thresholds,
@@ -244,17 +251,19 @@ class EpisodeTally:
         if self.several:
             header = ["seed", "episodes", "succeeded", "rate", "95 % interval"]
             rows = [
-                [str(seed), str(len(good)), str(good.sum()), *rate_cells(good.sum(), len(good))]
-                for seed, good in zip(self.seeds, self.succeeded, strict=True)
+                [str(seed), str(len(flags)), str(flags.sum()), *rate_cells(flags.sum(), len(flags))]
+                for seed, flags in zip(self.seeds, self.succeeded, strict=True)
             ]
             tables.append(Table(title="Seeds", header=header, rows=rows))
         signs: dict[tuple[int, int], list[str]] = {}
-        for seed, kept, good in zip(self.seeds, self.circumstances, self.succeeded, strict=False):
-            for world in np.flatnonzero(~good).tolist():
-                key = int(kept.sign_phase[world]), int(kept.sign[world])
+        for seed, arrays, succeeded in zip(
+            self.seeds, self.circumstances, self.succeeded, strict=False
+        ):
+            for world in np.flatnonzero(~succeeded).tolist():
+                key = int(arrays["sign_phase"][world]), int(arrays["sign"][world])
                 signs.setdefault(key, []).extend(self.names(seed, [world]))
         if signs:
-            phases = [*self.circumstances[0].phase_names, ""]  # the last one for no sign, -1
+            phases = [*self.phase_names, ""]  # the last one for no sign, -1
             rows = [
                 [
                     describe_sign(sign, phases[phase]),

@@ -1,6 +1,7 @@
 """Images of both backends from equal states, compared for gate *parity*."""
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -8,9 +9,9 @@ import mujoco
 import numpy as np
 import torch
 
-from mjstack.config.schema import OUTPUTS, Backend, Config, ParityCfg
-from mjstack.episodes.context import RunContext
-from mjstack.errors import MjstackError, RunError
+from mjstack.config.schema import OUTPUTS, Backend, Config
+from mjstack.episodes.stage import Stage
+from mjstack.errors import FolderError, MjstackError
 from mjstack.files import reading, write_npz
 from mjstack.report.gl import require_offscreen
 from mjstack.report.picture import save_images
@@ -18,6 +19,7 @@ from mjstack.report.record import GateResult
 from mjstack.report.table import Table
 from mjstack.report.write import safely_write
 from mjstack.sim import StateRenderer
+from mjstack.sim.cameras import PREFIXES, thing_of, with_outputs
 
 FILE = "parity_images.npz"
 PICTURE = "parity_images.png"
@@ -48,73 +50,111 @@ class Agreement:
     worst: int
 
 
-def compare_images(context: RunContext, result: GateResult) -> list[str]:
-    """Draw states of the reference episode with MJWarp and with native MuJoCo, and compare them.
+def compare_images(
+    stage: Stage, path: np.ndarray, folder: Path | None, pictures: list[str], result: GateResult
+) -> list[str]:
+    """Render states of the reference episode with MJWarp and with native MuJoCo, and compare them.
 
-    MJWarp's images and the states are kept in the run's folder. Where native MuJoCo cannot draw,
+    MJWarp's images and the states are kept in the run's folder. Where native MuJoCo cannot render,
     another machine compares them with its own.
+
+    Args:
+        stage: Scene and cameras.
+        path: Positions of the reference episode, shape ``(steps, nq)``.
+        folder: The run's, if it has one.
+        pictures: Names of the run's pictures; gets the name of that of the comparison.
+        result: The gate's, which gets figures, thresholds and notes.
 
     Returns:
         The problems.
     """
-    cfg = with_all_outputs(context.cfg)
+    scene = stage.cfg.scene
+    cfg = replace(stage.cfg, scene=replace(scene, cameras=with_outputs(scene.cameras, OUTPUTS)))
     limits = cfg.gate.parity
     if limits.images is None:
-        path = context.nominal.world.qpos
         path = path[np.isfinite(path).all(axis=1)]
         steps = np.linspace(0, len(path) - 1, limits.image_states).round().astype(int)
         qpos = path[steps]
-        mjwarp, _ = _draw_states(context, cfg, qpos, Backend.mjwarp, context.backend[1])
-        if context.folder is not None:
-            write_npz(
-                context.folder / FILE, {"qpos": qpos, "about": json.dumps(_about(cfg)), **mjwarp}
-            )
+        mjwarp, _ = _draw_states(stage.model, cfg, qpos, Backend.mjwarp, stage.backend[1])
+        if folder is not None:
+            write_npz(folder / FILE, {"qpos": qpos, "about": json.dumps(_about(cfg)), **mjwarp})
     else:
         qpos, mjwarp = load_images(cfg)
     try:
-        require_offscreen(context.model)
+        require_offscreen(stage.model)
     except MjstackError as error:
         result.notes["images"] = (
             f"not compared: {error} On a machine that draws, gate.parity.images=.../{FILE} compares"
             " them"
         )
         return []
-    native, labels = _draw_states(context, cfg, qpos, Backend.native, "cpu")
-    found = {
-        name: agree(name, native, mjwarp, labels, limits.image_pixels) for name in cfg.scene.cameras
+    native, labels = _draw_states(stage.model, cfg, qpos, Backend.native, "cpu")
+    agreements = {
+        name: agree(name, native, mjwarp, labels, limits.image_pixels) for name in scene.cameras
     }
-    _report(context, result, found)
-    _draw(context, found, native, mjwarp)
+    if folder is not None:
+        if problem := _draw(folder / PICTURE, agreements, native, mjwarp):
+            stage.progress.print_line(problem)
+        else:
+            pictures.append(PICTURE)
     result.thresholds |= {
         "images.same_thing": limits.image_same,
         "images.iou": limits.image_iou,
         "images.color_of_255": limits.image_color,
         "images.depth_m": limits.image_depth,
     }
-    return _problems(found, limits, _background(context.model))
+    return _report(stage, result, agreements)
 
 
-def _problems(found: dict[str, Agreement], limits: ParityCfg, background: set[str]) -> list[str]:
-    """Say where images differ too much, and which cameras compared nothing but the background."""
+def _report(stage: Stage, result: GateResult, agreements: dict[str, Agreement]) -> list[str]:
+    """Add figures and a table; return where images differ too much, and which cameras compared
+    nothing but the background.
+    """
+    limits = stage.cfg.gate.parity
+    fixed = np.flatnonzero(stage.model.geom_bodyid == 0).tolist()
+    background = {"nothing", *(thing_of(stage.model, number) for number in fixed)}
+    least = f"gate.parity.image_pixels={limits.image_pixels}"
     problems = []
-    for name, one in found.items():
-        if not one.iou.keys() - background:
-            problems.append(
-                f"camera {name}: nothing but the background has gate.parity.image_pixels="
-                f"{limits.image_pixels} pixels, so nothing was compared; raise"
-                f" scene.cameras.{name}.size"
+    for name, camera in agreements.items():
+        result.metrics |= {
+            f"images.{name}.same_thing": camera.same,
+            f"images.{name}.color_of_255": camera.color,
+            f"images.{name}.depth_m": camera.depth,
+            **{f"images.{name}.iou.{thing}": iou for thing, iou in camera.iou.items()},
+        }
+        same = f"{100 * camera.same:.2f} % of the pixels"
+        stage.progress.print_line(
+            f"camera {name}: the same thing in {same}, IoU at least"
+            f" {min(camera.iou.values(), default=1.0):.4f}, colours within {camera.color:.2f} of"
+            " 255"
+        )
+        if camera.left_out:
+            result.details.append(
+                f"camera {name}: not compared, with fewer than {least} pixels:"
+                f" {', '.join(camera.left_out)}"
             )
-        for thing, iou in one.iou.items():
-            if not iou >= limits.image_iou:
-                problems.append(f"camera {name}: IoU of {thing} is {iou:.4f}")
-        if not one.same >= limits.image_same:
-            problems.append(
-                f"camera {name}: {100 * one.same:.2f} % of the pixels show the same thing"
-            )
-        if not one.color <= limits.image_color:
-            problems.append(f"camera {name}: colours differ by {one.color:.2f} of 255")
-        if not one.depth <= limits.image_depth:
-            problems.append(f"camera {name}: depths differ by {one.depth:.2g} m")
+        alone = (
+            f"nothing but the background has {least} pixels, so nothing was compared; raise"
+            f" scene.cameras.{name}.size"
+        )
+        verdicts = {
+            alone: bool(camera.iou.keys() - background),
+            **{
+                f"IoU of {thing} is {iou:.4f}": iou >= limits.image_iou
+                for thing, iou in camera.iou.items()
+            },
+            f"{same} show the same thing": camera.same >= limits.image_same,
+            f"colours differ by {camera.color:.2f} of 255": camera.color <= limits.image_color,
+            f"depths differ by {camera.depth:.2g} m": camera.depth <= limits.image_depth,
+        }
+        problems += [f"camera {name}: {text}" for text, passes in verdicts.items() if not passes]
+    things = dict.fromkeys(thing for camera in agreements.values() for thing in camera.iou)
+    ious = [camera.iou for camera in agreements.values()]
+    rows = [
+        [thing, *(f"{iou[thing]:.4f}" if thing in iou else "-" for iou in ious)] for thing in things
+    ]
+    title = "Images of both backends: intersection over union of each thing"
+    result.tables.append(Table(header=["thing", *agreements], rows=rows, title=title))
     return problems
 
 
@@ -143,66 +183,52 @@ def agree(
             iou[name] = float((same & (a == number)).sum() / union)
         else:
             left_out.append(name)
-    colors = [images[f"images.{camera}"].astype(float) for images in (native, mjwarp)]
-    depths = [images[f"depth.{camera}"][..., 0] for images in (native, mjwarp)]
-    both = bool(same.any())
+
+    def difference(prefix: str, mean: Callable[[np.ndarray], float]) -> float:
+        a, b = (images[f"{prefix}.{camera}"][same].astype(float) for images in (native, mjwarp))
+        return float(mean(np.abs(a - b))) if same.any() else np.inf
+
     return Agreement(
         same=float(same.mean()),
         iou=iou,
         left_out=left_out,
-        color=float(np.abs(colors[0] - colors[1])[same].mean()) if both else np.inf,
-        depth=float(np.median(np.abs(depths[0] - depths[1])[same])) if both else np.inf,
+        color=difference("images", np.mean),
+        depth=difference("depth", np.median),
         worst=int(same.mean(axis=(1, 2)).argmin()),
     )
 
 
-def _background(model: mujoco.MjModel) -> set[str]:
-    """Names of the things that are fixed to the world, and of what is behind them."""
-    fixed = np.flatnonzero(model.geom_bodyid == 0)
-    return {"nothing", *(model.geom(number).name or "world" for number in fixed)}
-
-
 def _draw_states(
-    context: RunContext, cfg: Config, qpos: np.ndarray, backend: Backend, device: str
+    model: mujoco.MjModel, cfg: Config, qpos: np.ndarray, backend: Backend, device: str
 ) -> tuple[Images, list[str]]:
     """Images of states, shape ``(n, nq)``, and the names of things."""
-    renderer = StateRenderer(context.model, cfg, len(qpos), backend=backend, device=device)
-    drawn = renderer.draw(torch.from_numpy(qpos))
-    images = {name: image.cpu().numpy() for name, image in drawn.items()}
+    renderer = StateRenderer(model, cfg, len(qpos), backend=backend, device=device)
+    rendered = renderer.draw(torch.from_numpy(qpos))
+    images = {name: image.cpu().numpy() for name, image in rendered.items()}
     renderer.close()
     return images, renderer.labels
-
-
-def with_all_outputs(cfg: Config) -> Config:
-    """The configuration with every output of every camera."""
-    cameras = {
-        name: replace(camera, outputs=list(OUTPUTS), terminal=False)
-        for name, camera in cfg.scene.cameras.items()
-    }
-    return replace(cfg, scene=replace(cfg.scene, cameras=cameras))
 
 
 def load_images(cfg: Config) -> tuple[np.ndarray, Images]:
     """States, shape ``(n, nq)``, and MJWarp's images of them from ``gate.parity.images``.
 
     Raises:
-        RunError: The file cannot be read, or is of another scene or other cameras.
+        FolderError: The file cannot be read, or is of another scene or other cameras.
     """
     path = Path(str(cfg.gate.parity.images))
-    with reading(path, RunError, f"Name the {FILE} of a run of gate parity"):
+    with reading(path, f"Name the {FILE} of a run of gate parity"):
         with np.load(path, allow_pickle=False) as saved:
             images = {name: saved[name] for name in saved.files}
         about = json.loads(str(images.pop("about")))
         qpos = images.pop("qpos")
-        mine = _about(with_all_outputs(cfg))
-        for key in mine:
-            if about.get(key) != mine[key]:
-                raise RunError(
-                    f"{path} was drawn with {key}={about.get(key)}, expected {mine[key]}",
+        for key, value in _about(cfg).items():
+            if about.get(key) != value:
+                raise FolderError(
+                    f"{path} was drawn with {key}={about.get(key)}, expected {value}",
                     "Give the robot, the scene and the cameras of that run",
                 )
         for name, camera in cfg.scene.cameras.items():
-            for prefix in ("images", "depth", "segmentation"):
+            for prefix in PREFIXES.values():
                 if images[f"{prefix}.{name}"].shape[:3] != (len(qpos), *camera.size):
                     raise ValueError(f"{prefix}.{name} has another shape")
     return qpos, images
@@ -211,57 +237,25 @@ def load_images(cfg: Config) -> tuple[np.ndarray, Images]:
 def _about(cfg: Config) -> dict[str, object]:
     """The part of the configuration on which images depend, by key."""
     scene = cfg.scene
-    about: dict[str, object] = {
+    return {
         "robot.name": cfg.robot.name,
         "model.source": cfg.model.source,
         "scene.name": scene.name,
         "cameras": list(scene.cameras),
+        **{
+            f"scene.cameras.{name}.{key}": asdict(camera)[key]
+            for name, camera in scene.cameras.items()
+            for key in ("size", "fovy", "pose")
+        },
     }
-    for name, camera in scene.cameras.items():
-        for key in ("size", "fovy", "pose"):
-            about[f"scene.cameras.{name}.{key}"] = asdict(camera)[key]
-    return about
 
 
-def _report(context: RunContext, result: GateResult, found: dict[str, Agreement]) -> None:
-    """Add figures and a table."""
-    things = list(dict.fromkeys(thing for one in found.values() for thing in one.iou))
-    rows = []
-    for name, one in found.items():
-        result.metrics |= {
-            f"images.{name}.same_thing": one.same,
-            f"images.{name}.color_of_255": one.color,
-            f"images.{name}.depth_m": one.depth,
-            **{f"images.{name}.iou.{thing}": iou for thing, iou in one.iou.items()},
-        }
-        worst = min(one.iou.values(), default=1.0)
-        context.print_line(
-            f"camera {name}: the same thing in {100 * one.same:.2f} % of the pixels, IoU at least"
-            f" {worst:.4f}, colours within {one.color:.2f} of 255"
-        )
-        if one.left_out:
-            few = f"fewer than gate.parity.image_pixels={context.cfg.gate.parity.image_pixels}"
-            left_out = ", ".join(one.left_out)
-            result.details.append(f"camera {name}: not compared, with {few} pixels: {left_out}")
-    for thing in things:
-        cells = [one.iou.get(thing) for one in found.values()]
-        rows.append([thing, *("-" if iou is None else f"{iou:.4f}" for iou in cells)])
-    title = "Images of both backends: intersection over union of each thing"
-    result.tables.append(Table(header=["thing", *found], rows=rows, title=title))
-
-
-def _draw(context: RunContext, found: dict[str, Agreement], native: Images, mjwarp: Images) -> None:
-    """Save the state of each camera that differs most, side by side."""
-    if context.folder is None:
-        return
+def _draw(path: Path, agreements: dict[str, Agreement], native: Images, mjwarp: Images) -> str:
+    """Save the state of each camera that differs most, side by side; return why not."""
     rows = {}
-    for name, one in found.items():
-        a, b = (images[f"images.{name}"][one.worst] for images in (native, mjwarp))
-        apart = np.abs(a.astype(int) - b) * _AMPLIFIED
-        rows[f"{name}, state {one.worst}"] = [a, b, apart.clip(0, 255).astype(np.uint8)]
+    for name, camera in agreements.items():
+        a, b = (images[f"images.{name}"][camera.worst].astype(int) for images in (native, mjwarp))
+        difference = np.minimum(np.abs(a - b) * _AMPLIFIED, 255)
+        rows[f"{name}, state {camera.worst}"] = [a, b, difference]
     columns = ["native MuJoCo", "MJWarp", f"difference x {_AMPLIFIED}"]
-    path = context.folder / PICTURE
-    if problem := safely_write(path, save_images, rows, columns):
-        context.print_line(problem)
-    else:
-        context.page.pictures.append(PICTURE)
+    return safely_write(path, save_images, rows, columns)

@@ -2,14 +2,15 @@
 
 import math
 from contextlib import closing
+from dataclasses import asdict
 
 import torch
 
 from mjstack.config.check import PARITY_FIELDS
 from mjstack.config.schema import Backend, Config
-from mjstack.episodes.context import RunContext, judge_one, needs_episode
-from mjstack.episodes.motion import show_world
-from mjstack.episodes.rollout import NOMINAL, State, WorldRecorder, restore
+from mjstack.episodes.recorder import WorldRecorder
+from mjstack.episodes.rollout import NOMINAL, State, restore
+from mjstack.episodes.run import Run, needs_episode
 from mjstack.gates.images import compare_images
 from mjstack.math import quat_angle
 from mjstack.report.record import GateResult, Status
@@ -19,39 +20,36 @@ _CAPTURED = 10  # steps of a graph: one of fifty takes longer to capture than to
 
 
 @needs_episode
-def run_parity(context: RunContext) -> list[GateResult]:
+def run_parity(run: Run) -> list[GateResult]:
     """Compare steps from equal states, the options of each backend, and the whole task."""
-    one = make_simulation(context.model, context.cfg, 1, backend=Backend.mjwarp)
-    with closing(one) as mjwarp:
-        return [_compare(context, mjwarp)]
+    world = make_simulation(run.stage.model, run.cfg, 1, backend=Backend.mjwarp)
+    with closing(world) as mjwarp:
+        return [_compare(run, mjwarp)]
 
 
-def _compare(context: RunContext, mjwarp: Simulation) -> GateResult:
+def _compare(run: Run, mjwarp: Simulation) -> GateResult:
     """The result of the gate, measured in one MJWarp world."""
-    cfg = context.cfg
+    cfg = run.cfg
     result = GateResult(
         name="parity",
         status=Status.passed,
-        thresholds=context.check.thresholds(),
+        thresholds=run.stage.check.thresholds(),
         notes={"backend": mjwarp.description},
     )
-    problems = _compare_states(context, mjwarp, result)
-    options = compare_options(cfg, context.nominal.sim, mjwarp)
-    for option, (asked, held, uploaded, equal) in options.items():
-        line = f"option {option}: requested {asked}, native {held}, uploaded {uploaded}"
+    problems = _compare_states(run, mjwarp, result)
+    options = compare_options(cfg, run.nominal.sim, mjwarp)
+    for option, (requested, native, uploaded, equal) in options.items():
+        line = f"option {option}: requested {requested}, native {native}, uploaded {uploaded}"
         result.details.append(line)
         problems += [] if equal else [line]
 
     world = WorldRecorder()
-    episode = context.play(mjwarp, NOMINAL, [*context.viewers, world])
-    status, reason, judged = judge_one(context, episode)
+    episode = run.stage.play(mjwarp, NOMINAL, [*run.viewers, world])
+    status, reason, judged = run.judge_one(episode)
     if status is Status.failed:
         problems.append(reason)
-    if int(mjwarp.overflow[0]):
-        problems.append(
-            f"{describe_overflow(int(mjwarp.overflow[0]))} overflow: raise batch.njmax or"
-            " batch.nconmax"
-        )
+    if bits := int(mjwarp.overflow[0]):
+        problems.append(f"{describe_overflow(bits)} overflow: raise batch.njmax or batch.nconmax")
     limits = mjwarp.solver_limits
     result.metrics |= judged | {
         "peak_contacts": int(mjwarp.peak_contacts[0]),
@@ -59,65 +57,64 @@ def _compare(context: RunContext, mjwarp: Simulation) -> GateResult:
         "solver_limit_hit": bool(limits is not None and int(limits[0])),
         "episode_s": episode.timing.seconds,
     }
-    problems += _compare_ends(context, world, result)
+    problems += _compare_ends(run, world, result)
     if cfg.scene.cameras:
-        problems += compare_images(context, result)
+        problems += compare_images(
+            run.stage, run.nominal.world.qpos, run.folder, run.page.pictures, result
+        )
 
-    headline = context.check.headline(judged)
-    context.print_line(f"{cfg.task.name} check: {headline} ({mjwarp.description})")
-    context.artifacts.shown = ("parity world", world)
-    show_world(context, "parity", "parity, MJWarp", world, failed=status is Status.failed)
-    ends = [f"final.{name}.position_m" for name in context.index.objects]
+    headline = run.stage.check.headline(judged)
+    run.print_line(f"{cfg.task.name} check: {headline} ({mjwarp.description})")
+    run.artifacts.pictured = ("parity world", world.qpos)
+    failed = status is Status.failed
+    step_dt = cfg.timing.step_dt
+    run.page.show_world("parity", "parity, MJWarp", world.qpos, step_dt, failed=failed)
+    ends = [f"final.{name}.position_m" for name in run.stage.index.objects]
     apart = max((result.metrics[end] for end in ends), default=0.0)
-    good = f"{headline}; objects end at most {1e3 * apart:.2f} mm from native's"
+    summary = f"{headline}; objects end at most {1e3 * apart:.2f} mm from native's"
     if "images" in result.notes:
-        good += "; images were not compared"
-    result.reason = "; ".join(problems) or good
+        summary += "; images were not compared"
+    result.reason = "; ".join(problems) or summary
     result.status = Status.failed if problems else Status.passed
     return result
 
 
-def _compare_states(context: RunContext, mjwarp: Simulation, result: GateResult) -> list[str]:
+def _compare_states(run: Run, mjwarp: Simulation, result: GateResult) -> list[str]:
     """Step both backends from the same states of the reference episode; return the
     problems.
     """
-    limits = context.cfg.gate.parity
+    limits = run.cfg.gate.parity
     problems = []
-    for name, step in context.parity_steps.items():
-        state = context.nominal.states[step]
+    for name, step in run.parity_steps.items():
+        state = run.nominal.states[step]
         for steps, largest in ((1, limits.step1), (50, limits.step50)):
-            apart = compare_steps(context.nominal.sim, mjwarp, state, steps)
+            apart = compare_steps(run.nominal.sim, mjwarp, state, steps)
             for field, limit in largest.items():
                 result.metrics[f"{name}.step{steps}.{field}"] = apart[field]
                 result.thresholds[f"step{steps}.{field}"] = limit
                 if not apart[field] <= limit:
-                    problems.append(
-                        f"{name}, {steps} steps: {field} differs by {apart[field]:.2g},"
-                        f" limit {limit:.2g}"
-                    )
+                    text = f"{field} differs by {apart[field]:.2g}, limit {limit:.2g}"
+                    problems.append(f"{name}, {steps} steps: {text}")
     return problems
 
 
-def _compare_ends(context: RunContext, world: WorldRecorder, result: GateResult) -> list[str]:
+def _compare_ends(run: Run, world: WorldRecorder, result: GateResult) -> list[str]:
     """Poses of all objects at the end of the task; returns the problems."""
-    limits = context.cfg.gate.parity
+    limits = run.cfg.gate.parity
     far = limits.object_position
     turned = limits.object_rotation_deg
     result.thresholds |= {"final.position_m": far, "final.rotation_deg": turned}
     problems = []
-    for name, (address, _) in context.index.objects.items():
-        a, b = (
-            torch.from_numpy(one.qpos[-1, address : address + 7])
-            for one in (world, context.nominal.world)
-        )
+    recordings = (world, run.nominal.world)
+    for name, (address, _) in run.stage.index.objects.items():
+        a, b = (torch.from_numpy(w.qpos[-1, address : address + 7]) for w in recordings)
         distance = float((a[:3] - b[:3]).norm())
         angle = math.degrees(float(quat_angle(a[3:], b[3:])))
         result.metrics[f"final.{name}.position_m"] = distance
         result.metrics[f"final.{name}.rotation_deg"] = angle
         if not (distance <= far and angle <= turned):
-            problems.append(
-                f"{name} ends {1e3 * distance:.2f} mm and {angle:.2f} deg from native's"
-            )
+            apart = f"{1e3 * distance:.2f} mm and {angle:.2f} deg"
+            problems.append(f"{name} ends {apart} from native's")
     return problems
 
 
@@ -151,38 +148,28 @@ def compare_options(
 
     The request is ``the file's`` where the configuration leaves an option to the robot's file.
     """
-    solver = cfg.solver
-    requested: dict[str, float | int | str | None] = {
+    requested = asdict(cfg.solver) | {
         "timestep": cfg.timing.physics_dt,
         "integrator": "mjINT_IMPLICITFAST",
-        "cone": f"mjCONE_{solver.cone.upper()}",
+        "cone": f"mjCONE_{cfg.solver.cone.upper()}",
         "box_box": "primitive",
-        "iterations": solver.iterations,
-        "ls_iterations": solver.ls_iterations,
-        "impratio": solver.impratio,
-        "tolerance": solver.tolerance,
     }
     uploaded = mjwarp.option_values()
-    out = {}
-    for name, held in native.option_values().items():
-        asked = requested.get(name)
-        equal = _agree(name, held, uploaded[name]) and (asked is None or _agree(name, asked, held))
-        out[name] = (
-            "the file's" if asked is None else _short(asked),
-            _short(held),
-            _short(uploaded[name]),
-            equal,
-        )
-    return out
+    options = {}
+    for name, value in native.option_values().items():
+        request = requested.get(name)
+        equal = _agree(name, value, uploaded[name])
+        equal = equal and (request is None or _agree(name, request, value))
+        text = "the file's" if request is None else _short(request)
+        options[name] = (text, _short(value), _short(uploaded[name]), equal)
+    return options
 
 
-def _agree(name: str, asked: float | int | str, got: float | int | str) -> bool:
-    if isinstance(asked, str) or isinstance(got, str):
-        return asked == got
-    if name == "tolerance":  # MJWarp clamps it to what float32 can resolve
-        asked = max(asked, 1e-6)
-        got = max(got, 1e-6)
-    return math.isclose(asked, got, rel_tol=1e-5)
+def _agree(name: str, a: float | int | str, b: float | int | str) -> bool:
+    if isinstance(a, str) or isinstance(b, str):
+        return a == b
+    least = 1e-6 if name == "tolerance" else -math.inf  # MJWarp clamps it to float32's resolution
+    return math.isclose(max(a, least), max(b, least), rel_tol=1e-5)
 
 
 def _short(value: float | int | str) -> str:

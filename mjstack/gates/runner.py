@@ -4,20 +4,22 @@ import logging
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 from mjstack.config.complete import typed
 from mjstack.config.functions import resolve_func
 from mjstack.config.schema import Config
 from mjstack.distributed import Ranks
-from mjstack.episodes.context import RunContext, lacks_episode
+from mjstack.episodes.earlier_run import archive_starts, archived_starts
+from mjstack.episodes.run import Run
+from mjstack.episodes.stage import lacks_episode
 from mjstack.errors import MjstackError, RankError, describe_error
 from mjstack.interrupt import check_interrupt
 from mjstack.report.record import GateResult, Status
 
 log = logging.getLogger(__name__)
 
-Gate = Callable[[RunContext], list[GateResult]]
-_ALONE = "rank 0 alone"
+Gate = Callable[[Run], list[GateResult]]
 _RATE = "_per_s.median"
 
 
@@ -34,7 +36,7 @@ def find_gates(cfg: Config) -> dict[str, Gate]:
     for name, path in cfg.gate.functions().items():
         if name not in cfg.gates:
             continue
-        func = resolve_func(f"gate.{name}", path, first="context")
+        func = resolve_func(f"gate.{name}", path, first="run")
         kind = getattr(func, "config", None)
         if kind is not None and isinstance(cfg.gate[name], dict):
             cfg.gate.added[name] = typed(f"gate.{name}", cfg.gate[name], kind)
@@ -42,43 +44,50 @@ def find_gates(cfg: Config) -> dict[str, Gate]:
     return gates
 
 
-def run_gates(context: RunContext) -> None:
-    """Run the configured gates in their order. Each result goes to the context's ``record`` before
-    the next gate begins.
+def run_gates(run: Run, folder: Path) -> None:
+    """Run the configured gates in their order. Each result goes to the run's ``record`` before
+    the next gate begins. The folder keeps copies of starts files.
     """
-    for name, run in find_gates(context.cfg).items():
-        run_guarded(context, name, run)
+    stage = run.stage
+    cfg = stage.cfg
+    if cfg.resume is not None:
+        cfg = archived_starts(cfg, folder)
+    elif stage.ranks.writes:  # of several ranks, the first makes the copies
+        cfg = archive_starts(cfg, folder)
+    run = replace(run, stage=stage.with_config(cfg, measured=stage.measured))
+    for name, gate in find_gates(run.cfg).items():
+        run_guarded(run, name, gate)
 
 
-def run_guarded(context: RunContext, name: str, run: Gate, spread: str = "") -> None:
+def run_guarded(run: Run, name: str, gate: Gate, spread: str = "") -> None:
     """Run one gate, or other work that judges like one, and record its results. If it raises it has
     failed, with the error as its reason.
 
     Args:
-        context: The run.
+        run: The run.
         name: The gate's name.
-        run: Its function.
+        gate: Its function.
         spread: How ranks share its work, as the marks of gates say; by default as it is marked.
 
     Raises:
         Exception: It failed in a rank whose part the others need, or a rank has gone: the run is
             over.
     """
-    context.begin(name)
+    run.begin(name)
     began = time.perf_counter()
-    ranks = context.ranks
-    spread = spread or getattr(run, "spread", "")
+    ranks = run.stage.ranks
+    spread = spread or getattr(gate, "spread", "")
     over: BaseException | None = None
     try:
-        lack = lacks_episode(context.cfg) if getattr(run, "needs_episode", False) else ""
+        lack = lacks_episode(run.cfg) if getattr(gate, "needs_episode", False) else ""
         if lack:
             results = [GateResult(name=name, status=Status.skipped, reason=lack)]
         elif ranks.size == 1 or spread == "worlds":
-            results = run(context)
+            results = gate(run)
         elif spread == "ranks":
-            results = _in_each_rank(context, run)
+            results = _in_each_rank(run, gate)
         else:
-            results = ranks.from_first(lambda: _note(run(context), _ALONE))
+            results = ranks.from_first(lambda: _with_note(gate(run), "rank 0 alone"))
     except (Exception, SystemExit, KeyboardInterrupt) as error:
         cause = ranks.cause(error)
         if isinstance(cause, KeyboardInterrupt):
@@ -86,43 +95,44 @@ def run_guarded(context: RunContext, name: str, run: Gate, spread: str = "") -> 
         results = [GateResult(name=name, status=Status.failed, reason=log_error(cause))]
         gone = isinstance(cause, RankError) and cause.gone
         over = cause if gone or (ranks.size > 1 and spread == "worlds") else None
-        if over is not None and context.cfg.job.name == "gates" and context.folder is not None:
-            results[0].reason += f" To go on after the last finished seed: resume={context.folder}"
+        if over is not None and run.cfg.job.name == "gates" and run.folder is not None:
+            results[0].reason += f" To go on after the last finished seed: resume={run.folder}"
     seconds = time.perf_counter() - began
     for result in results:
         if result.status is not Status.skipped and not result.seconds:
             result.seconds = seconds
-        context.artifacts.results[result.name] = result
-        context.record(result)
+        run.artifacts.results[result.name] = result
+        run.record(result)
     if over is not None:
         raise over
 
 
-def _in_each_rank(context: RunContext, run: Gate) -> list[GateResult]:
+def _in_each_rank(run: Run, gate: Gate) -> list[GateResult]:
     """Run a gate in every rank on its own worlds: the results of rank 0, with the sums of all
     ranks' rates. It has failed if it has failed in any.
     """
-    ranks = context.ranks
-    own = replace(context, cfg=replace(context.cfg, nworld=len(context.worlds)), ranks=Ranks())
-    each = ranks.in_all(lambda: run(own))
-    results = _note(each[0], f"each of {ranks.size} ranks its own worlds; figures are rank 0's")
-    for number, result in enumerate(results):
-        others = [part[number] for part in each[1:]]
-        for rank, other in enumerate(others, 1):
-            result.details.append(f"rank {rank}: {other.status}, {other.reason}")
-            if other.status is Status.failed and result.status is not Status.failed:
+    stage = run.stage
+    ranks = stage.ranks
+    share = replace(run.cfg, nworld=len(stage.worlds))
+    alone = replace(run, stage=stage.with_config(share, ranks=Ranks(), measured=stage.measured))
+    results_of = ranks.in_all(lambda: gate(alone))
+    note = f"each of {ranks.size} ranks its own worlds; figures are rank 0's"
+    results = _with_note(results_of[0], note)
+    for result, *later in zip(*results_of, strict=True):
+        for rank, part in enumerate(later, 1):
+            result.details.append(f"rank {rank}: {part.status}, {part.reason}")
+            if part.status is Status.failed and result.status is not Status.failed:
                 result.status = Status.failed
-                result.reason = f"rank {rank}: {other.reason}"
+                result.reason = f"rank {rank}: {part.reason}"
         for key in [key for key in result.metrics if key.endswith(_RATE)]:
-            found = [part.metrics.get(key) for part in (result, *others)]
-            rates = [rate for rate in found if rate is not None]
-            if len(rates) == ranks.size:
+            if all(key in part.metrics for part in later):
+                rates = (part.metrics[key] for part in (result, *later))
                 result.metrics[f"all_ranks.{key}"] = sum(rates)
     return results
 
 
-def _note(results: list[GateResult], text: str) -> list[GateResult]:
-    """Results that say which ranks they are of."""
+def _with_note(results: list[GateResult], text: str) -> list[GateResult]:
+    """Results that name the ranks they are of."""
     for result in results:
         result.notes["ranks"] = text
     return results

@@ -2,25 +2,26 @@
 fails.
 """
 
-import itertools
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
+from typing_extensions import override
 
 from mjstack.config.check import places_objects, reads_starts_file
 from mjstack.config.schema import Config
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
-from mjstack.episodes.context import RunContext, needs_episode, spread
 from mjstack.episodes.record import starts_name
 from mjstack.episodes.regions import find_regions, regions_table, save_regions
 from mjstack.episodes.rollout import CLOSED_LOOP, FEEDBACK, Observer
+from mjstack.episodes.run import Run, needs_episode, spread
 from mjstack.episodes.seeds import play_seeds
-from mjstack.mdp.starts.starts_file import start_rows, write_rows, write_starts
+from mjstack.files import write_npz
+from mjstack.mdp.starts.starts_file import start_arrays
 from mjstack.report.record import GateResult
-from mjstack.report.write import format_percent, safely_write
+from mjstack.report.text import format_percent
+from mjstack.report.write import safely_write
 
 
 def success_config(cfg: Config) -> Config:
@@ -37,41 +38,41 @@ def success_config(cfg: Config) -> Config:
 
 @spread
 @needs_episode
-def run_success(context: RunContext) -> list[GateResult]:
+def run_success(run: Run) -> list[GateResult]:
     """Play the task from random starts under every seed, and hold the share of episodes that
     succeed against ``rate``.
     """
-    own = context.with_config(success_config(context.cfg))
-    cfg = own.cfg
+    success_run = run.on(run.stage.with_config(success_config(run.cfg)))
+    cfg = success_run.cfg
     t = cfg.gate.success
     unwritten: list[str] = []
     tally = play_seeds(
-        own,
+        success_run,
         "success",
         count=t.seeds,
         noun="episodes",
-        circumstances=True,
-        observers=lambda seed: [_StartsWriter(own, seed, unwritten)],
+        signs=True,
+        observers=lambda seed: [_StartsWriter(success_run, seed, unwritten)],
     )
     tally.details = unwritten + tally.details
-    kept = tally.circumstances
-    starts = np.concatenate([seed.start_places for seed in kept])
-    retries = np.concatenate([seed.retries for seed in kept])
+    starts = np.concatenate([seed["start_places"] for seed in tally.circumstances])
+    retries = np.concatenate([seed["retries"] for seed in tally.circumstances])
     succeeded = np.concatenate(tally.succeeded)
     retried = retries > 0
+    retried_succeeded = int((retried & succeeded).sum())
     regions = find_regions(
         starts,
         succeeded,
         cell=t.cell,
         yaw_cell_deg=t.yaw_cell_deg,
         episodes=t.cell_episodes,
-        objects=kept[0].objects,
+        objects=tally.object_names,
     )
     metrics = {
         "distinct_starts": len(np.unique(np.round(starts, 6).reshape(len(starts), -1), axis=0)),
         "retried": int(retried.sum()),
         "retries": int(retries.sum()),
-        "retried_succeeded": int((retried & succeeded).sum()),
+        "retried_succeeded": retried_succeeded,
         "unreachable": len(tally.unreachable),
         "episode_s": tally.seconds,
     }
@@ -80,14 +81,15 @@ def run_success(context: RunContext) -> list[GateResult]:
 
     parts = [f"{tally.summary}, {format_percent(t.rate)} wanted"]
     if retried.any():
-        parts.append(f"{retried.sum()} retried, {(retried & succeeded).sum()} of them succeeded")
+        parts.append(f"{retried.sum()} retried, {retried_succeeded} of them succeeded")
     if all(region.succeeded == region.episodes for region in regions):
         there = "had a failure" if regions else "(gate.success.cell_episodes): more seeds have more"
         tally.details.append(f"no region of at least {t.cell_episodes} episodes {there}")
-    tally.details += save_regions(own, regions, starts, tally)
+    if run.folder is not None:
+        tally.details += save_regions(cfg, run.folder, run.page, regions, starts, tally)
     result = tally.result(
         parts,
-        good=tally.good / tally.episodes >= t.rate,
+        passed=tally.successes / tally.episodes >= t.rate,
         metrics=metrics,
         thresholds={"success_rate_min": t.rate},
         tables=regions_table(cfg, regions),
@@ -98,25 +100,23 @@ def run_success(context: RunContext) -> list[GateResult]:
 class _StartsWriter(Observer):
     """Writes how worlds start into a file of the run, unless they start from that very file."""
 
-    def __init__(self, context: RunContext, seed: int, unwritten: list[str]) -> None:
+    def __init__(self, run: Run, seed: int, unwritten: list[str]) -> None:
         """``unwritten`` gets the problem if the file cannot be written."""
-        folder = context.folder
+        folder = run.folder
         self._path = None if folder is None else folder / starts_name(seed)
-        self._ranks = context.ranks
+        self._ranks = run.stage.ranks
         self._unwritten = unwritten
 
+    @override
     def start(self, env: Env, driver: Driver) -> None:
-        """See `Observer`."""
         path = self._path
         starts = env.cfg.starts
-        parts = self._ranks.gather(start_rows(env)) if self._ranks.size > 1 else []
+        parts = self._ranks.gather(start_arrays(env))
         if path is None or (starts is not None and path.resolve() == Path(starts).resolve()):
             return
         # Where the disk is full, the episodes are played all the same
-        write = (
-            partial(write_rows, itertools.chain(*parts)) if parts else partial(write_starts, env)
-        )
-        if problem := safely_write(path, write):
+        arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        if problem := safely_write(path, write_npz, arrays):
             self._unwritten.append(problem)
 
 

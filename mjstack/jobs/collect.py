@@ -1,35 +1,53 @@
-"""Job *collect*: demonstrations of the expert as a dataset, batch by batch, until as many as
-asked for are there.
+"""Job *collect*: demonstrations of the expert as a dataset, batch by batch, until as many as asked
+for are there.
 """
 
 import json
-import os
+import math
 import time
-from contextlib import closing
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import closing, nullcontext
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import cast
 
-import torch
+import numpy as np
 
-from mjstack.config.fingerprint import config_hash, differences
-from mjstack.config.schema import Backend, CollectJobCfg, Config
-from mjstack.datasets import DatasetSpec, lerobot, require_pyarrow
-from mjstack.datasets.reader import check_same, read_info
-from mjstack.datasets.video import check_encoder
-from mjstack.envs import Env, build_env, demonstration_config
-from mjstack.episodes.context import RunContext, require_episode
-from mjstack.errors import ConfigError, DatasetError, RankError
-from mjstack.files import check_unused, lock_folder, write_atomic
-from mjstack.jobs.collected import FILE, CollectPlan, read_batches
-from mjstack.jobs.collection import DATASET, Collection
-from mjstack.jobs.demonstration import ACTION, STATE, episode_config
+from mjstack.config.schema import CollectJobCfg, Config
+from mjstack.datasets import DatasetWriter, lerobot, require_pyarrow
+from mjstack.datasets.part import Part
+from mjstack.envs import demonstration_config
+from mjstack.episodes.batches import Batch, BatchPlan, play_batches
+from mjstack.episodes.run import Run
+from mjstack.episodes.stage import Stage, require_episode
+from mjstack.episodes.tally import rate_metrics
+from mjstack.errors import RankError
+from mjstack.files import write_atomic
+from mjstack.jobs.collect_episodes import EpisodeSource, demonstration_channels
+from mjstack.jobs.collect_plan import (
+    ACTION,
+    BATCHES,
+    DATASET,
+    NAME,
+    STATE,
+    BatchRecord,
+    CollectPlan,
+    check_folder,
+    plan_collection,
+    read_batches,
+)
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import CheckedJob, Job
+from mjstack.report.markdown import to_markdown
 from mjstack.report.record import GateResult, Status
-from mjstack.report.table import Table, format_value, to_document
+from mjstack.report.sections import Section
+from mjstack.report.table import Table
+from mjstack.report.text import format_value
 
-NAME = "collect"
+_SPARE = 1.05  # worlds played over episodes that are missing: some fail
+_MOST_EMPTY = 3  # batches in a row without an episode
 LOADING = """\
 import json
 from pathlib import Path
@@ -45,89 +63,49 @@ for name in ("observation.state", "action"):
 """
 
 
-def collect_folder(cfg: Config) -> Path:
-    """Where a configuration's dataset is, so that another call finds it."""
-    name = config_hash(episode_config(cfg))[:12]
-    return Path(cast(CollectJobCfg, cfg.job).folder or f"outputs/collect/{name}")
-
-
 def check_collect(cfg: Config) -> CheckedJob:
     """Raise for what cannot be done, before anything is written."""
     require_pyarrow()
     require_episode(cfg)
-    context = RunContext(cfg)
-    check_task(context)
-    plan = plan_collection(context)
-    if context.ranks.writes:  # it may have begun there when the others come
-        _check_folder(plan.home / DATASET, plan.spec)
+    stage = Stage(cfg)
+    check_task(stage)
+    plan = plan_collection(stage)
+    if stage.ranks.writes:  # it may have begun there when the others come
+        check_folder(plan.home / DATASET, plan.spec)
     count = cast(CollectJobCfg, cfg.job).episodes
-    title = f"task {cfg.task.name}, {count:,} demonstrations"
-    work = partial(run_collect, plan)
     return CheckedJob(
-        context=context,
-        title=title,
-        work=work,
+        stage=stage,
+        title=f"task {cfg.task.name}, {count:,} demonstrations",
+        work=partial(run_collect, plan),
         folder=plan.home,
-        own=DATASET,
+        marker=DATASET,
         resumes=NAME,
         spreads=True,
     )
 
 
-def plan_collection(context: RunContext) -> CollectPlan:
-    """Plan the configured dataset.
-
-    Raises:
-        ConfigError: Its episodes would not differ, or do not fit into the buffer.
-    """
-    cfg = context.cfg
-    shown = demonstration_config(cfg)
-    made = build_env(shown, model=context.model, nworld=2, backend=Backend.native, device="cpu")
-    with closing(made) as env:
-        if cast(CollectJobCfg, cfg.job).episodes > 1:
-            _check_starts(env)
-        plan = CollectPlan.of(context, collect_folder(cfg), env)
-        if cfg.scene.cameras:
-            _check_images(cfg, plan)
-        return plan
-
-
-def _check_images(cfg: Config, plan: CollectPlan) -> None:
-    """Refuse images that cannot be kept or encoded.
-
-    Raises:
-        MjstackError: One cannot.
-    """
-    for name, camera in cfg.scene.cameras.items():
-        if "rgb" not in camera.outputs:
-            expected = "rgb among them, which a dataset keeps"
-            raise ConfigError(f"scene.cameras.{name}.outputs", list(camera.outputs), expected)
-    check_encoder(plan.spec.videos, plan.spec.fps)
-
-
-def run_collect(plan: CollectPlan, context: RunContext, folder: Path) -> None:
+def run_collect(plan: CollectPlan, run: Run, folder: Path) -> None:
     """Add the missing episodes to the dataset, and leave dataset.md in the folder."""
-    context.begin(NAME)
-    if not context.ranks.writes:
-        context.ranks.from_first(lambda: None)  # which opens the dataset
-        Collection(plan, context).play()
-        return
+    run.begin(NAME)
+    ranks = run.stage.ranks
     began = time.perf_counter()
-    collection = Collection(plan, context)
-    context.ranks.from_first(lambda: None)
+    collection = Collection(plan, run.stage)
+    ranks.from_first(lambda: None)  # the dataset is open
+    if not ranks.writes:
+        collection.play()
+        return
 
     def conclude(status: Status, problem: str = "") -> None:
         result = collection.result(status, problem, time.perf_counter() - began)
         if collection.committed:
-            _write_table(context.cfg, plan, folder, result)
-            where = f"{collection.path}, described in {folder}/dataset.md"
-            context.print_line(f"dataset: {where}")
-        context.record(result)
+            _write_table(run.cfg, plan, folder, result)
+            run.print_line(f"dataset: {collection.path}, described in {folder}/dataset.md")
+        run.record(result)
 
     try:
         problem = collection.play()
     except (Exception, KeyboardInterrupt) as error:
-        cause = context.ranks.cause(error)
+        cause = ranks.cause(error)
         if isinstance(cause, KeyboardInterrupt):
             conclude(Status.interrupted, "interrupted")
         elif isinstance(cause, RankError):
@@ -135,6 +113,221 @@ def run_collect(plan: CollectPlan, context: RunContext, folder: Path) -> None:
             raise cause from error
         raise
     conclude(Status.failed if problem else Status.passed, problem)
+
+
+class Collection:
+    """A dataset, and the batches of worlds that add to it.
+
+    A batch is one seed in as many worlds as are needed and fit; the next batch has the next seed,
+    in later calls too. So a pair of seed and world is one episode for any nworld.
+
+    A batch is in the dataset as a whole or not at all: its episodes go into hidden files, which are
+    committed at once. Its record is written beside the dataset before that; a later call drops the
+    record of a batch that was not committed, and plays its seed again.
+
+    Several ranks share a batch's worlds. Each writes the episodes of its worlds into separate
+    files. The episodes are those that one rank adds, in the same order.
+
+    Attributes:
+        path: The dataset.
+        batches: All that were played, in earlier calls too; of rank 0.
+    """
+
+    def __init__(self, plan: CollectPlan, stage: Stage) -> None:
+        """Open the dataset of a plan; raises as `DatasetWriter` does."""
+        self._stage = stage
+        self._plan = plan
+        self._job = cast(CollectJobCfg, stage.cfg.job)
+        self._record_path = plan.home / BATCHES
+        self._problem = ""
+        self._played = 0
+        self.path = plan.home / DATASET
+        self._source = EpisodeSource(stage, plan.spec, self.path)
+        self.batches: list[BatchRecord] = []
+        self._writer: DatasetWriter | None = None
+        if not stage.ranks.writes:
+            return
+        if not (self.path / lerobot.INFO).exists():
+            self._record_path.unlink(missing_ok=True)  # of a dataset that was removed
+        self._writer = DatasetWriter(self.path, plan.spec)
+        self._before = self.committed
+
+    @property
+    def writer(self) -> DatasetWriter:
+        """The dataset's writer, of rank 0."""
+        assert self._writer is not None
+        return self._writer
+
+    @property
+    def committed(self) -> int:
+        """Number of episodes of the dataset."""
+        return len(self.writer.committed)
+
+    def play(self) -> str:
+        """Play and write until the episodes are there; what was committed is kept.
+
+        Returns:
+            Why that cannot be done; empty if it is done.
+
+        Raises:
+            FolderError: The dataset cannot be written any further.
+            OSError: The record of the batches cannot be written.
+        """
+        stage = self._stage
+        cfg = demonstration_config(stage.cfg, stage.action)
+        channels = demonstration_channels(stage)
+        with closing(self._source), self._writer or nullcontext():
+            if self._writer is not None:
+                self.batches = self._read_batches()
+            batches = play_batches(stage, self._batch_plans(), channels, cfg=cfg)
+            with closing(batches):
+                for batch in batches:
+                    self._add(batch)
+        return self._problem
+
+    def _read_batches(self) -> list[BatchRecord]:
+        """The batches of earlier calls that are in the dataset, or brought no episode."""
+        episodes = Counter(seed for seed, _ in self.writer.committed)
+        batches = []
+        for batch in read_batches(self._record_path):
+            if not batch.episodes or episodes[batch.seed]:
+                batch.episodes = episodes[batch.seed]
+                batches.append(batch)
+        return batches
+
+    def _batch_plans(self) -> Iterator[BatchPlan]:
+        """This rank's worlds of the batches, as long as episodes are missing."""
+        ranks = self._stage.ranks
+        while (plan := ranks.from_first(self._next_plan)) is not None:
+            yield BatchPlan(plan.seed, ranks.share(len(plan.worlds)))
+
+    def _next_plan(self) -> BatchPlan | None:
+        """The worlds of the next seed; None if enough episodes are there, or none is to come."""
+        missing = self._job.episodes - self.committed
+        if missing <= 0:
+            return None
+        last = self.batches[-self._played :][-_MOST_EMPTY:] if self._played else []
+        if len(last) == _MOST_EMPTY and not any(batch.episodes for batch in last):
+            rules = [f"{text} in {n} of {last[-1].worlds}" for text, n in last[-1].broken.items()]
+            self._problem = (
+                f"{_MOST_EMPTY} seeds in a row brought no episode, the last because of:"
+                f" {'; '.join(rules)} worlds"
+            )
+            return None
+        seeds = [seed for seed, _ in self.writer.committed] + [b.seed for b in self.batches]
+        seed = max([self._stage.cfg.seed - 1, *seeds]) + 1
+        spare = 1.0 if self._job.keep_failures else _SPARE
+        count = min(self._plan.most, math.ceil(spare * missing))
+        return BatchPlan(seed, range(max(self._stage.ranks.size, count)))
+
+    def _add(self, batch: Batch) -> None:
+        """Add a batch's episodes to the dataset."""
+        ranks = self._stage.ranks
+        failed = batch.episode.failed
+        finite = batch.finite().cpu().numpy()
+        parts = ranks.gather((failed, finite, int(batch.episode.retries.sum())))
+        chosen = ranks.from_first(partial(self._choose, batch.plan.seed, parts))
+        place = ranks.from_first(self._place)
+        with self._writer.guarded() if self._writer is not None else nullcontext():
+            files = ranks.gather(self._source.write(batch, chosen, *place))
+        ranks.from_first(partial(self._commit, [file for group in files for file in group]))
+
+    def _choose(self, seed: int, parts: Sequence[tuple[np.ndarray, np.ndarray, int]]) -> list[int]:
+        """Record a batch, and choose the worlds whose episodes are kept."""
+        failed = np.concatenate([bits for bits, _, _ in parts])
+        finite = np.concatenate([flags for _, flags, _ in parts])
+        candidates = (failed == 0) | self._job.keep_failures
+        missing = self._job.episodes - self.committed
+        chosen = np.flatnonzero(candidates & finite)[:missing].tolist()
+        rules = self._stage.check.rules
+        broken = {rules.texts[n]: len(worlds) for n, worlds in rules.failing(failed).items()}
+        if lost := int((candidates & ~finite).sum()):
+            broken["a number that is not finite"] = lost
+        record = BatchRecord(
+            seed=seed,
+            worlds=len(failed),
+            succeeded=int((failed == 0).sum()),
+            episodes=len(chosen),
+            retries=sum(retries for _, _, retries in parts),
+            broken=broken,
+        )
+        self.batches.append(record)
+        self._played += 1
+        records = [asdict(batch) for batch in self.batches]
+        write_atomic(self._record_path, json.dumps(records, indent=1) + "\n")
+        return chosen
+
+    def _place(self) -> tuple[int, int, int]:
+        """Number of the next episode and of the next frame of the dataset, and of the task."""
+        task = self._stage.cfg.task
+        number = self.writer.number_task(task.instruction or task.name)
+        return self.committed, self.writer.frames, number
+
+    def _commit(self, files: Sequence[Part]) -> None:
+        """Commit the files of all ranks, and print what the batch has brought."""
+        if files:
+            self.writer.commit(files)
+        batch = self.batches[-1]
+        self._stage.progress.print_line(
+            f"collect, seed {batch.seed}: {batch.succeeded} of {batch.worlds} worlds succeeded,"
+            f" {self.committed} of {self._job.episodes} episodes there"
+        )
+
+    def result(self, status: Status, problem: str, seconds: float) -> GateResult:
+        """The dataset and the expert's success, as a result of the report.
+
+        ``problem`` says why it did not pass; ``seconds`` is the wall time of this call.
+        """
+        asked = self._job.episodes
+        new = self.committed - self._before
+        steps = self.writer.frames
+        size = sum(path.stat().st_size for path in self.path.rglob("*") if path.is_file()) / 1e6
+        notes = {"dataset": str(self.path), "config_sha256": self._plan.spec.config_sha256}
+        metrics: dict[str, float] = {
+            "episodes": self.committed,
+            "episodes_of_this_call": new,
+            "steps": steps,
+            "megabytes": size,
+        }
+        reasons = [problem] if problem else []
+        there = f"{steps:,} steps, {size:.1f} MB"
+        reasons.append(f"{self.committed:,} episodes, {asked:,} asked for ({there})")
+        details: list[str] = []
+
+        if self.batches:
+            notes["seeds"] = f"{self.batches[0].seed} to {self.batches[-1].seed}"
+            driver = "expert" if self._stage.phases else "policy"
+            worlds = sum(batch.worlds for batch in self.batches)
+            succeeded = sum(batch.succeeded for batch in self.batches)
+            metrics |= {
+                "worlds_played": worlds,
+                **rate_metrics(succeeded, worlds),
+                "retries": sum(batch.retries for batch in self.batches),
+            }
+            share = f"{succeeded:,} of {worlds:,} worlds ({100.0 * succeeded / worlds:.4g} %)"
+            reasons.append(f"the {driver} succeeded in {share}")
+            broken = sum((Counter(batch.broken) for batch in self.batches), Counter())
+            details = [f"{text}: {count} of {worlds} worlds" for text, count in broken.items()]
+
+        # This call
+        if new:
+            metrics["episodes_per_s"] = new / seconds
+            if self._plan.spec.videos:
+                metrics["drawing_s"] = self._source.drawing
+                metrics["encoding_wait_s"] = self.writer.waited
+            reasons.append(f"{new / seconds:.3g} episodes/s in all")
+        elif self.committed >= asked:
+            reasons.append("they were there already")
+        return GateResult(
+            name="collect",
+            status=status,
+            reason="; ".join(reasons),
+            seconds=seconds,
+            thresholds={"episodes": asked},
+            metrics=metrics,
+            notes=notes,
+            details=details,
+        )
 
 
 def _write_table(cfg: Config, plan: CollectPlan, folder: Path, result: GateResult) -> None:
@@ -154,54 +347,9 @@ def _write_table(cfg: Config, plan: CollectPlan, folder: Path, result: GateResul
     tables = [Table(header=["fact", "value"], rows=facts), Table(header=header, rows=ranges)]
     title = f"{cfg.robot.title}, task {cfg.task.name}: demonstrations"
     loading = LOADING.format(folder=dataset)
-    text = f"{to_document(title, tables)}\nWith pyarrow alone:\n\n```python\n{loading}```\n"
+    facts_of = to_markdown([Section(title=title, parts=tables, level=1)])
+    text = f"{facts_of}\nWith pyarrow alone:\n\n```python\n{loading}```\n"
     write_atomic(folder / "dataset.md", text)
-
-
-def _check_starts(env: Env) -> None:
-    """Refuse starts that are the same in every world or under every seed: an episode would be in
-    the dataset twice.
-    """
-    starts = []
-    seed = env.cfg.seed
-    for other in (seed, seed - 1 if seed else 1):
-        env.reset(seed=other)
-        parts = (env.sim.qpos, env.sim.qvel, *env.sim.fields.values())
-        rows = torch.cat([part.double().flatten(1) for part in parts], dim=1)
-        starts += [row.numpy().tobytes() for row in rows]
-    if len(set(starts)) < len(starts):
-        raise ConfigError(
-            "reset",
-            f"[{', '.join(env.cfg.reset)}]",
-            "starts that differ from world to world and from seed to seed, so that no episode is"
-            " there twice",
-            "Use reset=randomized or reset=jitter",
-        )
-
-
-def _check_folder(dataset: Path, spec: DatasetSpec) -> None:
-    """Refuse a dataset that is not this configuration's.
-
-    Raises:
-        DatasetError: It is of another one.
-        FolderError: Another process is writing it, or the job's folder has a run of another job.
-    """
-    check_unused(dataset.parent, NAME, DATASET)
-    if not dataset.exists():
-        return
-    os.close(lock_folder(dataset))
-    info = read_info(dataset)
-    if info is None:
-        return
-    if info["mjstack"]["config_sha256"] != spec.config_sha256:
-        theirs = (info["mjstack"]["provenance"] or [{}])[-1].get("config", {})
-        found = differences(theirs, spec.provenance["config"])
-        raise DatasetError(
-            f"{dataset} has episodes of another configuration: {found}. Set job.folder to another"
-            " folder, or these keys back"
-        )
-    check_same(dataset, info, spec)
-    read_batches(dataset.parent / FILE)
 
 
 JOB = Job(check_collect)

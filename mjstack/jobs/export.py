@@ -5,20 +5,19 @@ MuJoCo.
 from contextlib import closing
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import cast
 
 import mujoco
 import numpy as np
 
 import mjstack
 from mjstack.config.schema import Backend, Config
-from mjstack.envs import Env, build_env, driven_config
-from mjstack.episodes.context import RunContext
+from mjstack.envs import build_env, driven_config
 from mjstack.episodes.rollout import POLICY as DRIVER
-from mjstack.errors import FolderError, PolicyError
+from mjstack.episodes.stage import Stage
+from mjstack.errors import FolderError
 from mjstack.files import write_atomic
 from mjstack.gates.runner import run_guarded
-from mjstack.jobs.demonstration import group_feature, joint_units
+from mjstack.jobs.collect_plan import group_feature, joint_units
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import CheckedJob, Job
 from mjstack.policy import Policy
@@ -34,28 +33,29 @@ MODEL = "model.mjb"
 def check_export(cfg: Config) -> CheckedJob:
     """Raise for what cannot be exported, before anything is written."""
     require_onnx()
-    context = RunContext(replace(cfg, controller=replace(cfg.controller, name=DRIVER)))
-    check_task(context)
-    if context.stage.policy.network.vision.sizes:
-        raise PolicyError(
+    stage = Stage(replace(cfg, controller=replace(cfg.controller, name=DRIVER)))
+    check_task(stage)
+    if stage.assets.policy.network.vision.sizes:
+        raise FolderError(
             f"policy={cfg.policy}: sees images, expected one that sees numbers alone, which ONNX"
             " files are written for",
             "Play it with controller=policy",
         )
-    title = f"task {cfg.task.name}, policy {context.stage.policy.folder}"
+    title = f"task {cfg.task.name}, policy {stage.assets.policy.folder}"
     return CheckedJob(
-        context=context,
+        stage=stage,
         title=title,
-        work=lambda context, folder: run_guarded(context, NAME, export_policy),
+        work=lambda run, folder: run_guarded(
+            run, NAME, lambda run: export_policy(run.stage, folder)
+        ),
     )
 
 
-def export_policy(context: RunContext) -> list[GateResult]:
+def export_policy(stage: Stage, folder: Path) -> list[GateResult]:
     """Write both files, or none."""
-    folder = cast(Path, context.folder)
-    policy = context.stage.policy
-    facts = export_facts(context.cfg, policy)
-    files = {MODEL: _model_bytes(context.model), POLICY: to_onnx(policy.network, facts)}
+    policy = stage.assets.policy
+    facts = export_facts(stage.cfg, policy)
+    files = {MODEL: _model_bytes(stage.model), POLICY: to_onnx(policy.network, facts)}
     try:
         for name, content in files.items():
             write_atomic(folder / name, content)
@@ -67,8 +67,7 @@ def export_policy(context: RunContext) -> list[GateResult]:
             "Make room, or set hydra.run.dir to another",
         ) from error
     width = sum(policy.widths.values())
-    answer = "numbers of its action terms" if policy.action else "joint targets"
-    shape = f"{policy.network.chunk} x {policy.network.joints} {answer}"
+    shape = f"{policy.network.chunk} x {policy.network.width} numbers of its action terms"
     sizes = {f"{name.replace('.', '_')}_mb": len(data) / 1e6 for name, data in files.items()}
     return [
         GateResult(
@@ -83,20 +82,15 @@ def export_policy(context: RunContext) -> list[GateResult]:
 
 def export_facts(cfg: Config, policy: Policy) -> dict:
     """Everything that a program needs beside the network, in JSON's types, by name."""
-    own = driven_config(cfg)
-    own.observation = {policy.group: policy.observation}
-    own.action = policy.action or own.action
-    with closing(build_env(own, nworld=1, backend=Backend.native, device="cpu")) as env:
-        return policy_facts(policy) | _scene_facts(env, policy)
-
-
-def _scene_facts(env: Env, policy: Policy) -> dict:
-    cfg = env.cfg
+    cfg = driven_config(cfg, action=policy.action)
+    cfg.observation = {policy.group: policy.observation}
+    with closing(build_env(cfg, nworld=1, backend=Backend.native, device="cpu")) as env:
+        units = joint_units(env)
+        columns = group_feature(env, policy.group, units)
+        index = env.index
     robot = cfg.robot
-    units = joint_units(env)
-    columns = group_feature(env, policy.group, units)
     network = policy.network
-    return {
+    return policy_facts(policy) | {
         "versions": policy.versions,
         "exported_with": {"mjstack": mjstack.__version__, "mujoco": mujoco.__version__},
         "columns": {"names": columns.names, "units": columns.units},
@@ -107,11 +101,11 @@ def _scene_facts(env: Env, policy: Policy) -> dict:
             "name": robot.name,
             "joints": robot.joints,
             "units": units,
-            "qpos": env.index.robot_qpos.tolist(),
-            "qvel": env.index.robot_qvel.tolist(),
-            "ctrl": env.index.ctrl.tolist(),
-            "low": env.index.ctrl_range[:, 0].tolist(),
-            "high": env.index.ctrl_range[:, 1].tolist(),
+            "qpos": index.robot_qpos.tolist(),
+            "qvel": index.robot_qvel.tolist(),
+            "ctrl": index.ctrl.tolist(),
+            "low": index.ctrl_range[:, 0].tolist(),
+            "high": index.ctrl_range[:, 1].tolist(),
             "home": robot.home,
             "start": robot.start,
             "grasp_sites": robot.grasp_sites,

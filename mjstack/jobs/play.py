@@ -2,22 +2,22 @@
 side in a video.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import cast
 
-import mujoco
 import numpy as np
 import torch
 
 from mjstack.config.schema import Config, PlayJobCfg
-from mjstack.episodes.context import RunContext, judge_one
-from mjstack.episodes.motion import show_world
+from mjstack.episodes.recorder import WorldRecorder
 from mjstack.episodes.replay import simulate_alone
-from mjstack.episodes.rollout import POLICY, WorldRecorder, play_episode, rollout
+from mjstack.episodes.rollout import POLICY, play_episode, rollout
+from mjstack.episodes.run import Run
+from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError
 from mjstack.gates.runner import run_guarded
 from mjstack.jobs.gates import check_task
@@ -44,108 +44,103 @@ def check_play(cfg: Config) -> CheckedJob:
         raise ConfigError("task", cfg.task.name, expected, "Name a policy: policy=FOLDER")
     job = cast(PlayJobCfg, cfg.job)
     if job.camera is not None and job.camera not in cfg.scene.cameras:
-        there = ", ".join(cfg.scene.cameras) or "there is none"
-        expected = f"null, or one of scene.cameras: {there}"
+        names = ", ".join(cfg.scene.cameras) or "there is none"
+        expected = f"null, or one of scene.cameras: {names}"
         raise ConfigError("job.camera", job.camera, expected, "Add a camera: cameras=front")
-    context = RunContext(cfg)
-    check_task(context)
+    stage = Stage(cfg)
+    check_task(stage)
     check_showing(cfg, f".{job.format}")
     if cfg.video and job.camera is None:  # cameras have been checked with the task
-        require_offscreen(context.model)
+        require_offscreen(stage.model)
     driver = "a policy" if cfg.controller.name == POLICY else "the expert"
     title = f"task {cfg.task.name}, {cfg.nworld} worlds with {driver}"
     return CheckedJob(
-        context=context,
+        stage=stage,
         title=title,
-        work=lambda context, folder: run_guarded(context, NAME, play_worlds),
+        work=lambda run, folder: run_guarded(run, NAME, play_worlds),
     )
 
 
-def play_worlds(context: RunContext) -> list[GateResult]:
+def play_worlds(run: Run) -> list[GateResult]:
     """Play each world alone, as it would start in a batch, and show it. Worlds may fail: a gate
     judges a driver.
     """
-    cfg = context.cfg
-    recorders = []
+    stage = run.stage
+    cfg = stage.cfg
+    advance = stage.progress.advance
+    positions = []
     fields = []
     details = []
-    good = 0
-    with closing(simulate_alone(context, *context.backend)) as sim:
+    succeeded = 0
+    with closing(simulate_alone(stage, *stage.backend)) as sim:
         for world in range(cfg.nworld):
-            env = context.start(sim, cfg.reset, worlds=[world])
-            driver = context.driver(env)
+            env = stage.start(sim, cfg.reset, worlds=[world])
+            driver = stage.driver(env)
             recorder = WorldRecorder()
-            looking = [*context.viewers, recorder]
+            observers = [*run.viewers, recorder]
             label = f"steps of world {world}"
-            told = "not judged: the task has no check"
+            outcome = "not judged: the task has no check"
             failed = False
             if cfg.task.check is None:
-                rollout(env, driver, looking, advance=context.advance, label=label)
+                rollout(env, driver, observers, advance=advance, label=label)
             else:
-                episode = play_episode(env, driver, looking, advance=context.advance, label=label)
-                status, told, metrics = judge_one(context, episode)
+                episode = play_episode(env, driver, observers, advance=advance, label=label)
+                status, outcome, metrics = run.judge_one(episode)
                 failed = status is Status.failed
-                good += not failed
-                told = told or f"succeeded, {context.check.headline(metrics)}"
-            recorders.append(recorder)
+                succeeded += not failed
+                outcome = outcome or f"succeeded, {stage.check.headline(metrics)}"
+            positions.append(recorder.qpos)
             fields.append({name: value.clone() for name, value in sim.fields.items()})
-            show_world(context, f"{NAME}_{world}", str(world), recorder, failed=failed)
-            details.append(f"world {world}: {told}")
-            context.print_line(details[-1])
+            page_world = (f"{NAME}_{world}", str(world), recorder.qpos, cfg.timing.step_dt)
+            run.page.show_world(*page_world, failed=failed)
+            details.append(f"world {world}: {outcome}")
+            run.print_line(details[-1])
     result = GateResult(
         name=NAME,
         status=Status.passed,
-        reason=f"{good} of {cfg.nworld} worlds succeeded" if cfg.task.check else told,
-        metrics={"worlds": cfg.nworld, **({"succeeded": good} if cfg.task.check else {})},
+        reason=f"{succeeded} of {cfg.nworld} worlds succeeded" if cfg.task.check else outcome,
+        metrics={"worlds": cfg.nworld, **({"succeeded": succeeded} if cfg.task.check else {})},
         notes={"backend": sim.description},
         details=details,
     )
     if cfg.video:
-        _save(context, np.stack([recorder.qpos for recorder in recorders]), fields, result)
+        _save(run, np.stack(positions), fields, result)
     return [result]
 
 
 def _save(
-    context: RunContext,
+    run: Run,
     qpos: np.ndarray,
     fields: Sequence[Mapping[str, torch.Tensor]],
     result: GateResult,
 ) -> None:
     """Write the video; without one there is nothing to look at, and the job fails."""
-    assert context.folder is not None
-    job = cast(PlayJobCfg, context.cfg.job)
-    path = context.folder / f"episode.{job.format}"
-    write = partial(save_video, fps=job.fps, width=job.width)
-    if job.camera is not None:
-        write = partial(_save_by_camera, write, context, fields)
-    shown = (context.stage.visual_model, qpos, context.cfg.timing.step_dt, context.advance)
-    if problem := safely_write(path, write, *shown):
+    assert run.folder is not None
+    stage = run.stage
+    job = cast(PlayJobCfg, stage.cfg.job)
+    path = run.folder / f"episode.{job.format}"
+
+    def write(path: Path) -> None:
+        """Write it as seen from the side, or by a camera with each world in its own looks."""
+        model = stage.assets.visual_model
+        step_dt = stage.cfg.timing.step_dt
+        advance = stage.progress.advance
+        save = partial(
+            save_video, path, model, qpos, step_dt, advance, fps=job.fps, width=job.width
+        )
+        if job.camera is None:
+            save()
+            return
+        looks = {field: torch.cat([world[field] for world in fields]) for field in fields[0]}
+        name = f"images.{job.camera}"
+        with closing(stage.color_renderer(len(qpos), list(looks), [job.camera])) as renderer:
+            save(draw=lambda q: renderer.draw(torch.from_numpy(q), looks)[name].cpu().numpy())
+
+    if problem := safely_write(path, write):
         result.status = Status.failed
         result.reason += f"; {problem}"
     else:
-        context.print_line(f"video: {path}")
-
-
-def _save_by_camera(
-    save: Callable[..., None],
-    context: RunContext,
-    fields: Sequence[Mapping[str, torch.Tensor]],
-    path: Path,
-    model: mujoco.MjModel,
-    qpos: np.ndarray,
-    *args: object,
-) -> None:
-    """Call `save_video` so that a camera of the scene draws, each world in its own looks."""
-    name = cast(str, cast(PlayJobCfg, context.cfg.job).camera)
-    looks = {field: torch.cat([world[field] for world in fields]) for field in fields[0]}
-    renderer = context.stage.color_renderer(len(qpos), list(looks), [name])
-
-    def draw(states: np.ndarray) -> np.ndarray:
-        images = renderer.draw(torch.from_numpy(states), looks)
-        return images[f"images.{name}"].cpu().numpy()
-
-    with closing(renderer):
-        save(path, model, qpos, *args, draw=draw)
+        run.print_line(f"video: {path}")
 
 
 JOB = Job(check_play, shows=True, live=True)

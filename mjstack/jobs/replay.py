@@ -1,299 +1,165 @@
-"""Job *replay*: one world of an earlier run's batch again, alone, with its trajectory kept and
-every rule explained.
+"""Job *replay*: worlds of an earlier run again. One world alone, with its trajectory kept and every
+rule explained; or all failing ones, with a table that says whether they fail again.
 """
 
-import math
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from omegaconf import OmegaConf
 
-from mjstack.config.schema import Backend, Config, SimCfg
-from mjstack.envs import driven_config
-from mjstack.episodes.context import RunContext, judge_one, require_episode
-from mjstack.episodes.earlier_run import EarlierRun, archived_starts, copy_names
+from mjstack.config.schema import Backend, Config
+from mjstack.episodes.batches import BatchPlan, play_batches
 from mjstack.episodes.failures import FailureMonitor, describe_sign
-from mjstack.episodes.motion import show_world
-from mjstack.episodes.record import EpisodeRecord
-from mjstack.episodes.replay import ReplayedWorld, replay_world, start_of_world
-from mjstack.errors import ConfigError, DeviceError, RunError
-from mjstack.files import write_atomic, write_npz
+from mjstack.episodes.replay import WorldTrace, simulate_alone
+from mjstack.episodes.rollout import Episode
+from mjstack.episodes.run import Run
+from mjstack.episodes.stage import require_episode
+from mjstack.episodes.tally import rate_cells
+from mjstack.errors import ConfigError
+from mjstack.files import to_csv, write_atomic, write_npz
 from mjstack.gates.runner import run_guarded
-from mjstack.gates.success import success_config
 from mjstack.jobs.gates import check_task
-from mjstack.jobs.replay_failing import Failing, replay_failing
+from mjstack.jobs.replay_plan import ReplayPlan, check_start, plan_replay
 from mjstack.jobs.runner import CheckedJob, Job, run_provenance
 from mjstack.jobs.showing import check_showing
-from mjstack.mdp.starts.placement import SCHEMA
 from mjstack.report.record import GateResult, Status
-from mjstack.sim import resolve_backend, resolve_device
+from mjstack.report.table import Table
+from mjstack.sim import resolve_device
 
-_PLACES = {
-    "git_commit": "mjstack's commit",
-    "cpu": "the processor",
-}  # besides versions, what arithmetic depends on
-_SAME_START = (
-    1e-6  # [m, rad], and of quaternions: backends differ by rounding, another start by more
-)
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ReplayPlan:
-    """One world to be played again.
-
-    Attributes:
-        run: The earlier run.
-        gate: Whose world it is, ``batch`` or ``success``.
-        seed: The seed.
-        world: The world's number.
-        where: Backend and device, each played once; the first is the earlier run's unless ``sim``
-            says otherwise.
-        record: The result of the gate.
-        context: The configuration that the gate played under, on the first backend here.
-    """
-
-    run: EarlierRun
-    gate: str
-    seed: int
-    world: int
-    where: list[tuple[Backend, str]]
-    record: EpisodeRecord
-    context: RunContext
+TABLE = "replayed_worlds.csv"
+_TABLE_ROWS = 100  # worlds in report.md
+# Besides versions, what arithmetic depends on
+_PLACES = {"git_commit": "mjstack's commit", "cpu": "the processor"}
 
 
 def check_replay(cfg: Config) -> CheckedJob:
     """Raise for what cannot be replayed, before anything is written."""
-    failing = _failing(cfg)
-    plan = _plan(cfg if failing is None else replace(cfg, world=failing.first))
-    context = plan.context
-    require_episode(context.cfg)
-    check_task(context)
-    check_showing(context.cfg)
-    _check_start(plan)
-    if failing is not None:
+    plan = plan_replay(cfg)
+    stage = plan.stage
+    require_episode(stage.cfg)
+    check_task(stage)
+    check_showing(stage.cfg)
+    check_start(plan)
+    nworld = stage.cfg.nworld
+    title = f"replay of world {plan.world} of {nworld}, seed {plan.seed}, of {plan.run.folder}"
+    if plan.failing:
         if cfg.view != "false" or cfg.video:
             expected = "one world, such as 17, which view and video show"
             raise ConfigError("world", cfg.world, expected)
-        return CheckedJob(
-            context=context,
-            title=f"replay of {len(failing)} failing worlds of {plan.run.folder}",
-            work=partial(replay_failing, failing, plan.where),
-            spreads=True,
-        )
-    nworld = context.cfg.nworld
-    title = f"replay of world {plan.world} of {nworld}, seed {plan.seed}, of {plan.run.folder}"
-    return CheckedJob(context=context, title=title, work=partial(_replay_all, plan))
+        count = sum(map(len, plan.bits.values()))
+        title = f"replay of {count} failing worlds of {plan.run.folder}"
+    work = partial(_replay_failing if plan.failing else _replay_one, plan)
+    return CheckedJob(stage=stage, title=title, work=work, spreads=plan.failing)
 
 
-def _replay_all(plan: ReplayPlan, context: RunContext, folder: Path) -> None:
+def _replay_one(plan: ReplayPlan, run: Run, folder: Path) -> None:
     """Play the world on its run's backend and, where that was MJWarp, on native MuJoCo too."""
-    played = OmegaConf.structured(replace(context.cfg, seed=plan.seed))
+    played = OmegaConf.structured(replace(run.cfg, seed=plan.seed))
     write_atomic(folder / "replayed_config.yaml", OmegaConf.to_yaml(played))
-    changes = _changes(plan.run.provenance, run_provenance(context))
+    changes = _changes(plan.run.provenance, run_provenance(run.stage))
     for line in changes:
-        context.print_line(line)
+        run.print_line(line)
     for number, (backend, _) in enumerate(plan.where):
-        run_guarded(context, f"replay_{backend}", partial(_replay, plan, number, changes))
+        run_guarded(run, f"replay_{backend}", partial(_replay, plan, number, changes, folder))
 
 
-def _failing(cfg: Config) -> Failing | None:
-    """The failing worlds, where all of them are asked for."""
-    gate, _, which = (cfg.world or "").rpartition(":")
-    if which != "failing" or cfg.run is None:
-        return None
-    run = EarlierRun.read(cfg.run)
-    had = [name for name in ("batch", "success") if name in run.cfg.gates]
-    if (gate or had[:1]) and (not gate or gate in had):
-        return Failing.of(run, gate or had[0])
-    expected = f"failing worlds of a gate that run had, {' or '.join(had) or 'but it had none'}"
-    raise ConfigError("world", cfg.world, expected)
-
-
-def _plan(cfg: Config) -> ReplayPlan:
-    for key, expected in (("run", "the folder of an earlier run"), ("world", "one of its worlds")):
-        if getattr(cfg, key) is None:
-            fix = "Write job=replay run=outputs/<date>/<time> world=17"
-            raise ConfigError(key, "null", f"{expected}, because job=replay plays one again", fix)
-    resolve_backend(cfg)  # what this command line asks for must be there
-    run = EarlierRun.read(str(cfg.run))
-
-    # The world: [gate:][seed:]number
-    *heads, tail = str(cfg.world).split(":")
-    world = int(tail)
-    had = [gate for gate in ("batch", "success") if gate in run.cfg.gates]
-    gate = heads.pop(0) if heads and not heads[0].isdigit() else (had or ["batch"])[0]
-    first = run.cfg.seed
-    last = first + run.cfg.gate[gate].seeds - 1
-    seed = int(heads[0]) if heads else first
-    expected = ""
-    if gate not in had:
-        expected = f"a world of a gate that run had, {' or '.join(had) or 'but it had none'}"
-    elif not first <= seed <= last:
-        expected = f"a seed from {first} to {last}, as that run has (seed:world)"
-    elif world >= run.cfg.nworld:
-        expected = f"a world from 0 to {run.cfg.nworld - 1}, as that run has"
-    if expected:
-        raise ConfigError("world", cfg.world, expected)
-    record = run.record(seed, gate)
-
-    # How it is played here
-    played = archived_starts(run.cfg, run.folder)
-    if gate == "success":
-        played = success_config(played)
-    where = _choose(cfg.sim, record)
-    backend, device = where[0]
-    sim = SimCfg(backend=backend, device=device, step=cfg.sim.step)
-    return ReplayPlan(
-        run=run,
-        gate=gate,
-        # The folder may be a stranger's: what a replay does not play is not built.
-        context=RunContext(
-            replace(driven_config(played), sim=sim, view=cfg.view, video=cfg.video, web=cfg.web)
-        ),
-        seed=seed,
-        world=world,
-        where=where,
-        record=record,
-    )
-
-
-def _choose(asked: SimCfg, record: EpisodeRecord) -> list[tuple[Backend, str]]:
-    """Backends and devices to play on."""
-    native = (Backend.native, "cpu")
-    backend = Backend(record.backend) if asked.backend is Backend.auto else asked.backend
-    if backend is Backend.native:
-        return [native]
-    device = resolve_device(asked.device)
-    if asked.device == "auto" and record.backend == "mjwarp":
-        with suppress(DeviceError):  # it is not here
-            device = resolve_device(record.device)
-    return [(backend, device), *([native] if asked.backend is Backend.auto else [])]
-
-
-def _check_start(plan: ReplayPlan) -> None:
-    """Raise if the world would start elsewhere than it did in that run."""
-    then = plan.record.start[plan.world]
-    off = math.inf
-    # MJWarp takes longer to load than the native start does to compute, and rounding may have it
-    # draw otherwise.
-    for backend, device in dict.fromkeys([(Backend.native, "cpu"), plan.where[0]]):
-        now = start_of_world(
-            plan.context, seed=plan.seed, world=plan.world, backend=backend, device=device
-        )
-        off = float(np.abs(now - then).max()) if now.shape == then.shape else math.inf
-        if off <= _SAME_START:
-            return
-    copies = ", ".join(copy_names(plan.run.cfg).values())
-    commit = plan.run.provenance.get("git_commit")
-    fix = f"Put back what it started from, as {copies}" if copies else f"Use mjstack at {commit}"
-    if not copies and (then_drawn := plan.run.provenance.get("starts_schema", 1)) != SCHEMA:
-        fix = f"Random starts are drawn otherwise now (schema {SCHEMA}, not {then_drawn}). {fix}"
-    raise RunError(
-        f"run={plan.run.folder}: world {plan.world} of seed {plan.seed} would start up to {off:.3g}"
-        f" (m, rad) from where it did, expected its own start. {fix}."
-    )
-
-
-def _changes(then: dict, now: dict) -> list[str]:
+def _changes(recorded: dict, current: dict) -> list[str]:
     """Facts that differ from the earlier run's and could change a result, or its last bits."""
-    before, here = (
-        one["versions"] | {name: one.get(key) for key, name in _PLACES.items()}
-        for one in (then, now)
+    before, now = (
+        facts["versions"] | {name: facts.get(key) for key, name in _PLACES.items()}
+        for facts in (recorded, current)
     )
     lines = [
         f"{name} was {before[name]} in that run and is {value} now"
-        for name, value in here.items()
+        for name, value in now.items()
         if name in before and before[name] != value
     ]
-    if then.get("policy") != now.get("policy"):
+    if recorded.get("policy") != current.get("policy"):
         lines.append("the policy is not the same as in that run: it was written anew")
-    if then.get("model_sha256") != now["model_sha256"]:
+    if recorded.get("model_sha256") != current["model_sha256"]:
         lines.append("the compiled model is not the same as in that run: this is another physics")
     return lines
 
 
 def _replay(
-    plan: ReplayPlan, number: int, changes: list[str], context: RunContext
+    plan: ReplayPlan, number: int, changes: list[str], folder: Path, run: Run
 ) -> list[GateResult]:
     """Play the world on one backend, and compare the result with the recorded one."""
     first = number == 0
     backend, device = plan.where[number]
+    stage = run.stage
+    check = stage.check
     monitors = [FailureMonitor()] if plan.gate == "success" else []
-    done = replay_world(
-        context,
-        seed=plan.seed,
-        world=plan.world,
-        backend=backend,
-        device=device,
-        observers=[*(context.viewers if first else []), *monitors],
-    )
-    rules = context.check.rules
-    status, reason, metrics = judge_one(context, done.episode)
-    kept, compared = _compare(plan, done, backend, device, changes, context)
-    reason = f"{reason or f'succeeded, {context.check.headline(metrics)}'}; {compared}"
-    bad = status is Status.failed
-    if not kept:
-        status = Status.failed
-    show_world(context, f"replay_{backend}", f"{plan.world}, {backend}", done.recorder, failed=bad)
+    trace = WorldTrace()
+    observers = [trace, *(run.viewers if first else []), *monitors]
+    facts = {"seed": plan.seed, "world": plan.world}
+    with closing(simulate_alone(stage, backend, device)) as sim:
+        episode = stage.play(sim, stage.cfg.reset, observers, seed=plan.seed, worlds=[plan.world])
+        lines = trace.explain(episode)
+    qpos = trace.arrays["qpos"]
+    status, reason, metrics = run.judge_one(episode)
+    failed = status is Status.failed
+    agrees, comparison = _compare(plan, number, episode, qpos[-1], changes, run)
+    label = f"{plan.world}, {backend}"
+    step_dt = run.cfg.timing.step_dt
+    run.page.show_world(f"replay_{backend}", label, qpos, step_dt, failed=failed)
     if first:
         title = f"world {plan.world} of seed {plan.seed}, replayed ({backend})"
-        context.artifacts.shown = (title, done.recorder)
-    told = [*done.findings, *(_first_sign(monitor, done, context) for monitor in monitors)]
-    for line in told:
-        context.print_line(f"  {line}")
+        run.artifacts.pictured = (title, qpos)
+    lines += [_first_sign(monitor, episode) for monitor in monitors]
+    for line in lines:
+        run.print_line(f"  {line}")
     name = "trajectory.npz" if first else f"trajectory_{backend}.npz"
-    assert context.folder is not None
-    write_npz(context.folder / name, done.arrays)
-    recorded = rules.describe(int(plan.record.failed[plan.world])) or "succeeded"
+    ends = {"backend": episode.description, "failed": int(episode.failed[0])}
+    write_npz(folder / name, facts | ends | trace.arrays)
+    recorded = check.rules.describe(plan.bits[plan.seed][plan.world]) or "succeeded"
     return [
         GateResult(
             name=f"replay_{backend}",
-            status=status,
-            reason=reason,
-            thresholds=context.check.thresholds(),
-            metrics={"seed": plan.seed, "world": plan.world, **metrics},
-            notes={"backend": done.episode.description, "recorded": recorded, "trajectory": name},
-            details=told + changes,
+            status=status if agrees else Status.failed,
+            reason=f"{reason or f'succeeded, {check.headline(metrics)}'}; {comparison}",
+            thresholds=check.thresholds(),
+            metrics=facts | metrics,
+            notes={"backend": episode.description, "recorded": recorded, "trajectory": name},
+            details=lines + changes,
         )
     ]
 
 
-def _first_sign(monitor: FailureMonitor, done: ReplayedWorld, context: RunContext) -> str:
+def _first_sign(monitor: FailureMonitor, episode: Episode) -> str:
     """The first sign of failure, as the success gate reports it."""
     sign = int(monitor.sign[0])
-    seen = "none"
+    text = "none"
     if sign:
         names = [phase.name for phase in monitor.driver.phases] or [""]
         phase = names[int(monitor.phase[0])]
-        seen = f"{describe_sign(sign, phase)}, seen in step {int(monitor.step[0])}"
-    retries = int(done.episode.retries[0])
-    return f"first sign of failure: {seen}; grasps tried again: {retries}"
+        text = f"{describe_sign(sign, phase)}, seen in step {int(monitor.step[0])}"
+    retries = int(episode.retries[0])
+    return f"first sign of failure: {text}; grasps tried again: {retries}"
 
 
 def _compare(
-    plan: ReplayPlan,
-    done: ReplayedWorld,
-    backend: Backend,
-    device: str,
-    changes: list[str],
-    context: RunContext,
+    plan: ReplayPlan, number: int, episode: Episode, end: np.ndarray, changes: list[str], run: Run
 ) -> tuple[bool, str]:
-    """Whether the world did what is promised after its record, and how it compares."""
+    """Whether the world did what is promised after its record, and how it compares; ``end`` are its
+    positions at the end.
+    """
+    backend, device = plan.where[number]
     record = plan.record
-    rules = context.check.rules
+    rules = run.stage.check.rules
     bits = int(record.failed[plan.world])
-    now = int(done.episode.failed[0])
+    now = int(episode.failed[0])
     same = bits == now
     result = "the same result" if same else rules.describe(bits) or "succeeded"
     if record.backend != backend:
-        another = "" if same else "another result: "
-        return True, f"that run's {record.backend} world had {another}{result}"
-    ours = done.recorder.qpos[-1]
-    theirs = record.qpos[plan.world]
-    exact = np.array_equal(ours, theirs, equal_nan=True)
+        prefix = "" if same else "another result: "
+        return True, f"that run's {record.backend} world had {prefix}{result}"
+    recorded_end = record.qpos[plan.world]
+    exact = np.array_equal(end, recorded_end, equal_nan=True)
     if same and exact:
         return True, "as recorded, and it ends bit for bit where it did"
 
@@ -307,14 +173,77 @@ def _compare(
         reasons.append("not all is as it was in that run")
     ends = "it ends bit for bit where it did"
     if not exact:
-        objects = [slice(a, a + 3) for a in context.index.object_qpos]
-        apart = max(float(np.linalg.norm(ours[at] - theirs[at])) for at in objects)
-        ends = f"its objects end {1e3 * apart:.3g} mm from where they did"
+        apart = end - recorded_end
+        most = max(float(np.linalg.norm(apart[a : a + 3])) for a in run.stage.index.object_qpos)
+        ends = f"its objects end {1e3 * most:.3g} mm from where they did"
         if not reasons:
             ends += ", expected bit for bit there"
     why = "".join(f", and {reason}" for reason in reasons)
     agrees = "as recorded, but" if same and reasons else f"NOT as recorded ({result}):"
     return bool(reasons), f"{agrees} {ends}{why}"
+
+
+def _replay_failing(plan: ReplayPlan, run: Run, folder: Path) -> None:
+    """Play all failing worlds on each backend, and leave a table; ranks share the seeds."""
+    rows: dict[tuple[int, int], dict[str, Any]] = {}
+    for backend, device in plan.where:
+        play = partial(_play_failing, plan, backend, device, rows, folder)
+        run_guarded(run, f"replay_{backend}", play, "worlds")
+
+
+def _play_failing(
+    plan: ReplayPlan,
+    backend: Backend,
+    device: str,
+    rows: dict[tuple[int, int], dict[str, Any]],
+    folder: Path,
+    run: Run,
+) -> list[GateResult]:
+    """Play them on one backend: worlds of a seed together, and apart from those that succeeded."""
+    stage = run.stage
+    ranks = stage.ranks
+    if ranks.size > 1 and backend is Backend.mjwarp and device.startswith("cuda"):
+        device = resolve_device("auto")
+    rules = stage.check.rules
+    share = list(plan.bits.items())[ranks.rank :: ranks.size]
+    batches = play_batches(
+        stage,
+        [BatchPlan(seed, list(worlds)) for seed, worlds in share],
+        simulate=partial(simulate_alone, stage, backend, device),
+    )
+    played: list[tuple[int, int, int]] = []  # seed, world and bits
+    for number, batch in enumerate(batches, 1):
+        failed = zip(batch.plan.worlds, batch.episode.failed.tolist(), strict=True)
+        played += [(batch.plan.seed, world, bits) for world, bits in failed]
+        stage.progress.advance("seeds", number, len(share))
+    played = sorted(world for part in ranks.gather(played) for world in part)
+    again = sum(bits != 0 for _, _, bits in played)
+    same = sum(bits == plan.bits[seed][world] for seed, world, bits in played)
+    for seed, world, bits in played:
+        row = rows.setdefault((seed, world), {"seed": seed, "world": world})
+        row["recorded"] = " ".join(rules.broken(plan.bits[seed][world]))
+        row[str(backend)] = " ".join(rules.broken(bits)) or "succeeded"
+    if ranks.writes:
+        write_atomic(folder / TABLE, to_csv(list(rows.values())))
+    rate, interval = rate_cells(again, len(played))
+    table_rows = list(rows.values())[:_TABLE_ROWS]
+    columns = {name: name for name in table_rows[0]}
+    return [
+        GateResult(
+            name=f"replay_{backend}",
+            status=Status.failed if again else Status.passed,
+            reason=f"{again} of {len(played)} failing worlds fail again ({rate}, 95 % interval"
+            f" {interval}), {same} by the same rules",
+            metrics={
+                "worlds": len(played),
+                "fail_again": again,
+                "by_the_same_rules": same,
+                "episodes_of_that_run": plan.episodes,
+            },
+            notes={"backend": f"{backend} on {device}", "table": TABLE},
+            tables=[Table.of(columns, table_rows, f"Failing worlds (all of them: {TABLE})")],
+        )
+    ]
 
 
 JOB = Job(

@@ -19,8 +19,8 @@ from rich.markup import escape
 from mjstack.config.fingerprint import config_content, config_hash
 from mjstack.config.functions import find_object
 from mjstack.config.schema import Backend, Config
-from mjstack.episodes.context import Artifacts, RunContext
-from mjstack.episodes.live import LiveView
+from mjstack.episodes.run import Run
+from mjstack.episodes.stage import Progress, Stage
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.files import write_atomic
 from mjstack.gates.runner import log_error
@@ -28,14 +28,17 @@ from mjstack.interrupt import check_interrupt, interrupted
 from mjstack.jobs.progress import STATUS_COLOR, ProgressBar
 from mjstack.jobs.showing import draw_episode, find_viewers, save_page, serve_live_view
 from mjstack.mdp.starts.placement import SCHEMA
-from mjstack.report.html import PAGE, Page, write_page
+from mjstack.report.formats import FORMATS, write_formats
+from mjstack.report.markdown import to_markdown
+from mjstack.report.page import Page
 from mjstack.report.provenance import collect_provenance
 from mjstack.report.record import GateResult, Provenance, Report, Status
-from mjstack.report.table import Console, Table, to_document
-from mjstack.report.web import EPISODE
-from mjstack.report.write import safely_write, summarize, write_report
+from mjstack.report.sections import Part, Section, summarize
+from mjstack.report.table import Console, Table
+from mjstack.report.web import EPISODE, lacks_viser
+from mjstack.report.write import safely_write
 from mjstack.sim import resolve_backend
-from mjstack.sim.build import cuda_driver, cuda_name, cuda_uuid
+from mjstack.sim.build import cuda_driver, cuda_uuid
 from mjstack.sim.native import available_cores
 
 log = logging.getLogger(__name__)
@@ -64,22 +67,22 @@ class CheckedJob:
     """A job that has passed its checks.
 
     Attributes:
-        context: The configuration, and what its check built.
+        stage: The configuration, and what its check built.
         title: The work in one line.
-        work: Does it in a folder, and hands each result to the context's ``record``.
+        work: Does it in a folder, and hands each result to the run's ``record``.
         folder: The default folder of a job that resumes; None for a folder of the hour.
-        own: A file by which it knows that folder.
+        marker: A file by which it knows that folder.
         resumes: Its name in report.json, by which it knows any folder that it goes on with.
         resumable: Its name there if it goes on only where the command line says so.
         earlier: The calls that the run goes on with, in words.
         spreads: Whether ranks share the work: `work` is called in each of them.
     """
 
-    context: RunContext
+    stage: Stage
     title: str
-    work: Callable[[RunContext, Path], None]
+    work: Callable[[Run, Path], None]
     folder: Path | None = None
-    own: str = ""
+    marker: str = ""
     resumes: str = ""
     resumable: str = ""
     earlier: Sequence[str] = ()
@@ -92,20 +95,14 @@ class CheckedJob:
             KeyboardInterrupt: The command was interrupted.
             Exception: The work has failed.
         """
-        quiet = replace(
-            self.context,
-            print_line=lambda line: None,
-            begin=lambda name: check_interrupt(),
-            advance=lambda what, done, total: check_interrupt(),
-            artifacts=Artifacts(),
-        )
-        quiet.ranks.gather(self._place())
-        self.work(quiet, folder)
+        self.stage.progress = Progress(advance=lambda what, done, total: check_interrupt())
+        self.stage.ranks.gather(self._place())
+        self.work(Run(self.stage, begin=lambda name: check_interrupt()), folder)
         check_interrupt()
 
     def _place(self) -> str:
         """Where this rank plays."""
-        return f"{socket.gethostname()}, {_device_name(*self.context.backend)}"
+        return f"{socket.gethostname()}, {_device_name(*self.stage.backend)}"
 
     def run(self, folder: Path, overrides: Sequence[str] = ()) -> Report:
         """Do the work and write its report after each result into the folder.
@@ -118,7 +115,11 @@ class CheckedJob:
         report = Report(
             folder=folder, overrides=list(overrides), resumes=self.resumes or self.resumable
         )
-        page = Page(title=f"{self.context.cfg.robot.title}, {self.title}")
+        cfg = self.stage.cfg
+        page = Page(
+            title=f"{cfg.robot.title}, {self.title}",
+            motion=cfg.web.episode and not lacks_viser(),
+        )
         # The collector need not look at all that was loaded each time it frees a gate's worlds.
         gc.collect()
         gc.freeze()
@@ -128,7 +129,7 @@ class CheckedJob:
             check_interrupt()
         except (Exception, SystemExit, KeyboardInterrupt) as error:
             self._end(error, report, console)
-        for finish in (partial(_write, page=page), partial(_print_summary, console)):
+        for finish in (partial(write_formats, page=page), partial(_print_summary, console)):
             try:
                 finish(report)
             except Exception as error:
@@ -140,44 +141,50 @@ class CheckedJob:
         """Do the work, and draw what it has left."""
         folder = report.folder
         where = f"{escape(self.title)} -> {escape(str(folder))}"
-        console.print(f"[bold]{escape(self.context.cfg.robot.title)}[/], {where}")
-        report.provenance = run_provenance(self.context)
+        console.print(f"[bold]{escape(self.stage.cfg.robot.title)}[/], {where}")
+        report.provenance = run_provenance(self.stage)
         if self.earlier:
             report.provenance["earlier_calls"] = list(self.earlier)
-        if self.context.ranks.size > 1:
-            places = self.context.ranks.gather(self._place())
+        if self.stage.ranks.size > 1:
+            places = self.stage.ranks.gather(self._place())
             report.provenance["ranks"] = [f"rank {r}: {p}" for r, p in enumerate(places)]
-        _write(report, page)
+        write_formats(report, page)
 
         def record(result: GateResult) -> None:
             report.gates.append(result)
-            _write(report, page)
+            write_formats(report, page)
             log.info("%s: %s %s", result.name, result.status, result.reason)
             bar.finish(result)
 
-        with ProgressBar(console) as bar, serve_live_view(self.context, console) as live:
-            context = replace(
-                self.context,
+        def begin(name: str) -> None:
+            bar.start(name)
+            if live is not None:
+                live.begin(name)
+
+        with ProgressBar(console) as bar, serve_live_view(self.stage, console) as live:
+            self.stage.progress = Progress(bar.print_line, bar.advance)
+            self.stage.observers = [live] if live else []
+            run = Run(
+                self.stage,
                 folder=folder,
                 overrides=report.overrides,
-                print_line=bar.print_line,
-                begin=partial(_begin, bar, live),
+                begin=begin,
                 record=record,
-                advance=bar.advance,
-                viewers=[live] if live else find_viewers(self.context),
-                live=live,
-                artifacts=Artifacts(),
+                viewers=[live] if live else find_viewers(self.stage),
                 page=page,
             )
-            self.work(context, folder)
+            self.work(run, folder)
         report.conclude()
-        _write(report, page)
-        report.pictures = [*draw_episode(context, console), *page.pictures]
-        page.note = save_page(context)
+        write_formats(report, page)
+        report.pictures = [
+            *draw_episode(self.stage, folder, run.artifacts.pictured, console),
+            *page.pictures,
+        ]
+        page.note = save_page(self.stage, folder, page)
 
     def _end(self, error: BaseException, report: Report, console: Console) -> None:
         """Say why the work has ended early."""
-        cause = self.context.ranks.cause(error)
+        cause = self.stage.ranks.cause(error)
         if interrupted() or isinstance(cause, KeyboardInterrupt):
             report.status = Status.interrupted
             console.print("interrupted; the finished gates are in the report")
@@ -190,12 +197,6 @@ class CheckedJob:
             problem = log_error(cause)
             log.error("%s", problem)
         Console(stderr=True, soft_wrap=True, markup=False).print(f"mjstack: {problem}")
-
-
-def _write(report: Report, page: Page) -> None:
-    """Write the report, and its page, whose failure takes no result back."""
-    write_report(report)
-    safely_write(report.folder / PAGE, write_page, report, page, stops=False)
 
 
 def count_devices(cfg: Config) -> int:
@@ -226,38 +227,39 @@ def check_share(cfg: Config, size: int) -> None:
         raise ConfigError("nworld", cfg.nworld, expected)
 
 
-def check_ranks(context: RunContext) -> None:
+def check_ranks(stage: Stage) -> None:
     """Raise if the ranks of a job do not fit together. Called in each of them.
 
     Raises:
         MjstackError: Versions or configurations differ, two ranks have one GPU, or there are fewer
             worlds than ranks.
     """
-    ranks = context.ranks
-    cfg = context.cfg
-    _, device = context.backend
+    ranks = stage.ranks
+    cfg = stage.cfg
+    _, device = stage.backend
     host = socket.gethostname()
     facts = collect_provenance()
-    own: dict[str, Any] = {**cast(dict, facts["versions"]), "mjstack's commit": facts["git_commit"]}
-    own["configuration"] = config_hash(config_content(cfg))[:12]
+    equal: dict[str, Any] = {
+        **cast(dict, facts["versions"]),
+        "mjstack's commit": facts["git_commit"],
+        "configuration": config_hash(config_content(cfg))[:12],
+    }
     gpu = cuda_uuid(device) if device.startswith("cuda") else ""
-    each = ranks.gather((host, own, gpu))
-    for rank, (there, found, _) in enumerate(each):
-        for name, value in each[0][1].items():
-            if found.get(name) != value:
+    gathered = ranks.gather((host, equal, gpu))
+    holders: dict[tuple[str, str], int] = {}
+    for rank, (place, values, unit) in enumerate(gathered):
+        for name, value in gathered[0][1].items():
+            if values.get(name) != value:
                 raise MjstackError(
-                    f"rank {rank} ({there}) has {name} {found.get(name)} and rank 0"
-                    f" ({each[0][0]}) {value}, expected the same in all ranks",
+                    f"rank {rank} ({place}) has {name} {values.get(name)} and rank 0"
+                    f" ({gathered[0][0]}) {value}, expected the same in all ranks",
                     "Install and start the same everywhere",
                 )
-    if gpu:
-        holders: dict[tuple[str, str], int] = {}
-        for rank, (there, _, which) in enumerate(each):
-            if (other := holders.setdefault((there, which), rank)) != rank:
-                raise MjstackError(
-                    f"ranks {other} and {rank} ({there}) have one GPU, {which}, expected one each",
-                    "Start as many ranks as there are GPUs, with sim.device=auto",
-                )
+        if unit and (holder := holders.setdefault((place, unit), rank)) != rank:
+            raise MjstackError(
+                f"ranks {holder} and {rank} ({place}) have one GPU, {unit}, expected one each",
+                "Start as many ranks as there are GPUs, with sim.device=auto",
+            )
     check_share(cfg, ranks.size)
 
 
@@ -273,17 +275,17 @@ def check_job(cfg: Config, overrides: Sequence[str] = ()) -> CheckedJob:
         if job.keys is not None and re.split(r"[.@/]", key)[0] not in job.keys:
             expected = f"only {', '.join(job.keys[1:])} beside job={cfg.job.name}"
             raise ConfigError(key, value, expected, "Leave it out")
-    for key, asked in (("view", cfg.view != "false"), ("video", cfg.video)):
-        if asked and not (job.live if cfg.view == "web" and key == "view" else job.shows):
-            expected = f"false with job={cfg.job.name}, which shows no world"
-            if key == "view" and job.live:
-                expected = f"web or false with job={cfg.job.name}"
-            raise ConfigError(key, cfg.view if key == "view" else "true", expected, "Leave it out")
+    by = f"false with job={cfg.job.name}"
+    if cfg.view != "false" and not (job.live if cfg.view == "web" else job.shows):
+        expected = f"web or {by}" if job.live else f"{by}, which shows no world"
+        raise ConfigError("view", cfg.view, expected, "Leave it out")
+    if cfg.video and not job.shows:
+        raise ConfigError("video", "true", f"{by}, which shows no world", "Leave it out")
     return job.check(cfg)
 
 
 def write_tables(
-    context: RunContext,
+    run: Run,
     name: str,
     title: str,
     table: Table,
@@ -297,55 +299,48 @@ def write_tables(
     Raises:
         OSError: A file cannot be written.
     """
-    folder = cast(Path, context.folder)
+    folder = cast(Path, run.folder)
     picture = folder / f"{name}.png"
     if draw is not None:
         if problem := safely_write(picture, draw):
-            context.print_line(problem)
+            run.print_line(problem)
         else:
-            context.page.pictures.append(picture.name)
-    context.page.tables.append(replace(table, title=table.title or title))
+            run.page.pictures.append(picture.name)
+    run.page.tables.append(replace(table, title=table.title or title))
     write_atomic(folder / f"{name}.csv", csv)
-    shown = [picture.name] if picture.exists() else []
-    write_atomic(folder / f"{name}.md", to_document(title, [table], notes, shown))
+    parts: list[Part] = [table, *([picture] if picture.exists() else []), list(notes)]
+    write_atomic(folder / f"{name}.md", to_markdown([Section(title=title, parts=parts, level=1)]))
 
 
-def run_provenance(context: RunContext) -> Provenance:
+def run_provenance(stage: Stage) -> Provenance:
     """Versions, machine, device, and hashes of configuration and model."""
-    backend, device = context.backend
+    backend, device = stage.backend
     # The numbers of the compiled model: the physics sees these, not the files
-    buffer = np.empty(mujoco.mj_sizeModel(context.model), np.uint8)
-    mujoco.mj_saveModel(context.model, None, buffer)
-    config = config_content(context.cfg)
+    buffer = np.empty(mujoco.mj_sizeModel(stage.model), np.uint8)
+    mujoco.mj_saveModel(stage.model, None, buffer)
+    config = config_content(stage.cfg)
     return collect_provenance() | {
         "device": _device_name(backend, device),
         "driver": cuda_driver() if device.startswith("cuda") else "no CUDA device",
         "config_sha256": config_hash(config),
         "model_sha256": hashlib.sha256(buffer.tobytes().hex().encode()).hexdigest(),
         "starts_schema": SCHEMA,
-        **({"policy": config["policy"]} if context.cfg.policy else {}),
+        **({"policy": config["policy"]} if stage.cfg.policy else {}),
     }
 
 
 def _device_name(backend: Backend, device: str) -> str:
     name = "Warp's CPU device"
     if device.startswith("cuda"):
-        name = cuda_name(device)
+        name = torch.cuda.get_device_name(device)
     elif backend is Backend.native:
         name = f"native MuJoCo on {available_cores()} cores"
     return f"{device}: {name}"
 
 
-def _begin(bar: ProgressBar, live: LiveView | None, name: str) -> None:
-    """Name the part of the run that begins."""
-    bar.start(name)
-    if live is not None:
-        live.begin(name)
-
-
 def _print_summary(console: Console, report: Report) -> None:
     console.print(summarize(report.gates).to_console(STATUS_COLOR))
     if (report.folder / "report.md").exists():  # the disk may be full
-        names = ["report.md", *filter(lambda n: (report.folder / n).exists(), (PAGE, EPISODE))]
+        names = [name for name in (*FORMATS, EPISODE) if (report.folder / name).exists()]
         console.print(f"report: {escape(str(report.folder))}/{', '.join(names)}")
     console.print(f"status: [{STATUS_COLOR[report.status]}]{report.status}[/]")

@@ -13,9 +13,10 @@ from typing import cast
 from mjstack.config.fingerprint import config_content, config_hash
 from mjstack.config.functions import find_object
 from mjstack.config.schema import Config, TrainJobCfg
-from mjstack.episodes.context import RunContext, require_episode
+from mjstack.episodes.assets import Assets
 from mjstack.episodes.rollout import POLICY
-from mjstack.episodes.stage import Stage
+from mjstack.episodes.run import Run
+from mjstack.episodes.stage import Stage, require_episode
 from mjstack.errors import ConfigError, FolderError
 from mjstack.files import check_unused, reading, to_csv, write_atomic
 from mjstack.gates.runner import run_guarded
@@ -26,22 +27,21 @@ from mjstack.jobs.showing import check_showing
 from mjstack.report.picture import save_curves
 from mjstack.report.record import GateResult, Status
 from mjstack.report.table import Table
-from mjstack.train.expert_states import whole_starts
-from mjstack.train.trainer import LAST, STATE, Trained, Trainer
+from mjstack.train.trainer import LAST, STATE, Trained, Trainer, whole_starts
 
 NAME = "train"
 CONFIG = "training.json"  # the configuration of the training in the folder
 # Changing one of these changes no training.
-_NO_MATTER = ("batch", "gates", "gate", "graph", "view", "video", "run", "world")
-_NO_MATTER_OF_JOB = ("folder", "test_seed", "iterations", "minutes", "max_minutes")
+_KEYS_WITHOUT_EFFECT = ("batch", "gates", "gate", "graph", "view", "video", "run", "world")
+_JOB_KEYS_WITHOUT_EFFECT = ("folder", "test_seed", "iterations", "minutes", "max_minutes")
 
 
 def training_config(cfg: Config) -> dict:
     """Everything that a training depends on, in JSON's types."""
     config = config_content(cfg)
-    for key in _NO_MATTER:
+    for key in _KEYS_WITHOUT_EFFECT:
         del config[key]
-    for key in _NO_MATTER_OF_JOB:
+    for key in _JOB_KEYS_WITHOUT_EFFECT:
         config["job"].pop(key, None)
     return config
 
@@ -53,26 +53,26 @@ def check_train(cfg: Config) -> CheckedJob:
     trainer = find_object("job.trainer", job.trainer)
     if not isinstance(trainer, Trainer):
         raise ConfigError("job.trainer", job.trainer, "a mjstack.train.trainer.Trainer")
-    context = RunContext(cfg)
+    stage = Stage(cfg)
     reset = whole_starts(cfg.reset) if trainer.midway else cfg.reset
-    check_task(context.with_config(replace(cfg, reset=reset)))
+    check_task(stage.with_config(replace(cfg, reset=reset)))
     check_showing(cfg)
-    used = trainer.check(context)
+    used = trainer.check(stage)
     tested = range(job.test_seed, job.test_seed + cfg.gate.success.seeds)
     if used.start < tested.stop and tested.start < used.stop:
         expected = f"seeds that training does not use, which are {used.start} to {used.stop - 1}"
         raise ConfigError("job.test_seed", job.test_seed, expected)
     name = config_hash(training_config(cfg))[:12]
     folder = Path(job.folder or f"outputs/train/{name}")
-    if context.ranks.writes:  # it may have begun there when the others come
+    if stage.ranks.writes:  # it may have begun there when the others come
         check_unused(folder, NAME, STATE, "job.folder")
         _check_folder(folder, cfg)
     return CheckedJob(
-        context=context,
+        stage=stage,
         title=f"task {cfg.task.name}, training",
         work=partial(_run, trainer),
         folder=folder,
-        own=STATE,
+        marker=STATE,
         resumes=NAME,
         spreads=True,
     )
@@ -83,33 +83,33 @@ def _check_folder(folder: Path, cfg: Config) -> None:
     path = folder / CONFIG
     if not path.exists():
         return
-    with reading(path, FolderError, "Set job.folder to another folder"):
-        theirs = json.loads(path.read_text())
-    ours = json.loads(json.dumps(training_config(cfg)))
-    if theirs != ours:
-        keys = sorted(key for key in {*theirs, *ours} if theirs.get(key) != ours.get(key))
+    with reading(path, "Set job.folder to another folder"):
+        earlier = json.loads(path.read_text())
+    config = json.loads(json.dumps(training_config(cfg)))
+    if earlier != config:
+        keys = sorted(key for key in earlier | config if earlier.get(key) != config.get(key))
         raise FolderError(
             f"{folder} has the training of another configuration, which differs in"
             f" {', '.join(keys)}. Set job.folder to another folder, or these keys back"
         )
 
 
-def _run(trainer: Trainer, context: RunContext, folder: Path) -> None:
+def _run(trainer: Trainer, run: Run, folder: Path) -> None:
     """Train, and judge the last policy."""
-    if context.ranks.writes:
-        _check_folder(folder, context.cfg)  # hydra.run.dir may name one
-        write_atomic(folder / CONFIG, json.dumps(training_config(context.cfg), indent=1) + "\n")
-    run_guarded(context, NAME, partial(_train, trainer, folder), "worlds")
-    if context.artifacts.results[NAME].status is Status.passed:
-        own = judged_context(context, folder / LAST)
-        run_guarded(own, "success", run_success)
+    if run.stage.ranks.writes:
+        _check_folder(folder, run.cfg)  # hydra.run.dir may name one
+        write_atomic(folder / CONFIG, json.dumps(training_config(run.cfg), indent=1) + "\n")
+    run_guarded(run, NAME, partial(_train, trainer, folder), "worlds")
+    if run.artifacts.results[NAME].status is Status.passed:
+        judged = judged_stage(run.stage, folder / LAST)
+        run_guarded(run.on(judged), "success", run_success)
 
 
-def judged_context(context: RunContext, policy: Path) -> RunContext:
-    """The context in which a policy is judged: it starts as the configuration says, under seeds
+def judged_stage(stage: Stage, policy: Path) -> Stage:
+    """The stage on which a policy is judged: it starts as the configuration says, under seeds
     that training has not used.
     """
-    cfg = context.cfg
+    cfg = stage.cfg
     gate = copy.copy(cfg.gate)
     gate.success = replace(gate.success, reset=whole_starts(cfg.reset))
     judged = replace(
@@ -119,17 +119,17 @@ def judged_context(context: RunContext, policy: Path) -> RunContext:
         controller=replace(cfg.controller, name=POLICY),
         gate=gate,
     )
-    stage = Stage(judged)
-    stage.model = context.model
-    return replace(context.with_config(judged), stage=stage)
+    assets = Assets(judged)
+    assets.model = stage.model
+    return stage.with_config(judged, assets=assets)
 
 
-def _train(trainer: Trainer, folder: Path, context: RunContext) -> list[GateResult]:
+def _train(trainer: Trainer, folder: Path, run: Run) -> list[GateResult]:
     """The training as a result of the report."""
     began = time.perf_counter()
-    trained = trainer.train(context, folder)
-    if context.ranks.writes:
-        _write_curve(context, trained)
+    trained = trainer.train(run.stage, folder)
+    if run.stage.ranks.writes:
+        _write_curve(run, trained)
     seconds = time.perf_counter() - began
     last = trained.curve[-1]
     figures = ", ".join(f"{name.replace('_', ' ')} {last[name]:.4g}" for name in trained.lines)
@@ -146,15 +146,15 @@ def _train(trainer: Trainer, folder: Path, context: RunContext) -> list[GateResu
     ]
 
 
-def _write_curve(context: RunContext, trained: Trained) -> None:
+def _write_curve(run: Run, trained: Trained) -> None:
     """Write train.csv, train.md and train.png."""
     rows = trained.curve
     columns = {name.replace("_", " "): name for name in rows[0]}
-    title = f"{context.cfg.robot.title}, task {context.cfg.task.name}: training"
+    title = f"{run.cfg.robot.title}, task {run.cfg.task.name}: training"
     lines = {name.replace("_", " "): [row[name] for row in rows] for name in trained.lines}
     at = [row[trained.abscissa] for row in rows]
     write_tables(
-        context,
+        run,
         NAME,
         title,
         Table.of(columns, rows),

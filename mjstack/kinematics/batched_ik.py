@@ -38,10 +38,6 @@ class BatchedIk:
     float32 or float64. Everything is in the world frame. Joints before the sites that the robot's
     profile does not name stay at the model's qpos0.
 
-    Attributes:
-        unreachable: Whether the last solve ended farther than ``tolerance`` from its target, or had
-            input that is not finite, shape ``(nworld,)``, bool.
-
     Example:
         >>> ik = BatchedIk(model, cfg.robot, nworld=64, device="cpu")
         >>> q, distance = ik.solve(q, target)
@@ -57,7 +53,6 @@ class BatchedIk:
         iterations: int = 8,
         posture_gain: float = 0.0,
         approach_gain: float = 0.0,
-        tolerance: float = 0.0005,
         block_dim: int = 32,
     ) -> None:
         """Read the chain from the model, allocate, and load the kernels.
@@ -75,7 +70,6 @@ class BatchedIk:
             posture_gain: Share per iteration of the way to the posture, from 0 to 1.
             approach_gain: Turn per iteration where the approach axis is a quarter turn off [rad],
                 from 0 to 1.
-            tolerance: Distance beyond which a target counts as unreachable [m].
             block_dim: CUDA threads per block. Few, because a world is one thread, and many
                 processors then share the worlds.
 
@@ -95,9 +89,8 @@ class BatchedIk:
         # In the last iterations no gain counts, so they undo what it cost in distance: measured, 2
         # of 4, 3 of 8, 10 of 40.
         guided = iterations - max(min(3, iterations // 2), iterations // 4) if gained else 0
-        near = _NEAR if gained else -1.0
-        self._settings = [iterations, guided, _DAMPING, _MAX_STEP]
-        self._settings += [posture_gain, approach_gain, near, tolerance]
+        self._settings = [iterations, guided, _DAMPING, _MAX_STEP, posture_gain, approach_gain]
+        self._settings.append(_NEAR if gained else -1.0)
 
         # Memory and kernels
         self._allocate(model, robot)
@@ -158,11 +151,9 @@ class BatchedIk:
             self._copy_in("posture", posture.expand(self.nworld, -1) if same else posture)
         if approach is not None:
             self._copy_in("approach", approach)
-        wanted = "home" if posture is None else "posture"
-        pointing = "down" if approach is None else "approach"
-        given = ["q", "target", wanted, pointing]
-        results = ["solution", "distance", "unreachable"]
-        self._launch(self._kernel, given, self._settings, results)
+        goal_posture = "home" if posture is None else "posture"
+        names = ["q", "target", goal_posture, "down" if approach is None else "approach"]
+        self._launch(self._kernel, names, self._settings, ["solution", "distance"])
         return self._view["solution"], self._view["distance"]
 
     def _allocate(self, model: mujoco.MjModel, robot: RobotCfg) -> None:
@@ -171,32 +162,25 @@ class BatchedIk:
         with wp.ScopedDevice(self._device):
             self._chain, shape = build_chain(model, robot)
             self._array = {
-                **{
-                    k: wp.zeros((n, len(robot.joints)), dtype=float)
-                    for k in ("q", "posture", "solution")
-                },
-                **{
-                    k: wp.zeros(n, dtype=wp.vec3)
-                    for k in ("target", "approach", "point", "closing", "pointing")
-                },
                 "home": wp.array(np.tile(locked_home(robot), (n, 1)), dtype=float),
                 "down": wp.full(n, wp.vec3(0.0, 0.0, -1.0), dtype=wp.vec3),
                 "distance": wp.zeros(n, dtype=float),
-                "unreachable": wp.zeros(n, dtype=wp.bool),
             }
+            for name in ("q", "posture", "solution"):
+                self._array[name] = wp.zeros((n, len(robot.joints)), dtype=float)
+            for name in ("target", "approach", "point", "closing", "pointing"):
+                self._array[name] = wp.zeros(n, dtype=wp.vec3)
         self._kernel = solve_kernel(shape)
         self._view = {name: wp.to_torch(array) for name, array in self._array.items()}
-        self.unreachable = self._view["unreachable"]
         # The buffers are filled before torch's stream writes into them.
         wp.synchronize_device(self._device)
 
     def _launch(
-        self, kernel: wp.Kernel, given: list[str], settings: list[Any], results: list[str]
+        self, kernel: wp.Kernel, names: list[str], settings: list[Any], results: list[str]
     ) -> None:
         """Run a kernel over the worlds, in torch's order."""
-        before = [self._array[name] for name in given]
-        after = [self._array[name] for name in results]
-        inputs = [self._chain, *before, *settings, *after]
+        arrays = [self._array[name] for name in [*names, *results]]
+        inputs = [self._chain, *arrays[: len(names)], *settings, *arrays[len(names) :]]
         with torch_stream_scope(self._device):
             wp.launch(kernel, dim=self.nworld, inputs=inputs, block_dim=self._block_dim)
 
@@ -204,7 +188,6 @@ class BatchedIk:
         """Copy an argument into float32 memory that keeps its address."""
         buffer = self._view[name]
         if values.shape != buffer.shape:  # else copy_ would broadcast it
-            raise ArgumentError(
-                name, f"shape {tuple(values.shape)}", f"shape {tuple(buffer.shape)}"
-            )
+            shapes = (f"shape {tuple(shape)}" for shape in (values.shape, buffer.shape))
+            raise ArgumentError(name, *shapes)
         buffer.copy_(values)

@@ -23,25 +23,23 @@ class Chain:
     into the links' frames.
 
     Links up to ``trunk`` carry both sites, from there to ``fork`` only the first one, from there to
-    ``end`` only the second.
+    ``end`` only the second. Inverse kinematics keeps a joint within ``low`` and ``high``, which are
+    infinite where it does not move it. Sites and the gripper's approach axis are seen from the last
+    link before them, the axis from the trunk's.
     """
 
     frame: wp.array[wp.transform]  # the joint's frame at position 0, seen from the link before
     axis: wp.array[wp.vec3]  # of unit length, in that frame
     kind: wp.array[int]  # HINGE or SLIDE
     column: wp.array[int]  # of the joint positions
-    low: wp.array[
-        float
-    ]  # where inverse kinematics keeps the joint; infinite where it does not move it
+    low: wp.array[float]
     high: wp.array[float]
     trunk: int
     fork: int
     end: int
-    first_site: wp.vec3  # seen from the last link before it
+    first_site: wp.vec3
     second_site: wp.vec3
-    approach: (
-        wp.vec3
-    )  # the gripper's approach axis, of unit length, seen from the trunk's last link
+    approach: wp.vec3  # of unit length
 
 
 @dataclass(frozen=True)
@@ -59,11 +57,10 @@ class Shape:
 @wp.func
 def turn(pose: wp.transform, axis: wp.vec3, kind: int, value: float) -> wp.transform:
     """A joint's frame after it has moved."""
+    motion = wp.transform(value * axis, wp.quat_identity())
     if kind == HINGE:
-        return wp.transform_multiply(
-            pose, wp.transform(wp.vec3(), wp.quat_from_axis_angle(axis, value))
-        )
-    return wp.transform_multiply(pose, wp.transform(value * axis, wp.quat_identity()))
+        motion = wp.transform(wp.vec3(), wp.quat_from_axis_angle(axis, value))
+    return wp.transform_multiply(pose, motion)
 
 
 @wp.func
@@ -73,12 +70,8 @@ def follow(
     """Pose after links ``first`` to ``last`` (exclusive), from a pose."""
     pose = start
     for i in range(first, last):
-        pose = turn(
-            wp.transform_multiply(pose, chain.frame[i]),
-            chain.axis[i],
-            chain.kind[i],
-            q[w, chain.column[i]],
-        )
+        frame = wp.transform_multiply(pose, chain.frame[i])
+        pose = turn(frame, chain.axis[i], chain.kind[i], q[w, chain.column[i]])
     return pose
 
 
@@ -95,12 +88,10 @@ def forward_kernel(
     """
     w = wp.tid()
     trunk = follow(chain, q, w, 0, chain.trunk, wp.transform_identity())
-    first = wp.transform_point(
-        follow(chain, q, w, chain.trunk, chain.fork, trunk), chain.first_site
-    )
-    second = wp.transform_point(
-        follow(chain, q, w, chain.fork, chain.end, trunk), chain.second_site
-    )
+    first_end = follow(chain, q, w, chain.trunk, chain.fork, trunk)
+    second_end = follow(chain, q, w, chain.fork, chain.end, trunk)
+    first = wp.transform_point(first_end, chain.first_site)
+    second = wp.transform_point(second_end, chain.second_site)
     point[w] = wp.lerp(first, second, 0.5)
     closing[w] = wp.normalize(wp.sub(second, first))
     approach[w] = wp.transform_vector(trunk, chain.approach)
@@ -143,9 +134,9 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
         A joint that would pass its limit is stopped there, and the others are solved again for the
         rest: merely cutting the step would stall beside a limit.
         """
-        given = guide  # of a stopped joint: its step
+        preset = guide  # of a stopped joint: its step
         step = guide
-        held = Values()
+        at_limit = Values()
         lambda_squared = damping * damping + FAR_DAMPING * wp.dot(error, error)
         stopped = wp.int32(1)
         while stopped > 0:  # each pass stops another joint, or is the last
@@ -153,19 +144,19 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
             gram = lambda_squared * wp.identity(n=3, dtype=float)
             for i in range(END):
                 column = jacobian[i]
-                rest -= given[i] * column
-                if held[i] == 0.0:
+                rest -= preset[i] * column
+                if at_limit[i] == 0.0:
                     gram += wp.outer(column, column)
             weights = wp.inverse(gram) * rest
             stopped = wp.int32(0)
             for i in range(END):
-                if held[i] == 0.0:
-                    part = given[i] + wp.dot(jacobian[i], weights)
+                if at_limit[i] == 0.0:
+                    part = preset[i] + wp.dot(jacobian[i], weights)
                     bounded = wp.clamp(q[i] + part, low[i], high[i])
                     if bounded != q[i] + part:
                         part = bounded - q[i]
-                        given[i] = part
-                        held[i] = 1.0
+                        preset[i] = part
+                        at_limit[i] = 1.0
                         stopped += 1
                     step[i] = part
         return step
@@ -173,7 +164,7 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
     @wp.kernel(enable_backward=False, module="unique")
     def solve(
         chain: Chain,
-        given: wp.array2d[float],
+        start: wp.array2d[float],
         target: wp.array[wp.vec3],
         posture: wp.array2d[float],
         desired: wp.array[wp.vec3],
@@ -184,10 +175,8 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
         posture_gain: float,
         approach_gain: float,
         near: float,
-        tolerance: float,
         solution: wp.array2d[float],
         distance: wp.array[float],
-        unreachable: wp.array[wp.bool],
     ) -> None:
         """``solution`` is the nearest iterate; of those nearer than ``near``, the last."""
         # Input: worlds that are not finite keep their joint positions.
@@ -196,9 +185,9 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
         finite = wp.isfinite(goal)
         if guided > 0:
             finite = finite and wp.isfinite(desired[w])
-        for j in range(given.shape[1]):
-            finite = finite and wp.isfinite(given[w, j])
-            solution[w, j] = given[w, j]
+        for j in range(start.shape[1]):
+            finite = finite and wp.isfinite(start[w, j])
+            solution[w, j] = start[w, j]
             if guided > 0:
                 finite = finite and wp.isfinite(posture[w, j])
         q = Values()
@@ -209,18 +198,17 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
             j = chain.column[i]
             low[i] = chain.low[i]
             high[i] = chain.high[i]
-            q[i] = within(given[w, j], low[i], high[i])
+            q[i] = within(start[w, j], low[i], high[i])
             home[i] = posture[w, j]
             if wp.static(shape.moved[i]):
                 solution[w, j] = q[i]
         if not finite:
             distance[w] = NAN
-            unreachable[w] = True
             return
         # Links behind the moved ones
-        rest = follow(chain, given, w, TRUNK, wp.static(shape.trunk), wp.transform_identity())
-        first_end = follow(chain, given, w, FIRST_REST, wp.static(shape.fork), rest)
-        second_end = follow(chain, given, w, SECOND_REST, wp.static(n), rest)
+        rest = follow(chain, start, w, TRUNK, wp.static(shape.trunk), wp.transform_identity())
+        first_end = follow(chain, start, w, FIRST_REST, wp.static(shape.fork), rest)
+        second_end = follow(chain, start, w, SECOND_REST, wp.static(n), rest)
         first_site = wp.transform_point(first_end, chain.first_site)
         second_site = wp.transform_point(second_end, chain.second_site)
         approach = wp.transform_vector(rest, chain.approach)
@@ -295,6 +283,5 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
             if wp.static(shape.moved[i]):
                 solution[w, chain.column[i]] = best[i]
         distance[w] = nearest
-        unreachable[w] = not (nearest <= tolerance)
 
     return solve

@@ -84,8 +84,8 @@ class PointReach:
         for off in _STARTS:
             if (best.distance <= _CONVERGED).all():
                 break
-            found = self._search(self._start(points, off), points)
-            _replace(best, found, found.distance < best.distance)
+            solutions = self._search(self._start(points, off), points)
+            _replace(best, solutions, solutions.distance < best.distance)
         return best
 
     def solve_upright(self, points: np.ndarray, tolerance: float) -> Reached:
@@ -100,12 +100,11 @@ class PointReach:
         goals = points[reached]
         upright = self._look(best.q[reached], goals)
         for start in [upright.q, *(self._start(goals, off) for off in _STARTS)]:
-            turned = self._descend(start, goals, _POINTING)
-            found = self._search(turned, goals)
-            better = (found.distance <= tolerance) & (found.tilt < upright.tilt)
-            _replace(upright, found, better)
-        for everywhere, there in zip(best, upright, strict=True):
-            everywhere[reached] = there
+            solutions = self._search(self._descend(start, goals, _POINTING), goals)
+            better = (solutions.distance <= tolerance) & (solutions.tilt < upright.tilt)
+            _replace(upright, solutions, better)
+        for values, upright_values in zip(best, upright, strict=True):
+            values[reached] = upright_values
         return best
 
     def _start(self, points: np.ndarray, off: float) -> np.ndarray:
@@ -151,9 +150,8 @@ class PointReach:
         for _ in range(3):
             open_ = jacobian * free[:, None]
             turned = open_.swapaxes(1, 2)
-            step = (
-                free * np.linalg.solve(turned @ open_ + weight, turned @ error[..., None])[..., 0]
-            )
+            step = np.linalg.solve(turned @ open_ + weight, turned @ error[..., None])[..., 0]
+            step = free * step
             free &= ~(((q <= self._low) & (step < 0.0)) | ((q >= self._high) & (step > 0.0)))
         largest = np.abs(step).max(axis=1, keepdims=True)
         return step * np.minimum(1.0, _MAX_STEP / np.maximum(largest, 1e-12))
@@ -196,10 +194,10 @@ class PointReach:
         return Reached(q, distance, np.arccos(np.clip(-pose[:, 5], -1.0, 1.0)))
 
 
-def _replace(best: Reached, found: Reached, better: np.ndarray) -> None:
+def _replace(best: Reached, solutions: Reached, better: np.ndarray) -> None:
     """Write the solutions of some points over those so far."""
-    for old, new in zip(best, found, strict=True):
-        old[better] = new[better]
+    for values, new in zip(best, solutions, strict=True):
+        values[better] = new[better]
 
 
 def _rotations(axis: np.ndarray, angles: np.ndarray) -> np.ndarray:

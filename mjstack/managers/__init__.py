@@ -2,6 +2,7 @@
 at once.
 """
 
+import mjstack.report.gl  # noqa: F401  (before mujoco)
 from mjstack.managers.action import ActionManager, ActionTerm
 from mjstack.managers.episode import (
     ResetManager,

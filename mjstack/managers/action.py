@@ -64,13 +64,9 @@ class ActionManager:
             label = f"action.{name}"
             term: ActionTerm = Term(label, term_cfg, env, base=ActionTerm).call
             for actuator in term.actuators:
-                if actuator in driven:
-                    raise TermError(
-                        label,
-                        f"drives actuator {actuator}, which {driven[actuator]} drives too: leave"
-                        " one of them out",
-                    )
-                driven[actuator] = label
+                if driven.setdefault(actuator, label) != label:
+                    problem = f"drives actuator {actuator}, which {driven[actuator]} drives too"
+                    raise TermError(label, f"{problem}: leave one of them out")
             self.terms[name] = term
         terms = self.terms.values()
         self._dims = [term.dim for term in terms]
@@ -101,15 +97,12 @@ class ActionManager:
         action = action.detach()  # physics has no gradient, and a buffer must not acquire one
         self._processed.copy_(action)
         self._whole = all_finite(self._processed)
-        kept = self._processed  # a float64 may be more than it holds
-        if not action.is_cuda and not self._whole and not bool(torch.isfinite(kept).all()):
-            world = int((~torch.isfinite(kept)).any(1).nonzero()[0, 0])
-            raise ArgumentError(
-                "action",
-                f"{action[world].tolist()} in world {world}",
-                "finite numbers",
-                "Check what the policy returns",
-            )
+        copy = self._processed  # a float64 may be more than it holds
+        if not action.is_cuda and not self._whole and not bool(copy.isfinite().all()):
+            world = int((~copy.isfinite()).any(1).nonzero()[0, 0])
+            value = f"{action[world].tolist()} in world {world}"
+            fix = "Check what the policy returns"
+            raise ArgumentError("action", value, "finite numbers", fix)
 
     def apply(self) -> None:
         """Make the processed action the current one and the current one the previous one, and write
@@ -142,7 +135,6 @@ class ActionManager:
         zero_rows(mask, self.action, self.previous_action)
 
     def __str__(self) -> str:
-        rows = [
-            (name, term.dim, term.unit, self._cfg[name].params) for name, term in self.terms.items()
-        ]
+        terms = self.terms.items()
+        rows = [(name, term.dim, term.unit, self._cfg[name].params) for name, term in terms]
         return render_table(f"action: {self.action_dim} numbers", ("term", "dim", "range"), rows)

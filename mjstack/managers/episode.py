@@ -49,13 +49,14 @@ class _ValueManager:
     """Terms that give every world a value at every step, by name."""
 
     def __init__(
-        self, kind: str, env: EnvView, cfg: Mapping[str, TermCfg], *, boolean: bool = False
+        self, kind: str, env: EnvView, cfg: Mapping[str, TermCfg], dtype: torch.dtype
     ) -> None:
         self._env = env
         self._terms = {name: Term(f"{kind}.{name}", term, env) for name, term in cfg.items()}
         for term in self._terms.values():
-            first_value(term, env, boolean=boolean)
+            first_value(term, env, boolean=dtype is torch.bool)
         self.names = list(self._terms)
+        self.values = torch.zeros((env.nworld, len(cfg)), dtype=dtype, device=env.device)
 
     def reset(self, mask: torch.Tensor) -> None:
         """Clear what the terms keep of the masked worlds."""
@@ -83,13 +84,10 @@ class RewardManager(_ValueManager):
             TermError: A term cannot be found, does not return ``(nworld,)`` numbers, or has a
                 weight that is not finite.
         """
-        super().__init__("reward", env, cfg)
+        super().__init__("reward", env, cfg, torch.float32)
         self._cfg = dict(cfg)
-        weights = [cfg[name].weight * env.cfg.timing.step_dt for name in self.names]
+        weights = [term.weight * env.cfg.timing.step_dt for term in cfg.values()]
         self.weights = torch.tensor(weights, dtype=torch.float32, device=env.device)
-        self.values = torch.zeros(
-            (env.nworld, len(self.names)), dtype=torch.float32, device=env.device
-        )
         self.reward = self.values.sum(1)
         self.episode_sums = torch.zeros_like(self.values)
 
@@ -107,15 +105,11 @@ class RewardManager(_ValueManager):
         """
         before = None if ended is None else self.values.clone()
         if self._terms:
-            torch.mul(
-                torch.stack([term(self._env) for term in self._terms.values()], 1).float(),
-                self.weights,
-                out=self.values,
-            )
-        if void is not None:
-            self.values.masked_fill_(void[:, None], 0.0)
-        if ended is not None:
-            self.values.masked_fill_(ended[:, None], 0.0)
+            values = torch.stack([term(self._env) for term in self._terms.values()], dim=1)
+            torch.mul(values.float(), self.weights, out=self.values)
+        for worthless in (void, ended):
+            if worthless is not None:
+                self.values.masked_fill_(worthless[:, None], 0.0)
         self.episode_sums += self.values
         if before is not None:
             self.values += before
@@ -147,16 +141,12 @@ class TerminationManager(_ValueManager):
         Raises:
             TermError: A term cannot be found, or does not return ``(nworld,)`` bool.
         """
-        super().__init__("termination", env, cfg, boolean=True)
+        super().__init__("termination", env, cfg, torch.bool)
         self._cfg = dict(cfg)
-        self.values = torch.zeros(
-            (env.nworld, len(self.names)), dtype=torch.bool, device=env.device
-        )
         self.terminated = self.values.any(1)
         self.truncated = self.values.any(1)
-        self._ends = torch.tensor(
-            [not cfg[name].time_out for name in self.names], dtype=torch.bool, device=env.device
-        )
+        ends = [not term.time_out for term in cfg.values()]
+        self._ends = torch.tensor(ends, dtype=torch.bool, device=env.device)
 
     def compute(self, ended: torch.Tensor | None = None) -> None:
         """Write `terminated`, `truncated` and `values`.

@@ -3,7 +3,7 @@ and history.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import torch
@@ -12,7 +12,7 @@ from mjstack.config.functions import offered
 from mjstack.config.schema import ObservationGroupCfg, ObservationTermCfg
 from mjstack.errors import TermError
 from mjstack.managers.term import Term, first_value, render_table
-from mjstack.managers.view import EnvView, rows_of, unit_draw
+from mjstack.managers.view import EnvView, random_uniform, rows_of
 from mjstack.scene.index import ALL, Columns, Rows
 
 _SLIDE = 0.1  # m: as much noise for a sliding joint as 1 rad for another
@@ -23,9 +23,8 @@ class _Part:
 
     def __init__(self, label: str, cfg: ObservationTermCfg, env: EnvView) -> None:
         if cfg.clip is not None and not cfg.clip[0] < cfg.clip[-1]:
-            raise TermError(
-                label, f"clip={list(cfg.clip)}: expected two numbers, the smaller one first"
-            )
+            expected = "expected two numbers, the smaller one first"
+            raise TermError(label, f"clip={list(cfg.clip)}: {expected}")
         self.cfg = cfg
         self.term = Term(label, cfg, env)
         if self.term.has_memory:
@@ -54,27 +53,23 @@ class _Group:
         self.name = name
         self.noisy = cfg.noise
         self._env = env
+        label = f"observation.{name}"
+        if not cfg.terms:
+            raise TermError(label, "has no terms: expected at least one, or no such group")
         self.parts = {
-            term: _Part(f"observation.{name}.terms.{term}", c, env) for term, c in cfg.terms.items()
+            term: _Part(f"{label}.terms.{term}", part, env) for term, part in cfg.terms.items()
         }
-        if not self.parts:
-            raise TermError(
-                f"observation.{name}", "has no terms: expected at least one, or no such group"
-            )
         parts = self.parts.values()
         self.dim = sum(part.dim for part in parts)
-        widths = [part.width for part in parts]
-        self.width = sum(widths)
+        self.width = sum(part.width for part in parts)
         self._columns = slice(first, first + self.width)
 
         # Only columns with noise get numbers: where one stands in the draw follows from them alone.
         slides = slide_joints(env.sim.model, env.cfg.robot.joints)
-        noise = [size for p in parts for size in column_noise(p.cfg, p.width, slides)]
-        noise = noise if cfg.noise else []
-        noisy = [column for column, size in enumerate(noise) if size]
-        self._noise_columns = Columns([first + column for column in noisy], env.device)
-        sizes = [noise[column] for column in noisy]
-        self._noise = torch.tensor(sizes, dtype=torch.float32, device=env.device)
+        sizes = [size for p in parts for size in column_noise(p.cfg, p.width, slides)]
+        noise = {first + n: size for n, size in enumerate(sizes) if size and cfg.noise}
+        self._noise_columns = Columns([*noise], env.device)
+        self._noise = torch.tensor([*noise.values()], dtype=torch.float32, device=env.device)
         # Where each column of the group comes from: for `append` in the group before and the new
         # step behind it, where a part's steps move up by one; for `restart` in the new step.
         shift: list[int] = []
@@ -98,8 +93,9 @@ class _Group:
         """Add the group's noise to a step of some worlds."""
         if not len(self._noise):
             return
-        env = self._env
-        draw = unit_draw(env, f"observation.{self.name}", len(self._noise), env.episode_step, at)
+        name = f"observation.{self.name}"
+        step_number = self._env.episode_step
+        draw = random_uniform(self._env, name, len(self._noise), step=step_number, at=at).float()
         columns = self._noise_columns.at
         if isinstance(columns, slice):
             step[:, columns].add_(self._noise * draw)
@@ -112,8 +108,8 @@ class _Group:
         if not self.remembers:
             out.copy_(step)
             return
-        both = torch.cat((self._past, step), dim=1)
-        torch.index_select(both, 1, self._shift, out=self._past)
+        longer = torch.cat((self._past, step), dim=1)
+        torch.index_select(longer, 1, self._shift, out=self._past)
         out.copy_(self._past)
 
     def restart(self, out: torch.Tensor, step: torch.Tensor, mask: torch.Tensor, at: Rows) -> None:
@@ -121,13 +117,13 @@ class _Group:
         alone where it has their numbers.
         """
         step = step[:, self._columns]
-        kept = self._past if self.remembers else out
+        into = self._past if self.remembers else out
         if self.remembers:
             step = step.index_select(1, self._repeat)
         if isinstance(at, torch.Tensor):
-            kept.index_copy_(0, at, step)
+            into.index_copy_(0, at, step)
         else:
-            torch.where(mask[:, None], step, kept, out=kept)
+            torch.where(mask[:, None], step, into, out=into)
         if self.remembers:
             out.copy_(self._past)
 
@@ -168,7 +164,7 @@ class ObservationManager:
         self._env = env
         self._groups: dict[str, _Group] = {}
         for name, group in cfg.items():
-            first = sum(each.width for each in self._groups.values())
+            first = sum(earlier.width for earlier in self._groups.values())
             self._groups[name] = _Group(name, group, env, first)
         self.remembers = any(group.remembers for group in self._groups.values())
         self.group_dims = {name: group.dim for name, group in self._groups.items()}
@@ -176,24 +172,20 @@ class ObservationManager:
             name: {term: p.dim for term, p in group.parts.items()}
             for name, group in self._groups.items()
         }
-        self.groups = {
-            name: torch.full((env.nworld, dim), math.nan, dtype=torch.float32, device=env.device)
-            for name, dim in self.group_dims.items()
-        }
+        empty = torch.full((env.nworld, 1), math.nan, dtype=torch.float32, device=env.device)
+        self.groups = {name: empty.repeat(1, dim) for name, dim in self.group_dims.items()}
         self._parts = [p for group in self._groups.values() for p in group.parts.values()]
-        widths = torch.tensor([part.width for part in self._parts], dtype=torch.int64)
-
-        def row(values: Iterable[float]) -> torch.Tensor:
-            """A number for each column of one step, from one for each part."""
-            of_parts = torch.tensor([*values], dtype=torch.float32)
-            return of_parts.repeat_interleave(widths).to(env.device)
-
-        clips = [part.cfg.clip or (-math.inf, math.inf) for part in self._parts]
         self._clips = any(part.cfg.clip for part in self._parts)
-        self._low = row(low for low, _ in clips)
-        self._high = row(high for _, high in clips)
         self._scales = any(part.cfg.scale != 1.0 for part in self._parts)
-        self._scale = row(part.cfg.scale for part in self._parts)
+        # Limits and scale of each column of one step
+        widest = (-math.inf, math.inf)
+        columns = [
+            (*(part.cfg.clip or widest), part.cfg.scale)
+            for part in self._parts
+            for _ in range(part.width)
+        ]
+        table = torch.tensor(columns, dtype=torch.float32, device=env.device).view(-1, 3)
+        self._low, self._high, self._scale = table.T.contiguous()
 
     def compute(self) -> dict[str, torch.Tensor]:
         """Take in a new step of every world, and return `groups`."""
@@ -229,13 +221,10 @@ class ObservationManager:
 
     def not_finite_terms(self, world: int) -> list[str]:
         """Names of the terms whose last value in a world is not finite. Waits for the device."""
-        names = []
-        for name, group in self._groups.items():
-            values = self.groups[name][world].split([part.dim for part in group.parts.values()])
-            for part, value in zip(group.parts.values(), values, strict=True):
-                if not bool(torch.isfinite(value).all()):
-                    names.append(part.term.label)
-        return names
+        values = torch.cat([values[world] for values in self.groups.values()])
+        finite = torch.isfinite(values).split([part.dim for part in self._parts])
+        pairs = zip(self._parts, finite, strict=True)
+        return [part.term.label for part, terms in pairs if not bool(terms.all())]
 
     def __str__(self) -> str:
         rows = []
@@ -243,8 +232,8 @@ class ObservationManager:
             for name, part in terms.parts.items():
                 cfg = part.cfg
                 noise = cfg.noise if terms.noisy else 0.0
-                shown = (part.dim, cfg.history, noise, cfg.clip or "", cfg.scale)
-                rows.append((group, name, *shown, part.term.params))
+                settings = (part.dim, cfg.history, noise, cfg.clip or "", cfg.scale)
+                rows.append((group, name, *settings, part.term.params))
         dims = ", ".join(f"{group} {dim}" for group, dim in self.group_dims.items())
         columns = ("group", "term", "dim", "history", "noise", "clip", "scale")
         return render_table(f"observation: {dims}", columns, rows)

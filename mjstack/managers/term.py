@@ -19,13 +19,8 @@ from mjstack.errors import ConfigError, MjstackError, ParameterError, TermError,
 from mjstack.managers.view import EnvView
 from mjstack.math import describe_tensor
 
-_WORDS = {
-    float: "a number",
-    int: "an integer",
-    bool: "true or false",
-    str: "a name",
-    type(None): "null",
-}
+_WORDS = {float: "a number", int: "an integer", bool: "true or false", str: "a name"}
+_WORDS |= {type(None): "null"}
 
 
 def check_params(
@@ -38,34 +33,27 @@ def check_params(
     """
     signature = inspect.signature(func)
     try:
-        given = signature.bind_partial(*[None] * leading).arguments
+        positional = signature.bind_partial(*[None] * leading).arguments
     except TypeError as error:
         form = "(env, mask, *, ...)" if leading == 2 else "(env, *, ...)"
-        raise TermError(
-            label,
-            f"{getattr(func, '__name__', func)} does not take what its manager gives, expected"
-            f" {form}",
-        ) from error
-    others = [p for name, p in signature.parameters.items() if name not in given]
-    if any(p.kind is p.VAR_KEYWORD for p in others):
+        problem = f"{getattr(func, '__name__', func)} does not take what its manager gives"
+        raise TermError(label, f"{problem}, expected {form}") from error
+    options = {name: p for name, p in signature.parameters.items() if name not in positional}
+    if any(p.kind is p.VAR_KEYWORD for p in options.values()):
         return
-    names = [p.name for p in others]
     for name in params:
-        if name not in names:
-            raise TermError(label, f"parameter '{name}' does not exist. {suggest(name, names)}")
-    missing = [p.name for p in others if p.default is p.empty and p.name not in params]
-    if missing:
-        raise TermError(
-            label, f"parameter '{missing[0]}' is missing: set {label}.params.{missing[0]}"
-        )
+        if name not in options:
+            raise TermError(label, f"parameter '{name}' does not exist. {suggest(name, options)}")
+    for name, option in options.items():
+        if option.default is option.empty and name not in params:
+            raise TermError(label, f"parameter '{name}' is missing: set {label}.params.{name}")
     try:
         called = func.__init__ if inspect.isclass(func) else func
         hints = get_type_hints(called, include_extras=True)
     except (NameError, TypeError):  # a user's annotations may name what cannot be resolved here
         return
     for name, value in params.items():
-        expected = _mismatch(value, hints.get(name, Any))
-        if expected:
+        if expected := _mismatch(value, hints.get(name, Any)):
             raise ConfigError(f"{label}.params.{name}", value, expected)
 
 
@@ -104,7 +92,8 @@ def blamed(label: str) -> Iterator[None]:
     try:
         yield
     except ParameterError as error:
-        raise ConfigError(f"{label}.params.{error.key}", *error.facts) from error
+        error.move(f"{label}.params.{error.key}")
+        raise
     except ConfigError:  # names its key itself
         raise
     except MjstackError as error:
@@ -199,26 +188,25 @@ class Term:
         is_class = inspect.isclass(func)
         check_params(label, func, self.params, 1 if is_class or not masked else 2)
         self.model_fields: Sequence[str] = getattr(func, "model_fields", ())
-        self.call: Any = func
+        self.call: Any = partial(func, **self.params)
         if is_class:
             with blamed(label):
-                self.call = func(env, **self.params)
+                self.call = self.call(env)
             if hasattr(func, "label"):
                 self.call.label = label
-        self._call_params = {} if is_class else self.params
         self._reset = getattr(self.call, "reset", None)
         self.has_memory = self._reset is not None
-        # Two groups may ask for the same: a function of the state gives both the same answer.
-        # Others may keep something.
-        shared_by = (id(env), func, repr(sorted(self.params.items())))
-        self._shared_by = None if is_class or masked else shared_by
+        # Two groups may need the same: a function of the state gives both the same value, while
+        # others may keep something.
+        key = (id(env), func, repr(sorted(self.params.items())))
+        self._key = None if is_class or masked else key
 
     def __call__(self, *args: Any) -> Any:
         """Call the term with the environment, and a mask if it takes one."""
         current_term.label = self.label
-        if self._shared_by is None:
-            return self.call(*args, **self._call_params)
-        return shared(self._shared_by, partial(self.call, *args, **self._call_params))
+        if self._key is None:
+            return self.call(*args)
+        return shared(self._key, partial(self.call, *args))
 
     def reset(self, mask: torch.Tensor) -> None:
         """Let a term with a memory forget the masked worlds."""
@@ -261,8 +249,8 @@ def render_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any
     """A manager's terms as text; the last cell of a row has the parameters by name."""
     table = Table(*columns, "parameters", title=title, title_justify="left")
     for *cells, params in rows:
-        shown = ", ".join(f"{name}={value}" for name, value in params.items())
-        table.add_row(*map(str, cells), shown)
+        settings = ", ".join(f"{name}={value}" for name, value in params.items())
+        table.add_row(*map(str, cells), settings)
     out = io.StringIO()
     Console(file=out, width=120, color_system=None, markup=False).print(table)
     return out.getvalue().rstrip()

@@ -107,44 +107,18 @@ def random_uniform(
         floats.
     """
     dtype = env.sim.qpos.dtype
-    if env.device.type == "cuda":
-        return _draw_on_device(env, name, size, low, high, step).to(dtype)
-    draw = unit_draw(env, name, size, step, at).to(dtype)
+    stream = zlib.crc32(name.encode())
+    world = env.world[at]
+    episode = env.episode[at]
+    step = None if step is None else step[at]
+    if env.device.type == "cuda":  # one kernel; it loads Warp, which native runs do not need
+        from mjstack.sim.draws import draw_uniform
+
+        return draw_uniform(env.key, stream, world, episode, step, size, low, high).to(dtype)
+    draw = uniform(env.seed, stream, world, episode, step, size).to(dtype)
     if (low, high) == (-1.0, 1.0):  # then all of the below is exact, and changes nothing
         return draw
     return low + 0.5 * (high - low) * (draw + 1.0)
-
-
-def unit_draw(
-    env: EnvView, name: str, size: int, step: torch.Tensor | None = None, at: Rows = ALL
-) -> torch.Tensor:
-    """The numbers of `random_uniform` from -1 to 1 in float32, in which they are drawn."""
-    if env.device.type == "cuda":
-        return _draw_on_device(env, name, size, -1.0, 1.0, step)
-    worlds = [env.world, env.episode, torch.zeros_like(env.world) if step is None else step]
-    if isinstance(at, torch.Tensor):
-        worlds = [numbers[at] for numbers in worlds]
-    world, episode, step = worlds
-    stream = zlib.crc32(name.encode())
-    return uniform(seed=env.seed, world=world, episode=episode, step=step, stream=stream, size=size)
-
-
-def _draw_on_device(
-    env: EnvView, name: str, size: int, low: float, high: float, step: torch.Tensor | None
-) -> torch.Tensor:
-    """One kernel; it loads Warp, which native runs do not need."""
-    from mjstack.sim.draws import draw_uniform
-
-    return draw_uniform(
-        key=env.key,
-        stream=zlib.crc32(name.encode()),
-        world=env.world,
-        episode=env.episode,
-        step=step,
-        size=size,
-        low=low,
-        high=high,
-    )
 
 
 def rows_of(mask: torch.Tensor) -> Rows:

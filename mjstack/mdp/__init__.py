@@ -1,1 +1,3 @@
 """Terms: plain functions on batched views."""
+
+import mjstack.report.gl  # noqa: F401  (before mujoco)

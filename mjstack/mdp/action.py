@@ -20,11 +20,10 @@ class _Commands(ActionTerm):
     """Commands of some of the robot's actuators, from actions of -1 to 1."""
 
     def _set_up(self, env: EnvView, chosen: Sequence[int], dim: int) -> None:
-        chosen = list(chosen)
         self._ctrl = env.sim.ctrl
-        self._columns = Columns(env.index.ctrl[chosen], env.device)
+        self._columns = Columns(env.index.ctrl[list(chosen)], env.device)
         self._part = self._columns.read(self._ctrl)  # its own memory, if they lie side by side
-        self._low, self._high = robot(env).ctrl_range[chosen].unbind(1)
+        self._low, self._high = robot(env).ctrl_range[list(chosen)].unbind(1)
         self.actuators = self._columns.indices
         self.dim = dim
         self.high = torch.ones(dim, dtype=self._ctrl.dtype, device=env.device)
@@ -67,9 +66,9 @@ class JointPosition(_Commands):
         Raises:
             MjstackError: A joint does not exist.
         """
-        names = env.cfg.robot.joints
-        n_arm = env.index.n_arm
-        parts = {"arm": names[:n_arm], "gripper": names[n_arm:], "all": names}
+        profile = env.cfg.robot
+        names = profile.joints
+        parts = {"arm": profile.arm_joints, "gripper": profile.gripper_joints, "all": names}
         if isinstance(joints, str):
             joints = parts.get(joints, [joints])
         for name in joints:
@@ -157,27 +156,27 @@ class JointTargets(_Commands):
             ParameterError: There are not as many numbers as joints.
         """
         joints = len(env.index.ctrl)
-        given = {"mean": mean, "std": std, "low": low, "high": high}
-        for key, values in given.items():
+        scaling = {"mean": mean, "std": std, "low": low, "high": high}
+        for key, values in scaling.items():
             if len(values) != joints:
                 raise ParameterError(key, list(values), f"{joints} numbers, one per joint")
         self._set_up(env, range(joints), dim=steps * joints)
         self._steps = steps
         self._mean, self._std, least, most = (
             torch.tensor(values, dtype=self._ctrl.dtype, device=env.device)
-            for values in given.values()
+            for values in scaling.values()
         )
         self._low = torch.maximum(self._low, least)
         self._high = torch.minimum(self._high, most)
         self.low, self.high = (
             ((limit - self._mean) / self._std).repeat(steps) for limit in (self._low, self._high)
         )
-        self._held = env.cfg.timing.policy_decimation
+        self._decimation = env.cfg.timing.policy_decimation
         self._step = env.episode_step
 
     def write_commands(self, action: Tensor) -> None:
         """Write the commands of the control step."""
-        number = self._step.remainder(self._held).clamp(max=self._steps - 1)
+        number = self._step.remainder(self._decimation).clamp(max=self._steps - 1)
         targets = action.unflatten(1, (self._steps, -1))
         now = targets.gather(1, number[:, None, None].expand(-1, 1, targets.shape[2]))[:, 0]
         self._write_bounded(self._mean + self._std * now)
@@ -235,12 +234,9 @@ class EndEffectorDelta(_Commands):
         if roll:
             name = profile.roll_joint
             if name is None or name in profile.ik_joints:
-                raise ParameterError(
-                    "roll", roll, f"0, because robot.roll_joint={name} is not free"
-                )
-            # The roll joint's column, and how far it turns
-            width = self._all.read(self._ctrl).shape[1]
-            self._roll = torch.zeros(width, dtype=self._ctrl.dtype, device=env.device)
+                expected = f"0, because robot.roll_joint={name} is not free"
+                raise ParameterError("roll", roll, expected)
+            self._roll = torch.zeros_like(robot(env).home)  # how far each joint turns
             self._roll[profile.joints.index(name)] = roll
             self._limits = robot(env).ctrl_range.unbind(1)
         self._ik = BatchedIk(
@@ -267,11 +263,11 @@ class EndEffectorDelta(_Commands):
         self._write_bounded(command[:, : self._n_arm].to(self._ctrl.dtype))
 
     def _tilted(self, point: Tensor, approach: Tensor, action: Tensor) -> Tensor:
-        """The approach axis turned towards the wanted tilt, by a step at most, in the vertical
+        """The approach axis turned towards the desired tilt, by a step at most, in the vertical
         plane through the base and the grasp point.
         """
-        wanted = 0.5 * (action + 1.0) * self._tilt
+        goal = 0.5 * (action + 1.0) * self._tilt
         away = point[:, :2] / torch.linalg.vector_norm(point[:, :2], dim=1, keepdim=True)
         now = torch.atan2((approach[:, :2] * away).sum(1), -approach[:, 2])
-        angle = now + (wanted - now).clamp(-_TILT_STEP, _TILT_STEP)
+        angle = now + (goal - now).clamp(-_TILT_STEP, _TILT_STEP)
         return torch.cat((torch.sin(angle)[:, None] * away, -torch.cos(angle)[:, None]), dim=1)

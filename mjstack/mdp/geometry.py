@@ -115,8 +115,8 @@ def objects_in_hand(index: SceneIndex, sim: Simulation) -> Tensor:
     """Whether all jaws press on each object of the scene, at the last physics step, shape
     ``(nworld, objects)``, bool.
     """
-    held = [(jaw_forces(index, sim, name) > LOADED).all(1) for name in index.bodies]
-    return torch.stack(held, dim=1)
+    forces = torch.stack([jaw_forces(index, sim, name) for name in index.bodies], dim=1)
+    return (forces > LOADED).all(2)
 
 
 def jaw_forces(index: SceneIndex, sim: Simulation, name: str) -> Tensor:

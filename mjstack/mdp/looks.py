@@ -38,9 +38,8 @@ class Light:
             brightness: Smallest and largest factor.
             tint: Half-width of a further factor of each colour, about 1.
         """
-        model = env.sim.model
-        _require_pictures(model.nlight, "lights")
-        lights = range(model.nlight)
+        _require_pictures(env, "lights")
+        lights = range(env.sim.model.nlight)
         self._pos, self._dir, self._diffuse = (
             Elements(env, f"light_{name}", lights, exact=False)
             for name in ("pos", "dir", "diffuse")
@@ -128,8 +127,7 @@ class CameraPoses:
             pos: Of the move along each axis of what carries the camera [m].
             angle: Of the turn about each axis of the camera [rad].
         """
-        self._names = _cameras(env)
-        cameras = range(len(self._names))
+        cameras = range(len(_cameras(env)))
         self._pos = Elements(env, "cam_pos", cameras, exact=False)
         self._quat = Elements(env, "cam_quat", cameras, exact=False)
         self._move = pos
@@ -138,7 +136,7 @@ class CameraPoses:
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write cam_pos and cam_quat."""
         at = rows_of(mask)
-        draw = _draw_cameras(env, self.label, self._names, 6, at).to(self._pos.nominal.dtype)
+        draw = _draw_cameras(env, self.label, 6, at).to(self._pos.nominal.dtype)
         half = 0.5 * self._angle * draw[..., 3:]
         turn = torch.cat((torch.ones_like(half[..., :1]), half), dim=-1)
         turn = torch.nn.functional.normalize(turn, dim=-1)
@@ -155,37 +153,36 @@ class FieldOfView:
 
     def __init__(self, env: EnvView, *, scale: Sequence[float]) -> None:
         """Take the smallest and largest factor."""
-        self._names = _cameras(env)
-        self._fovy = Elements(env, "cam_fovy", range(len(self._names)), exact=False)
+        self._fovy = Elements(env, "cam_fovy", range(len(_cameras(env))), exact=False)
         self._ends = bounds("scale", scale)
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write cam_fovy."""
         at = rows_of(mask)
-        low, high = self._ends
-        draw = _draw_cameras(env, self.label, self._names, 1, at)[..., 0]
-        factor = low + 0.5 * (high - low) * (draw.to(self._fovy.nominal.dtype) + 1.0)
+        factor = _draw_cameras(env, self.label, 1, at, *self._ends)[..., 0]
         self._fovy.write(mask, self._fovy.nominal * factor, at)
 
 
 def _cameras(env: EnvView) -> list[str]:
     """Names of the model's cameras, in its order."""
-    model = env.sim.model
-    _require_pictures(model.nlight, "cameras")
-    return [model.camera(number).name for number in range(model.ncam)]
+    _require_pictures(env, "cameras")
+    return [env.sim.model.camera(number).name for number in range(env.sim.model.ncam)]
 
 
-def _require_pictures(found: int, what: str) -> None:
-    """Raise where the model has nothing that only pictures need."""
-    if not found:
+def _require_pictures(env: EnvView, what: str) -> None:
+    """Raise where the model has no light, which only pictures need."""
+    if not env.sim.model.nlight:
         raise MjstackError(
             f"the scene has no {what}, because nothing is drawn", "Set cameras=front"
         )
 
 
-def _draw_cameras(env: EnvView, label: str, names: Sequence[str], size: int, at: Rows) -> Tensor:
+def _draw_cameras(
+    env: EnvView, label: str, size: int, at: Rows, low: float = -1.0, high: float = 1.0
+) -> Tensor:
     """Numbers of each camera by its name, so that another camera changes none of them, shape
     ``(n, cameras, size)``.
     """
-    draws = [random_uniform(env, f"{label}.{name}", size, at=at) for name in names]
+    names = _cameras(env)
+    draws = [random_uniform(env, f"{label}.{name}", size, low, high, at=at) for name in names]
     return torch.stack(draws, dim=1)

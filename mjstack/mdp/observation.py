@@ -82,10 +82,9 @@ def positions(env: EnvView, *, objects: list[str] | None = None) -> Tensor:
         env: The environment.
         objects: The objects; all of the scene that can move if None.
     """
-    names = list(env.cfg.scene.free) if objects is None else objects
-    if not names:
-        return env.sim.qpos[:, :0]
-    return torch.cat([pose_w(env, name)[:, :3] for name in names], dim=1)
+    names = env.cfg.scene.free if objects is None else objects
+    parts = [pose_w(env, name)[:, :3] for name in names]
+    return torch.cat([env.sim.qpos[:, :0], *parts], dim=1)
 
 
 @offers(unit="m")
@@ -101,7 +100,7 @@ def offsets(env: EnvView, *, objects: list[str] | None = None) -> Tensor:
 def goals(env: EnvView) -> Tensor:
     """Where the scene's places are [m], shape ``(nworld, 2 * places)``."""
     places = [place_xy(env, name) for name in env.cfg.scene.places]
-    return torch.cat(places, dim=1) if places else env.sim.qpos[:, :0]
+    return torch.cat([env.sim.qpos[:, :0], *places], dim=1)
 
 
 @offers(unit="1")

@@ -4,6 +4,7 @@ values each time.
 
 import math
 from collections.abc import Sequence
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -37,9 +38,8 @@ def home(env: EnvView, mask: Tensor, *, pose: Pose = "home") -> None:
 class JointNoise:
     """Adds uniform noise to the robot's joint positions and targets, within the joints' ranges."""
 
-    label = (  # the manager sets the term's own, so that two of them draw different numbers
-        "reset.joints"
-    )
+    # The manager sets the term's own label, so that two of them draw different numbers
+    label = "reset.joints"
 
     def __init__(self, env: EnvView, *, arm: NotNegative, gripper: NotNegative = 0.0) -> None:
         """Take the half-widths.
@@ -52,7 +52,7 @@ class JointNoise:
         self._width = torch.full_like(robot(env).home, gripper)
         self._width[: env.index.n_arm] = arm
         limits = joint_limits(env.sim.model, env.cfg.robot.joints)
-        self._low, self._high = (torch.from_numpy(each).to(self._width) for each in limits)
+        self._low, self._high = (torch.from_numpy(limit).to(self._width) for limit in limits)
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write qpos and ctrl."""
@@ -136,11 +136,7 @@ class RandomizeObjects:
         self._candidates = candidates
         # The first draws are the same for every scene; the others follow.
         self._more = 3 * candidates if may_meet(env.cfg.scene, region, gap) else 0
-        noise = [
-            term.params.get("arm", 0.0)
-            for term in env.cfg.reset.values()
-            if offered(term.func, "joint_noise")
-        ]
+        noisy = [term for term in env.cfg.reset.values() if offered(term.func, "joint_noise")]
         self._placement = Placement(
             env.cfg,
             env.sim.model,
@@ -148,7 +144,7 @@ class RandomizeObjects:
             region=region,
             gap=gap,
             pose=getattr(robot(env), pose).tolist(),
-            noise=sum(noise),
+            noise=sum(term.params.get("arm", 0.0) for term in noisy),
         )
         self._placement.require_room(region, candidates + self._more)
         require_reach(env, region)
@@ -157,13 +153,12 @@ class RandomizeObjects:
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write qpos."""
         count = len(env.index.objects)
-        some = count * (2 * self._candidates + 1)
+        sizes = (count * (2 * self._candidates + 1), 2 * count * self._more)
         at = rows_of(mask)
-        draws = random_uniform(env, self.label, some + 2 * count * self._more, at=at)
-        first = draws[:, :some].reshape(len(draws), count, -1)
-        more = draws[:, some:].reshape(len(draws), count, -1)
-        candidates = torch.cat((first[..., 1:], more), dim=2)
-        offsets, _ = self._placement.choose(candidates.reshape(len(draws), count, -1, 2))
+        draws = random_uniform(env, self.label, sum(sizes), at=at)
+        first, more = (part.unflatten(1, (count, -1)) for part in draws.split(sizes, dim=1))
+        candidates = torch.cat((first[..., 1:], more), dim=2).unflatten(2, (-1, 2))
+        offsets, _ = self._placement.choose(candidates)
         _write_objects(env, mask, self._poses, offsets, self._yaw * first[..., 0], at)
 
 
@@ -171,11 +166,13 @@ class _Randomized:
     """A quantity of the model, drawn anew for each episode."""
 
     label = "reset.model"
+    kind: ClassVar[type[Quantity]]
 
-    def __init__(self, env: EnvView, quantity: Quantity, ends: tuple[float, float]) -> None:
-        self._quantity = quantity
-        self._nominal = quantity.nominal.to(env.sim.qpos.dtype)
-        self._ends = ends
+    def __init__(self, env: EnvView, *, scale: Sequence[float]) -> None:
+        """Take the smallest and largest factor."""
+        self._ends = bounds("scale", scale)
+        self._quantity = self.kind(env)
+        self._nominal = self._quantity.nominal.to(env.sim.qpos.dtype)
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write the model fields."""
@@ -188,19 +185,19 @@ class _Randomized:
 class ObjectMass(_Randomized):
     """Scales each object's mass and inertia."""
 
-    def __init__(self, env: EnvView, *, scale: Sequence[float]) -> None:
-        """Take the smallest and largest factor."""
-        super().__init__(env, ObjectMasses(env), bounds("scale", scale))
+    kind = ObjectMasses
 
 
 @uses_fields(*SlidingFriction.fields)
 class ObjectFriction(_Randomized):
     """Draws the sliding friction of each object, and of the grip; see `SlidingFriction`."""
 
+    kind = SlidingFriction
+
     def __init__(self, env: EnvView, *, sliding: Sequence[float]) -> None:
         """Take the smallest and largest coefficient."""
-        ends = bounds("sliding", sliding)
-        super().__init__(env, SlidingFriction(env, ends[0]), ends)
+        super().__init__(env, scale=bounds("sliding", sliding))
+        self._quantity = SlidingFriction(env, self._ends[0])
 
 
 @uses_fields(*ServoGains.fields)
@@ -209,9 +206,7 @@ class ActuatorGains(_Randomized):
     servo.
     """
 
-    def __init__(self, env: EnvView, *, scale: Sequence[float]) -> None:
-        """Take the smallest and largest factor."""
-        super().__init__(env, ServoGains(env), bounds("scale", scale))
+    kind = ServoGains
 
 
 def _object_poses(env: EnvView) -> Columns:
@@ -227,8 +222,7 @@ def _write_objects(
     are those of ``at``.
     """
     now = poses.read(env.sim.qpos)[at].unflatten(1, (-1, 7))
-    # Float64, because a float32 cosine need not be that of any angle, and a file of starts has the
-    # angle.
+    # In float64, so that the rounded cosine and sine are the same on every backend
     turned = quat_from_yaw(yaw.double()).to(offset.dtype)
     value = torch.cat((now[..., :2] + offset, now[..., 2:3], turned), dim=-1).flatten(1)
     poses.write_masked(env.sim.qpos, mask, value, at)

@@ -5,8 +5,8 @@ from torch import Tensor
 
 from mjstack.config.fields import Positive
 from mjstack.managers.view import EnvView
-from mjstack.mdp.geometry import above_table, nearness, place_xy, pose_w, robot
-from mjstack.mdp.observation import grasp_point_to_object
+from mjstack.mdp import observation
+from mjstack.mdp.geometry import above_table, nearness, place_xy, pose_w
 
 
 def reach(env: EnvView, *, object: str, scale: Positive, height: float = 0.0) -> Tensor:
@@ -18,7 +18,7 @@ def reach(env: EnvView, *, object: str, scale: Positive, height: float = 0.0) ->
         scale: Distance over which the reward falls [m].
         height: How far above the object's centre the point is [m].
     """
-    return nearness(grasp_point_to_object(env, object=object, height=height), scale)
+    return nearness(observation.grasp_point_to_object(env, object=object, height=height), scale)
 
 
 def lift(env: EnvView, *, object: str, height: Positive) -> Tensor:
@@ -45,4 +45,4 @@ def action_rate(env: EnvView) -> Tensor:
 
 def joint_vel(env: EnvView) -> Tensor:
     """Squared joint velocities [rad^2/s^2], summed."""
-    return env.sim.part("qvel", robot(env).qvel).square().sum(1)
+    return observation.joint_vel(env).square().sum(1)

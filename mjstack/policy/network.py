@@ -1,5 +1,5 @@
-"""The network of a policy: a multilayer perceptron between normalised observations and joint
-targets, and convolutions between images and it.
+"""The network of a policy: a multilayer perceptron between normalised observations and actions,
+and convolutions between images and it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -52,14 +52,15 @@ class ImageEncoder(nn.Module):
 
 
 class PolicyNetwork(nn.Module):
-    """Answers an observation with the joint targets of the next control steps, a chunk.
+    """Maps an observation to the actions of the next control steps, a chunk.
 
     Both are normalised inside, by mean and standard deviation, which are saved with the weights. So
-    is a range that no joint target leaves.
+    is a range that no action leaves.
 
     Attributes:
-        chunk: Steps of one answer.
-        joints: Joint targets of one step.
+        chunk: Actions of one query.
+        width: Numbers of one action.
+        hidden: Widths of the hidden layers.
         vision: Images that it sees; without cameras if there are none.
     """
 
@@ -73,7 +74,7 @@ class PolicyNetwork(nn.Module):
     def __init__(
         self,
         inputs: int,
-        joints: int,
+        width: int,
         chunk: int,
         hidden: Sequence[int],
         vision: Vision | None = None,
@@ -82,14 +83,15 @@ class PolicyNetwork(nn.Module):
 
         Args:
             inputs: Width of an observation.
-            joints: Joint targets of one step.
-            chunk: Steps of one answer.
+            width: Numbers of one action.
+            chunk: Actions of one query.
             hidden: Widths of the hidden layers.
             vision: Images that it sees besides.
         """
         super().__init__()
         self.chunk = chunk
-        self.joints = joints
+        self.width = width
+        self.hidden = list(hidden)
         self.vision = vision = vision or Vision()
         self.encoders = nn.ModuleList(
             ImageEncoder(size, vision.channels, vision.features) for size in vision.sizes.values()
@@ -98,36 +100,36 @@ class PolicyNetwork(nn.Module):
         layers: list[nn.Module] = []
         for before, after in pairwise(widths):
             layers += [nn.Linear(before, after), nn.ELU()]
-        self.layers = nn.Sequential(*layers, nn.Linear(widths[-1], chunk * joints))
-        for name, width in (("observation", inputs), ("action", joints)):
-            self.register_buffer(f"{name}_mean", torch.zeros(width))
-            self.register_buffer(f"{name}_std", torch.ones(width))
-        self.register_buffer("action_low", torch.full((joints,), -_UNBOUNDED))
-        self.register_buffer("action_high", torch.full((joints,), _UNBOUNDED))
+        self.layers = nn.Sequential(*layers, nn.Linear(widths[-1], chunk * width))
+        for name, size in (("observation", inputs), ("action", width)):
+            self.register_buffer(f"{name}_mean", torch.zeros(size))
+            self.register_buffer(f"{name}_std", torch.ones(size))
+        self.register_buffer("action_low", torch.full((width,), -_UNBOUNDED))
+        self.register_buffer("action_high", torch.full((width,), _UNBOUNDED))
 
     def set_scale(self, name: str, mean: Tensor, std: Tensor) -> None:
         """Set how ``observation`` or ``action`` is normalised, each shape ``(width,)``. A constant
-        column of an observation is only shifted; a constant joint target hardly leaves its mean.
+        column of an observation is only shifted; a constant action hardly leaves its mean.
         """
         constant = 1.0 if name == "observation" else 1e-3
         self.get_buffer(f"{name}_mean").copy_(mean)
         self.get_buffer(f"{name}_std").copy_(torch.where(std > _CONSTANT, std, constant))
 
     def set_range(self, low: Tensor, high: Tensor) -> None:
-        """Set the range that joint targets are kept in [rad, m], each shape ``(joints,)``."""
+        """Set the range that actions are kept in, each shape ``(width,)``."""
         self.action_low.copy_(low)
         self.action_high.copy_(high)
 
     def normalized(self, observation: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
-        """Answer in normalised joint targets, shape ``(n, chunk, joints)``."""
+        """Normalised actions, shape ``(n, chunk, width)``."""
         scaled = (observation - self.observation_mean) / self.observation_std
         scaled = scaled.clamp(-FARTHEST, FARTHEST)
-        seen = [enc(image) for enc, image in zip(self.encoders, images, strict=True)]
-        scaled = torch.cat([scaled, *(each.to(scaled.dtype) for each in seen)], dim=1)
-        return self.layers(scaled).unflatten(1, (self.chunk, self.joints))
+        features = [enc(image) for enc, image in zip(self.encoders, images, strict=True)]
+        scaled = torch.cat([scaled, *(part.to(scaled.dtype) for part in features)], dim=1)
+        return self.layers(scaled).unflatten(1, (self.chunk, self.width))
 
     def forward(self, observation: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
-        """Joint targets [rad, m].
+        """Actions, in the units of the policy's action terms.
 
         Args:
             observation: Shape ``(n, inputs)``.
@@ -135,7 +137,7 @@ class PolicyNetwork(nn.Module):
                 in the network's type.
 
         Returns:
-            Shape ``(n, chunk, joints)``.
+            Shape ``(n, chunk, width)``.
         """
-        answer = self.action_mean + self.action_std * self.normalized(observation, images)
-        return torch.minimum(torch.maximum(answer, self.action_low), self.action_high)
+        actions = self.action_mean + self.action_std * self.normalized(observation, images)
+        return torch.minimum(torch.maximum(actions, self.action_low), self.action_high)

@@ -32,7 +32,7 @@ def require_onnx() -> Any:
 
 def to_onnx(network: PolicyNetwork, facts: Mapping[str, Any]) -> bytes:
     """Write a network as ONNX: input ``observation``, shape ``(n, inputs)``, and output ``action``,
-    shape ``(n, chunk, joints)``, both float32 for any n.
+    shape ``(n, chunk, width)``, both float32 for any n.
 
     Args:
         network: The network; observations and actions are scaled inside, as it does itself.
@@ -43,13 +43,12 @@ def to_onnx(network: PolicyNetwork, facts: Mapping[str, Any]) -> bytes:
     constants: dict[str, np.ndarray] = {}
     nodes: list[Any] = []
 
-    def add(kind: str, value: str, *others: Tensor | np.ndarray, **options: Any) -> str:
+    def add(kind: str, value: str, *numbers: Tensor | np.ndarray, **options: Any) -> str:
         """A node on the last one's value and constants; returns the name of its value."""
         name = f"{kind.lower()}_{len(nodes)}"
-        for number, other in enumerate(others):
-            array = other.numpy() if isinstance(other, Tensor) else other
-            constants[f"{name}_{number}"] = array
-        inputs = [value, *(f"{name}_{number}" for number in range(len(others)))]
+        inputs = [value, *(f"{name}_{number}" for number in range(len(numbers)))]
+        for key, array in zip(inputs[1:], numbers, strict=True):
+            constants[key] = array.numpy() if isinstance(array, Tensor) else array
         nodes.append(helper.make_node(kind, inputs, [name], **options))
         return name
 
@@ -65,7 +64,7 @@ def to_onnx(network: PolicyNetwork, facts: Mapping[str, Any]) -> bytes:
             value = add("Elu", value, alpha=layer.alpha)
         else:
             raise TypeError(f"{type(layer).__name__} has no counterpart here")
-    shape = np.array([-1, network.chunk, network.joints], np.int64)
+    shape = np.array([-1, network.chunk, network.width], np.int64)
     value = add("Mul", add("Reshape", value, shape), network.action_std)
     value = add("Add", value, network.action_mean)
     add("Min", add("Max", value, network.action_low), network.action_high)
@@ -78,7 +77,7 @@ def to_onnx(network: PolicyNetwork, facts: Mapping[str, Any]) -> bytes:
         nodes,
         "policy",
         [helper.make_tensor_value_info(INPUT, kind, ["n", inputs])],
-        [helper.make_tensor_value_info(OUTPUT, kind, ["n", network.chunk, network.joints])],
+        [helper.make_tensor_value_info(OUTPUT, kind, ["n", network.chunk, network.width])],
         [onnx.numpy_helper.from_array(array, name) for name, array in constants.items()],
     )
     opset = helper.make_opsetid("", _OPSET)

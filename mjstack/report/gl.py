@@ -1,27 +1,18 @@
-"""How MuJoCo draws offscreen: chosen when mujoco is imported, which decides then."""
+"""How MuJoCo draws offscreen. mujoco decides when it is imported: so every package that imports it
+imports this module first, which chooses.
+"""
 
 from __future__ import annotations
 
 import os
 import sys
+from ctypes.util import find_library
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import mujoco
 
 _LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
-
-
-class BeforeMujoco:
-    """Chooses at the import of mujoco: the search takes a while, and Ctrl-C is not handled yet when
-    the command imports mjstack.
-    """
-
-    def find_spec(self, name: str, path: object = None, target: object = None) -> None:
-        """Find nothing."""
-        if name == "mujoco":
-            sys.meta_path.remove(self)
-            choose_gl()
 
 
 def choose_gl() -> None:
@@ -31,16 +22,13 @@ def choose_gl() -> None:
     A choice whose library is missing would break the import of mujoco itself; then the scene is not
     drawn.
     """
-    from ctypes.util import find_library
-
-    if not sys.platform.startswith("linux"):
+    choice = os.environ.get("MUJOCO_GL", "").lower()
+    windows = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if not sys.platform.startswith("linux") or ((choice or windows) and choice not in _LIBRARIES):
         return
-    asked = os.environ.get("MUJOCO_GL", "").lower()
-    found = [name for name, library in _LIBRARIES.items() if find_library(library)]
-    if asked in _LIBRARIES and asked not in found:
-        os.environ["MUJOCO_GL"] = "disable"
-    elif not asked and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        os.environ["MUJOCO_GL"] = found[0] if found else "disable"
+    candidates = [choice] if choice else list(_LIBRARIES)
+    available = (name for name in candidates if find_library(_LIBRARIES[name]))
+    os.environ["MUJOCO_GL"] = next(available, "disable")
 
 
 def open_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
@@ -71,3 +59,6 @@ def require_offscreen(model: mujoco.MjModel) -> None:
         MjstackError: This machine cannot draw offscreen.
     """
     open_renderer(model, 16, 16).close()
+
+
+choose_gl()

@@ -2,54 +2,58 @@
 video.
 """
 
+import itertools
 import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
-from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import matplotlib
 import mujoco
 import numpy as np
-from matplotlib.patches import Rectangle
 from PIL import Image, features
 
 from mjstack.errors import MissingExtra, MjstackError
 from mjstack.interrupt import check_interrupt
 from mjstack.report.gl import open_renderer
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
+if TYPE_CHECKING:
+    from matplotlib.patches import Rectangle
 
-Drawn = tuple[Sequence[float], Sequence[float]]
 Draw = Callable[[np.ndarray], Iterable[np.ndarray]]
-Frames = Callable[[Sequence[int]], Iterator[np.ndarray]]
+Frames = Callable[[Sequence[int]], Iterator[Image.Image]]
 
 
 @contextmanager
 def figure(
-    path: Path, title: str, columns: int = 1, rows: int = 1, **options: Any
+    path: Path,
+    title: str,
+    columns: int = 1,
+    rows: int = 1,
+    *,
+    figsize: tuple[float, float],
+    **options: Any,
 ) -> Iterator[tuple[Any, Any]]:
-    """Make a figure with panels by options of ``plt.subplots``, and save it when the block ends.
+    """Make a figure with panels by options of ``Figure.subplots``, and save it when the block ends.
 
     Yields:
         The figure, and its axes: an array unless there is one panel.
     """
-    drawn, axes = plt.subplots(rows, columns, layout="constrained", **options)
-    try:
-        yield drawn, axes
-        if title:
-            drawn.suptitle(title, wrap=True)
-        drawn.savefig(path, dpi=100)
-    finally:
-        plt.close(drawn)
+    from matplotlib.figure import Figure  # takes a while to load
+
+    picture = Figure(figsize, layout="constrained")
+    yield picture, picture.subplots(rows, columns, **options)
+    if title:
+        picture.suptitle(title, wrap=True)
+    picture.savefig(path, dpi=100)
 
 
-def outline(centre: Sequence[float], half: Sequence[float], **style: Any) -> Rectangle:
+def outline(centre: Sequence[float], half: Sequence[float], **style: Any) -> "Rectangle":
     """A rectangle around a point, of which the border is drawn."""
+    from matplotlib.patches import Rectangle
+
     corner = (centre[0] - half[0], centre[1] - half[1])
     return Rectangle(corner, 2.0 * half[0], 2.0 * half[1], **({"fill": False} | style))
 
@@ -87,7 +91,7 @@ def save_scene(path: Path, model: mujoco.MjModel, qpos: np.ndarray) -> None:
         MjstackError: This machine cannot draw offscreen.
     """
     (image,) = _render(model, qpos[None], 960, 720)
-    plt.imsave(path, image)
+    Image.fromarray(image).save(path)
 
 
 def save_video(
@@ -109,7 +113,7 @@ def save_video(
         model: The scene.
         qpos: States at the ends of steps, shape ``(worlds, steps, nq)``.
         step_dt: Time between two of them [s].
-        advance: Told about progress.
+        advance: Reports progress.
         fps: Frames per second [Hz], as near as whole steps allow.
         width: Of the video [pixels]; 640 by default with one world, 960 with several.
         draw: Draws a state of every world, shape ``(worlds, nq)``, as images ``(height, width,
@@ -125,7 +129,7 @@ def save_video(
     columns = math.ceil(math.sqrt(worlds))
     wide = (width or (640 if worlds == 1 else 960)) // columns
 
-    def frames(numbers: Sequence[int]) -> Iterator[np.ndarray]:
+    def frames(numbers: Sequence[int]) -> Iterator[Image.Image]:
         """Draw some frames."""
         chosen = states[list(numbers)]
         if draw is None:
@@ -134,30 +138,22 @@ def save_video(
             images = (image for frame in chosen for image in draw(frame))
         for done in range(1, len(chosen) + 1):
             check_interrupt()
-            yield _side_by_side([_fit(image, wide) for image in islice(images, worlds)], columns)
+            yield _side_by_side(list(itertools.islice(images, worlds)), columns, wide)
             if len(chosen) == count:  # not of a sample
                 advance("pictures of the video", done, count)
 
     write(path, frames, count, step_dt * skip)
 
 
-def _fit(image: np.ndarray, wide: int) -> np.ndarray:
-    """Scale an image to a width; a smaller one is the mean of what its pixels cover."""
-    height, width, _ = image.shape
-    if width == wide:
-        return image
-    size = (wide, max(1, round(height * wide / width)))
-    return np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BOX))
-
-
-def _side_by_side(images: Sequence[np.ndarray], columns: int) -> np.ndarray:
-    """Images of one size in rows; the places that are left are black."""
-    rows = math.ceil(len(images) / columns)
+def _side_by_side(images: Sequence[np.ndarray], columns: int, wide: int) -> Image.Image:
+    """Images of one size in rows, scaled to a width; the places that are left are black."""
     height, width, _ = images[0].shape
-    frame = np.zeros((rows, height, columns, width, 3), np.uint8)
+    tall = max(1, round(height * wide / width))
+    frame = Image.new("RGB", (columns * wide, math.ceil(len(images) / columns) * tall))
     for number, image in enumerate(images):
-        frame[number // columns, :, number % columns] = image
-    return frame.reshape(rows * height, columns * width, 3)
+        scaled = Image.fromarray(image).resize((wide, tall), Image.Resampling.BOX)
+        frame.paste(scaled, (number % columns * wide, number // columns * tall))
+    return frame
 
 
 def require_video(ending: str = ".mp4") -> Callable[[Path, Frames, int, float], None]:
@@ -182,13 +178,12 @@ def require_video(ending: str = ".mp4") -> Callable[[Path, Frames, int, float], 
 def _write_mp4(
     writer_of: Callable[..., Any], path: Path, frames: Frames, count: int, dt: float
 ) -> None:
-    drawn = frames(range(count))
-    first = next(drawn)
-    writer = writer_of(str(path), first.shape[1::-1], fps=1.0 / dt, macro_block_size=16)
+    images = frames(range(count))
+    first = next(images)
+    writer = writer_of(str(path), first.size, fps=1.0 / dt, macro_block_size=16)
     writer.send(None)
-    writer.send(first)
-    for frame in drawn:
-        writer.send(frame)
+    for image in itertools.chain([first], images):
+        writer.send(image.tobytes())
     writer.close()
 
 
@@ -203,11 +198,12 @@ def _write_loop(
     """Write a GIF or a WebP. All frames of a GIF have the same colours, without dithering, so that
     what does not move keeps its colour.
     """
-    images: Iterator[Image.Image] = map(Image.fromarray, frames(range(count)))
+    images = frames(range(count))
     if path.suffix == ".gif":
-        sample = np.concatenate(list(frames([0, count // 2, count - 1])))
+        sample = np.concatenate(list(map(np.asarray, frames([0, count // 2, count - 1]))))
         palette = Image.fromarray(sample).quantize(_COLORS)
-        images = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
+        quantize = partial(Image.Image.quantize, palette=palette, dither=Image.Dither.NONE)
+        images = map(quantize, images)
     first = next(images)
     ends = 10 * np.round(100.0 * dt * np.arange(count + 1)).astype(int)  # a GIF counts in 10 ms
     first.save(
@@ -229,7 +225,10 @@ def opens_windows() -> bool:
 
 
 def save_trajectories(
-    path: Path, positions: np.ndarray, objects: Mapping[str, Drawn], title: str
+    path: Path,
+    positions: np.ndarray,
+    objects: Mapping[str, tuple[Sequence[float], Sequence[float]]],
+    title: str,
 ) -> None:
     """Plot the objects' way: positions [m], shape ``(steps, objects, 3)``, and the half sizes [m]
     and the colour of each object by name.
@@ -316,8 +315,8 @@ def save_places(
             axes.plot(pair[:, 1], pair[:, 0], color="0.3", lw=0.5, alpha=0.6)
         marks = (("succeeded", succeeded, ".", 0.25), ("failed", ~succeeded, "x", 1.0))
         for number, (name, color) in enumerate(colors.items()):
-            for word, some, marker, alpha in marks:
-                x, y = places[some, number, :2].T
+            for word, rows, marker, alpha in marks:
+                x, y = places[rows, number, :2].T
                 label = f"{name}, {word}: {len(x):,}"
                 axes.scatter(y, x, 30.0, color=color, marker=marker, alpha=alpha, label=label)
         axes.set(xlabel="y [m]", ylabel="x [m]", aspect="equal")

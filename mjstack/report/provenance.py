@@ -47,8 +47,8 @@ def _git_commit() -> str:
     root = Path(__file__).resolve().parents[2]
     mark = "--dirty= with changes"
     git = ["git", "-C", str(root), "describe", "--always", "--abbrev=40", "--exclude=*", mark]
-    found = ""
+    commit = ""
     if (root / ".git").exists():
         with suppress(OSError, subprocess.SubprocessError):
-            found = subprocess.run(git, capture_output=True, text=True, timeout=10).stdout.strip()
-    return found or "no checkout"
+            commit = subprocess.run(git, capture_output=True, text=True, timeout=10).stdout.strip()
+    return commit or "no checkout"

@@ -75,5 +75,5 @@ class Report:
     def conclude(self) -> None:
         """pass: no gate that was asked for failed, and at least one passed."""
         outcomes = [gate.status for gate in self.gates]
-        good = Status.passed in outcomes and Status.failed not in outcomes
-        self.status = Status.passed if good else Status.failed
+        passed = Status.passed in outcomes and Status.failed not in outcomes
+        self.status = Status.passed if passed else Status.failed

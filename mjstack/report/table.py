@@ -1,16 +1,18 @@
 """Tables of text cells, as Markdown and on a terminal."""
 
-import math
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import rich.console
 import rich.table
 from rich.markup import escape
 from rich.text import Text
+from typing_extensions import override
+
+from mjstack.report.text import format_value
 
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 
@@ -22,9 +24,29 @@ class Console(rich.console.Console):
         """Go on without an output: a reader that has gone is no failure of a run."""
         os.dup2(os.open(os.devnull, os.O_WRONLY), self.file.fileno())
 
+    @override
     def render_str(self, text: str, **options: Any) -> Text:
-        """See `rich.console.Console`."""
         return super().render_str(_CONTROL.sub("", text), **options)
+
+
+class Marked(str):
+    """A text, and what a page makes of it.
+
+    Attributes:
+        grade: Colours it: ``good``, ``near``, ``bad`` or a status.
+        share: Draws a bar that is filled to this share; None for none.
+        link: Leads to this address; empty for none.
+    """
+
+    grade: str = ""
+    share: float | None = None
+    link: str = ""
+
+    def __new__(cls, text: str, **attributes: str | float) -> Self:
+        """Make a text."""
+        marked = super().__new__(cls, text)
+        vars(marked).update(attributes)
+        return marked
 
 
 @dataclass(kw_only=True, slots=True)
@@ -33,7 +55,7 @@ class Table:
 
     Attributes:
         header: Names of the columns.
-        rows: Cells, as many as there are columns.
+        rows: Cells, as many as there are columns; a `Marked` one is more than its text.
         title: Its heading; empty for none.
     """
 
@@ -44,7 +66,7 @@ class Table:
     @classmethod
     def of(
         cls, columns: Mapping[str, str], rows: Iterable[Mapping[str, object]], title: str = ""
-    ) -> "Table":
+    ) -> Self:
         """Make a table from records, with the key of each column's values; "-" where a record has
         none.
         """
@@ -68,33 +90,6 @@ class Table:
                 *(f"[{known[c]}]{escape(c)}[/]" if c in known else escape(c) for c in row)
             )
         return table
-
-
-def format_value(value: object) -> str:
-    """A number with as many digits as a reader needs; other values as they are."""
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return f"{value:,.0f}" if 1e4 <= abs(value) < math.inf else f"{value:.4g}"
-    return "" if value is None else str(value)
-
-
-def to_document(
-    title: str,
-    tables: Sequence[Table] = (),
-    notes: Sequence[str] = (),
-    pictures: Sequence[str] = (),
-    text: str = "",
-    level: int = 1,
-) -> str:
-    """A Markdown file, or a section of one: heading, text, tables, pictures, notes as a list."""
-    parts = [f"{'#' * level} {title}", *filter(None, [text])]
-    for table in tables:
-        parts += [f"{'#' * (level + 1)} {table.title}"] if table.title else []
-        parts.append("\n".join(table.to_markdown()))
-    parts += [f"![{picture}]({picture})" for picture in pictures]
-    parts += ["\n".join(f"- {note}" for note in notes)] if notes else []
-    return "\n\n".join(parts) + "\n"
 
 
 def _escape(cell: str) -> str:

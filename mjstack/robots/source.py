@@ -8,16 +8,13 @@ import mujoco
 import numpy as np
 
 from mjstack.config.schema import ModelCfg, RobotCfg
-from mjstack.errors import ConfigError, SourceError, UnknownName, first_line
+from mjstack.errors import ConfigError, MjstackError, UnknownName, first_line
 
 BUILTIN = Path(__file__).parent
 _MENAGERIE_FIX = "Set MENAGERIE_ROOT to a checkout of MuJoCo Menagerie, or use model=builtin."
 
 _CONTACT = ("contype", "conaffinity", "condim", "friction", "solref", "solimp", "priority")
-_GEOM_DEFAULTS = (
-    *("type", "density", "mass", "gap", "margin", "solmix", "group", "material", "rgba"),
-    *_CONTACT,
-)
+_GEOM_DEFAULTS = ("type", "density", "mass", "gap", "margin", "solmix", "group", "material", "rgba")
 
 
 def robot_spec(robot: RobotCfg, model: ModelCfg) -> mujoco.MjSpec:
@@ -32,7 +29,7 @@ def robot_spec(robot: RobotCfg, model: ModelCfg) -> mujoco.MjSpec:
         profile has one, the arm's force limit. It has no keyframes.
 
     Raises:
-        SourceError: The description cannot be found or read.
+        MjstackError: The description cannot be found or read.
         UnknownName: It lacks a joint, body or site of the profile.
         ConfigError: A joint has no range or no servo.
     """
@@ -42,7 +39,7 @@ def robot_spec(robot: RobotCfg, model: ModelCfg) -> mujoco.MjSpec:
         spec = mujoco.MjSpec.from_file(str(path))
     except (ValueError, FileNotFoundError) as error:
         fix = _MENAGERIE_FIX if menagerie else "Correct the file (robot.file)."
-        raise SourceError(f"{path} cannot be read: {first_line(error)}. {fix}") from error
+        raise MjstackError(f"{path} cannot be read: {first_line(error)}. {fix}") from error
     if menagerie and robot.replace_collision:
         _replace_collision(spec, robot)
     for name in robot.jaw_bodies:
@@ -55,7 +52,8 @@ def robot_spec(robot: RobotCfg, model: ModelCfg) -> mujoco.MjSpec:
             _require(f"robot.{key}: joint", name, spec.joints)
             _prepare_joint(spec, name)
     fresh = mujoco.MjSpec().default.geom
-    for field in _GEOM_DEFAULTS:  # the file's own would count for the scene's geoms too
+    # The file's own defaults would count for the scene's geoms too
+    for field in (*_GEOM_DEFAULTS, *_CONTACT):
         setattr(spec.default.geom, field, getattr(fresh, field))
     for key in list(spec.keys):  # keyframes of the robot alone do not fit a scene's state
         spec.delete(key)
@@ -91,7 +89,7 @@ def _menagerie_path(robot: RobotCfg) -> Path:
     try:
         return Path(mujoco_menagerie.get(robot.menagerie_name).path()) / robot.menagerie_file
     except (mujoco_menagerie.MenagerieError, OSError) as error:
-        raise SourceError(
+        raise MjstackError(
             f"model=menagerie: {robot.menagerie_name} is neither cached nor can it be fetched"
             f" ({type(error).__name__}). {_MENAGERIE_FIX}"
         ) from error
@@ -101,13 +99,12 @@ def _replace_collision(spec: mujoco.MjSpec, robot: RobotCfg) -> None:
     """Put the collision geoms of mjstack's own file in place of the loaded ones."""
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
-    ours = mujoco.MjSpec.from_file(str(_file_path(robot))).compile()
+    builtin = mujoco.MjSpec.from_file(str(_file_path(robot))).compile()
     fields = ("type", "pos", "quat", "size", *_CONTACT)
-    for i in range(ours.ngeom):
-        if ours.geom_contype[i] or ours.geom_conaffinity[i]:
-            values = {field: getattr(ours, f"geom_{field}")[i] for field in fields}
-            body = spec.body(ours.body(ours.geom_bodyid[i]).name)
-            body.add_geom(name=ours.geom(i).name, group=3, **values)
+    for i in np.flatnonzero(builtin.geom_contype | builtin.geom_conaffinity):
+        values = {field: getattr(builtin, f"geom_{field}")[i] for field in fields}
+        body = spec.body(builtin.body(builtin.geom_bodyid[i]).name)
+        body.add_geom(name=builtin.geom(i).name, group=3, **values)
 
 
 def _add_grasp_sites(spec: mujoco.MjSpec, robot: RobotCfg) -> None:
@@ -135,14 +132,11 @@ def _prepare_joint(spec: mujoco.MjSpec, name: str) -> None:
     if not low < high:
         raise ConfigError(f"range of joint {name}", [low, high], "a range in the robot's file")
     servos = [a for a in spec.actuators if a.target == name]
-    if (
-        len(servos) != 1
-        or servos[0].biasprm[1] != -servos[0].gainprm[0]
-        or not servos[0].gainprm[0]
-    ):
-        found = ", ".join(a.name for a in servos) or "none"
-        raise ConfigError(f"actuators of joint {name}", found, "one <position> in the robot's file")
-    servo = servos[0]
+    positions = [a for a in servos if a.gainprm[0] and a.biasprm[1] == -a.gainprm[0]]
+    if len(servos) != 1 or not positions:
+        names = ", ".join(a.name for a in servos) or "none"
+        raise ConfigError(f"actuators of joint {name}", names, "one <position> in the robot's file")
+    (servo,) = servos
     servo.name = name
     if not servo.ctrlrange[0] < servo.ctrlrange[1]:
         servo.inheritrange = 1.0

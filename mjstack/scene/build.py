@@ -4,12 +4,13 @@ set before compilation.
 
 import itertools
 import math
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from mjstack.config.schema import BoxCfg, CameraCfg, Config, ObjectCfg, SceneCfg
-from mjstack.errors import SourceError, UnknownName
+from mjstack.errors import MjstackError, UnknownName
 from mjstack.robots import robot_spec
 
 TABLE = "table"
@@ -26,14 +27,14 @@ def build_model(cfg: Config, *, visuals: bool = False) -> mujoco.MjModel:
             them, and steps faster.
 
     Raises:
-        SourceError: The robot's file does not fit the scene, such as one with a geom named table.
+        MjstackError: The robot's file does not fit the scene, such as one with a geom named table.
     """
     spec = robot_spec(cfg.robot, cfg.model)
     try:
         return build_scene(spec, cfg, visuals=visuals)
     except ValueError as error:
         problem = ", ".join(str(error).removeprefix("Error: ").splitlines())
-        raise SourceError(
+        raise MjstackError(
             f"robot {cfg.robot.name} in scene {cfg.scene.name}: {problem}. Correct the robot's file"
             " or the scene, whose names (floor, table and the objects) the robot cannot have."
         ) from error
@@ -70,22 +71,10 @@ def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> m
 
     # Bodies
     world = spec.worldbody
-    world.add_geom(
-        name="floor",
-        type=mujoco.mjtGeom.mjGEOM_PLANE,
-        size=[0, 0, 0.05],
-        rgba=[0.32, 0.36, 0.42, 1],
-        condim=3,
-    )
-    world.add_geom(
-        name=TABLE,
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        pos=scene.table_center,
-        size=scene.table_half,
-        friction=scene.table_friction,
-        condim=3,
-        rgba=[0.72, 0.66, 0.58, 1],
-    )
+    _add_geom(world, "floor", "plane", size=[0, 0, 0.05], rgba=[0.32, 0.36, 0.42, 1])
+    place = {"pos": scene.table_center, "size": scene.table_half}
+    friction = scene.table_friction
+    _add_geom(world, TABLE, "box", **place, friction=friction, rgba=[0.72, 0.66, 0.58, 1])
     if scene.box is not None:
         _add_box(spec, scene.box, scene.table_top)
     for name, thing in scene.objects.items():
@@ -96,13 +85,14 @@ def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> m
     if scene.support_sensors:
         pairs += [(WORLD, name) for name in scene.objects]
         pairs += itertools.combinations(scene.objects, 2)
+    body = mujoco.mjtObj.mjOBJ_BODY
     for first, second in pairs:  # the net contact force [N]: 3 numbers, world frame
         spec.add_sensor(
             name=force_sensor(first, second),
             type=mujoco.mjtSensor.mjSENS_CONTACT,
-            objtype=mujoco.mjtObj.mjOBJ_BODY,
+            objtype=body,
             objname=first,
-            reftype=mujoco.mjtObj.mjOBJ_BODY,
+            reftype=body,
             refname=second,
             intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), _NETFORCE, 1],
         )
@@ -135,6 +125,12 @@ def force_sensor(first: str, second: str) -> str:
     return f"{first}/{second}"
 
 
+def _add_geom(body: mujoco.MjsBody, name: str, shape: str, **values: Any) -> mujoco.MjsGeom:
+    """Add a geom whose contacts slide and do not turn about their normal."""
+    kind = getattr(mujoco.mjtGeom, f"mjGEOM_{shape.upper()}")
+    return body.add_geom(name=name, type=kind, condim=3, **values)
+
+
 def _add_object(world: mujoco.MjsBody, name: str, thing: ObjectCfg, top: float) -> None:
     """Add an object that stands on a surface at height top [m]. Its body, joint and geom have its
     name.
@@ -142,15 +138,9 @@ def _add_object(world: mujoco.MjsBody, name: str, thing: ObjectCfg, top: float) 
     body = world.add_body(name=name, pos=[*thing.xy, top + thing.half_height])
     if not thing.fixed:
         body.add_freejoint(name=name)
-    geom = body.add_geom(
-        name=name,
-        type=getattr(mujoco.mjtGeom, f"mjGEOM_{thing.shape.upper()}"),
-        size=[*thing.size, 0.0, 0.0][:3],
-        mass=thing.mass,
-        friction=thing.friction,
-        condim=3,
-        rgba=thing.color,
-    )
+    size = [*thing.size, 0.0, 0.0][:3]
+    surface = {"friction": thing.friction, "rgba": thing.color}
+    geom = _add_geom(body, name, thing.shape, size=size, mass=thing.mass, **surface)
     if thing.shape == "capsule":  # MuJoCo's stands along z; this one lies along x
         geom.quat = [math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0]
 
@@ -166,7 +156,7 @@ def _add_camera(spec: mujoco.MjSpec, name: str, camera: CameraCfg, scene: SceneC
         origin[:] = [*scene.table_center[:2], scene.table_top]
     body = spec.body(mount)
     if body is None:
-        known = [TABLE, *(each.name for each in spec.bodies if each.name)]
+        known = [TABLE, *(named.name for named in spec.bodies if named.name)]
         raise UnknownName(f"scene.cameras.{name}.pose.mount: body", mount, known)
     # A camera looks along its -z, and its y points up in the image.
     axes = np.zeros((3, 3))
@@ -196,13 +186,5 @@ def _add_box(spec: mujoco.MjSpec, box: BoxCfg, top: float) -> None:
         size = [thick, half_y + box.wall, up] if i else [half_x, thick, up]
         parts[name] = (pos, size, box.wall_solref)
     for name, (pos, size, solref) in parts.items():
-        spec.worldbody.add_geom(
-            name=f"box_{name}",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            pos=pos,
-            size=size,
-            friction=box.friction,
-            condim=3,
-            solref=solref,
-            rgba=[0.50, 0.55, 0.52, 1],
-        )
+        surface = {"friction": box.friction, "solref": solref, "rgba": [0.50, 0.55, 0.52, 1]}
+        _add_geom(spec.worldbody, f"box_{name}", "box", pos=pos, size=size, **surface)

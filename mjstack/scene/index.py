@@ -1,5 +1,6 @@
 """Names to addresses, resolved once; facts of a robot's joints; and how low bodies reach."""
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -9,7 +10,7 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import RobotCfg, SceneCfg
-from mjstack.errors import UnknownName
+from mjstack.errors import ConfigError, UnknownName
 from mjstack.math import quat_z_row
 from mjstack.scene.build import WORLD, force_sensor
 
@@ -157,12 +158,12 @@ class SceneIndex:
         def sensors(bodies: Iterable[tuple[str, str]]) -> list[int]:
             return [int(model.sensor_adr[find(model, "sensor", force_sensor(*p))]) for p in bodies]
 
-        others = list(combinations(scene.objects, 2))
+        pairs = list(combinations(scene.objects, 2))
         self.jaw_force = {
             name: sensors((jaw, name) for jaw in robot.jaw_bodies) for name in scene.objects
         }
         self.support_force = {
-            name: sensors([(WORLD, name), *(pair for pair in others if name in pair)])
+            name: sensors([(WORLD, name), *(pair for pair in pairs if name in pair)])
             for name in scene.objects
             if scene.support_sensors
         }
@@ -200,10 +201,8 @@ class SceneIndex:
         if name not in self._columns:
             qpos, qvel = self.object_address(name)
             here = torch.device("cpu")  # side by side, so that no device has anything of them
-            self._columns[name] = (
-                Columns(range(qpos, qpos + 7), here),
-                Columns(range(qvel, qvel + 6), here),
-            )
+            columns = (Columns(range(qpos, qpos + 7), here), Columns(range(qvel, qvel + 6), here))
+            self._columns[name] = columns
         return self._columns[name]
 
     def object_address(self, name: str) -> tuple[int, int]:
@@ -238,17 +237,10 @@ def joint_limits(model: mujoco.MjModel, names: Sequence[str]) -> tuple[np.ndarra
     """
     joints = [find(model, "joint", name) for name in names]
     servos = [find(model, "actuator", name) for name in names]
-    low, high = zip(
-        *(
-            np.where(limited[:, None], span, [-np.inf, np.inf]).T
-            for limited, span in (
-                (model.jnt_limited[joints], model.jnt_range[joints]),
-                (model.actuator_ctrllimited[servos], model.actuator_ctrlrange[servos]),
-            )
-        ),
-        strict=True,
-    )
-    return np.maximum(*low), np.minimum(*high)
+    limited = (model.jnt_limited[joints], model.actuator_ctrllimited[servos])
+    spans = (model.jnt_range[joints], model.actuator_ctrlrange[servos])
+    low, high = np.where(np.stack(limited)[..., None], spans, [-np.inf, np.inf]).transpose(2, 0, 1)
+    return low.max(axis=0), high.min(axis=0)
 
 
 def locked_home(robot: RobotCfg) -> np.ndarray:
@@ -262,6 +254,21 @@ def approach_body(model: mujoco.MjModel, robot: RobotCfg) -> int:
     if robot.approach_body:
         return find(model, "body", robot.approach_body)
     return int(model.jnt_bodyid[find(model, "joint", robot.arm_joints[-1])])
+
+
+def turn_sign(model: mujoco.MjModel, robot: RobotCfg) -> float:
+    """1.0 where the arm's first joint turns to the left, seen from above; -1.0 where to the right.
+
+    Raises:
+        ConfigError: It does not turn about the vertical.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    up = float(data.xaxis[find(model, "joint", robot.arm_joints[0])][2])
+    if abs(up) < 0.999:
+        expected = f"0, because joint {robot.arm_joints[0]} does not turn about the vertical"
+        raise ConfigError("robot.approach_gain", robot.approach_gain, expected)
+    return math.copysign(1.0, up)
 
 
 def lowest_height(
@@ -280,9 +287,9 @@ def lowest_height(
         xquat: Their orientations, shape ``(nworld, nbody, 4)``.
     """
     # The geoms, each in its body
-    wanted = [model.body(name).id for name in bodies]
+    owners = [model.body(name).id for name in bodies]
     collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    geoms = np.flatnonzero(collides & np.isin(model.geom_bodyid, wanted))
+    geoms = np.flatnonzero(collides & np.isin(model.geom_bodyid, owners))
     g = mujoco.mjtGeom
     kind = model.geom_type[geoms]
     radius = model.geom_size[geoms, 0]

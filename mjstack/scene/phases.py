@@ -70,12 +70,12 @@ def build_phases(cfg: Config) -> list[Phase]:
     bottom = dict.fromkeys(sources, 0.0)  # above the table, when a phase begins
     phases: list[Phase] = []
     start = 0
-    held = ""  # the object that was grasped last
+    load = ""  # the object that was grasped last
     in_hand = False
     rest = 0.0  # height above the table at which the last target would leave it
     for name, spec in cfg.controller.phases.items():
         if spec.gripper == "open" and in_hand:
-            bottom[held] = rest
+            bottom[load] = rest
             in_hand = False
         target = None
         if spec.anchor is not None:
@@ -86,7 +86,7 @@ def build_phases(cfg: Config) -> list[Phase]:
             rest = 0.0
             if spec.level == "on_top":
                 rest = up + half
-                up = rest + scene.objects[held].half_height
+                up = rest + scene.objects[load].half_height
             above = (
                 spec.h_scale * cfg.robot.approach_height
                 + spec.offset[2]
@@ -99,11 +99,11 @@ def build_phases(cfg: Config) -> list[Phase]:
             target = Target(sources.index(spec.anchor), toward, offset, z, over)
         stop = start + round(spec.seconds / cfg.timing.step_dt)
         grasped = -1 if spec.grasps is None else sources.index(spec.grasps)
-        carried = sources.index(held) if in_hand and spec.grasps is None else -1
+        carried = sources.index(load) if in_hand and spec.grasps is None else -1
         phases.append(Phase(name, start, stop, spec, target, grasped, carried))
         start = stop
         if spec.grasps is not None:
-            held = spec.grasps
+            load = spec.grasps
             in_hand = True
     return phases
 
@@ -127,11 +127,11 @@ def object_targets(cfg: Config) -> dict[str, list[tuple[Phase, Target]]]:
     """The phases that go to each free object, in their order; each height, offset and opening
     once.
     """
-    found: dict[str, dict[tuple, tuple[Phase, Target]]] = {name: {} for name in cfg.scene.free}
+    out: dict[str, dict[tuple, tuple[Phase, Target]]] = {name: {} for name in cfg.scene.free}
     names = source_names(cfg.scene)
     for phase in build_phases(cfg):
         target = phase.target
-        if target is not None and (thing := names[target.source]) in found:
+        if target is not None and (thing := names[target.source]) in out:
             key = (round(target.z, 6), phase.spec.gripper, target.offset, target.toward)
-            found[thing].setdefault(key, (phase, target))
-    return {name: list(targets.values()) for name, targets in found.items()}
+            out[thing].setdefault(key, (phase, target))
+    return {name: list(targets.values()) for name, targets in out.items()}

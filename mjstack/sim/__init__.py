@@ -1,5 +1,6 @@
 """Physics backends behind one protocol."""
 
+import mjstack.report.gl  # noqa: F401  (before mujoco)
 from mjstack.sim.build import StateRenderer, make_simulation, resolve_backend, resolve_device
 from mjstack.sim.simulation import (
     LOST_PHYSICS,

@@ -25,9 +25,9 @@ def resolve_device(requested: str) -> str:
     if requested == "auto":
         return f"cuda:{int(os.environ.get('LOCAL_RANK', 0)) % count}" if count else "cpu"
     if requested.startswith("cuda") and int(requested.partition(":")[2]) >= count:
-        found = ", ".join(f"cuda:{number}" for number in range(count)) or "no CUDA device"
+        devices = ", ".join(f"cuda:{number}" for number in range(count)) or "no CUDA device"
         raise DeviceError(
-            f"sim.device={requested}: this machine has {found}. Use sim.device=auto or"
+            f"sim.device={requested}: this machine has {devices}. Use sim.device=auto or"
             " sim.device=cpu."
         )
     return requested
@@ -48,12 +48,8 @@ def resolve_backend(
     if backend is Backend.auto:
         backend = Backend.mjwarp if device.startswith("cuda") else Backend.native
     if cfg.sim.backend is Backend.native and cfg.sim.device.startswith("cuda"):
-        raise ConfigError(
-            "sim.device",
-            cfg.sim.device,
-            "cpu or auto, because native MuJoCo runs on the CPU",
-            "Use sim=mjwarp",
-        )
+        expected = "cpu or auto, because native MuJoCo runs on the CPU"
+        raise ConfigError("sim.device", cfg.sim.device, expected, "Use sim=mjwarp")
     return backend, "cpu" if backend is Backend.native else device
 
 
@@ -80,21 +76,16 @@ def make_simulation(
 
     Raises:
         UnknownName: A field does not exist, or cannot differ.
-        UnsupportedModel: The backend, or ``sim.step``, does not implement a feature of the model.
+        MjstackError: The backend, or ``sim.step``, does not implement a feature of the model.
     """
     backend, device = resolve_backend(cfg, backend, device)
     if backend is Backend.native:
         return NativeSimulation(model, nworld, fields=fields)
     from mjstack.sim.mjwarp import MjwarpSimulation  # loads Warp, which native runs do not need
 
+    sizes = sizes or resolve_sizes(cfg)
     return MjwarpSimulation(
-        model,
-        nworld,
-        sizes or resolve_sizes(cfg),
-        device,
-        cfg.graph,
-        fields=fields,
-        step=cfg.sim.step,
+        model, nworld, sizes, device, cfg.graph, fields=fields, step=cfg.sim.step
     )
 
 
@@ -116,15 +107,8 @@ class StateRenderer:
         device: str | None = None,
         fields: Sequence[str] = (),
     ) -> None:
-        """Make the worlds and their cameras.
-
-        Args:
-            model: The compiled model.
-            cfg: The configuration, with its cameras.
-            count: Most states that are drawn at once.
-            backend: Overrides the configured backend.
-            device: Overrides the configured device.
-            fields: Model fields that differ between states, by MuJoCo's names.
+        """Make worlds and the configuration's cameras for at most ``count`` states at once; other
+        arguments as of `make_simulation`.
 
         Raises:
             MjstackError: The images do not fit into memory.
@@ -132,7 +116,6 @@ class StateRenderer:
         self._sim = make_simulation(
             model, cfg, count, backend=backend, device=device, fields=fields
         )
-        self._names = list(cfg.scene.cameras)
         self._cameras = self._sim.make_cameras(cfg.scene.cameras)
         self._images = self._cameras.allocate()
         self._world = torch.arange(count, device=self._sim.device)
@@ -156,14 +139,14 @@ class StateRenderer:
             MjstackError: This machine cannot draw.
         """
         n = len(qpos)
-        if n > len(self._world):
-            raise ArgumentError("qpos", f"{n} states", f"at most {len(self._world)}")
+        if n > self._sim.nworld:
+            raise ArgumentError("qpos", f"{n} states", f"at most {self._sim.nworld}")
         self._sim.qpos[:n] = qpos
         for name, values in (fields or {}).items():
             self._sim.fields[name][:n] = values
         self._sim.kinematics()
         mask = None if n == len(self._world) else self._world < n
-        self._cameras.draw(self._images, dict.fromkeys(self._names, mask))
+        self._cameras.draw(self._images, dict.fromkeys(self._cameras.cameras, mask))
         return {name: image[:n] for name, image in self._images.items()}
 
     def close(self) -> None:
@@ -171,11 +154,6 @@ class StateRenderer:
         self._sim.synchronize()
         self._cameras.close()
         self._sim.close()
-
-
-def cuda_name(device: str) -> str:
-    """The GPU's name."""
-    return torch.cuda.get_device_name(device)
 
 
 def cuda_uuid(device: str) -> str:

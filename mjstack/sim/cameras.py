@@ -58,7 +58,7 @@ class Cameras(ABC):
         self._nworld = nworld
         self._device = device
         check_image_memory(model, cameras, nworld, device, mjwarp=self.mjwarp)
-        of_geoms = [_thing(model, geom) for geom in range(model.ngeom)]
+        of_geoms = [thing_of(model, geom) for geom in range(model.ngeom)]
         self.labels = list(dict.fromkeys(of_geoms))
         self._label_of_geom = [self.labels.index(name) for name in of_geoms]
 
@@ -85,27 +85,24 @@ class Cameras(ABC):
 
     @abstractmethod
     def draw(self, out: Mapping[str, Tensor], masks: Masks) -> None:
-        """Draw cameras into buffers of `allocate`. The images of other worlds stay.
-
-        Args:
-            out: The buffers.
-            masks: Which cameras are drawn in which worlds.
+        """Draw the cameras and worlds of the masks into buffers of `allocate`. The images of other
+        worlds stay.
 
         Raises:
             MjstackError: This machine cannot draw.
         """
 
-    @abstractmethod
     def close(self) -> None:
-        """Give what drawing needs back."""
+        """Give what drawing needs back; MJWarp's memory goes with the last reference."""
+        return
 
 
-def color_cameras(
-    cameras: Mapping[str, CameraCfg], names: Sequence[str] | None = None
+def with_outputs(
+    cameras: Mapping[str, CameraCfg], outputs: Sequence[str], names: Sequence[str] | None = None
 ) -> dict[str, CameraCfg]:
-    """Some cameras, or all, with colours as their only output."""
+    """Some cameras, or all, with other outputs; none draws the ends of episodes."""
     chosen = cameras if names is None else names
-    return {name: replace(cameras[name], outputs=["rgb"], terminal=False) for name in chosen}
+    return {name: replace(cameras[name], outputs=[*outputs], terminal=False) for name in chosen}
 
 
 def image_bytes(
@@ -117,8 +114,8 @@ def image_bytes(
         dtype, shape = _TYPES[output]
         pixel = (1 + camera.terminal) * dtype.itemsize * math.prod(shape)
         size += math.prod(camera.size) * (pixel + mjwarp * _RENDERED[output])
-    drawn = sum(int(group) in VISIBLE_GROUPS for group in model.geom_group)
-    return nworld * (size + mjwarp * drawn * _PER_GEOM)
+    visible = sum(int(group) in VISIBLE_GROUPS for group in model.geom_group)
+    return nworld * (size + mjwarp * visible * _PER_GEOM)
 
 
 def check_image_memory(
@@ -133,13 +130,13 @@ def check_image_memory(
     size = image_bytes(model, cameras, nworld, mjwarp=mjwarp)
     free = free_memory(device)
     if size > free:
-        sizes = {name: f"{camera.size[0]}x{camera.size[1]}" for name, camera in cameras.items()}
-        shown = ", ".join(f"{name} {pixels}" for name, pixels in sizes.items())
+        sizes = {name: "x".join(map(str, camera.size)) for name, camera in cameras.items()}
+        listing = ", ".join(f"{name} {pixels}" for name, pixels in sizes.items())
         expected = (
             f"images that fit into the memory of {device}, where {nworld} worlds need"
             f" {size / 2**30:.3g} GiB and {free / 2**30:.3g} GiB are free"
         )
-        raise ConfigError("scene.cameras", shown, expected, "Lower nworld, or the cameras' size")
+        raise ConfigError("scene.cameras", listing, expected, "Lower nworld, or the cameras' size")
 
 
 def _outputs(cameras: Mapping[str, CameraCfg]) -> Iterator[tuple[str, CameraCfg, str]]:
@@ -148,7 +145,7 @@ def _outputs(cameras: Mapping[str, CameraCfg]) -> Iterator[tuple[str, CameraCfg,
             yield name, camera, output
 
 
-def _thing(model: mujoco.MjModel, geom: int) -> str:
+def thing_of(model: mujoco.MjModel, geom: int) -> str:
     """The thing that a geom belongs to."""
     body = model.geom_bodyid[geom]
     return (model.body(body).name or f"body_{body}") if body else model.geom(geom).name or "world"

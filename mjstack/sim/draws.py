@@ -68,7 +68,6 @@ def _philox_uniform(
 
 
 def draw_uniform(
-    *,
     key: torch.Tensor,
     stream: int,
     world: torch.Tensor,

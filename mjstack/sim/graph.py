@@ -106,17 +106,15 @@ class StepGraph:
         check_interrupt()
         if self._version() != self._seen:
             self.drop()
-        if self._mode == "off" or self._failed:
-            self._work()
-            return
         if self._replay is not None:
             self._replay()
+        elif self._mode == "off" or self._failed:
+            self._work()
         elif not self._warm:
             self._warm_up()
-        elif self._capture():
-            self()  # capturing does not run anything
         else:
-            self._work()
+            self._capture()
+            self()  # capturing does not run anything; where it failed, the work runs eagerly
 
     def drop(self) -> None:
         """Clear the capture: the next call runs eagerly again, and the one after it captures."""
@@ -137,7 +135,7 @@ class StepGraph:
         self._warm = True
         self.warm_up_seconds = time.perf_counter() - began
 
-    def _capture(self) -> bool:
+    def _capture(self) -> None:
         """Capture the work; Python's collector waits, so that nothing is freed in the middle of
         it.
         """
@@ -153,7 +151,7 @@ class StepGraph:
                 capture = self._capture_cuda if device.is_cuda else self._capture_cpu
                 self._replay = capture(device)
         except Exception as error:
-            culprit = f" because of {found}" if (found := self._culprit()) else ""
+            culprit = f" because of {term}" if (term := self._culprit()) else ""
             failure = MjstackError(
                 f"{self._name} cannot be captured{culprit} ({first_line(error)}): expected fixed"
                 " shapes and no host read (.item(), .cpu(), nonzero, if tensor)",
@@ -166,12 +164,11 @@ class StepGraph:
                 raise failure from error
             self._failed = True
             log.warning("%s It runs eagerly.", failure)
-            return False
+        else:
+            self.capture_seconds = time.perf_counter() - began
         finally:
             if collecting:
                 gc.enable()
-        self.capture_seconds = time.perf_counter() - began
-        return True
 
     def _capture_cuda(self, device: wp.Device) -> Callable[[], None]:
         from mjstack.sim.warp_setup import torch_stream_scope, wp
@@ -259,7 +256,7 @@ class Scratch:
         self._free[self._owner[ptr], size].append(ptr)
 
 
-def side_by_side(device: torch.device, *works: Callable[[], None], branches: bool = True) -> None:
+def side_by_side(device: torch.device, *works: Callable[[], None]) -> None:
     """Do independent works: in a CUDA graph that is being captured as parallel branches, else one
     after the other.
 
@@ -267,9 +264,8 @@ def side_by_side(device: torch.device, *works: Callable[[], None], branches: boo
         device: Where they run.
         works: No one may write what another reads or writes, nor keep a temporary that another one
             uses.
-        branches: False for one after the other in any case.
     """
-    if not branches or device.type != "cuda" or not torch.cuda.is_current_stream_capturing():
+    if device.type != "cuda" or not torch.cuda.is_current_stream_capturing():
         for work in works:
             work()
         return

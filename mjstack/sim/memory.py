@@ -16,8 +16,8 @@ _LIMITS = (
 def available_memory() -> int:
     """Memory that this process may still take, in bytes: the system's, or its container's."""
     text = "".join(path.read_text() for path in map(Path, _LIMITS) if path.exists())
-    found = re.findall(r"(?m)^(?:MemAvailable: +(\d+) kB|(\d+))$", text)
-    return min((1024 * int(kib or 0) or int(limit) for kib, limit in found), default=sys.maxsize)
+    limits = re.findall(r"(?m)^(?:MemAvailable: +(\d+) kB|(\d+))$", text)
+    return min((1024 * int(kib or 0) or int(limit) for kib, limit in limits), default=sys.maxsize)
 
 
 def free_memory(device: torch.device) -> int:

@@ -1,5 +1,6 @@
 """MuJoCo Warp: thousands of worlds on CUDA, or on Warp's CPU device for checks."""
 
+# No `from __future__ import annotations` here: Warp reads the annotations as objects.
 import logging
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -9,26 +10,22 @@ import mujoco
 import torch
 
 from mjstack.config.schema import CameraCfg
-from mjstack.errors import UnsupportedModel, first_line
-from mjstack.sim import fused, fused_smooth
+from mjstack.errors import MjstackError, first_line
 from mjstack.sim.cameras import Cameras
+from mjstack.sim.fused.launch import arguments
+from mjstack.sim.fused.smooth import positions
+from mjstack.sim.fused.step import StepPlan, plan_step, rearranged_step
 from mjstack.sim.graph import StepGraph, inside_graph, side_by_side
 from mjstack.sim.mjwarp_cameras import MjwarpCameras
 from mjstack.sim.model_fields import PLACING_FIELDS, Fields, check_fields
+from mjstack.sim.mujoco_warp import mjw
 from mjstack.sim.simulation import Simulation, named_options
 from mjstack.sim.sizes import BatchSizes
-from mjstack.sim.substep import (
-    ARRANGEMENTS,
-    Arrangement,
-    can_rearrange,
-    place_static_geoms,
-    rearranged_step,
-)
 from mjstack.sim.usage import Usage
-from mjstack.sim.warp_setup import mjw, torch_stream_scope, wp
+from mjstack.sim.warp_setup import torch_stream_scope, wp
 
 log = logging.getLogger(__name__)
-_tell = cache(log.info)  # once per process
+_log_once = cache(log.info)  # in a process
 
 
 class MjwarpSimulation(Simulation):
@@ -39,7 +36,7 @@ class MjwarpSimulation(Simulation):
     steps of one `step(n)` are captured into a graph, unless they are a part of a larger one.
 
     Attributes:
-        arrangement: How a captured step is arranged.
+        plan: How a physics step is done.
     """
 
     backend = "mjwarp"
@@ -55,20 +52,13 @@ class MjwarpSimulation(Simulation):
         fields: Sequence[str] = (),
         step: str = "auto",
     ) -> None:
-        """Upload the model and allocate nworld worlds at qpos0.
-
-        Args:
-            model: The compiled model.
-            nworld: Number of worlds.
-            sizes: Buffer sizes.
-            device: ``"cpu"`` or ``"cuda:N"``.
-            graph: Whether `step` replays a captured graph.
-            fields: Model fields that may differ from world to world.
-            step: How a physics step is done.
+        """Upload the model and allocate the worlds at qpos0, on ``"cpu"`` or ``"cuda:N"``. Graph
+        and step are ``graph`` and ``sim.step`` of the configuration; other arguments as of
+        `make_simulation`.
 
         Raises:
             UnknownName: A field does not exist, or cannot differ.
-            UnsupportedModel: MJWarp, or the step, does not implement a feature of the model.
+            MjstackError: MJWarp does not implement a feature of the model.
         """
         self.model = model
         self.nworld = nworld
@@ -88,25 +78,21 @@ class MjwarpSimulation(Simulation):
                     warnings.filterwarnings("error", category=UserWarning)
                     self._m = mjw.put_model(model, batch_sizes=dict.fromkeys(names, nworld))
             except (NotImplementedError, ValueError, UserWarning) as error:
-                raise UnsupportedModel(
+                raise MjstackError(
                     f"MJWarp does not support this model: {first_line(error)}",
                     "Remove the feature from the model, or run sim=native",
                 ) from error
             self._m.opt.disableflags |= int(mjw.DisableBit.NATIVECCD)
             self._m.opt.warn_overflow = 0
-            self._d = mjw.make_data(model, nworld=nworld, **sizes.as_kwargs(nworld))
-            self._best, self._why = self._best_step()
-            step = self._resolve(step)
-            self._smooth_applies = self._best == "fused" and not fused_smooth.why_not(self._m)
-            self._usage = usage = Usage(model, nworld, self.device)
+            self._d = mjw.make_data(model, nworld=nworld, **sizes.as_kwargs())
+            stock = step == "stock"
+            self.plan = StepPlan() if stock else plan_step(model, self._m, self._d)
+            self._usage = Usage(model, nworld, self.device)
 
-        self.arrangement = ARRANGEMENTS[step]
-        described = f"{step} step"
-        if self._why and step == self._best:
-            described += f" ({self._why})"
-            _tell(f"sim.step: {described}")
+        if self.plan.reason:
+            _log_once(f"sim.step: {self.plan}")
         self.description = (
-            f"MuJoCo Warp {mjw.__version__}, Warp {wp.__version__}, {name}, {described}"
+            f"MuJoCo Warp {mjw.__version__}, Warp {wp.__version__}, {name}, {self.plan}"
         )
 
         # Views of state, fields and counters
@@ -124,17 +110,18 @@ class MjwarpSimulation(Simulation):
             }
         )
         self.constraint_count = wp.to_torch(self._d.nefc)
-        self.contact_count = usage.contacts
-        self.peak_contacts = usage.peak_contacts
-        self.peak_constraints = usage.peak_rows
-        self.peak_pool = usage.peak_pool
-        self.overflow = usage.overflow
-        self.solver_limits = usage.limits
-        self.step_count = usage.steps
-        self._erased = tuple(torch.zeros_like(usage.overflow) for _ in range(3))
+        for name, view in self._usage.views.items():
+            setattr(self, name, view)
+        self._erased = tuple(torch.zeros_like(self.overflow) for _ in range(3))
         self._mask = torch.zeros(nworld, dtype=torch.bool, device=self.device)
         self._selected = wp.from_torch(self._mask)
-        self._warm_up()
+
+        # Compile and load every kernel, then leave the worlds as new
+        with torch_stream_scope(self._device):
+            self._decimation(1, kinematics=True)
+        self.synchronize()
+        self.reset()
+        self.synchronize()
 
     def step(self, n: int = 1, *, kinematics: bool = False) -> None:
         """Advance every world by n physics steps under the current ctrl; the poses follow with
@@ -151,7 +138,7 @@ class MjwarpSimulation(Simulation):
         with torch_stream_scope(self._device):
             self._place()
             mjw.forward(self._m, self._d)
-            self._usage.count(self._m, self._d, steps=0)
+        self.latch()
 
     def kinematics(self, mask: torch.Tensor | None = None) -> None:
         """Bring the poses of all worlds up to the current qpos: a mask would save nothing."""
@@ -167,7 +154,7 @@ class MjwarpSimulation(Simulation):
         self._keep_peaks(mask)
         if mask is None:
             self._mask.fill_(True)
-            self._usage.peak_pool.zero_()
+            self._usage.views["peak_pool"].zero_()
         else:
             self._mask.copy_(mask)
         with torch_stream_scope(self._device):
@@ -199,47 +186,20 @@ class MjwarpSimulation(Simulation):
             with torch_stream_scope(self._device):
                 mjw.step(self._m, self._d)
 
-        return StepGraph(
-            work,
-            self.device,
-            self._graph_mode,
-            name="a bare step",
-            scratch=False,
-        )
+        return StepGraph(work, self.device, self._graph_mode, name="a bare step", scratch=False)
 
     def graph_of(self, n: int = 1, *, kinematics: bool = False) -> StepGraph:
         """The graph that `step(n)` replays."""
         key = (n, kinematics)
         if key not in self._graphs:
-            self._graphs[key] = StepGraph(
-                lambda: self._decimation(n, kinematics),
-                self.device,
-                self._graph_mode,
-                name=f"step({n})",
-                scratch=self.arrangement.scratch,
-            )
+            work = partial(self._decimation, *key)
+            self._graphs[key] = StepGraph(work, self.device, self._graph_mode, name=f"step({n})")
         return self._graphs[key]
 
     def latch(self) -> None:
         """Record what the worlds use and have lost by now; `step` does it by itself."""
         with torch_stream_scope(self._device):
             self._usage.count(self._m, self._d, steps=0)
-
-    def arrange(self, arrangement: Arrangement) -> None:
-        """Choose how a captured step is arranged, for measurements.
-
-        Raises:
-            UnsupportedModel: The arrangement leaves out something that the model needs.
-        """
-        if not self.allows(arrangement):
-            raise UnsupportedModel(f"this step does not apply: {self._why}", "Choose another")
-        self.arrangement = arrangement
-        self._graphs.clear()
-
-    def allows(self, arrangement: Arrangement) -> bool:
-        """Whether an arrangement does all that the model needs."""
-        best = ARRANGEMENTS[self._best]
-        return arrangement.own_stages <= best.own_stages and arrangement.fused <= best.fused
 
     def synchronize(self) -> None:
         """Wait for the device."""
@@ -252,8 +212,7 @@ class MjwarpSimulation(Simulation):
     def _decimation(self, n: int, kinematics: bool) -> None:
         self._place()
         count = partial(self._usage.count, self._m, self._d, steps=1)
-        arrangement = self.arrangement
-        if not arrangement.own_stages:
+        if self.plan.name == "stock":
             for _ in range(n):
                 mjw.step(self._m, self._d)
                 count()
@@ -263,62 +222,17 @@ class MjwarpSimulation(Simulation):
         # The use of a step is counted while the next one begins, which touches neither contacts nor
         # rows.
         beside: tuple[Callable[[], None], ...] = ()
+        step = partial(rearranged_step, self._m, self._d, self.device, self.plan)
         for i in range(n):
-            rearranged_step(
-                self._m,
-                self._d,
-                self.device,
-                sensors=i == n - 1 or not arrangement.sensors_once,
-                branches=arrangement.branches,
-                own=arrangement.fused,
-                smooth=self._smooth(),
-                beside_kinematics=beside,
-            )
+            step(sensors=i == n - 1, beside_kinematics=beside)
             beside = (count,)
-        side_by_side(
-            self.device,
-            *((self._pose,) if kinematics else ()),
-            *beside,
-            branches=arrangement.branches,
-        )
-
-    def _best_step(self) -> tuple[str, str]:
-        """The fastest step that does all that the model needs, and why it is not faster."""
-        if not can_rearrange(self.model, self._m):
-            return "stock", "the model has features that only mujoco_warp.step knows"
-        why = fused.why_not(self._m, self._d)
-        if why:
-            return "arranged", why
-        slower = {
-            "contact rows": fused.why_not_rows(self._m),
-            "smooth dynamics": fused_smooth.why_not(self._m),
-        }
-        return "fused", "; ".join(
-            f"MJWarp's {part}, because {why}" for part, why in slower.items() if why
-        )
-
-    def _smooth(self) -> bool:
-        """Whether smooth dynamics are three kernels."""
-        return self.arrangement.fused and self.arrangement.smooth and self._smooth_applies
-
-    def _resolve(self, asked: str) -> str:
-        """The step that is done."""
-        if asked == "auto":
-            return self._best
-        if not self.allows(ARRANGEMENTS[asked]):
-            raise UnsupportedModel(
-                f"sim.step={asked} does not apply: {self._why}", "Use sim.step=auto"
-            )
-        return asked
+        side_by_side(self.device, *((self._pose,) if kinematics else ()), *beside)
 
     def _pose(self) -> None:
         """Poses of the current qpos, and nothing that a later step would start from: its forward
         computes them anew.
         """
-        if self._smooth():
-            fused_smooth.positions(self._m, self._d)
-        else:
-            mjw.kinematics(self._m, self._d)
+        (positions if self.plan.smooth else mjw.kinematics)(self._m, self._d)
         self._place(posed=True)
 
     def _place(self, *, posed: bool = False) -> None:
@@ -334,23 +248,34 @@ class MjwarpSimulation(Simulation):
         wp.launch(
             place_static_geoms,
             dim=(self.nworld, m.ngeom),
-            inputs=[
-                m.body_rootid,
-                m.body_weldid,
-                m.body_mocapid,
-                m.geom_bodyid,
-                m.geom_pos,
-                m.geom_quat,
-                d.xpos,
-                d.xquat,
-            ],
-            outputs=[d.geom_xpos, d.geom_xmat],
+            inputs=[*arguments(place_static_geoms, m, d)],
         )
 
-    def _warm_up(self) -> None:
-        """Compile and load every kernel, then leave the worlds as new."""
-        with torch_stream_scope(self._device):
-            self._decimation(1, kinematics=True)
-        self.synchronize()
-        self.reset()
-        self.synchronize()
+
+@wp.kernel(enable_backward=False)
+def place_static_geoms(
+    body_rootid: wp.array[int],
+    body_weldid: wp.array[int],
+    body_mocapid: wp.array[int],
+    geom_bodyid: wp.array[int],
+    geom_pos: wp.array2d[wp.vec3],
+    geom_quat: wp.array2d[wp.quat],
+    xpos: wp.array2d[wp.vec3],
+    xquat: wp.array2d[wp.quat],
+    geom_xpos: wp.array2d[wp.vec3],
+    geom_xmat: wp.array2d[wp.mat33],
+) -> None:
+    """Write the poses of exactly those geoms that MJWarp's kinematics leaves out. Warp's own
+    quaternions are xyzw.
+    """
+    world, geom = wp.tid()  # type: ignore[misc]
+    body = geom_bodyid[geom]
+    if body_weldid[body] != 0 or body_mocapid[body_rootid[body]] != -1:
+        return
+    # Fields that the worlds share have one row.
+    p = geom_pos[world % geom_pos.shape[0], geom]
+    g = geom_quat[world % geom_quat.shape[0], geom]
+    b = xquat[world, body]
+    q = wp.quat(b[1], b[2], b[3], b[0])
+    geom_xpos[world, geom] = xpos[world, body] + wp.quat_rotate(q, p)
+    geom_xmat[world, geom] = wp.quat_to_matrix(wp.normalize(q * wp.quat(g[1], g[2], g[3], g[0])))

@@ -1,17 +1,18 @@
 """Cameras of MuJoCo Warp: its ray caster, and kernels that bring what it draws into tensors."""
 
 # No `from __future__ import annotations` here: Warp reads the annotations as objects.
-import math
 from collections.abc import Collection, Mapping
 
 import mujoco
 import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from mjstack.config.schema import CameraCfg
 from mjstack.sim.cameras import PREFIXES, VISIBLE_GROUPS, Cameras, Masks
-from mjstack.sim.warp_setup import mjw, torch_stream_scope, wp
+from mjstack.sim.mujoco_warp import mjw
+from mjstack.sim.warp_setup import torch_stream_scope, wp
 
 _AWAY = 1e6  # m above everything: where cameras that draw nothing look up from
 TILE = 8
@@ -39,14 +40,8 @@ class MjwarpCameras(Cameras):
         fields: Collection[str],
         cameras: Mapping[str, CameraCfg],
     ) -> None:
-        """Build the renderer, and compile it.
-
-        Args:
-            model: The compiled model.
-            m: The same on the device.
-            d: The worlds.
-            fields: Model fields that differ from world to world.
-            cameras: The cameras by name.
+        """Build the renderer of the worlds ``d``, and compile it. The model is also on the device,
+        ``m``; ``fields`` are the names of those that differ from world to world.
         """
         self._m = m
         m.block_dim.render = BLOCK_DIM
@@ -54,24 +49,23 @@ class MjwarpCameras(Cameras):
         self._wp_device = device = m.geom_type.device
         super().__init__(model, d.nworld, torch.device(wp.device_to_torch(device)), cameras)
         dynamic = "cam_fovy" in fields
-        wanted = {
+        requested = {
             output: [output in camera.outputs for camera in cameras.values()] for output in PREFIXES
         }
-        ambient = "light_ambient" in fields or bool(model.light_ambient.any())
-        specular = (
-            "light_specular" in fields
-            or bool(model.light_specular.any())
-            or any(model.vis.headlight.specular)
+        ambient, specular = (
+            name in fields or bool(getattr(model, name).any())
+            for name in ("light_ambient", "light_specular")
         )
+        specular |= bool(model.vis.headlight.specular.any())
         with wp.ScopedDevice(device):
             # What the model has not is compiled out.
             self._context = mjw.create_render_context(
                 model,
                 d.nworld,
                 cam_res=[(width, height) for height, width in (c.size for c in cameras.values())],
-                render_rgb=wanted["rgb"],
-                render_depth=wanted["depth"],
-                render_seg=wanted["segmentation"],
+                render_rgb=requested["rgb"],
+                render_depth=requested["depth"],
+                render_seg=requested["segmentation"],
                 use_textures=model.ntex > 0,
                 enabled_geom_groups=list(VISIBLE_GROUPS),
                 cam_active=list(cameras),
@@ -83,21 +77,19 @@ class MjwarpCameras(Cameras):
             )
             self._labels = wp.array(self._label_of_geom, dtype=int)
             # Rays that are computed for each world know their pixel by their number.
-            self._places = wp.array(self._arrange_rays(1 if dynamic else TILE), dtype=int)
+            places = self._arrange_rays(1 if dynamic else TILE)
+            self._places = [wp.array(rays, dtype=int) for rays in places]
         self._numbers = {name: number for number, name in enumerate(cameras)}
         self._due = torch.ones((d.nworld, len(cameras)), dtype=torch.bool, device=self._device)
         self.draw({}, {})  # compiles
 
+    @override
     def draw(self, out: Mapping[str, Tensor], masks: Masks) -> None:
-        """See `Cameras`."""
         rc = self._context
         whole = all(name in masks and masks[name] is None for name in self.cameras)
         for name, number in self._numbers.items():
             mask = masks.get(name)
-            if mask is None:
-                self._due[:, number] = name in masks
-            else:
-                self._due[:, number] = mask
+            self._due[:, number] = name in masks if mask is None else mask
         due = wp.from_torch(self._due)
         with torch_stream_scope(self._wp_device):
             mjw.camlight(self._m, self._d)
@@ -113,38 +105,28 @@ class MjwarpCameras(Cameras):
             for name in masks:
                 self._copy(out, name, due)
 
-    def _arrange_rays(self, tile: int) -> np.ndarray:
+    def _arrange_rays(self, tile: int) -> list[np.ndarray]:
         """Order the rays of each camera by squares of pixels.
 
         Returns:
-            The ray of each pixel among those of its camera, one camera after the other.
+            For each camera the ray of each pixel among those of the camera.
         """
-        rc = self._context
-        places = []
-        order = []
-        first = 0
+        orders = []
         for camera in self.cameras.values():
             y, x = np.indices(camera.size).reshape(2, -1)
-            pixels = np.lexsort((x, y, x // tile, y // tile))
-            places.append(np.argsort(pixels))
-            order.append(first + pixels)
-            first += len(pixels)
-        rays = np.concatenate(order)
+            orders.append(np.lexsort((x, y, x // tile, y // tile)))
+        first = np.cumsum([0, *map(len, orders)])
+        rays = np.concatenate([start + order for start, order in zip(first, orders, strict=False)])
         for name in ("ray", "ray_offset"):
-            values = getattr(rc, name)
+            values = getattr(self._context, name)
             values.assign(values.numpy()[rays])
-        return np.concatenate(places)
-
-    def close(self) -> None:
-        """See `Cameras`; the memory goes with the last reference."""
+        return [np.argsort(order) for order in orders]
 
     def _copy(self, out: Mapping[str, Tensor], name: str, due: wp.array) -> None:
         """Copy what a camera has drawn into its buffers."""
         rc = self._context
         camera = self.cameras[name]
         number = self._numbers[name]
-        before = list(self.cameras.values())[:number]
-        first = sum(math.prod(other.size) for other in before)
         copies = {
             "rgb": (copy_rgb, [rc.rgb_data, rc.rgb_adr]),
             "depth": (copy_depth, [rc.depth_data, rc.depth_adr]),
@@ -156,7 +138,7 @@ class MjwarpCameras(Cameras):
             wp.launch(
                 kernel,
                 dim=(self._nworld, *camera.size),
-                inputs=[due, number, self._places[first:], *inputs],
+                inputs=[due, number, self._places[number], *inputs],
                 outputs=[wp.from_torch(image)],
             )
 
@@ -182,14 +164,14 @@ def copy_rgb(
     due: wp.array2d[bool],
     number: int,
     places: wp.array[int],
-    drawn: wp.array2d[wp.uint32],
+    pixels: wp.array2d[wp.uint32],
     first: wp.array[int],
     out: wp.array4d[wp.uint8],
 ) -> None:
     """Red, green and blue of the worlds that are due, from words of alpha, red, green and blue."""
     world, y, x = wp.tid()  # type: ignore[misc]
     if due[world, number]:
-        word = drawn[world, first[number] + places[y * out.shape[2] + x]]
+        word = pixels[world, first[number] + places[y * out.shape[2] + x]]
         out[world, y, x, 0] = wp.uint8(word >> wp.uint32(16))
         out[world, y, x, 1] = wp.uint8(word >> wp.uint32(8))
         out[world, y, x, 2] = wp.uint8(word)
@@ -200,14 +182,14 @@ def copy_depth(
     due: wp.array2d[bool],
     number: int,
     places: wp.array[int],
-    drawn: wp.array2d[float],
+    pixels: wp.array2d[float],
     first: wp.array[int],
     out: wp.array4d[float],
 ) -> None:
     """Depth of the worlds that are due."""
     world, y, x = wp.tid()  # type: ignore[misc]
     if due[world, number]:
-        out[world, y, x, 0] = drawn[world, first[number] + places[y * out.shape[2] + x]]
+        out[world, y, x, 0] = pixels[world, first[number] + places[y * out.shape[2] + x]]
 
 
 @wp.kernel(enable_backward=False)
@@ -215,7 +197,7 @@ def copy_labels(
     due: wp.array2d[bool],
     number: int,
     places: wp.array[int],
-    drawn: wp.array2d[wp.vec2i],
+    pixels: wp.array2d[wp.vec2i],
     first: wp.array[int],
     labels: wp.array[int],
     out: wp.array3d[int],
@@ -223,7 +205,7 @@ def copy_labels(
     """Labels of the geoms that the worlds which are due show; -1 where there is none."""
     world, y, x = wp.tid()  # type: ignore[misc]
     if due[world, number]:
-        geom = drawn[world, first[number] + places[y * out.shape[2] + x]][0]
+        geom = pixels[world, first[number] + places[y * out.shape[2] + x]][0]
         if geom >= 0:
             out[world, y, x] = labels[geom]
         else:

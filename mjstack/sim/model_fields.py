@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import torch
 
-from mjstack.errors import MjstackError, RebindError, UnknownName
+from mjstack.errors import MjstackError, UnknownName
 
 # The float arrays that `mujoco_warp.put_model` batches, as of 4.0, by the first word of MuJoCo's
 # names; a test compares them with the installed version. Left out: integers, which are the model's
@@ -37,6 +37,9 @@ _NAMES = {
         " ctrlrange gear acc0 lengthrange"
     ),
 }
+REBOUND = (
+    "{0} is a view of the simulation's memory and cannot be rebound: write {0}[:] = ... instead"
+)
 FIELD_NAMES = tuple(
     f"{first}_{rest}" if rest else first
     for first, words in _NAMES.items()
@@ -74,7 +77,7 @@ class Fields(dict[str, torch.Tensor]):
         # Python ends `fields[name] *= 2` by setting the item to the tensor that it has just changed
         # in place.
         if self[name] is not value:
-            raise RebindError(f"sim.fields['{name}']")
+            raise MjstackError(REBOUND.format(f"sim.fields['{name}']"))
 
 
 class SimpleBodies:

@@ -9,9 +9,10 @@ import mujoco
 import numpy as np
 import torch
 from mujoco.batch import Batch
+from typing_extensions import override
 
 from mjstack.config.schema import CameraCfg
-from mjstack.errors import UnsupportedModel, first_line
+from mjstack.errors import MjstackError, first_line
 from mjstack.interrupt import check_interrupt
 from mjstack.sim.cameras import Cameras
 from mjstack.sim.model_fields import Fields, SimpleBodies, check_fields
@@ -19,7 +20,8 @@ from mjstack.sim.native_cameras import NativeCameras
 from mjstack.sim.simulation import Overflow, Simulation, named_options
 
 _COUNTS = ("ncon", "nefc")
-_OTHERS = ("qfrc_actuator", "sensordata")
+_RESULTS = ("qfrc_actuator", "sensordata")
+_COUNTERS = ("contact_count", "constraint_count", "peak_contacts", "peak_constraints", "overflow")
 _POSES = ("xpos", "xquat", "site_xpos", "geom_xpos")
 _OVERFLOWS = {
     mujoco.mjtWarning.mjWARN_CONTACTFULL: Overflow.NARROWPHASE,
@@ -41,8 +43,8 @@ _STEPS = 4096  # of a thread in one call of MuJoCo's, which no interrupt ends: s
 
 def available_cores() -> int:
     """Cores that this process may use: under torchrun its share of the machine's."""
-    found = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return max(1, (found or 1) // int(os.environ.get("LOCAL_WORLD_SIZE", 1)))
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return max(1, (cores or 1) // int(os.environ.get("LOCAL_WORLD_SIZE", 1)))
 
 
 class NativeSimulation(Simulation):
@@ -69,17 +71,12 @@ class NativeSimulation(Simulation):
         fields: Sequence[str] = (),
         nthread: int | None = None,
     ) -> None:
-        """Allocate nworld worlds at qpos0.
-
-        Args:
-            model: The compiled model.
-            nworld: Number of worlds.
-            fields: Model fields that may differ from world to world.
-            nthread: Threads; all cores by default.
+        """Allocate the worlds at qpos0, for some threads, by default all cores; other arguments as
+        of `make_simulation`.
 
         Raises:
             UnknownName: A field does not exist, or cannot differ.
-            UnsupportedModel: The model sleeps, or has IPC contacts: what MuJoCo keeps of these from
+            MjstackError: The model sleeps, or has IPC contacts: what MuJoCo keeps of these from
                 step to step is not in the state.
         """
         names = check_fields(fields)
@@ -92,15 +89,15 @@ class NativeSimulation(Simulation):
             f"MuJoCo {mujoco.__version__} on {nthread} thread{'s' if nthread > 1 else ''},"
             f" {platform.machine()} CPU"
         )
-        own = copy.copy(m)
+        stepped = copy.copy(m)
         # MuJoCo skips an offset that was zero when it compiled: these flags make it read the field.
         for kind, offsets in _SAMEFRAME.items():
             if not offsets.isdisjoint(names):
-                getattr(own, kind)[:] = int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE)
+                getattr(stepped, kind)[:] = int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE)
         try:
-            self.batch = batch = Batch(own, nworld, nthread)
+            self.batch = batch = Batch(stepped, nworld, nthread)
         except ValueError as error:
-            raise UnsupportedModel(
+            raise MjstackError(
                 f"MuJoCo cannot step many worlds of this model: {first_line(error)}",
                 "Remove the feature from the model",
             ) from error
@@ -115,22 +112,14 @@ class NativeSimulation(Simulation):
         # The position stage, which brings poses up to date, would leave another world's numbers in
         # the rest: that is copied out before.
         self._poses = [batch.bind(name) for name in _POSES]
-        for name, array in zip(_POSES, self._poses, strict=True):
+        for array in self._poses:
             array.flags.writeable = True  # a diverged world's become NaN
+        self._bound = {name: batch.bind(name) for name in (*_RESULTS, *_COUNTS)}
+        self._copies = {name: self._bound[name].copy() for name in _RESULTS}
+        self._counts = np.zeros((nworld, len(_COUNTERS)), dtype=np.int32)
+        views = (*_POSES, *_RESULTS, *_COUNTERS)
+        for name, array in zip(views, (*self._derived, *self._counts.T), strict=True):
             setattr(self, name, torch.from_numpy(array))
-        self._found = {name: batch.bind(name) for name in (*_OTHERS, *_COUNTS)}
-        self._others = {name: self._found[name].copy() for name in _OTHERS}
-        for name, array in self._others.items():
-            setattr(self, name, torch.from_numpy(array))
-        # Columns: contacts, rows, peak contacts, peak rows, overflow bits.
-        self._counts = np.zeros((nworld, 5), dtype=np.int32)
-        (
-            self.contact_count,
-            self.constraint_count,
-            self.peak_contacts,
-            self.peak_constraints,
-            self.overflow,
-        ) = torch.from_numpy(self._counts).unbind(1)
         self._erased = torch.zeros((3, nworld), dtype=torch.int32).unbind(0)
         self._steps = np.zeros(nworld, dtype=np.int64)
         self.step_count = torch.from_numpy(self._steps)
@@ -140,7 +129,7 @@ class NativeSimulation(Simulation):
         self._fields = {name: batch.expand(name).astype(float, copy=False) for name in names}
         # MuJoCo has colors and the like in single precision.
         expanded = [(batch.expand(name), values) for name, values in self._fields.items()]
-        self._single = [(own, values) for own, values in expanded if own is not values]
+        self._single = [pair for pair in expanded if pair[0] is not pair[1]]
         self.fields = Fields(
             {name: torch.from_numpy(values) for name, values in self._fields.items()}
         )
@@ -148,8 +137,8 @@ class NativeSimulation(Simulation):
         self._simple = SimpleBodies(m, self._fields, batch.expand("dof_M0")) if derive else None
         self.reset()
 
+    @override
     def step(self, n: int = 1, *, kinematics: bool = False) -> None:
-        """See `Simulation`."""
         if n:
             self._compute(n, kinematics)
         elif kinematics:
@@ -161,25 +150,30 @@ class NativeSimulation(Simulation):
 
     def kinematics(self, mask: torch.Tensor | None = None) -> None:
         """See `Simulation`; the other worlds are not visited."""
-        for worlds in self._visit(self._finite_worlds(self._poses, mask=mask), 1):
+        for worlds in self._visit(self._finite_worlds(self._poses, mask), 1):
             self._pose(worlds)
 
+    @override
     def reset(self, mask: torch.Tensor | None = None) -> None:
-        """See `Simulation`."""
         rows = self._rows(mask)
         self.batch.state[rows] = self._initial
         if "qpos0" in self._fields:
             self.qpos.numpy()[rows] = self._fields["qpos0"][rows]
-        self._others["sensordata"][rows] = 0
+        self._copies["sensordata"][rows] = 0
         self._keep_peaks(mask)
         self._counts[rows] = 0
         self._steps[rows] = 0
 
     @property
+    def _derived(self) -> list[np.ndarray]:
+        """What a step writes besides the state."""
+        return [*self._poses, *self._copies.values()]
+
+    @property
     def world_bytes(self) -> int:
         """Memory that a world takes."""
-        arrays = (self.batch.state, *self._poses, *self._others.values())
-        return sum(a.nbytes for a in (*arrays, *self._fields.values())) // self.nworld
+        arrays = (self.batch.state, *self._derived, *self._fields.values())
+        return sum(array.nbytes for array in arrays) // self.nworld
 
     def option_values(self) -> dict[str, float | int | str]:
         """The physics options of the model."""
@@ -190,12 +184,6 @@ class NativeSimulation(Simulation):
     def make_cameras(self, cameras: Mapping[str, CameraCfg]) -> Cameras:
         """See `Simulation`; their OpenGL contexts open with the first image."""
         return NativeCameras(self.model, self.qpos.numpy(), self._fields, cameras)
-
-    def synchronize(self) -> None:
-        """Nothing to wait for: `step` returns when every thread has."""
-
-    def close(self) -> None:
-        """Nothing to do: the threads sleep, and end with the last view of their memory."""
 
     def _rows(self, mask: torch.Tensor | None) -> np.ndarray:
         """The mask as numpy sees it; every world for None."""
@@ -211,8 +199,8 @@ class NativeSimulation(Simulation):
         gain nothing.
         """
         worlds = np.flatnonzero(self._rows(mask))
-        some = len(worlds) < self.nworld
-        finite = np.isfinite(self._physics[worlds] if some else self._physics).all(axis=1)
+        subset = len(worlds) < self.nworld
+        finite = np.isfinite(self._physics[worlds] if subset else self._physics).all(axis=1)
         if not finite.all():
             for array in derived:
                 array[worlds[~finite]] = np.nan
@@ -230,23 +218,23 @@ class NativeSimulation(Simulation):
         batch = self.batch
         if self._simple is not None:
             self._simple.update()
-        for own, values in self._single:
-            own[:] = values
-        finite = self._finite_worlds([*self._poses, *self._others.values()])
+        for single, values in self._single:
+            single[:] = values
+        finite = self._finite_worlds(self._derived)
         for worlds in self._visit(finite, max(n, 1)):
             self._flags[worlds] = self.model.opt.disableflags
             batch.warning[worlds] = 0
             counts = self._counts[worlds]
+            peaks = counts[:, 2:4]
             if n:
-                counts[:, 2:4] = np.maximum(counts[:, 2:4], self._integrate(worlds, n))
+                np.maximum(peaks, self._integrate(worlds, n), out=peaks)
                 self._steps[worlds] += n
             else:
                 batch.forward(worlds)
-            for name, array in self._others.items():
-                array[worlds] = self._found[name][worlds]
-            for column, name in enumerate(_COUNTS):
-                counts[:, column] = self._found[name][worlds]
-            np.maximum(counts[:, 2:4], counts[:, :2], out=counts[:, 2:4])
+            for name, array in self._copies.items():
+                array[worlds] = self._bound[name][worlds]
+            counts[:, :2] = self._contacts(worlds)
+            np.maximum(peaks, counts[:, :2], out=peaks)
             for warning, bit in _OVERFLOWS.items():
                 counts[batch.warning[worlds, int(warning), 1] > 0, 4] |= int(bit)
             self._counts[worlds] = counts
@@ -259,19 +247,22 @@ class NativeSimulation(Simulation):
         """Step worlds n times; their largest numbers of contacts and rows on the way."""
         batch = self.batch
         begun = batch.bind("time")[worlds]
-        found = batch.rollout(n, record=_COUNTS, ids=worlds)
-        most = np.stack([found[name].max(axis=1) for name in _COUNTS], axis=1)
+        records = batch.rollout(n, record=_COUNTS, ids=worlds)
+        most = np.stack([records[name].max(axis=1) for name in _COUNTS], axis=1)
         # A rollout leaves a world where MuJoCo warned. It goes on step by step.
         warned = np.flatnonzero(batch.warning[worlds, :, 1].any(axis=1))
         if len(warned):
-            taken = (batch.bind("time")[worlds] - begun) / self.model.opt.timestep
-            left = n - np.rint(taken[warned]).astype(int)
+            steps_made = (batch.bind("time")[worlds] - begun) / self.model.opt.timestep
+            left = n - np.rint(steps_made[warned]).astype(int)
             for k in range(left.max()):
                 late = warned[left > k]
                 batch.step(worlds[late])
-                now = [self._found[name][worlds[late]] for name in _COUNTS]
-                most[late] = np.maximum(most[late], np.stack(now, axis=1))
+                most[late] = np.maximum(most[late], self._contacts(worlds[late]))
         return most
+
+    def _contacts(self, worlds: np.ndarray) -> np.ndarray:
+        """Contacts and rows of some worlds now, shape ``(n, 2)``."""
+        return np.stack([self._bound[name][worlds] for name in _COUNTS], axis=1)
 
     def _pose(self, worlds: np.ndarray) -> None:
         """Bring the poses of worlds up to date."""

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from mjstack.config.schema import CameraCfg
 from mjstack.interrupt import check_interrupt
@@ -32,48 +33,42 @@ class NativeCameras(Cameras):
         fields: Mapping[str, np.ndarray],
         cameras: Mapping[str, CameraCfg],
     ) -> None:
-        """Take the worlds.
-
-        Args:
-            model: The compiled model.
-            qpos: The worlds' states, shape ``(nworld, nq)``.
-            fields: Their model fields, each ``(nworld, ...)``.
-            cameras: The cameras by name.
+        """Take the model, the worlds' states, shape ``(nworld, nq)``, and their model fields, each
+        ``(nworld, ...)``.
         """
         super().__init__(model, len(qpos), torch.device("cpu"), cameras)
         self._qpos = qpos
         self._fields = fields
-        self._model = drawn = copy.copy(model)
-        drawn.vis.quality.offsamples = 0
+        self._model = scene_model = copy.copy(model)
+        scene_model.vis.quality.offsamples = 0
         sizes = np.array([camera.size for camera in cameras.values()])
-        drawn.vis.global_.offheight, drawn.vis.global_.offwidth = sizes.max(axis=0)
-        self._far = float(drawn.vis.map.zfar * drawn.stat.extent)
-        self._data = mujoco.MjData(drawn)
+        scene_model.vis.global_.offheight, scene_model.vis.global_.offwidth = sizes.max(axis=0)
+        self._farthest = _FAR * float(scene_model.vis.map.zfar * scene_model.stat.extent)
+        self._data = mujoco.MjData(scene_model)
         self._labels = np.array([*self._label_of_geom, -1], dtype=np.int32)
         self._option = mujoco.MjvOption()
         self._option.geomgroup[:] = 0
         self._option.geomgroup[list(VISIBLE_GROUPS)] = 1
         self._option.sitegroup[:] = 0
-        self._own = threading.local()
+        self._thread = threading.local()
 
+    @override
     def draw(self, out: Mapping[str, Tensor], masks: Masks) -> None:
-        """See `Cameras`."""
         worlds = {
             name: np.arange(self._nworld) if mask is None else mask.nonzero()[:, 0].numpy()
             for name, mask in masks.items()
         }
-        every = sorted({int(world) for some in worlds.values() for world in some})
-        due = {name: set(some.tolist()) for name, some in worlds.items()}
-        for world in every:
+        due = {name: set(numbers.tolist()) for name, numbers in worlds.items()}
+        for world in sorted(set().union(*due.values())):
             check_interrupt()
             self._pose(world)
-            for name, some in due.items():
-                if world in some:
+            for name, numbers in due.items():
+                if world in numbers:
                     self._draw(out, name, world)
 
     def close(self) -> None:
         """See `Cameras`; contexts of other threads end with those."""
-        for renderer in vars(self._own).pop("renderers", {}).values():
+        for renderer in vars(self._thread).pop("renderers", {}).values():
             renderer.close()
 
     def _pose(self, world: int) -> None:
@@ -99,7 +94,7 @@ class NativeCameras(Cameras):
             elif output == "depth":
                 renderer.enable_depth_rendering()
                 depth = renderer.render()
-                image[..., 0] = np.where(depth < _FAR * self._far, depth, 0.0)
+                image[..., 0] = np.where(depth < self._farthest, depth, 0.0)
                 renderer.disable_depth_rendering()
             else:
                 renderer.enable_segmentation_rendering()
@@ -108,7 +103,7 @@ class NativeCameras(Cameras):
 
     def _renderer(self, height: int, width: int) -> mujoco.Renderer:
         """This thread's renderer of images of a size."""
-        renderers = vars(self._own).setdefault("renderers", {})
+        renderers = vars(self._thread).setdefault("renderers", {})
         if (height, width) not in renderers:
             renderers[height, width] = open_renderer(self._model, height, width)
         return renderers[height, width]

@@ -9,12 +9,12 @@ import mujoco
 import torch
 
 from mjstack.config.schema import CameraCfg
-from mjstack.errors import ArgumentError, RebindError
+from mjstack.errors import ArgumentError, MjstackError
 from mjstack.math import describe_tensor
 from mjstack.scene.index import Columns
 from mjstack.sim.cameras import Cameras
 from mjstack.sim.graph import StepGraph
-from mjstack.sim.model_fields import Fields
+from mjstack.sim.model_fields import REBOUND, Fields
 from mjstack.sim.sizes import BatchSizes
 
 
@@ -149,7 +149,7 @@ class Simulation(ABC):
         # the tensor that it has just changed in place.
         bound = self.__dict__.get(name)
         if isinstance(bound, (torch.Tensor, Fields)) and bound is not value:
-            raise RebindError(f"sim.{name}" + "[name]" * isinstance(bound, Fields))
+            raise MjstackError(REBOUND.format(f"sim.{name}" + "[name]" * isinstance(bound, Fields)))
         super().__setattr__(name, value)
 
     def part(self, name: str, columns: Columns | int, *shape: int) -> torch.Tensor:
@@ -168,33 +168,25 @@ class Simulation(ABC):
             return self._parts[key]
         view = getattr(self, name)
         if isinstance(at, torch.Tensor):
-            found = view.index_select(1, at)
-            return found.unflatten(1, shape) if shape else found
+            part = view.index_select(1, at)
+            return part.unflatten(1, shape) if shape else part
         with torch.inference_mode(False):
-            found = view[:, at]
-            self._parts[key] = found.unflatten(1, shape) if shape else found
+            part = view[:, at]
+            self._parts[key] = part.unflatten(1, shape) if shape else part
         return self._parts[key]
 
     @cached_property
     def _parts(self) -> dict[tuple, torch.Tensor]:
         return {}
 
-    @property
-    def most_contacts(self) -> torch.Tensor:
-        """Largest contact_count since the last full reset (one without a mask), shape
-        ``(nworld,)``, int32: the peak of a run in which worlds end and start anew.
+    def lasting_peaks(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Largest contact_count and constraint_count, and bits of `Overflow`, since the last full
+        reset (one without a mask), each of shape ``(nworld,)``, int32: those of a run in which
+        worlds end and start anew.
         """
-        return torch.maximum(self._erased[0], self.peak_contacts)
-
-    @property
-    def most_constraints(self) -> torch.Tensor:
-        """Largest constraint_count over the same time, shape ``(nworld,)``, int32."""
-        return torch.maximum(self._erased[1], self.peak_constraints)
-
-    @property
-    def overflow_ever(self) -> torch.Tensor:
-        """Bits of `Overflow` over the same time, shape ``(nworld,)``, int32."""
-        return self._erased[2] | self.overflow
+        contacts, rows, bits = self._erased
+        most_contacts = torch.maximum(contacts, self.peak_contacts)
+        return most_contacts, torch.maximum(rows, self.peak_constraints), bits | self.overflow
 
     @abstractmethod
     def step(self, n: int = 1, *, kinematics: bool = False) -> None:
@@ -252,25 +244,22 @@ class Simulation(ABC):
     def option_values(self) -> dict[str, float | int | str]:
         """The physics options as this backend holds them, by MuJoCo's names."""
 
-    @abstractmethod
     def synchronize(self) -> None:
-        """Wait for the device."""
+        """Wait for the device. On native MuJoCo `step` returns when every thread has."""
+        return
 
-    @abstractmethod
     def close(self) -> None:
-        """Give threads and buffers back."""
+        """Give buffers back. Native MuJoCo's threads end with the last view of their memory."""
+        return
 
     def check_mask(self, mask: torch.Tensor | None) -> None:
         """Check what can be known of a mask without reading it; `reset` has the error."""
-        expected = f"a torch.bool tensor of shape ({self.nworld},) on {self.device}"
-        if mask is None:
-            return
-        if not isinstance(mask, torch.Tensor) or (mask.dtype, mask.shape, mask.device) != (
-            torch.bool,
-            (self.nworld,),
-            self.device,
+        expected = (torch.bool, (self.nworld,), self.device)
+        if mask is not None and (
+            not isinstance(mask, torch.Tensor) or (mask.dtype, mask.shape, mask.device) != expected
         ):
-            raise ArgumentError("mask", describe_tensor(mask), expected)
+            text = f"a torch.bool tensor of shape ({self.nworld},) on {self.device}"
+            raise ArgumentError("mask", describe_tensor(mask), text)
 
     def _keep_peaks(self, mask: torch.Tensor | None) -> None:
         """Keep the peaks that a reset of some worlds would erase; drop all in a full one."""
@@ -287,9 +276,7 @@ class Simulation(ABC):
 def named_options(option: object) -> dict[str, float | int | str]:
     """Iteration limits and MuJoCo's names of the choices, of a model's or an uploaded option."""
     limits = {name: int(getattr(option, name)) for name in ("iterations", "ls_iterations")}
-    kinds = {
-        "integrator": mujoco.mjtIntegrator,
-        "cone": mujoco.mjtCone,
-        "solver": mujoco.mjtSolver,
+    return limits | {
+        name: getattr(mujoco, f"mjt{name.title()}")(int(getattr(option, name))).name
+        for name in ("integrator", "cone", "solver")
     }
-    return limits | {name: kind(int(getattr(option, name))).name for name, kind in kinds.items()}

@@ -5,7 +5,7 @@ from typing import Any
 
 from mjstack.config.schema import BatchCfg, Config, PlacementsCfg
 
-KEYS = ("nconmax", "njmax", "naconmax", "nccdmax", "naccdmax")
+KEYS = ("nconmax", "njmax", "nccdmax")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -14,52 +14,30 @@ class BatchSizes:
 
     Attributes:
         nconmax: Contacts per world, pooled: one world may have more than its share.
-        naconmax: Contacts of all worlds together, or None for ``nconmax * nworld``.
         njmax: Constraint rows per world, a hard limit.
-        nccdmax: Convex collisions per world, pooled, or None for MJWarp's default.
-        naccdmax: Convex collisions of all worlds together, or None.
+        nccdmax: Convex collisions per world, pooled; None for as many as contacts.
         source: Where they come from, for reports.
     """
 
     nconmax: int
     njmax: int
-    naconmax: int | None = None
     nccdmax: int | None = None
-    naccdmax: int | None = None
     source: str = field(default="the configuration", compare=False)
 
-    def as_kwargs(self, nworld: int) -> dict[str, int]:
-        """Arguments for ``mujoco_warp.make_data``.
-
-        Convex pairs are some of the pairs in the contact pool. MJWarp refuses more room for them
-        than that pool has, so what could never be used is cut off.
-
-        Args:
-            nworld: Number of worlds.
+    @property
+    def convex_room(self) -> int:
+        """Convex collisions per world that fit. They are some of the pairs in the contact pool, so
+        more room than that has is never used, and MJWarp refuses it.
         """
-        kwargs = _given(self)
-        if "nccdmax" in kwargs:
-            kwargs["nccdmax"] = min(
-                kwargs["nccdmax"], self.nconmax, self.contact_pool(nworld) // nworld
-            )
-        if "naccdmax" in kwargs:
-            kwargs["naccdmax"] = min(kwargs["naccdmax"], self.contact_pool(nworld))
-        return kwargs
+        return min(self.nconmax, self.nccdmax or self.nconmax)
 
-    def contact_pool(self, nworld: int) -> int:
-        """Contacts that fit into the pool of nworld worlds."""
-        return self.naconmax if self.naconmax is not None else self.nconmax * nworld
-
-    def convex_pool(self, nworld: int) -> int:
-        """Convex pairs of one kind that fit into the pool of nworld worlds."""
-        kwargs = self.as_kwargs(nworld)
-        share = kwargs.get("nccdmax")
-        pool = self.contact_pool(nworld) if share is None else share * nworld
-        return kwargs.get("naccdmax", pool)
+    def as_kwargs(self) -> dict[str, int]:
+        """Arguments for ``mujoco_warp.make_data``."""
+        return {"nconmax": self.nconmax, "njmax": self.njmax, "nccdmax": self.convex_room}
 
     def as_overrides(self) -> str:
         """The same on the command line: ``batch.nconmax=40 batch.njmax=184``."""
-        return " ".join(f"batch.{name}={value}" for name, value in _given(self).items())
+        return " ".join(f"batch.{name}={value}" for name, value in configured_sizes(self).items())
 
     def __str__(self) -> str:
         return f"{self.as_overrides()} ({self.source})"
@@ -91,7 +69,7 @@ def resolve_measuring_sizes(cfg: Config) -> BatchSizes:
 
 def apply_configured(cfg: Config, sizes: BatchSizes) -> BatchSizes:
     """The sizes, with what the configuration sets in their place."""
-    return replace(sizes, **_given(cfg.batch))
+    return replace(sizes, **configured_sizes(cfg.batch))
 
 
 def _placements(cfg: Config) -> PlacementsCfg:
@@ -99,6 +77,6 @@ def _placements(cfg: Config) -> PlacementsCfg:
     return cfg.robot.placements.get(cfg.scene.name) or PlacementsCfg()
 
 
-def _given(sizes: BatchSizes | BatchCfg) -> dict[str, Any]:
+def configured_sizes(sizes: BatchSizes | BatchCfg) -> dict[str, Any]:
     """The sizes that are set."""
     return {name: value for name in KEYS if (value := getattr(sizes, name)) is not None}

@@ -8,59 +8,45 @@ import mujoco
 import numpy as np
 import torch
 
+from mjstack.sim.mujoco_warp import mjw
 from mjstack.sim.simulation import LOST_PHYSICS
 from mjstack.sim.sizes import BatchSizes
-from mjstack.sim.warp_setup import mjw, wp
+from mjstack.sim.warp_setup import wp
 
 
 class Usage:
     """The use of buffers by each world, now and at most, and the physics that was lost.
 
     Attributes:
-        contacts: ``contact_count`` of `Simulation`.
-        peak_contacts: Its ``peak_contacts``.
-        peak_rows: Its ``peak_constraints``.
-        peak_pool: Its ``peak_pool``.
-        overflow: Its ``overflow``.
-        limits: Its ``solver_limits``.
-        steps: Its ``step_count``.
+        views: The counters, by the names that `Simulation` has for them.
     """
 
     def __init__(self, model: mujoco.MjModel, nworld: int, device: torch.device) -> None:
         """Allocate the counters."""
-        counts = torch.zeros((5, nworld), dtype=torch.int32, device=device)
-        self.contacts, self.peak_contacts, self.peak_rows, self.overflow, self.limits = counts
-        self.peak_pool = torch.zeros(3, dtype=torch.int32, device=device)
-        self.steps = torch.zeros(nworld, dtype=torch.int64, device=device)
-        self._arrays = [wp.from_torch(view) for view in (*counts, self.peak_pool, self.steps)]
-        self._perworld = counts
+        self._counts = torch.zeros((5, nworld), dtype=torch.int32, device=device)
+        self._steps = torch.zeros(nworld, dtype=torch.int64, device=device)
+        pool = torch.zeros(3, dtype=torch.int32, device=device)
+        names = ("contact_count", "peak_contacts", "peak_constraints", "overflow", "solver_limits")
+        self.views = dict(zip(names, self._counts, strict=True))
+        self.views |= {"peak_pool": pool, "step_count": self._steps}
+        self._arrays = [wp.from_torch(view) for view in self.views.values()]
         kinds = convex_kinds(model)
         self._kinds = wp.array(kinds, dtype=int)
         self._kind_counts = wp.zeros(int(kinds.max()) + 1, dtype=int)
 
     def count(self, m: mjw.Model, d: mjw.Data, steps: int) -> None:
         """Count what the worlds use now, and the steps that they have just made."""
-        nworld = len(self.contacts)
-        pool = d.contact.worldid.shape[0]
         # A thread per world, and at least one for every eighth place of the pool, which is mostly
         # empty.
-        stride = max(nworld, pool // 8)
-        contacts, peak_contacts, peak_rows, lost, limits, peak_pool, steps_made = self._arrays
+        stride = max(d.nworld, d.contact.worldid.shape[0] // 8)
+        contacts, *counters, peak_pool, steps_made = self._arrays
         contacts.zero_()
+        used = [d.nacon, d.contact.worldid, d.nefc, d.ncollision, d.overflow]
         wp.launch(
             record_usage,
             dim=stride,
-            inputs=[
-                d.nacon,
-                d.contact.worldid,
-                d.nefc,
-                d.ncollision,
-                d.overflow,
-                LOST_PHYSICS,
-                steps,
-                stride,
-            ],
-            outputs=[contacts, peak_contacts, peak_rows, peak_pool, lost, limits, steps_made],
+            inputs=[*used, LOST_PHYSICS, steps, stride],
+            outputs=[contacts, *counters, peak_pool, steps_made],
         )
         if self._kind_counts.size:
             self._kind_counts.zero_()
@@ -73,8 +59,8 @@ class Usage:
 
     def clear(self, mask: torch.Tensor) -> None:
         """Clear the counters of the worlds of a mask, shape ``(nworld,)``, bool."""
-        self._perworld.masked_fill_(mask, 0)
-        self.steps.masked_fill_(mask, 0)
+        self._counts.masked_fill_(mask, 0)
+        self._steps.masked_fill_(mask, 0)
 
 
 def convex_kinds(model: mujoco.MjModel) -> np.ndarray:
@@ -88,11 +74,10 @@ def convex_kinds(model: mujoco.MjModel) -> np.ndarray:
     primitive = {int(g.mjGEOM_SPHERE), int(g.mjGEOM_CAPSULE), int(g.mjGEOM_BOX)}
     round_ = {int(g.mjGEOM_SPHERE), int(g.mjGEOM_CYLINDER)}
     kinds = np.full(2 * (model.geom_type.max(initial=0) + 1,), -1, dtype=np.int32)
-    number = 0
-    for a, b in combinations_with_replacement(shapes, 2):
-        if not ({a, b} <= primitive or {a, b} == round_):
-            kinds[a, b] = kinds[b, a] = number
-            number += 1
+    pairs = list(combinations_with_replacement(shapes, 2))
+    convex = [pair for pair in pairs if not ({*pair} <= primitive or {*pair} == round_)]
+    for number, (a, b) in enumerate(convex):
+        kinds[a, b] = kinds[b, a] = number
     return kinds
 
 
@@ -117,18 +102,11 @@ def data_bytes(model: mujoco.MjModel, nworld: int, sizes: BatchSizes) -> int:
         nworld: Number of worlds.
         sizes: Buffer sizes.
     """
-    share = dataclasses.replace(sizes, naconmax=None, naccdmax=None)
     with wp.ScopedDevice("cpu"):
-        one, two, longer = (
-            array_bytes(
-                mjw.make_data(model, nworld=n, **dataclasses.replace(share, nconmax=c).as_kwargs(n))
-            )
-            for n, c in ((1, sizes.nconmax), (2, sizes.nconmax), (1, sizes.nconmax + 1))
+        single, double = (
+            array_bytes(mjw.make_data(model, nworld=n, **sizes.as_kwargs())) for n in (1, 2)
         )
-    per_contact = longer - one
-    per_world = two - one - sizes.nconmax * per_contact
-    constant = one - per_world - sizes.nconmax * per_contact
-    return constant + nworld * per_world + sizes.contact_pool(nworld) * per_contact
+    return single + (nworld - 1) * (double - single)
 
 
 @wp.kernel(enable_backward=False)
@@ -144,9 +122,9 @@ def record_usage(
     contacts: wp.array[int],
     peak_contacts: wp.array[int],
     peak_nefc: wp.array[int],
-    peak_pool: wp.array[int],
     lost: wp.array[int],
     limits: wp.array[int],
+    peak_pool: wp.array[int],
     steps: wp.array[wp.int64],
 ) -> None:
     """Count each world's contacts, and keep the largest counters and every overflow bit seen so
@@ -158,8 +136,8 @@ def record_usage(
     """
     i = wp.tid()
     for c in range(i, wp.min(nacon[0], worldid.shape[0]), stride):  # type: ignore[arg-type]
-        found = worldid[c]
-        wp.atomic_max(peak_contacts, found, wp.atomic_add(contacts, found, 1) + 1)
+        world = worldid[c]
+        wp.atomic_max(peak_contacts, world, wp.atomic_add(contacts, world, 1) + 1)
     if i < steps.shape[0]:
         peak_nefc[i] = wp.max(peak_nefc[i], nefc[i])
         lost[i] = lost[i] | (overflow[i] & lost_bits)

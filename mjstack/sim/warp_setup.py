@@ -1,12 +1,11 @@
-"""Warp and MuJoCo Warp, imported in one place, and ordered with torch's work."""
+"""Warp, set up before its first use, and ordered with torch's work."""
 
 import torch
 import warp as wp
 
 wp.config.log_level = wp.LOG_ERROR  # it would greet on every run
-import mujoco_warp as mjw  # noqa: E402  (the first use of Warp)
 
-__all__ = ["mjw", "torch_stream_scope", "wp"]
+__all__ = ["torch_stream_scope", "wp"]
 
 # One object per torch stream, until the process ends: a second one for the same stream would
 # unregister it when freed.

@@ -1,11 +1,12 @@
 """Task *box*: objects into a box, one after the other, each to its place."""
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from mjstack.config.fields import spec
 from mjstack.errors import ConfigError, UnknownName
@@ -16,14 +17,15 @@ from mjstack.tasks.check import EpisodeCheck, Judgement, Rule
 from mjstack.tasks.parts import (
     AtLeast,
     Carried,
-    HeldSuccess,
+    Condition,
     InWindow,
     Streak,
     away,
     in_hand,
     released,
 )
-from mjstack.tasks.view import Step, TaskView, once_per_step
+from mjstack.tasks.placed import HeldSuccess
+from mjstack.tasks.view import PhaseNames, Step, TaskView, once_per_step
 
 
 class BoxCheck(EpisodeCheck):
@@ -78,8 +80,8 @@ class BoxCheck(EpisodeCheck):
 
     t: Thresholds
 
+    @override
     def build(self) -> list[Rule]:
-        """See `EpisodeCheck`."""
         t = self.t
         self.objects = list(t.objects)
         self._read_box()
@@ -88,57 +90,82 @@ class BoxCheck(EpisodeCheck):
             "corner_speed_max_m_per_s": ("corner_speed_m_per_s", "max"),
             "jaw_clearance_min_m": ("jaw_clearance_m", "min"),
         }
-        for each in self.objects:
+        for name in self.objects:
             self.summaries |= {
-                f"slot_err_{each}_max_m": (f"slot_err_{each}_m", "max"),
-                f"grasp_steps_{each}_min": (f"grasp_steps_{each}", "min"),
-                f"settled_steps_{each}_min": (f"settled_steps_{each}", "min"),
+                f"slot_err_{name}_max_m": (f"slot_err_{name}_m", "max"),
+                f"grasp_steps_{name}_min": (f"grasp_steps_{name}", "min"),
+                f"settled_steps_{name}_min": (f"settled_steps_{name}", "min"),
             }
 
         grasp = Streak(
-            "GRASP",
-            "{object} not grasped",
-            self.objects,
+            *("GRASP", "{object} not grasped", self.objects),
             in_hand(*self.objects),
             t.grasp_steps,
-            phases=self.during("close"),
-            anew=self.during("approach"),
+            phases=self._during("close"),
+            anew=self._during("approach"),
         )
         lift = Streak(
-            "LIFT",
-            "{object} not lifted",
-            self.objects,
+            *("LIFT", "{object} not lifted", self.objects),
             self.airborne,
             t.lift_steps,
-            phases=self.during("lift", "carry"),
+            phases=self._during("lift", "carry"),
             after=grasp,
         )
-        carry = _CarriedOver(self, lift)
-        release = _Release(self, carry)
-        inside = InWindow(
-            "INSIDE",
-            "an object not at rest in the box at the end",
+        carry = _CarriedOver(
+            *("CARRY", "{object} not carried over the box", self.objects),
+            self.airborne,
+            t.carry_steps,
+            distance=t.carry_distance,
+            phases=self._during("carry"),
+            after=lift,
+            inside=self.over,
+            hold=self._during("hold"),
+        )
+        drop = _Drop(
+            *("DROP", "{object} dropped", self.objects),
+            in_hand(*self.objects),
+            0,
+            value="unloaded_steps{}",
+            phases=self._during("close", "lift", "carry", "hold"),
+            grasp=grasp,
+            lift=lift,
+            carry=carry,
+        )
+        release = _Release(
+            *("RELEASE", "{object} not released", self.objects),
+            lambda step: step.untouched,
+            t.open_fraction,
+            value="opening{}",  # widest without contact
+            phases=self._during("open", "retreat", "settle"),
+            after=carry,
+        )
+        settled = _Settled(
+            *("SETTLED", "{object} not at rest in the box after its release", self.objects),
             self.resting,
             t.window,
-            measure=self.trace,
+            phases=self._during("settle"),
+            after=release,
         )
-        drop = _Drop(self, grasp, lift, carry)
-        settled = _Settled(self, release)
-        order = _Order(self, release)
-        return [grasp, lift, carry, drop, release, settled, order, inside, _JawClear(self)]
+        text = "an object not at rest in the box at the end"
+        inside = InWindow("INSIDE", text, self.resting, t.window, measure=self.trace)
+        order = _Order(self.objects, release)
+        jaw_clear = _JawClear(self.cfg.robot.jaw_bodies, self._high[2], t.jaw_clearance)
+        return [grasp, lift, carry, drop, release, settled, order, inside, jaw_clear]
+
+    def _during(self, *roles: str) -> list[list[str]]:
+        """Names of each object's phases of some roles."""
+        return [[f"{role}_{name}" for role in roles] for name in self.objects]
 
     def _read_box(self) -> None:
         """Read the scene's box, and raise unless every object fits into it at its place."""
+        t = self.t
         scene = self.cfg.scene
         box = scene.box
         if box is None:
             raise ConfigError("scene", scene.name, "a scene with a box", "Set scene=box")
         top = scene.table_top
-        self.box = box
-        self.rim = top + box.height
         self._low = [*(box.center[i] - box.half[i] for i in (0, 1)), top + box.floor]
-        self._high = [*(box.center[i] + box.half[i] for i in (0, 1)), self.rim]
-        t = self.t
+        self._high = [*(box.center[i] + box.half[i] for i in (0, 1)), top + box.height]
         if len(t.places) != len(t.objects):
             raise ConfigError("task.check.places", t.places, "a place for each object")
         self.slots = dict(zip(t.objects, t.places, strict=True))
@@ -152,10 +179,6 @@ class BoxCheck(EpisodeCheck):
             if not all(abs(xy[i] - box.center[i]) <= box.half[i] - half[i] for i in (0, 1)):
                 raise ConfigError(f"scene.places.{slot}.xy", xy, f"a place in the box for {name}")
 
-    def during(self, *roles: str) -> list[list[str]]:
-        """Names of each object's phases of some roles."""
-        return [[f"{role}_{each}" for role in roles] for each in self.t.objects]
-
     @once_per_step
     def airborne(self, step: Step) -> Tensor:
         """Whether each object is held in the air, shape ``(nworld, objects)``, bool."""
@@ -167,7 +190,7 @@ class BoxCheck(EpisodeCheck):
         """Whether each object is out of the jaws, inside and slow, shape ``(nworld, objects)``,
         bool.
         """
-        slow = corner_speed(step) < self.t.rest_speed
+        slow = step.corner_speed < self.t.rest_speed
         return step.untouched & self.placed(step) & slow
 
     @once_per_step
@@ -187,8 +210,8 @@ class BoxCheck(EpisodeCheck):
         """Whether each object is in the box."""
         return self.outside(step).amax(-1) <= self.t.inside
 
+    @override
     def goals(self, step: Step) -> dict[str, Tensor]:
-        """See `EpisodeCheck`."""
         return {name: self.at_slot(step.view.env, name).float() for name in self.objects}
 
     def at_slot(self, env: EnvView, name: str) -> Tensor:
@@ -197,160 +220,108 @@ class BoxCheck(EpisodeCheck):
         height = self._low[2] + self.cfg.scene.objects[name].half_height
         return torch.cat((xy, torch.full_like(xy[:, :1], height)), dim=1)
 
+    @override
     def trace(self, step: Step) -> dict[str, Tensor]:
-        """See `EpisodeCheck`."""
         return {
-            **{f"slot_err_{each}_m": away(step, each, self.slots[each]) for each in self.objects},
+            **{f"slot_err_{name}_m": away(step, name, slot) for name, slot in self.slots.items()},
             "beyond_m": self.outside(step).amax((1, 2)),
-            "corner_speed_m_per_s": corner_speed(step).amax(1),
+            "corner_speed_m_per_s": step.corner_speed.amax(1),
         }
 
     def headline(self, values: Mapping[str, float]) -> str:
         """How well the objects are placed."""
-        off = [f"{each} {1e3 * values[f'slot_err_{each}_m']:.1f} mm" for each in self.objects]
+        off = [f"{name} {1e3 * values[f'slot_err_{name}_m']:.1f} mm" for name in self.objects]
         clearance = 1e3 * values["jaw_clearance_m"]
         return f"{', '.join(off)} off their places, jaws {clearance:.0f} mm above the rim"
 
 
-@once_per_step
-def corner_speed(step: Step) -> Tensor:
-    """Speed of the fastest corner [m/s], shape ``(nworld, objects)``."""
-    signs = step.view.constant(*itertools.chain(*itertools.product((-1.0, 1.0), repeat=3)))
-    arms = step.view.half[:, None] * signs.view(8, 3)
-    # A free joint's linear velocity is the world's, its angular velocity the body's: all of it in
-    # the body's frame.
-    linear = (step.turn * step.velocity[..., :3, None]).sum(-2)
-    spin = step.velocity[..., None, 3:].expand(-1, -1, 8, -1)
-    swept = torch.linalg.cross(spin, arms.expand_as(spin))
-    return torch.linalg.vector_norm(linear[..., None, :] + swept, dim=-1).amax(-1)
-
-
+@dataclass(eq=False, kw_only=True)
 class _CarriedOver(Carried):
     """CARRY: carried, and over the box when it is let go of."""
 
-    def __init__(self, check: BoxCheck, lift: Streak) -> None:
-        t = check.t
-        super().__init__(
-            "CARRY",
-            "{object} not carried over the box",
-            check.objects,
-            check.airborne,
-            t.carry_steps,
-            distance=t.carry_distance,
-            phases=check.during("carry"),
-            after=lift,
-        )
-        self._check = check
+    inside: Condition
+    hold: PhaseNames
 
     def start(self, view: TaskView) -> None:
         super().start(view)
-        self._hold = view.during(self._check.during("hold"))
+        self._hold = view.during(self.hold)
         self.over = view.counter(len(self.objects))  # in the last step of the hold, or of any load
 
     def update(self, step: Step) -> None:
         super().update(step)
         hold = step.judged(self._hold) if step.view.phased else step.in_hand
-        self.over.copy_(torch.where(hold, self._check.over(step), self.over))
+        self.over.copy_(torch.where(hold, self.inside(step), self.over))
 
     def judge(self, end: Step) -> Judgement:
-        held, values = super().judge(end)
-        return held & (self.over > 0.0), values | self.by_object("over_box{}", self.over)
+        holds, values = super().judge(end)
+        return holds & (self.over > 0.0), values | self.by_object("over_box{}", self.over)
 
 
+@dataclass(eq=False, kw_only=True)
 class _Drop(AtLeast):
     """DROP: no step without load between the last grasp and the release."""
 
-    def __init__(self, check: BoxCheck, grasp: Streak, lift: Streak, carry: _CarriedOver) -> None:
-        super().__init__(
-            "DROP",
-            "{object} dropped",
-            check.objects,
-            "unloaded_steps{}",
-            0,
-            phases=check.during("close", "lift", "carry", "hold"),
-        )
-        self.wanted = ["0"] * len(self.wanted)
-        self._grasp = grasp
-        self._lift = lift
-        self._carry = carry
+    grasp: Streak
+    lift: Streak
+    carry: _CarriedOver
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.expected = ["0"] * len(self.objects)
 
     def update(self, step: Step) -> None:
         if step.view.phased:
             # A grasp that slips while the jaws still close is made anew; the last one counts.
-            grasped = self._grasp.length == self._grasp.least
-            self.best.masked_fill_(step.judged(self._grasp.key) & grasped, 0.0)
-            lost = self._grasp.held() & step.judged(self.key)
+            grasped = self.grasp.length == self.grasp.least
+            self.best.masked_fill_(step.judged(self.grasp.key) & grasped, 0.0)
+            lost = self.grasp.holds() & step.judged(self.key)
         else:
-            lost = self._lift.held() & (self._carry.over == 0.0)
-        self.best.add_(lost & ~step.in_hand)
+            lost = self.lift.holds() & (self.carry.over == 0.0)
+        self.best.add_(lost & ~self.condition(step))
 
-    def held(self) -> Tensor:
+    def holds(self) -> Tensor:
         return self.best == 0.0
 
 
 class _Release(AtLeast):
     """RELEASE: out of the jaws, the gripper open."""
 
-    def __init__(self, check: BoxCheck, carry: Carried) -> None:
-        super().__init__(
-            "RELEASE",
-            "{object} not released",
-            check.objects,
-            "opening{}",  # widest without contact
-            check.t.open_fraction,
-            phases=check.during("open", "retreat", "settle"),
-        )
-        self._carry = carry
-
     def update(self, step: Step) -> None:
-        opens = step.judged(self.key) if step.view.phased else self._carry.held()
-        opening = step.opening.amin(1, keepdim=True)
-        wide = torch.where(opens & step.untouched, opening, 0.0)
+        opens = step.judged(self.key) if step.view.phased else self.unlocked()
+        wide = torch.where(opens & self.condition(step), step.narrowest, 0.0)
         torch.maximum(self.best, wide, out=self.best)
 
 
 class _Settled(AtLeast):
     """SETTLED: at rest in the box after the release."""
 
-    def __init__(self, check: BoxCheck, release: _Release) -> None:
-        super().__init__(
-            "SETTLED",
-            "{object} not at rest in the box after its release",
-            check.objects,
-            "settled_steps{}",  # as of the settling's last step, or the most
-            check.t.window,
-            phases=check.during("settle"),
-        )
-        self._check = check
-        self._release = release
-
     def start(self, view: TaskView) -> None:
         super().start(view)
         self._rest = view.zeros(len(self.objects))  # steps at rest in a row
 
     def update(self, step: Step) -> None:
-        self._rest.add_(1.0).mul_(self._check.resting(step))
-        if step.view.phased:
+        self._rest.add_(1.0).mul_(self.condition(step))
+        if step.view.phased:  # as of the settling's last step, or else the most
             settled = torch.where(step.judged(self.key), self._rest, self.best)
         else:
-            settled = torch.maximum(self.best, self._rest * self._release.held())
+            settled = torch.maximum(self.best, self._rest * self.unlocked())
         self.best.copy_(settled)
 
 
 class _Order(Rule):
     """ORDER: no object is grasped before the one before it is released."""
 
-    def __init__(self, check: BoxCheck, release: _Release) -> None:
-        pairs = itertools.pairwise(check.objects)
-        text = " or ".join(f"{later} grasped before {each} was released" for each, later in pairs)
-        super().__init__("ORDER", text or "never broken", wanted="0")
+    def __init__(self, objects: Sequence[str], release: _Release) -> None:
+        pairs = itertools.pairwise(objects)
+        text = " or ".join(f"{later} grasped before {name} was released" for name, later in pairs)
+        super().__init__("ORDER", text or "never broken", expected="0")
         self._release = release
 
     def start(self, view: TaskView) -> None:
         self._early = view.zeros()
 
     def update(self, step: Step) -> None:
-        early = step.in_hand[:, 1:] & ~self._release.held()[:, :-1]
+        early = step.in_hand[:, 1:] & ~self._release.holds()[:, :-1]
         self._early.masked_fill_(early.any(1), 1.0)
 
     def judge(self, end: Step) -> Judgement:
@@ -362,17 +333,17 @@ class _JawClear(Rule):
 
     at_end = True
 
-    def __init__(self, check: BoxCheck) -> None:
-        wanted = f"at least {check.t.jaw_clearance:g}"
-        super().__init__("JAW_CLEAR", "gripper too low at the end", wanted=wanted)
-        self._check = check
+    def __init__(self, jaws: Sequence[str], rim: float, least: float) -> None:
+        super().__init__("JAW_CLEAR", "gripper too low at the end", expected=f"at least {least:g}")
+        self._jaws = jaws
+        self._rim = rim
+        self._least = least
 
     def judge(self, end: Step) -> Judgement:
         sim = end.view.env.sim
         sim.kinematics()
-        jaws = lowest_height(sim.model, self._check.cfg.robot.jaw_bodies, sim.xpos, sim.xquat)
-        clearance = jaws - self._check.rim  # which is above the table
-        return clearance >= self._check.t.jaw_clearance, {"jaw_clearance_m": clearance}
+        clearance = lowest_height(sim.model, self._jaws, sim.xpos, sim.xquat) - self._rim
+        return clearance >= self._least, {"jaw_clearance_m": clearance}
 
 
 class BoxSuccess(HeldSuccess):

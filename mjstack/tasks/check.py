@@ -25,6 +25,7 @@ Example:
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from itertools import chain
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -48,8 +49,6 @@ _EVERY_TASK = {
     "STEPS": "step counter off",
     "OVERFLOW": "buffer overflow",
 }
-_SUFFIXES = {"m/s": "m_per_s", "rad/s": "rad_per_s", "N": "n"}
-
 
 Judgement = tuple[Tensor, dict[str, Tensor]]
 """Whether a rule was shown to hold, bool, shape ``(nworld,)`` or ``(nworld, rules)``, and measured
@@ -85,8 +84,8 @@ class Rules(dict[str, int]):
         Args:
             failed: Bits of every world, shape ``(nworld,)``.
         """
-        worlds = {name: np.flatnonzero(failed & bit).tolist() for name, bit in self.items()}
-        return {name: found for name, found in worlds.items() if found}
+        masks = {name: failed & bit for name, bit in self.items()}
+        return {name: np.flatnonzero(mask).tolist() for name, mask in masks.items() if mask.any()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,13 +95,13 @@ class CheckResult:
     Attributes:
         failed: Bits of the task's rules, shape ``(nworld,)``, int32.
         values: Measured values, by name with unit, each ``(nworld,)``.
-        shown: Names of those that tell about each rule, by its name.
+        value_names: Names of those that tell about each rule, by its name.
         phased: Whether the driver had phases, so that rules counted in those that they name.
     """
 
     failed: Tensor
     values: dict[str, Tensor]
-    shown: dict[str, list[str]]
+    value_names: dict[str, list[str]]
     phased: bool
 
 
@@ -114,7 +113,7 @@ class Rule(ABC):
     Attributes:
         texts: The failure in words if it is broken, by name; one entry, or one for each object.
         suffixes: Part of the names of the measured values that tell about each of them.
-        wanted: The values that the rule wants, in words.
+        expected: The measured values that each of them expects, in words.
         phases: For each object, the phases in which it counts.
         at_end: Whether it can only hold at the end of a whole episode.
     """
@@ -127,8 +126,7 @@ class Rule(ABC):
         name: str,
         text: str,
         objects: Sequence[str] = (),
-        *,
-        wanted: str = "see the thresholds",
+        expected: str = "see the thresholds",
     ) -> None:
         """Name the rule.
 
@@ -136,16 +134,15 @@ class Rule(ABC):
             name: In capital letters. The rule of one of several objects is ``NAME_OBJECT``.
             text: The failure in words if it is broken; ``{object}`` is the object's name.
             objects: The objects that it judges one by one.
-            wanted: The measured values that the rule wants, in words.
+            expected: The measured values that the rule expects, in words.
         """
         self.objects = list(objects)
-        self.suffixes = [f"_{each}" for each in objects] if len(objects) > 1 else [""]
-        names = objects or [""]
+        self.suffixes = [f"_{object}" for object in objects] if len(objects) > 1 else [""]
         self.texts = {
-            f"{name}{suffix.upper()}": text.format(object=each)
-            for suffix, each in zip(self.suffixes, names, strict=True)
+            f"{name}{suffix.upper()}": text.format(object=object)
+            for suffix, object in zip(self.suffixes, objects or [""], strict=True)
         }
-        self.wanted = [wanted] * len(self.suffixes)
+        self.expected = [expected] * len(self.texts)
 
     def start(self, view: TaskView) -> None:  # noqa: B027
         """Allocate for the worlds of a view."""
@@ -168,10 +165,8 @@ class Rule(ABC):
             name: Such as ``lift_steps{}``.
             value: Shape ``(nworld, objects)``.
         """
-        return {
-            name.format(suffix): column
-            for suffix, column in zip(self.suffixes, value.unbind(1), strict=True)
-        }
+        names = map(name.format, self.suffixes)
+        return dict(zip(names, value.unbind(1), strict=True))
 
 
 class EpisodeCheck(ABC):
@@ -187,8 +182,7 @@ class EpisodeCheck(ABC):
     Attributes:
         cfg: The configuration.
         t: The thresholds.
-        key: Equal to that of another check of its class with the same thresholds; see
-            `once_per_step`.
+        key: That of every check of its class with these thresholds; see `once_per_step`.
         rules: Names, bits and words of the rules.
         objects: The objects that the task is about, which the rules read.
         summaries: Metrics of a batch: by name, a measured value and which of its worlds' counts,
@@ -208,10 +202,10 @@ class EpisodeCheck(ABC):
         name = node.pop("func", None)
         if not issubclass(check_class(cfg) or object, type(self)):
             expected = f"{type(self).__module__}.{type(self).__name__}, whose rules a term needs"
-            by = f", such as task.success ({cfg.task.success.func})" if cfg.task.success else ""
-            raise ConfigError(
-                "task.check.func" if name else "task.check", name or "null", expected + by
-            )
+            if cfg.task.success:
+                expected += f", such as task.success ({cfg.task.success.func})"
+            key = "task.check.func" if name else "task.check"
+            raise ConfigError(key, name or "null", expected)
         self.cfg = cfg
         self.t: Any = typed("task.check", node, self.Thresholds)
         self.key = f"{type(self).__module__}.{type(self).__qualname__} {self.t}"
@@ -226,12 +220,10 @@ class EpisodeCheck(ABC):
         for name in self.objects:
             if name not in cfg.scene.objects:
                 raise UnknownName("task.check: object", name, cfg.scene.objects)
-        for name in [n for rule in self._rules for names in rule.phases for n in names]:
+        for name in chain(*chain(*(rule.phases for rule in self._rules))):
             if phases and name not in phases:
                 raise UnknownName("task.check: phase", name, phases)
-        self.rules = Rules(
-            {name: text for rule in self._rules for name, text in rule.texts.items()}
-        )
+        self.rules = Rules(dict(chain(*(rule.texts.items() for rule in self._rules))))
 
     @abstractmethod
     def build(self) -> list[Rule]:
@@ -280,27 +272,26 @@ class EpisodeCheck(ABC):
         """Judge the episode; every rule that was not shown to hold has failed."""
         sim = self._view.env.sim
         complete = int(self._view.count) == self._steps
-        wanted = self._steps * self.cfg.timing.decimation
-        held = {
+        physics_steps = self._steps * self.cfg.timing.decimation
+        passed = {
             "FINITE": self._finite,
-            "STEPS": (sim.step_count == wanted) & complete,
+            "STEPS": (sim.step_count == physics_steps) & complete,
             "OVERFLOW": (sim.overflow & LOST_PHYSICS) == 0,
         }
         values: dict[str, Tensor] = {}
-        shown: dict[str, list[str]] = {}
+        names: dict[str, list[str]] = {}
         end = self._view.step()
         for rule in self._rules:
-            ok, measured = rule.judge(end)
+            holds, measured = rule.judge(end)
             if rule.at_end:
-                ok = ok & complete
-            held |= zip(rule.texts, ok.view(len(ok), -1).unbind(1), strict=True)
+                holds = holds & complete
+            passed |= zip(rule.texts, holds.view(len(holds), -1).unbind(1), strict=True)
             values |= measured
             for name, suffix in zip(rule.texts, rule.suffixes, strict=True):
-                shown[name] = [value for value in measured if f"{suffix}_" in f"{value}_"]
-        failed = torch.zeros_like(self._finite, dtype=torch.int32)
-        for name, bit in self.rules.items():
-            failed |= bit * (~held[name]).to(failed.dtype)
-        return CheckResult(failed, values, shown, self._view.phased)
+                names[name] = [value for value in measured if f"{suffix}_" in f"{value}_"]
+        bits = [bit * (~passed[name]).int() for name, bit in self.rules.items()]
+        failed = torch.stack(bits).sum(0, dtype=torch.int32)
+        return CheckResult(failed, values, names, self._view.phased)
 
     @abstractmethod
     def placed(self, step: Step) -> Tensor:
@@ -324,23 +315,24 @@ class EpisodeCheck(ABC):
         for item in fields(self.Thresholds):
             value = getattr(self.t, item.name)
             unit = field_range(item).unit
-            suffix = _SUFFIXES.get(unit, unit)
+            suffix = "n" if unit == "N" else unit.replace("/", "_per_")
             bare = not suffix or item.name.endswith(f"_{suffix}")
             if isinstance(value, int | float):
                 numbers[item.name if bare else f"{item.name}_{suffix}"] = value
         return numbers
 
     def report(self, result: CheckResult) -> dict[str, tuple[str, str]]:
-        """Report the values of the first world, and what is wanted, by the name of each of the
+        """Report the values of the first world, and the expected ones, by the name of each of the
         task's rules.
         """
-        told = {name: f"{name} {float(value[0]):.4g}" for name, value in result.values.items()}
         report = {}
         for rule in self._rules:
             phases = rule.phases if result.phased and rule.phases else [()] * len(rule.texts)
-            for name, wanted, names in zip(rule.texts, rule.wanted, phases, strict=True):
-                found = ", ".join(told[each] for each in result.shown[name]) or "see the values"
-                report[name] = (found, f"{wanted} in {' and '.join(names)}" if names else wanted)
+            for name, expected, names in zip(rule.texts, rule.expected, phases, strict=True):
+                during = f" in {' and '.join(names)}" if names else ""
+                values = {key: float(result.values[key][0]) for key in result.value_names[name]}
+                measured = EpisodeCheck.headline(self, values) or "see the values"
+                report[name] = (measured, expected + during)
         return report
 
     def headline(self, values: Mapping[str, float]) -> str:
@@ -357,10 +349,10 @@ def check_class(cfg: Config) -> type[EpisodeCheck] | None:
     if cfg.task.check is None:
         return None
     name = str(cfg.task.check.get("func"))
-    found = cast(type[EpisodeCheck], resolve_func("task.check", name, base=EpisodeCheck))
-    for method in sorted(found.__abstractmethods__):
+    check = cast(type[EpisodeCheck], resolve_func("task.check", name, base=EpisodeCheck))
+    for method in sorted(check.__abstractmethods__):
         raise TermError("task.check.func", f"{name}: method '{method}' is missing")
-    return found
+    return check
 
 
 def make_check(cfg: Config) -> EpisodeCheck:
@@ -369,8 +361,8 @@ def make_check(cfg: Config) -> EpisodeCheck:
     Raises:
         MjstackError: The task has none, or a threshold cannot be used.
     """
-    found = check_class(cfg)
-    if found is None:
+    check = check_class(cfg)
+    if check is None:
         expected = f"a check of task {cfg.task.name}: without one it can be trained, not verified"
         raise ConfigError("task.check", "null", expected, "Train it: mjstack.make_env")
-    return found(cfg)
+    return check(cfg)

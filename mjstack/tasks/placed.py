@@ -1,4 +1,8 @@
-"""Success of any task that has a check: every object is where it belongs."""
+"""Success of a step: a condition has held for some steps; for any task that has a check, that every
+object is where it belongs.
+"""
+
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -6,7 +10,43 @@ from torch import Tensor
 from mjstack.config.fields import Count, Fraction
 from mjstack.managers.view import EnvView
 from mjstack.tasks.check import make_check
-from mjstack.tasks.parts import Condition, HeldSuccess, released
+from mjstack.tasks.parts import Condition, released
+
+
+class HeldSuccess:
+    """Achieved while a condition has held for some steps in a row.
+
+    Attributes:
+        nowhere: Whether it was seen, on the CPU, that the condition holds in no world.
+    """
+
+    nowhere = False
+
+    def __init__(self, env: EnvView, condition: Callable[[], Tensor], steps: int) -> None:
+        """Allocate the streaks.
+
+        Args:
+            env: The environment.
+            condition: Whether it holds now, shape ``(nworld,)``, bool.
+            steps: How many steps in a row.
+        """
+        self._condition = condition
+        self._steps = steps
+        self._length = torch.zeros(env.nworld, dtype=torch.int32, device=env.device)
+
+    def __call__(self, env: EnvView) -> Tensor:
+        """Process a step; shape ``(nworld,)``, bool."""
+        holds = self._condition()
+        self.nowhere = not holds.is_cuda and not bool(holds.any())
+        if self.nowhere:
+            self._length.zero_()
+            return holds
+        self._length.add_(1).mul_(holds)
+        return self._length >= self._steps
+
+    def reset(self, mask: Tensor) -> None:
+        """Forget the masked worlds."""
+        self._length.masked_fill_(mask, 0)
 
 
 class Placed(HeldSuccess):
@@ -30,12 +70,12 @@ class Placed(HeldSuccess):
         """
         check = make_check(env.cfg)
         view = check.view(env)
-        asked: list[Condition] = [check.placed]
+        conditions: list[Condition] = [check.placed]
         if open_fraction is not None:
-            asked.append(released(*check.objects, open_fraction=open_fraction))
+            conditions.append(released(*check.objects, open_fraction=open_fraction))
 
         def holds() -> Tensor:
             step = view.step()
-            return torch.cat([condition(step) for condition in asked], dim=1).all(1)
+            return torch.cat([condition(step) for condition in conditions], dim=1).all(1)
 
         super().__init__(env, holds, steps)

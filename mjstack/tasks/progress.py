@@ -97,10 +97,10 @@ class Progress:
         above = offset[..., 2]
         away = torch.linalg.vector_norm(pos - grasp_point_pos(env).float()[:, None], dim=-1)
         across = torch.linalg.vector_norm(offset[..., :2], dim=-1)
-        held = in_hand & (away <= self._within)
-        lifted = held & (low >= self._height)
+        grasped = in_hand & (away <= self._within)
+        lifted = grasped & (low >= self._height)
         over = (across <= self._near) & (above >= -BELOW)
-        reached = torch.stack((self._always, lifted, over, held, placed), dim=-1)
+        reached = torch.stack((self._always, lifted, over, grasped, placed), dim=-1)
 
         # How far it has got in each: the last one that it has got to is worth most
         opening = step.narrowest.expand_as(low)

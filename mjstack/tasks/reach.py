@@ -5,12 +5,14 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from mjstack.config.fields import Count, Positive, spec
 from mjstack.managers.view import EnvView
 from mjstack.mdp.observation import grasp_point_to_object
 from mjstack.tasks.check import EpisodeCheck, Rule
-from mjstack.tasks.parts import HeldSuccess, InWindow
+from mjstack.tasks.parts import InWindow
+from mjstack.tasks.placed import HeldSuccess
 from mjstack.tasks.view import Step
 
 
@@ -33,8 +35,8 @@ class ReachCheck(EpisodeCheck):
     t: Thresholds
     summaries = {"distance_max_m": ("distance_m", "max")}  # noqa: RUF012
 
+    @override
     def build(self) -> list[Rule]:
-        """See `EpisodeCheck`."""
         self.objects = [self.t.object]
         text = f"grasp point not above {self.t.object}"
         return [InWindow("REACHED", text, self.placed, self.t.window, measure=self.trace)]
@@ -43,15 +45,19 @@ class ReachCheck(EpisodeCheck):
         """Whether the grasp point is near, shape ``(nworld, 1)``."""
         return (self.trace(step)["distance_m"] <= self.t.distance)[:, None]
 
+    @override
     def trace(self, step: Step) -> dict[str, Tensor]:
-        """See `EpisodeCheck`."""
-        t = self.t
-        offset = grasp_point_to_object(step.view.env, object=t.object, height=t.height)
-        return {"distance_m": torch.linalg.vector_norm(offset, dim=1)}
+        return {"distance_m": distance_to(step.view.env, self.t.object, self.t.height)}
 
     def headline(self, values: Mapping[str, float]) -> str:
         """How near it is."""
         return f"{1e3 * values['distance_m']:.1f} mm from the point"
+
+
+def distance_to(env: EnvView, object: str, height: float) -> Tensor:
+    """Distance of the grasp point from a point above an object [m], shape ``(nworld,)``."""
+    offset = grasp_point_to_object(env, object=object, height=height)
+    return torch.linalg.vector_norm(offset, dim=1)
 
 
 class ReachSuccess(HeldSuccess):
@@ -72,9 +78,4 @@ class ReachSuccess(HeldSuccess):
         Raises:
             MjstackError: There is no such object.
         """
-
-        def near() -> Tensor:
-            offset = grasp_point_to_object(env, object=object, height=height)
-            return torch.linalg.vector_norm(offset, dim=1) <= distance
-
-        super().__init__(env, near, steps)
+        super().__init__(env, lambda: distance_to(env, object, height) <= distance, steps)

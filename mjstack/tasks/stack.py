@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from mjstack.config.fields import spec
 from mjstack.managers.view import EnvView
@@ -13,7 +14,6 @@ from mjstack.tasks.check import EpisodeCheck, Rule
 from mjstack.tasks.parts import (
     AtRest,
     Carried,
-    HeldSuccess,
     InWindow,
     Streak,
     airborne,
@@ -23,6 +23,7 @@ from mjstack.tasks.parts import (
     on_top_of,
     released,
 )
+from mjstack.tasks.placed import HeldSuccess
 from mjstack.tasks.view import Step, once_per_step
 
 
@@ -84,39 +85,30 @@ class StackCheck(EpisodeCheck):
         "rest_rotation_max_deg": ("rest_rotation_deg", "max"),
     }
 
+    @override
     def build(self) -> list[Rule]:
-        """See `EpisodeCheck`."""
         t = self.t
         self.objects = [t.object, t.onto]
-        moved = [t.object]
         up = airborne(t.object, height=t.airborne_height)
         self.stacked = on_top(t.object, t.onto, xy_err=t.xy_err, dz_min=t.dz_min, dz_max=t.dz_max)
         self.supported = on_table(t.onto, gap=t.support_gap)
         self.released = released(t.object, open_fraction=t.open_fraction)
         lift = Streak(
-            "LIFT", "{object} not lifted", moved, up, t.lift_steps, phases=[t.lift_phases]
+            "LIFT", "{object} not lifted", [t.object], up, t.lift_steps, phases=[t.lift_phases]
         )
         carry = Carried(
-            "CARRY",
-            "{object} not carried",
-            moved,
-            up,
-            t.carry_steps,
+            *("CARRY", "{object} not carried", [t.object], up, t.carry_steps),
             distance=t.carry_distance,
             phases=[[t.carry_phase]],
             after=lift,
         )
+        rest = (t.rest_speed, t.rest_position, t.rest_rotation_deg)
         return [
             lift,
             carry,
             InWindow("STACKED", "not stacked", self.stacked, t.window, measure=self.trace),
             InWindow("SUPPORTED", f"{t.onto} not on the table", self.supported, t.window),
-            AtRest(
-                t.window,
-                speed=t.rest_speed,
-                position=t.rest_position,
-                rotation_deg=t.rest_rotation_deg,
-            ),
+            AtRest(t.window, *rest),
             InWindow("RELEASED", f"{t.object} not released", self.released, t.window),
         ]
 
@@ -130,12 +122,12 @@ class StackCheck(EpisodeCheck):
         """Whether the object is on the other one, and that one on the table."""
         return torch.stack((self.on_goal(step), self.supported(step)), dim=1)
 
+    @override
     def goals(self, step: Step) -> dict[str, Tensor]:
-        """See `EpisodeCheck`."""
         return {self.t.object: on_top_of(step, self.t.onto, self.t.object)}
 
+    @override
     def trace(self, step: Step) -> dict[str, Tensor]:
-        """See `EpisodeCheck`."""
         xy_err, dz = offset(step, *self.objects)
         return {"xy_err_m": xy_err, "dz_m": dz}
 
@@ -161,7 +153,7 @@ class StackSuccess(HeldSuccess):
         """
         check = StackCheck(env.cfg)
         view = check.view(env)
-        super().__init__(env, lambda: self._stands(view.step()), check.settle_steps)
+        super().__init__(env, lambda: self._stands(view.step()), check.t.window)
         self._check = check
         ring = (check.t.window, len(view.objects))
         # Where the oldest step is, in every world.
@@ -180,11 +172,10 @@ class StackSuccess(HeldSuccess):
         self._step = step
         self._slot.add_(1).remainder_(self._steps)
         stands = self._check.on_goal(step)
+        if stands.is_cuda or bool(stands.any()):
+            stands = self._check.placed(step).all(1) & self._check.released(step)[:, 0]
         if not stands.is_cuda and not bool(stands.any()):
             return stands  # no window that holds this step can pass: its slot is never judged
-        stands = self._check.placed(step).all(1) & self._check.released(step)[:, 0]
-        if not stands.is_cuda and not bool(stands.any()):
-            return stands
         self._pose.index_copy_(1, self._slot, step.pose[:, None])
         self._energy.index_copy_(1, self._slot, step.speed.square()[:, None])
         for ring in (self._far, self._turned):

@@ -2,7 +2,8 @@
 alone, which are never stale.
 """
 
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property, wraps
 from typing import Any
 
@@ -29,15 +30,19 @@ def once_per_step(compute: Callable[..., Any]) -> Callable[..., Any]:
     """
 
     @wraps(compute)
-    def shared(*args: Any) -> Any:
-        *others, step = args
-        key = (compute, step.view.key, *(each.key for each in others))
-        known = step.known
-        if key not in known:
-            known[key] = compute(*args)
-        return known[key]
+    def cached(*args: Any) -> Any:
+        *checks, step = args
+        key = (compute, step.view.key, *(check.key for check in checks))
+        if key not in step.known:
+            step.known[key] = compute(*args)
+        return step.known[key]
 
-    return shared
+    return cached
+
+
+def step_value(compute: Callable[[Any], Any]) -> Any:
+    """Make a method of `Step` a property that is computed once per step."""
+    return property(once_per_step(compute))
 
 
 class TaskView:
@@ -85,36 +90,30 @@ class TaskView:
         scene = env.cfg.scene
         self.things = [scene.objects[name] for name in objects]
         self.top = scene.table_top
-        self.half = torch.tensor([each.half for each in self.things], device=env.device)
-        self.radius = torch.tensor([each.radius for each in self.things], device=env.device)
-        # Columns of the poses and velocities, if all of the objects can move
-        self.movable: tuple[Columns, Columns] | None = None
-        if not set(objects) & set(index.fixed):
-            first = zip(*(index.object_address(name) for name in objects), strict=True)
-            qpos, qvel = (
-                Columns([a + i for a in at for i in range(width)], env.device)
-                for at, width in zip(first, (7, 6), strict=True)
-            )
-            self.movable = qpos, qvel
-        self.jaws = self._forces([index.jaw_force[name] for name in objects])
-        self.supports = self._forces([index.support_force.get(name, []) for name in objects])
+        self.half = torch.tensor([thing.half for thing in self.things], device=env.device)
+        self.radius = torch.tensor([thing.radius for thing in self.things], device=env.device)
 
-    def _forces(self, addresses: Sequence[Sequence[int]]) -> Columns:
-        return Columns([a + i for row in addresses for a in row for i in range(3)], self.env.device)
+        def columns(addresses: Iterable[int], width: int) -> Columns:
+            return Columns([a + i for a in addresses for i in range(width)], env.device)
+
+        # Columns of the poses and velocities, if all of the objects can move
+        self.movable: list[Columns] = []
+        if not set(objects) & set(index.fixed):
+            first = zip(*map(index.object_address, objects), strict=True)
+            self.movable = [columns(at, width) for at, width in zip(first, (7, 6), strict=True)]
+        self.jaws = columns((a for name in objects for a in index.jaw_force[name]), 3)
+        supports = (index.support_force.get(name, []) for name in objects)
+        self.supports = columns(itertools.chain(*supports), 3)
 
     def step(self, phase: Tensor | None = None) -> "Step":
         """The state now, computed where it is asked for, once."""
         return Step(self, phase)
 
-    def column(self, name: str) -> int:
-        """Number of an object."""
-        return self.objects.index(name)
-
     def columns(self, names: Sequence[str]) -> Columns:
         """Columns of some objects, made once: a captured step may not copy from the host."""
         key = tuple(names)
         if key not in self._columns:
-            self._columns[key] = Columns([self.column(name) for name in names], self.env.device)
+            self._columns[key] = Columns(list(map(self.objects.index, names)), self.env.device)
         return self._columns[key]
 
     def during(self, phases: PhaseNames) -> slice:
@@ -176,36 +175,32 @@ class Step:
         self.known: dict[Any, Any] = {} if current_term.values is None else current_term.values
         self._phase = phase
 
-    @property
-    @once_per_step
+    @step_value
     def pose(self) -> Tensor:
         """Position [m] and quaternion (wxyz), shape ``(nworld, objects, 7)``."""
         view = self.view
-        if view.movable is not None:
+        if view.movable:
             return view.env.sim.part("qpos", view.movable[0], len(view.objects), 7).float()
         return torch.stack([pose_w(view.env, name) for name in view.objects], dim=1).float()
 
-    @property
-    @once_per_step
+    @step_value
     def pos(self) -> Tensor:
         """Position [m], shape ``(nworld, objects, 3)``."""
         return self.pose[..., :3]
 
-    @property
-    @once_per_step
+    @step_value
     def quat(self) -> Tensor:
         """Orientation (wxyz), shape ``(nworld, objects, 4)``."""
         return self.pose[..., 3:]
 
-    @property
-    @once_per_step
+    @step_value
     def velocity(self) -> Tensor:
         """Velocity as MuJoCo has it: linear [m/s] in the world, angular [rad/s] in the object's
         frame, shape ``(nworld, objects, 6)``.
         """
         view = self.view
         env = view.env
-        if view.movable is not None:
+        if view.movable:
             return env.sim.part("qvel", view.movable[1], len(view.objects), 6).float()
         still = view.constant(*[0.0] * 6).expand(env.nworld, -1)
         parts = [
@@ -216,28 +211,22 @@ class Step:
         ]
         return torch.stack(parts, dim=1)
 
-    @property
-    @once_per_step
+    @step_value
     def turn(self) -> Tensor:
         """Rotation matrices, shape ``(nworld, objects, 3, 3)``."""
         return quat_to_matrix(self.quat)
 
-    @property
-    @once_per_step
+    @step_value
     def height(self) -> Tensor:
         """Height of the lowest point above the table [m], shape ``(nworld, objects)``."""
-        pos, quat = self.pos, self.quat
-        first, *others = self.view.things
-        if all((each.shape, each.size) == (first.shape, first.size) for each in others):
-            return lowest_point(pos, quat, first.shape, first.size) - self.view.top
-        lowest = [
-            lowest_point(pos[:, column], quat[:, column], each.shape, each.size)
-            for column, each in enumerate(self.view.things)
-        ]
+        forms = [(thing.shape, thing.size) for thing in self.view.things]
+        if forms.count(forms[0]) == len(forms):
+            return lowest_point(self.pos, self.quat, *forms[0]) - self.view.top
+        poses = zip(self.pos.unbind(1), self.quat.unbind(1), forms, strict=True)
+        lowest = [lowest_point(pos, quat, *form) for pos, quat, form in poses]
         return torch.stack(lowest, dim=1) - self.view.top
 
-    @property
-    @once_per_step
+    @step_value
     def bounds(self) -> tuple[Tensor, Tensor]:
         """Least and largest coordinates [m] of the corners, or of those of the box around another
         shape, each ``(nworld, objects, 3)``.
@@ -245,48 +234,54 @@ class Step:
         reach = (self.turn.abs() * self.view.half[:, None]).sum(-1)
         return self.pos - reach, self.pos + reach
 
-    @property
-    @once_per_step
+    @step_value
     def speed(self) -> Tensor:
         """Fastest that any point can be [m/s], shape ``(nworld, objects)``."""
         parts = torch.linalg.vector_norm(self.velocity.unflatten(-1, (2, 3)), dim=-1)
         linear, angular = parts.unbind(-1)
         return linear + self.view.radius * angular
 
-    @property
-    @once_per_step
+    @step_value
+    def corner_speed(self) -> Tensor:
+        """Speed of the fastest corner [m/s], shape ``(nworld, objects)``."""
+        view = self.view
+        signs = view.constant(*itertools.chain(*itertools.product((-1.0, 1.0), repeat=3)))
+        arms = view.half[:, None] * signs.view(8, 3)
+        # A free joint's linear velocity is the world's, its angular velocity the body's: all of it
+        # in the body's frame.
+        linear = (self.turn * self.velocity[..., :3, None]).sum(-2)
+        spin = self.velocity[..., None, 3:].expand(-1, -1, 8, -1)
+        swept = torch.linalg.cross(spin, arms.expand_as(spin))
+        return torch.linalg.vector_norm(linear[..., None, :] + swept, dim=-1).amax(-1)
+
+    @step_value
     def pressed(self) -> Tensor:
         """Whether each jaw presses on each object, shape ``(nworld, objects, jaws)``, bool."""
         return self._sensed(self.view.jaws)
 
-    @property
-    @once_per_step
+    def center(self, name: str) -> Tensor:
+        """Position of an object [m], shape ``(nworld, 3)``."""
+        return self.pos[:, self.view.objects.index(name)]
+
+    @step_value
     def in_hand(self) -> Tensor:
         """Whether all jaws press on each object, shape ``(nworld, objects)``, bool."""
         return self.pressed.all(-1)
 
-    @property
-    @once_per_step
+    @step_value
     def untouched(self) -> Tensor:
         """Whether no jaw presses on each object, shape ``(nworld, objects)``, bool."""
         return ~self.pressed.any(-1)
 
-    @property
-    @once_per_step
-    def opening(self) -> Tensor:
-        """How far each gripper joint is open as measured, 0 closed to 1 open, shape ``(nworld,
-        n_gripper)``, float32.
-        """
-        return gripper_opening(self.view.env).float()
-
-    @property
-    @once_per_step
+    @step_value
     def narrowest(self) -> Tensor:
-        """The least open one of them, shape ``(nworld, 1)``."""
-        return self.opening if self.opening.shape[1] == 1 else self.opening.amin(1, keepdim=True)
+        """How far the least open gripper joint is open as measured, 0 closed to 1 open, shape
+        ``(nworld, 1)``, float32.
+        """
+        opening = gripper_opening(self.view.env).float()
+        return opening if opening.shape[1] == 1 else opening.amin(1, keepdim=True)
 
-    @property
-    @once_per_step
+    @step_value
     def supported(self) -> Tensor:
         """Whether anything but a jaw presses on each object, shape ``(nworld, objects)``, bool;
         needs ``scene.support_sensors``.

@@ -3,20 +3,20 @@
 import math
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, replace
+from contextlib import closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
 import torch
 
-from mjstack.config.schema import CloneJobCfg, CloneSizes
+from mjstack.config.schema import CloneJobCfg
 from mjstack.envs import Env, driven_config
-from mjstack.episodes.context import RunContext
+from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, MjstackError, UnknownName, renamed_keys
 from mjstack.managers.observation import ObservationManager
 from mjstack.sim.memory import free_memory
-from mjstack.train.clone_learner import Learner
+from mjstack.train.clone_learner import CloneLearner
 from mjstack.train.dataset import check_dataset, read_demonstrations
 from mjstack.train.demonstrations import batches_of, lead_gripper, play_expert
 from mjstack.train.trainer import (
@@ -24,34 +24,28 @@ from mjstack.train.trainer import (
     Trained,
     Trainer,
     earlier_state,
-    filled,
     observed_group,
     one_world,
 )
 
 
-def check_clone(context: RunContext) -> range:
+def check_clone(stage: Stage) -> range:
     """Check the observation, the sizes and the dataset; see `Trainer`."""
-    cfg = context.cfg
+    cfg = stage.cfg
     job = cast(CloneJobCfg, cfg.job)
-    sizes = resolve_sizes(job, context.backend[1])
-    group = observed_group(job, sizes.leave_out)
-    check_vision(context, job)
-    with _started_world(context) as env:
+    group = observed_group(job)
+    _check_vision(stage, job)
+    with _started_world(stage) as env:
         with renamed_keys({"observation": "job.observation"}):
             widths = ObservationManager(env, {job.group: group}).term_dims[job.group]
         if job.dataset is not None:
             return check_dataset(Path(job.dataset), env, group, widths)
-    return range(cfg.seed, cfg.seed + len(batches_of(job, sizes, cfg.nworld)))
+    return range(cfg.seed, cfg.seed + len(batches_of(job, cfg.nworld)))
 
 
-def check_vision(context: RunContext, job: CloneJobCfg) -> None:
-    """Refuse images that a policy cannot see, or that do not fit into memory.
-
-    Raises:
-        MjstackError: Some do not.
-    """
-    cameras = context.cfg.scene.cameras
+def _check_vision(stage: Stage, job: CloneJobCfg) -> None:
+    """Refuse images that a policy cannot see, or that do not fit into memory."""
+    cameras = stage.cfg.scene.cameras
     for name in job.vision.cameras:
         if name not in cameras:
             raise UnknownName("job.vision.cameras: camera", name, cameras)
@@ -69,52 +63,41 @@ def check_vision(context: RunContext, job: CloneJobCfg) -> None:
         raise ConfigError("job.dataset", job.dataset, expected, "Or set job.vision.cameras=[]")
     images = 3 * sum(math.prod(cameras[name].size) for name in job.vision.cameras)
     needed = job.vision.pool * images
-    free = free_memory(torch.device(context.backend[1]))
+    free = free_memory(torch.device(stage.backend[1]))
     if needed > free:
-        expected = (
-            f"at most {free // images}, as the device has {free / 2**30:.3g} GiB free and so many"
-            f" steps need {needed / 2**30:.3g} GiB"
-        )
+        expected = f"at most {free // images}, as the device has {free / 2**30:.3g} GiB free and so"
+        expected += f" many steps need {needed / 2**30:.3g} GiB"
         raise ConfigError("job.vision.pool", job.vision.pool, expected, "Or make images smaller")
 
 
 @contextmanager
-def _started_world(context: RunContext) -> Iterator[Env]:
+def _started_world(stage: Stage) -> Iterator[Env]:
     """One started world of the task."""
-    with one_world(context, driven_config(context.cfg, reset={})) as env:
+    with one_world(stage, driven_config(stage.cfg, reset={})) as env:
         env.reset()
         yield env
 
 
-def resolve_sizes(job: CloneJobCfg, device: str) -> CloneSizes:
-    """The job's sizes, those of the device where they are null."""
-    return filled(job, job.sizes["cuda" if device.startswith("cuda") else "cpu"])
-
-
-def train_clone(context: RunContext, folder: Path) -> Trained:
+def train_clone(stage: Stage, folder: Path) -> Trained:
     """Play the expert or read a dataset, and fit a network to its answers; see `Trainer`."""
     # An earlier call's training, which may be complete
-    cfg = context.cfg
+    cfg = stage.cfg
     job = cast(CloneJobCfg, cfg.job)
-    sizes = resolve_sizes(job, context.backend[1])
-    device = context.backend[1].partition(":")[0]
-    ranks = context.ranks
-    made_with = {"sizes": asdict(sizes), "device": device, "processes": ranks.size}
-    earlier = earlier_state(folder, made_with)
-    if earlier and earlier[1]["done"] == sizes.batches:
-        context.print_line(f"train: {folder} is trained already, and is judged anew")
+    earlier = earlier_state(stage, folder)
+    if earlier and earlier[1]["done"] == job.batches:
+        stage.progress.print_line(f"train: {folder} is trained already, and is judged anew")
         return _trained(folder, earlier[1])
 
     # Demonstrations
     began = time.perf_counter()
-    group = observed_group(job, sizes.leave_out)
+    group = observed_group(job)
     cfg = replace(cfg, observation={job.group: group})
     if job.dataset is None:
-        demonstrations = play_expert(context, sizes, group)
+        demonstrations = play_expert(stage, group)
     else:
-        with _started_world(context) as env:
+        with _started_world(stage) as env:
             widths = ObservationManager(env, {job.group: group}).term_dims[job.group]
-        demonstrations = read_demonstrations(Path(job.dataset), context, group, widths)
+        demonstrations = read_demonstrations(Path(job.dataset), stage, group, widths)
     if len(demonstrations.ends) < 2:
         raise MjstackError(
             f"{demonstrations.source}: {len(demonstrations.ends)} of {demonstrations.played}"
@@ -122,8 +105,8 @@ def train_clone(context: RunContext, folder: Path) -> Trained:
             "Ask for more (job.episodes), or look at why with gates=[success]",
         )
     demonstrations = lead_gripper(demonstrations, len(cfg.robot.gripper_joints))
-    counts = torch.tensor([len(demonstrations.ends), demonstrations.played], device=device)
-    ranks.sum_(counts)
+    counts = demonstrations.ends.new_tensor([len(demonstrations.ends), demonstrations.played])
+    stage.ranks.sum_(counts)
     facts = {
         "expert_episodes": int(counts[0]),
         "expert_episodes_played": int(counts[1]),
@@ -132,10 +115,10 @@ def train_clone(context: RunContext, folder: Path) -> Trained:
     }
 
     # Batches
-    learner = Learner(context, cfg, sizes, demonstrations, folder, made_with, facts)
-    if earlier:
-        learner.restore(*earlier)
-    learner.learn()
+    with closing(CloneLearner(stage, cfg, demonstrations, folder, facts)) as learner:
+        if earlier:
+            learner.restore(*earlier)
+        learner.learn()
     return _trained(folder, learner.facts())
 
 
@@ -144,19 +127,15 @@ def _trained(folder: Path, facts: dict[str, Any]) -> Trained:
     last = facts["curve"][-1]
     expert = dict(facts["expert"])
     notes = {"policy": str(folder / LAST), "demonstrations": expert.pop("source")}
-    metrics = {
+    metrics = expert | {
         "batches": facts["done"],
         "training_s": facts["seconds"],
         "loss": last["loss"],
         "validation_loss": last["validation_loss"],
-        "best_validation_loss": facts["best"],
+        "best_validation_loss": min(row["validation_loss"] for row in facts["curve"]),
     }
-    return Trained(
-        metrics=expert | metrics,
-        notes=notes,
-        curve=facts["curve"],
-        lines=["loss", "validation_loss"],
-    )
+    lines = ["loss", "validation_loss"]
+    return Trained(metrics=metrics, notes=notes, curve=facts["curve"], lines=lines, scale="log")
 
 
 TRAINER = Trainer(check_clone, train_clone)

@@ -1,6 +1,6 @@
 """The network of a clone with the scale of its demonstrations, and the noise on what it sees."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import cast
 
 import mujoco
@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mjstack.config.functions import offered
-from mjstack.config.schema import CloneJobCfg, CloneSizes, Config, ObservationTermCfg
+from mjstack.config.schema import CloneJobCfg, Config, ObservationTermCfg
 from mjstack.distributed import Ranks
 from mjstack.managers.observation import column_noise, slide_joints
 from mjstack.policy import PolicyNetwork, Vision
@@ -17,14 +17,11 @@ from mjstack.train.demonstrations import Demonstrations
 _LEAST = 0.1  # scale of a column, of the largest one of its term
 
 
-def make_network(
-    cfg: Config, hidden: Sequence[int], demonstrations: Demonstrations, ranks: Ranks
-) -> PolicyNetwork:
+def make_network(cfg: Config, demonstrations: Demonstrations, ranks: Ranks) -> PolicyNetwork:
     """A network with random weights, on the CPU. Its scale is that of all ranks' demonstrations.
 
     Args:
         cfg: The training's configuration; its seed gives the weights.
-        hidden: Widths of the layers.
         demonstrations: Those of this rank.
         ranks: The processes of the training.
     """
@@ -33,9 +30,8 @@ def make_network(
     labels = demonstrations.labels
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(cfg.seed)
-        network = PolicyNetwork(
-            seen.shape[1], labels.shape[1], job.chunk, hidden, vision_of(cfg, job)
-        )
+        sizes = (seen.shape[1], labels.shape[1], job.chunk, job.hidden)
+        network = PolicyNetwork(*sizes, vision_of(cfg, job))
     mean, std = _moments(labels, ranks)
     network.set_scale("action", mean.cpu(), std.cpu())
     # A column that hardly moves would count as much as the others of its term, and the policy would
@@ -47,10 +43,8 @@ def make_network(
     return network
 
 
-def input_noise(
-    cfg: Config, model: mujoco.MjModel, sizes: CloneSizes, widths: Mapping[str, int]
-) -> list[float]:
-    """Half-width of the noise on each column of the observation in a training.
+def input_noise(cfg: Config, model: mujoco.MjModel, widths: Mapping[str, int]) -> Tensor:
+    """Half-width of the noise on each column of the observation in a training, shape ``(n,)``.
 
     Measured jaws have more of it. Their joint target depends on where they are more than any other,
     and a policy that answers with where they are lets them drift.
@@ -58,38 +52,32 @@ def input_noise(
     Args:
         cfg: The training's configuration.
         model: The scene's.
-        sizes: Of the training.
         widths: Numbers of each term of the observation.
     """
     job = cast(CloneJobCfg, cfg.job)
     robot = cfg.robot
     slides = slide_joints(model, robot.joints)
     travel = [abs(a - b) for a, b in zip(robot.gripper_open, robot.gripper_closed, strict=True)]
-    found: list[float] = []
+    widest: list[float] = []
     for name, width in widths.items():
         term = cast(ObservationTermCfg, cfg.observation[job.group].terms[name])
         columns = column_noise(term, width // term.history, slides)
-        columns = [sizes.input_noise * column for column in columns]
+        columns = [job.input_noise * column for column in columns]
         if offered(term.func, "unit") == "joint" and len(columns) == len(robot.joints):
-            jaws = columns[-len(travel) :]
-            columns[-len(travel) :] = [
-                noise + job.gripper_noise * each for noise, each in zip(jaws, travel, strict=True)
-            ]
-        found += [term.scale * column for column in term.history * columns]
-    return found
+            for jaw, span in enumerate(travel, start=-len(travel)):
+                columns[jaw] += job.gripper_noise * span
+        widest += [term.scale * column for column in term.history * columns]
+    return torch.tensor(widest)
 
 
 def vision_of(cfg: Config, job: CloneJobCfg) -> Vision:
     """The images that a policy of the job sees."""
-    settings = job.vision
-    if not settings.cameras:
+    vision = job.vision
+    if not vision.cameras:
         return Vision()
-    cameras = cfg.scene.cameras
-    return Vision(
-        sizes={name: (cameras[name].size[0], cameras[name].size[1]) for name in settings.cameras},
-        channels=settings.channels,
-        features=settings.features,
-    )
+    images = {name: cfg.scene.cameras[name].size for name in vision.cameras}
+    sizes = {name: (height, width) for name, (height, width) in images.items()}
+    return Vision(sizes=sizes, channels=vision.channels, features=vision.features)
 
 
 def _moments(values: Tensor, ranks: Ranks) -> tuple[Tensor, Tensor]:

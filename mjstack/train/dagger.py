@@ -3,37 +3,32 @@ have done in the states to which that leads.
 """
 
 import math
-from contextlib import closing
-from dataclasses import asdict, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
-from mjstack.config.schema import CloneSizes, DaggerJobCfg
+from mjstack.config.schema import CloneJobCfg, DaggerJobCfg
 from mjstack.drivers.driver import Driver
 from mjstack.drivers.policy import PolicyDriver
 from mjstack.envs import Env
-from mjstack.episodes.context import RunContext
-from mjstack.episodes.rollout import STATE_BASED, play_episode
+from mjstack.episodes.batches import BatchPlan, play_batches
+from mjstack.episodes.rollout import STATE_BASED
+from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.managers.view import random_uniform
-from mjstack.policy import Policy, save_policy
+from mjstack.policy import Policy
 from mjstack.policy.checkpoint import read_state, write_state
-from mjstack.train.clone import check_clone, resolve_sizes
-from mjstack.train.clone_learner import Learner
-from mjstack.train.demonstrations import DemonstrationRecorder, Demonstrations
-from mjstack.train.trainer import (
-    BEST,
-    LAST,
-    EventWriter,
-    Trained,
-    Trainer,
-    earlier_state,
-    observed_group,
-)
+from mjstack.train.clone import check_clone
+from mjstack.train.clone_learner import CloneLearner
+from mjstack.train.demonstrations import Demonstrations, demonstration_channels, observed_config
+from mjstack.train.trainer import LAST, Trained, Trainer, earlier_state, observed_group
 
+_TENSORS = ("seen", "labels", "ends")  # of `Demonstrations`, in the file of a round
 _SPELL = 0.5  # s, for which the expert or the policy drives before it is drawn anew
 
 
@@ -71,28 +66,19 @@ class MixedDriver(Driver):
         self.label.copy_(self._expert.command())
         if self._policy is None:
             return self.label
-        answer = self._policy.command()
+        action = self._policy.command()
         spell = torch.div(self._env.episode_step, self._spell, rounding_mode="floor")
         draw = random_uniform(self._env, "train.driver", 1, 0.0, 1.0, step=spell)
         drives = (draw < self._beta) & ~self._alone[:, None]
-        return torch.where(drives, self.label, answer)
+        return torch.where(drives, self.label, action)
 
 
-class RoundLearner(Learner):
+class RoundLearner(CloneLearner):
     """Fits a network round by round. A row of the curve is a round, with the success of its policy
-    in the worlds of the next one.
-
-    Attributes:
-        row: The row of a round whose success is not known yet.
+    in the worlds of the next one. The best policy is the first one with the largest success.
     """
 
     trainer = "dagger"
-
-    def __init__(self, *args: Any) -> None:
-        """Take the arguments of `Learner`; the demonstrations are those of the first round."""
-        super().__init__(*args)
-        self.row: dict[str, Any] | None = None
-        self.best = -1.0
 
     @property
     def policy(self) -> Policy:
@@ -101,45 +87,22 @@ class RoundLearner(Learner):
 
     def begin(self, demonstrations: Demonstrations) -> None:
         """Begin a round with the demonstrations of all rounds so far."""
-        self.take(demonstrations)
+        self.process(demonstrations)
         self._expert["expert_episodes"] = len(demonstrations.ends)
 
-    def _open_events(self) -> None:
-        """A row is complete when its success is known."""
+    @override
+    def score(self, row: Mapping[str, Any]) -> tuple[float, ...]:
+        return row["success"], -row["round"]
 
     def _save(self) -> None:
-        self.row = self._new_row()
-        save_policy(self._folder / LAST, self._policy)
+        """See `Learner`; `conclude` is called when the success is known."""
+        self._keep_row()
         self._write_state()
 
-    def conclude(self, number: int, success: float) -> None:
-        """Add the row of a round to the curve, with the success of its policy."""
-        assert self.row is not None
-        row = {"round": number, "success": success, **self.row}
-        self.row = None
-        self.curve.append(row)
-        if success > self.best:
-            self.best = success
-            self._policy.training |= row
-            save_policy(self._folder / BEST, self._policy)
-        events = EventWriter(self._folder, self.done - 1, self._context.print_line)
-        events.add(row, self.done)
-        events.close()
-        self._write_state()
 
-    def facts(self) -> dict[str, Any]:
-        """See `Learner`."""
-        return super().facts() | {"row": self.row}
-
-    def restore(self, state: dict[str, Tensor], facts: dict[str, Any]) -> None:
-        """See `Learner`."""
-        super().restore(state, facts)
-        self.row = facts["row"]
-
-
-def check_dagger(context: RunContext) -> range:
+def check_dagger(stage: Stage) -> range:
     """Check the expert, the observation and the sizes; see `Trainer`."""
-    cfg = context.cfg
+    cfg = stage.cfg
     job = cast(DaggerJobCfg, cfg.job)
     if cfg.controller.name != STATE_BASED:
         expected = "state_based, because trainer=dagger asks the expert in the policy's states"
@@ -150,177 +113,128 @@ def check_dagger(context: RunContext) -> range:
     if job.dataset is not None:
         expected = "null, because trainer=dagger asks the expert itself"
         raise ConfigError("job.dataset", job.dataset, expected, "Set trainer=clone")
-    if (processes := context.ranks.size) > 1:
+    if (processes := stage.ranks.size) > 1:
         raise MjstackError(
             f"torchrun has started {processes} processes, and trainer=dagger runs in one",
             "Start it without torchrun, or set trainer=clone",
         )
-    check_clone(context)
-    sizes = resolve_sizes(job, context.backend[1])
-    if sizes.episodes < 2:
+    check_clone(stage)
+    if job.episodes < 2:
         expected = "at least 2, because one of them is for validation"
-        raise ConfigError("job.episodes", sizes.episodes, expected)
-    return range(cfg.seed, cfg.seed + (job.rounds + 1) * _batches(sizes, cfg.nworld))
+        raise ConfigError("job.episodes", job.episodes, expected)
+    return range(cfg.seed, cfg.seed + (job.rounds + 1) * _batches(job, cfg.nworld))
 
 
-def _batches(sizes: CloneSizes, nworld: int) -> int:
+def _batches(job: CloneJobCfg, nworld: int) -> int:
     """Batches of worlds of a round."""
-    return math.ceil(sizes.episodes / nworld)
+    return math.ceil(job.episodes / nworld)
 
 
-def train_dagger(context: RunContext, folder: Path) -> Trained:
+def train_dagger(stage: Stage, folder: Path) -> Trained:
     """Play and learn, round by round; see `Trainer`."""
     # An earlier call's training
-    job = cast(DaggerJobCfg, context.cfg.job)
-    device = context.backend[1].partition(":")[0]
-    sizes = resolve_sizes(job, device)
-    made_with = {"sizes": asdict(sizes), "device": device}
-    earlier = earlier_state(folder, made_with)
+    job = cast(DaggerJobCfg, stage.cfg.job)
+    earlier = earlier_state(stage, folder)
     if earlier and len(earlier[1]["curve"]) == job.rounds:
-        context.print_line(f"train: {folder} is trained already, and is judged anew")
+        stage.progress.print_line(f"train: {folder} is trained already, and is judged anew")
         return _trained(folder, earlier[1])
 
     # Rounds: the last one shows the success of the policy alone
-    learner = None
+    learner: RoundLearner | None = None
     parts: list[Demonstrations] = []
     for number in range(job.rounds + 1):
-        policy = learner.policy if learner else None
-        part, success = _round(context, folder, sizes, policy, number)
+        path = folder / f"round-{number}.safetensors"
+        if not path.exists():  # a later call reads what an earlier one has played
+            policy = learner.policy if learner else None
+            write_state(path, *_play_round(stage, policy, number))
+        tensors, facts = read_state(path)
+        seen, labels, ends = (tensors[name].to(stage.backend[1]) for name in _TENSORS)
+        part = Demonstrations(
+            seen=seen,
+            labels=labels,
+            ends=ends,
+            widths=facts["widths"],
+            played=len(ends),
+            source=path.name,
+        )
         parts.append(part)
-        if learner is None:
-            learner = _make_learner(context, folder, sizes, part, made_with)
+        if learner is None:  # its scale is that of the first round
+            cfg = replace(stage.cfg, observation={job.group: observed_group(job)})
+            learner = RoundLearner(stage, cfg, parts[0], folder, {})
             if earlier:
                 learner.restore(*earlier)
-        elif learner.row is not None and learner.done == number * sizes.batches:
-            learner.conclude(number, success)
+        elif learner.row is not None and learner.done == number * job.batches:
+            learner.conclude(round=number, success=facts["success"])
         if number < job.rounds:
-            learner.begin(_join(parts))
-            learner.learn(number * sizes.batches, (number + 1) * sizes.batches)
+            learner.begin(Demonstrations.join(parts, "all rounds"))
+            learner.learn(number * job.batches, (number + 1) * job.batches)
     assert learner is not None
-    for number in range(job.rounds + 1):
-        _round_file(folder, number).unlink(missing_ok=True)
+    learner.close()
+    for path in folder.glob("round-*.safetensors"):
+        path.unlink()
     return _trained(folder, learner.facts())
-
-
-def _make_learner(
-    context: RunContext,
-    folder: Path,
-    sizes: CloneSizes,
-    first: Demonstrations,
-    made_with: dict[str, Any],
-) -> RoundLearner:
-    """The learner, its scale that of the first round."""
-    job = cast(DaggerJobCfg, context.cfg.job)
-    cfg = replace(context.cfg, observation={job.group: observed_group(job, sizes.leave_out)})
-    total = replace(sizes, batches=job.rounds * sizes.batches)
-    return RoundLearner(context, cfg, total, first, folder, made_with, {})
 
 
 def _trained(folder: Path, facts: dict[str, Any]) -> Trained:
     """The result of a complete training, from the facts of its state."""
     curve = facts["curve"]
-    return Trained(
-        metrics={
-            "rounds": len(curve),
-            "episodes": facts["expert"]["expert_episodes"],
-            "batches": facts["done"],
-            "training_s": facts["seconds"],
-            "loss": curve[-1]["loss"],
-            "validation_loss": curve[-1]["validation_loss"],
-            "best_training_success": facts["best"],
-        },
-        notes={"policy": str(folder / LAST)},
-        curve=curve,
-        lines=["success"],
-        abscissa="round",
-        scale="linear",
-    )
-
-
-def _round_file(folder: Path, number: int) -> Path:
-    return folder / f"round-{number}.safetensors"
-
-
-def _round(
-    context: RunContext, folder: Path, sizes: CloneSizes, policy: Policy | None, number: int
-) -> tuple[Demonstrations, float]:
-    """States of a round with the expert's answers, and the share of successes of the policy where
-    it drove alone. They are played once: a later call reads them.
-    """
-    path = _round_file(folder, number)
-    device = context.backend[1]
-    if not path.exists():
-        seen, labels, widths, success = _play_round(context, sizes, policy, number)
-        found = {"widths": widths, "success": success}
-        write_state(path, {"seen": seen, "labels": labels}, found)
-    tensors, facts = read_state(path)
-    seen = tensors["seen"].to(device)
-    episodes, steps = seen.shape[:2]
-    demonstrations = Demonstrations(
-        seen=seen.flatten(0, 1),
-        labels=tensors["labels"].to(device).flatten(0, 1),
-        ends=steps * torch.arange(1, episodes + 1, device=device),
-        widths=facts["widths"],
-        played=episodes,
-        source=f"round {number}",
-    )
-    return demonstrations, facts["success"]
-
-
-def _join(parts: list[Demonstrations]) -> Demonstrations:
-    """The demonstrations of all rounds so far."""
-    first = torch.tensor([0, *(len(part.seen) for part in parts[:-1])]).cumsum(0).tolist()
-    return Demonstrations(
-        seen=torch.cat([part.seen for part in parts]),
-        labels=torch.cat([part.labels for part in parts]),
-        ends=torch.cat([part.ends + at for part, at in zip(parts, first, strict=True)]),
-        widths=parts[0].widths,
-        played=sum(part.played for part in parts),
-        source="all rounds",
-    )
+    metrics = {
+        "rounds": len(curve),
+        "episodes": facts["expert"]["expert_episodes"],
+        "batches": facts["done"],
+        "training_s": facts["seconds"],
+        "loss": curve[-1]["loss"],
+        "validation_loss": curve[-1]["validation_loss"],
+        "best_training_success": max(row["success"] for row in curve),
+    }
+    notes = {"policy": str(folder / LAST)}
+    return Trained(metrics=metrics, notes=notes, curve=curve, abscissa="round")
 
 
 def _play_round(
-    context: RunContext, sizes: CloneSizes, policy: Policy | None, number: int
-) -> tuple[Tensor, Tensor, dict[str, int], float]:
-    """Observations, shape ``(episodes, steps, inputs)``, the expert's joint targets, widths of the
-    observation's terms, and the share of successes of the policy alone, or of the expert.
+    stage: Stage, policy: Policy | None, number: int
+) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Play a round, with the expert alone where there is no policy yet.
+
+    Returns:
+        Steps with the expert's labels, by the names of `Demonstrations`; and ``widths`` of the
+        observation's terms and the share of ``success`` of the policy alone, or of the expert.
     """
-    cfg = context.cfg
+    cfg = stage.cfg
     job = cast(DaggerJobCfg, cfg.job)
-    group = observed_group(job, sizes.leave_out)
-    nworld = min(cfg.nworld, sizes.episodes)
+    nworld = min(cfg.nworld, job.episodes)
     beta = job.beta * job.beta_decay ** (number - 1) if policy else 1.0
     share = 1.0 if number in (0, job.rounds) else job.alone
     alone = math.ceil(share * nworld)
-    batches = _batches(sizes, nworld)
+    batches = _batches(job, nworld)
     first = cfg.seed + number * batches
-    seen: list[Tensor] = []
-    labels: list[Tensor] = []
-    widths: dict[str, int] = {}
-    accepted = 0
-    with closing(context.batch_simulation(nworld)) as sim:
-        for seed in range(first, first + batches):
-            env = context.start(sim, cfg.reset, seed=seed)
-            own = PolicyDriver(env, policy) if policy else None
-            driver = MixedDriver(context.driver(env), own, env, beta, alone)
-            recorder = DemonstrationRecorder(job.group, group)
-            label = f"steps of round {number} of {job.rounds}, seed {seed}"
-            looking = [recorder, *context.spectators]
-            episode = play_episode(env, driver, looking, advance=context.advance, label=label)
-            widths = recorder.widths
-            accepted += int((episode.result.failed[:alone] == 0).sum())
-            # A world whose state is not finite has nothing to say
-            finite = [each.isfinite().all(2).all(0) for each in (recorder.seen, recorder.labels)]
-            good = finite[0] & finite[1]
-            seen.append(recorder.seen[:, good].transpose(0, 1))
-            labels.append(recorder.labels[:, good].transpose(0, 1))
-    success = accepted / (alone * batches)
+
+    def drive(plan: BatchPlan, env: Env) -> Driver:
+        learner = PolicyDriver(env, policy) if policy else None
+        return MixedDriver(stage.driver(env), learner, env, beta, alone)
+
+    parts = []
+    successes = 0
+    for batch in play_batches(
+        stage,
+        [BatchPlan(seed, range(nworld)) for seed in range(first, first + batches)],
+        demonstration_channels(job),
+        cfg=observed_config(stage, observed_group(job)),
+        driver=drive,
+        label=f"steps of round {number} of {job.rounds}",
+    ):
+        successes += int(batch.succeeded[:alone].sum())
+        # Nothing is learned from a world whose state is not finite
+        finite = batch.finite().nonzero()[:, 0]
+        parts.append(Demonstrations.of(batch, finite, job, nworld))
     who = "the policy alone" if policy else "the expert"
-    context.print_line(
-        f"train: round {number}: {who} succeeded in {accepted} of {alone * batches} episodes"
+    episodes = alone * batches
+    stage.progress.print_line(
+        f"train: round {number}: {who} succeeded in {successes} of {episodes} episodes"
     )
-    return torch.cat(seen), torch.cat(labels), widths, success
+    played = Demonstrations.join(parts, f"round {number}")
+    tensors = {name: getattr(played, name) for name in _TENSORS}
+    return tensors, {"widths": played.widths, "success": successes / episodes}
 
 
 TRAINER = Trainer(check_dagger, train_dagger)

@@ -15,14 +15,15 @@ from mjstack.datasets import lerobot
 from mjstack.datasets.reader import readable
 from mjstack.datasets.spec import term_columns
 from mjstack.envs import Env
-from mjstack.episodes.context import RunContext
-from mjstack.errors import DatasetError
+from mjstack.episodes.stage import Stage
+from mjstack.errors import FolderError
 from mjstack.mdp.geometry import robot
 from mjstack.train.demonstrations import Demonstrations
 
 _ACTION = "action"
 _SUCCESS = "next.success"
 _EPISODE = "episode_index"
+_TASK = "task_index"
 _BEYOND = 1e-3  # rad, m: how far a joint target may be out of its actuator's range
 
 Place = tuple[str, int]  # a feature, and which of its numbers
@@ -56,7 +57,7 @@ def check_dataset(
     joint = int(worst.argmax())
     if worst[joint] > _BEYOND:
         values = action[:, joint]
-        raise DatasetError(
+        raise FolderError(
             f"{folder}: {_ACTION} of {cfg.robot.joints[joint]} is {values.min():g} to"
             f" {values.max():g}, expected absolute joint targets within {low[joint]:g} to"
             f" {high[joint]:g} rad or m. Give a dataset with these units"
@@ -66,41 +67,38 @@ def check_dataset(
 
 
 def read_demonstrations(
-    folder: Path, context: RunContext, group: ObservationGroupCfg, widths: dict[str, int]
+    folder: Path, stage: Stage, group: ObservationGroupCfg, widths: dict[str, int]
 ) -> Demonstrations:
     """The episodes of a dataset that succeeded, on the device of the training. Without a column
     ``next.success`` all are taken to have succeeded.
 
     Args:
         folder: The dataset.
-        context: The run. Each rank reads its share of the episodes.
+        stage: The stage. Each rank reads its share of the episodes.
         group: The observation of the policy.
         widths: Numbers of each of its terms.
 
     Raises:
-        DatasetError: A file is missing or damaged.
+        FolderError: A file is missing or damaged.
     """
-    cfg = context.cfg
+    cfg = stage.cfg
     info = _read_info(folder)
     places = _find_columns(folder, info, cfg, group, widths)
-    wanted = dict(places) | {_EPISODE: [(_EPISODE, 0)], "task_index": [("task_index", 0)]}
-    if _SUCCESS in info["features"]:
-        wanted[_SUCCESS] = [(_SUCCESS, 0)]
-    task = _task_number(folder, cfg)
-    parts = [_read(path, wanted) for path in _files(folder, info)]
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in wanted}
+    facts = [_EPISODE, _TASK, *({_SUCCESS} & info["features"].keys())]
+    places |= {name: [(name, 0)] for name in facts}
+    parts = [_read(path, places) for path in _files(folder, info)]
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in places}
 
     # Episodes of the task that succeeded
-    episode = columns[_EPISODE][:, 0]
-    ends = np.flatnonzero(np.diff(episode, append=-1)) + 1
+    ends = np.flatnonzero(np.diff(columns[_EPISODE][:, 0], append=-1)) + 1
     starts = np.concatenate([[0], ends[:-1]])
-    good = columns["task_index"][ends - 1, 0] == task
+    usable = columns[_TASK][ends - 1, 0] == _task_number(folder, cfg)
     if _SUCCESS in columns:
-        good &= columns[_SUCCESS][ends - 1, 0] != 0.0
-    ranks = context.ranks
-    own = [(a, b) for a, b in zip(starts[good], ends[good], strict=True)][ranks.rank :: ranks.size]
-    keep = np.concatenate([np.arange(a, b) for a, b in own]) if own else np.arange(0)
-    device = context.backend[1]
+        usable &= columns[_SUCCESS][ends - 1, 0] != 0.0
+    ranks = stage.ranks
+    episodes = list(zip(starts[usable], ends[usable], strict=True))[ranks.rank :: ranks.size]
+    keep = np.concatenate([np.arange(*episode) for episode in episodes] or [np.arange(0)])
+    device = stage.backend[1]
 
     def on_device(name: str) -> torch.Tensor:
         return torch.as_tensor(columns[name][keep].astype(np.float32), device=device)
@@ -109,11 +107,15 @@ def read_demonstrations(
     done = (
         "succeeded in" if _SUCCESS in columns else f"(none has {_SUCCESS}) are taken to succeed in"
     )
-    context.print_line(f"train: {len(own)} of {played} episodes of {folder} {done} the task")
+    stage.progress.print_line(
+        f"train: {len(episodes)} of {played} episodes of {folder} {done} the task"
+    )
     return Demonstrations(
         seen=on_device("observation"),
         labels=on_device(_ACTION),
-        ends=torch.as_tensor(np.cumsum([b - a for a, b in own]), dtype=torch.int64, device=device),
+        ends=torch.as_tensor(
+            np.cumsum([b - a for a, b in episodes]), dtype=torch.int64, device=device
+        ),
         widths=widths,
         played=played,
         source=str(folder),
@@ -125,7 +127,7 @@ def _read_info(folder: Path) -> dict[str, Any]:
     lerobot.require_pyarrow()
     path = folder / lerobot.INFO
     if not path.is_file():
-        raise DatasetError(
+        raise FolderError(
             f"job.dataset={folder}: has no {lerobot.INFO}, expected a LeRobotDataset v3. Give the"
             " folder dataset of job=collect"
         )
@@ -135,7 +137,7 @@ def _read_info(folder: Path) -> dict[str, Any]:
         for name in ("robot_type", "fps", "features"):
             info[name]
     if not version.startswith("v3"):
-        raise DatasetError(
+        raise FolderError(
             f"job.dataset={folder}: is a LeRobotDataset {version}, expected v3.0. Convert it with"
             " LeRobot"
         )
@@ -152,57 +154,57 @@ def _find_columns(
     """Where the numbers of the observation and of the action are.
 
     Raises:
-        DatasetError: One is missing, or the dataset is of another robot or rate.
+        FolderError: One is missing, or the dataset is of another robot or rate.
     """
     expected = {"robot_type": cfg.robot.name, "fps": round(cfg.task.control_hz)}
     for key, value in expected.items():
         if info[key] != value:
-            raise DatasetError(
+            raise FolderError(
                 f"job.dataset={folder}: has {key}={info[key]}, expected {value}. Give another"
                 " dataset, or set robot and task to its own"
             )
-    features = info["features"]
-    job = cast(CloneJobCfg, cfg.job)
-    name = f"observation.{job.group}"
-    first = [name] if name in features else []
-    others = [each for each in features if each.startswith("observation.") and each != name]
-    seen = _places([*first, *others], features)
+    name = f"observation.{cast(CloneJobCfg, cfg.job).group}"
+    observations = [key for key in info["features"] if key.startswith("observation.")]
+    observed = _places(sorted(observations, key=lambda key: key != name), info["features"])
     numbers = [
         column
         for term, width in widths.items()
         for column in term_columns(term, width, group.terms[term].history)
     ]
     targets = [f"{joint}.pos" for joint in cfg.robot.joints]
-    done = _places([_ACTION], features)
-    for wanted, found, where in ((numbers, seen, name), (targets, done, _ACTION)):
-        for column in wanted:
-            if column not in found:
-                raise DatasetError(
+    commanded = _places([_ACTION], info["features"])
+    for columns, places, where in ((numbers, observed, name), (targets, commanded, _ACTION)):
+        for column in columns:
+            if column not in places:
+                raise FolderError(
                     f"job.dataset={folder}: has no column {column} in {where}, expected all that"
                     " the policy sees. Collect it with job=collect observation=state, or choose"
                     " observation@job.observation"
                 )
-    return {"observation": [seen[n] for n in numbers], _ACTION: [done[n] for n in targets]}
+    return {
+        "observation": [observed[column] for column in numbers],
+        _ACTION: [commanded[column] for column in targets],
+    }
 
 
 def _places(names: Sequence[str], features: Mapping[str, Any]) -> dict[str, Place]:
     """Where each number of some features is; the first one of a name."""
-    found: dict[str, Place] = {}
+    places: dict[str, Place] = {}
     for name in names:
         feature = features.get(name, {})
         if str(feature.get("dtype")).startswith("float"):
             for number, column in enumerate(_names(feature.get("names"))):
-                found.setdefault(str(column), (name, number))
-    return found
+                places.setdefault(str(column), (name, number))
+    return places
 
 
-def _names(given: object) -> list[object]:
+def _names(value: object) -> list[object]:
     """Names of a feature's numbers: LeRobot has a list, or a mapping of lists or of numbers."""
-    if isinstance(given, dict):
-        if all(isinstance(each, list) for each in given.values()):
-            return [name for names in given.values() for name in names]
-        return sorted(given, key=given.__getitem__)
-    return given if isinstance(given, list) else []
+    if isinstance(value, dict):
+        if all(isinstance(names, list) for names in value.values()):
+            return [name for names in value.values() for name in names]
+        return sorted(value, key=value.__getitem__)
+    return value if isinstance(value, list) else []
 
 
 def _files(folder: Path, info: Mapping[str, Any]) -> list[Path]:
@@ -228,7 +230,7 @@ def _task_number(folder: Path, cfg: Config) -> int:
     """Number of the task in the dataset.
 
     Raises:
-        DatasetError: The dataset does not have it.
+        FolderError: The dataset does not have it.
     """
     path = folder / lerobot.TASKS
     with readable(path):
@@ -237,16 +239,16 @@ def _task_number(folder: Path, cfg: Config) -> int:
         text = "task" if "task" in names else next(n for n in names if n != "task_index")
         tasks = dict(zip(table[text].to_pylist(), table["task_index"].to_pylist(), strict=True))
     if cfg.task.instruction not in tasks:
-        raise DatasetError(
+        raise FolderError(
             f"job.dataset={folder}: has the task {', '.join(map(repr, tasks)) or 'none'}, expected"
             f" {cfg.task.instruction!r}. Give another dataset, or set task"
         )
     return int(tasks[cfg.task.instruction])
 
 
-def _read(path: Path, wanted: Mapping[str, Sequence[Place]]) -> dict[str, np.ndarray]:
+def _read(path: Path, columns: Mapping[str, Sequence[Place]]) -> dict[str, np.ndarray]:
     """Numbers of a data file by name, each shape ``(frames, numbers)``."""
-    features = sorted({feature for places in wanted.values() for feature, _ in places})
+    features = sorted({feature for places in columns.values() for feature, _ in places})
     with readable(path):
         table = lerobot.require_pyarrow()[1].ParquetFile(path).read(columns=features)
         values = {}
@@ -255,10 +257,10 @@ def _read(path: Path, wanted: Mapping[str, Sequence[Place]]) -> dict[str, np.nda
             flat = column.flatten() if hasattr(column, "flatten") else column
             array = np.asarray(flat.to_numpy(zero_copy_only=False), dtype=float)
             values[feature] = array.reshape(len(table), -1)
-        found = {
+        arrays = {
             name: np.stack([values[feature][:, number] for feature, number in places], axis=1)
-            for name, places in wanted.items()
+            for name, places in columns.items()
         }
-        if not all(np.isfinite(array).all() for array in found.values()):
+        if not all(np.isfinite(array).all() for array in arrays.values()):
             raise ValueError("numbers that are not finite")
-        return found
+        return arrays

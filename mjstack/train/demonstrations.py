@@ -2,21 +2,21 @@
 targets that the expert has given.
 """
 
+import itertools
 import math
-from collections.abc import Mapping
-from contextlib import closing
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import cast
 
 import torch
 from torch import Tensor
 
-from mjstack.config.schema import CloneJobCfg, CloneSizes, ObservationGroupCfg
+from mjstack.config.schema import CloneJobCfg, Config, ObservationGroupCfg
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
-from mjstack.episodes.context import RunContext
-from mjstack.episodes.rollout import Observer, play_episode
-from mjstack.managers.observation import ObservationManager
+from mjstack.episodes.batches import Batch, BatchPlan, play_batches
+from mjstack.episodes.recorder import Channels, Read, start_and_every_step
+from mjstack.episodes.stage import Stage
 from mjstack.managers.view import random_uniform
 
 NOISE_SECONDS = 0.5  # in which the noise of a joint is forgotten
@@ -42,71 +42,49 @@ class NoisyDriver(Driver):
         self._arm = env.index.n_arm
         shape = (env.nworld, len(env.index.ctrl))
         self.label = torch.zeros(shape, device=env.device)
-        self._given = torch.zeros(shape, device=env.device)
+        self._command = torch.zeros(shape, device=env.device)
         self._offset = torch.zeros((env.nworld, self._arm), device=env.device)
-        self._keep = math.exp(-env.cfg.timing.step_dt / NOISE_SECONDS)
+        self._decay = math.exp(-env.cfg.timing.step_dt / NOISE_SECONDS)
         # A uniform number from -1 to 1 has a variance of 1/3.
-        self._width = noise * math.sqrt(3.0 * (1.0 - self._keep**2))
+        self._width = noise * math.sqrt(3.0 * (1.0 - self._decay**2))
 
     def command(self) -> Tensor:
         """Joint targets of the next step, shape ``(nworld, nu)``."""
         env = self._env
         self.label.copy_(self._expert.command())
-        self._given.copy_(self.label)
+        self._command.copy_(self.label)
         if self._width > 0.0:
             draw = random_uniform(env, "train.noise", self._arm, step=env.episode_step).float()
-            self._offset.mul_(self._keep).add_(draw, alpha=self._width)
-            self._given[:, : self._arm] += self._offset
-        return self._given
+            self._offset.mul_(self._decay).add_(draw, alpha=self._width)
+            self._command[:, : self._arm] += self._offset
+        return self._command
 
 
-class DemonstrationRecorder(Observer):
-    """Keeps every step of every world on the device.
-
-    Attributes:
-        seen: Observations before each step, shape ``(steps, nworld, inputs)``.
-        labels: The expert's joint targets of each step, shape ``(steps, nworld, nu)``.
-        widths: Numbers of each term of the observation.
-        qpos: Positions before each step, shape ``(steps, nworld, nq)``, float32; None if they are
-            not kept.
+def demonstration_channels(job: CloneJobCfg) -> list[Channels]:
+    """What is recorded of an episode with a driver that has labels: observations before each step,
+    positions too where images are rendered from them, and the labels.
     """
 
-    seen: Tensor
-    labels: Tensor
-    widths: dict[str, int]
-    qpos: Tensor | None = None
+    def read_before(env: Env, driver: Driver) -> Read:
+        observations = env.observation_manager.groups[job.group]
+        qpos = env.sim.qpos
+        states = {"qpos": qpos} if job.vision.cameras else {}
+        return lambda: {
+            "observation": observations,
+            **{name: state.float() for name, state in states.items()},
+        }
 
-    def __init__(self, name: str, group: ObservationGroupCfg, *, keep_states: bool = False) -> None:
-        """Take the observation group's name and configuration, and whether positions are kept."""
-        self._name = name
-        self._group = group
-        self._keep_states = keep_states
+    def read_label(env: Env, driver: Driver) -> Read:
+        label = cast(NoisyDriver, driver).label
+        return lambda: {"label": label}
 
-    def start(self, env: Env, driver: Driver) -> None:
-        """See `Observer`."""
-        super().start(env, driver)
-        self._observations = ObservationManager(env, {self._name: self._group})
-        self._now = self._observations.groups[self._name]
-        self.widths = self._observations.term_dims[self._name]
-        shape = (driver.steps, env.nworld)
-        self.seen = torch.zeros((*shape, self._now.shape[1]), device=env.device)
-        self.labels = torch.zeros((*shape, len(env.index.ctrl)), device=env.device)
-        if self._keep_states:
-            self.qpos = torch.zeros((*shape, env.sim.qpos.shape[1]), device=env.device)
-            self._last = env.sim.qpos.float().clone()
-        self._next = torch.zeros(1, dtype=torch.int64, device=env.device)
-        self._observations.refresh(torch.ones(env.nworld, dtype=torch.bool, device=env.device))
+    return [Channels(read_before, start_and_every_step), Channels(read_label)]
 
-    def update(self) -> None:
-        """See `Observer`."""
-        driver = cast(NoisyDriver, self.driver)
-        self.seen.index_copy_(0, self._next, self._now[None])
-        self.labels.index_copy_(0, self._next, driver.label[None])
-        if self.qpos is not None:
-            self.qpos.index_copy_(0, self._next, self._last[None])
-            self._last.copy_(self.env.sim.qpos)
-        self._next.add_(1)
-        self._observations.compute()
+
+def observed_config(stage: Stage, group: ObservationGroupCfg) -> Config:
+    """The configuration of a driven episode in which a policy's group is observed."""
+    job = cast(CloneJobCfg, stage.cfg.job)
+    return replace(stage.driven(stage.cfg.reset), observation={job.group: group})
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -133,6 +111,43 @@ class Demonstrations:
     source: str
     qpos: Tensor | None = None
     fields: Mapping[str, Tensor] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, batch: Batch, worlds: Tensor, job: CloneJobCfg, played: int) -> "Demonstrations":
+        """Those of a batch's worlds with these numbers, of so many that were played."""
+        rows = {name: batch.select(name, worlds) for name in batch.rows}
+        labels = rows.pop("label")
+        steps = labels.shape[1]
+        before = {name: values[:, :steps].flatten(0, 1) for name, values in rows.items()}
+        fields = batch.env.sim.fields if job.vision.cameras else {}
+        return cls(
+            seen=before["observation"],
+            labels=labels.flatten(0, 1),
+            ends=steps * torch.arange(1, len(worlds) + 1, device=worlds.device),
+            widths=batch.env.observation_manager.term_dims[job.group],
+            played=played,
+            source=f"seed {batch.plan.seed}",
+            qpos=before.get("qpos"),
+            fields={name: fields[name][worlds] for name in fields},
+        )
+
+    @classmethod
+    def join(cls, parts: Sequence["Demonstrations"], source: str) -> "Demonstrations":
+        """The episodes of all parts, in their order."""
+        first = [0, *itertools.accumulate(len(part.seen) for part in parts)]
+        states = [part.qpos for part in parts if part.qpos is not None]
+        return cls(
+            seen=torch.cat([part.seen for part in parts]),
+            labels=torch.cat([part.labels for part in parts]),
+            ends=torch.cat([part.ends + at for part, at in zip(parts, first, strict=False)]),
+            widths=parts[0].widths,
+            played=sum(part.played for part in parts),
+            source=source,
+            qpos=torch.cat(states) if states else None,
+            fields={
+                name: torch.cat([part.fields[name] for part in parts]) for name in parts[0].fields
+            },
+        )
 
     def episode(self) -> Tensor:
         """The episode that each step belongs to, shape ``(steps,)``, int64."""
@@ -171,76 +186,46 @@ def lead_gripper(demonstrations: Demonstrations, fingers: int) -> Demonstrations
     return replace(demonstrations, labels=labels)
 
 
-def batches_of(job: CloneJobCfg, sizes: CloneSizes, nworld: int) -> list[tuple[int, float]]:
+def batches_of(job: CloneJobCfg, nworld: int) -> list[tuple[int, float]]:
     """Batches of worlds, each with another seed: how many of their worlds count, and the noise
     [rad] of their commands.
     """
     return [
         (min(nworld, count - first), noise)
-        for count, noise in ((sizes.episodes, 0.0), (sizes.noisy_episodes, job.command_noise))
+        for count, noise in ((job.episodes, 0.0), (job.noisy_episodes, job.command_noise))
         for first in range(0, count, nworld)
     ]
 
 
-def play_expert(
-    context: RunContext, sizes: CloneSizes, group: ObservationGroupCfg
-) -> Demonstrations:
+def play_expert(stage: Stage, group: ObservationGroupCfg) -> Demonstrations:
     """Play the expert, and keep the episodes that the task's check accepts.
 
     Args:
-        context: The run; starts and expert are the configured ones. Each rank plays its worlds.
-        sizes: How many episodes.
+        stage: The stage; starts and expert are the configured ones. Each rank plays its worlds.
         group: What a policy will see.
     """
-    cfg = context.cfg
+    cfg = stage.cfg
     job = cast(CloneJobCfg, cfg.job)
-    nworld = min(cfg.nworld, max(sizes.episodes, sizes.noisy_episodes))
-    batches = list(enumerate(batches_of(job, sizes, nworld), start=cfg.seed))
-    worlds = context.ranks.share(nworld)
-    most = sum(len(range(worlds.start, min(worlds.stop, count))) for _, (count, _) in batches)
-    drawn = bool(job.vision.cameras)
-    seen = labels = qpos = torch.zeros(0)
-    fields: dict[str, list[Tensor]] = {}
-    widths: dict[str, int] = {}
-    kept = steps = 0
-    with closing(context.batch_simulation(len(worlds))) as sim:
-        for seed, (count, noise) in batches:
-            env = context.start(sim, cfg.reset, seed=seed, worlds=worlds)
-            driver = NoisyDriver(context.driver(env), env, noise)
-            recorder = DemonstrationRecorder(job.group, group, keep_states=drawn)
-            label = f"steps of the expert, seed {seed}"
-            looking = [recorder, *context.spectators]
-            episode = play_episode(env, driver, looking, advance=context.advance, label=label)
-            if not widths:
-                widths = recorder.widths
-                steps = driver.steps
-                seen = recorder.seen.new_zeros((most, steps, recorder.seen.shape[2]))
-                labels = recorder.labels.new_zeros((most, steps, recorder.labels.shape[2]))
-                if recorder.qpos is not None:
-                    qpos = recorder.qpos.new_zeros((most, steps, recorder.qpos.shape[2]))
-            good = (episode.result.failed == 0).nonzero()[:, 0]
-            good = good[good < count - worlds.start]
-            into = slice(kept, kept + len(good))
-            seen[into] = recorder.seen[:, good].transpose(0, 1)
-            labels[into] = recorder.labels[:, good].transpose(0, 1)
-            if recorder.qpos is not None:
-                qpos[into] = recorder.qpos[:, good].transpose(0, 1)
-                for name in sim.fields:
-                    fields.setdefault(name, []).append(sim.fields[name][good].clone())
-            kept += len(good)
-            what = f"noise of {noise:g} rad" if noise else "no noise"
-            succeeded = sum(context.ranks.gather(len(good)))
-            context.print_line(
-                f"train: seed {seed}, {what}: {succeeded} of {count} episodes of the expert"
-                " succeeded"
-            )
-    return Demonstrations(
-        seen=seen[:kept].flatten(0, 1),
-        labels=labels[:kept].flatten(0, 1),
-        ends=steps * torch.arange(1, kept + 1, device=seen.device),
-        widths=widths,
-        played=most,
-        source=f"the expert, seeds {batches[0][0]} to {batches[-1][0]}",
-        qpos=qpos[:kept].flatten(0, 1) if drawn else None,
-        fields={name: torch.cat(parts) for name, parts in fields.items()},
-    )
+    nworld = min(cfg.nworld, max(job.episodes, job.noisy_episodes))
+    worlds = stage.ranks.share(nworld)
+    batches = dict(enumerate(batches_of(job, nworld), start=cfg.seed))
+    parts = []
+    for batch in play_batches(
+        stage,
+        [BatchPlan(seed, worlds) for seed in batches],
+        demonstration_channels(job),
+        cfg=observed_config(stage, group),
+        driver=lambda plan, env: NoisyDriver(stage.driver(env), env, batches[plan.seed][1]),
+        label="steps of the expert",
+    ):
+        count, noise = batches[batch.plan.seed]
+        counted = range(worlds.start, min(worlds.stop, count))
+        accepted = batch.succeeded[: len(counted)].nonzero()[:, 0]
+        parts.append(Demonstrations.of(batch, accepted, job, len(counted)))
+        condition = f"noise of {noise:g} rad" if noise else "no noise"
+        succeeded = sum(stage.ranks.gather(len(accepted)))
+        stage.progress.print_line(
+            f"train: seed {batch.plan.seed}, {condition}: {succeeded} of {count} episodes of the"
+            " expert succeeded"
+        )
+    return Demonstrations.join(parts, f"the expert, seeds {min(batches)} to {max(batches)}")

@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from mjstack.config.schema import VisionCfg
-from mjstack.episodes.context import RunContext
+from mjstack.episodes.stage import Stage
 from mjstack.managers.episode import required_fields
 from mjstack.policy import Vision
 from mjstack.train.demonstrations import Demonstrations
 
-_OWN = 2**40  # seeds that nothing else has
+_FIRST_SEED = 2**40  # from which on nothing else has seeds
 _AT_ONCE = 2048  # states that are drawn at most, where more are needed
 
 
@@ -31,7 +31,7 @@ class ImagePool:
 
     def __init__(
         self,
-        context: RunContext,
+        stage: Stage,
         settings: VisionCfg,
         vision: Vision,
         demonstrations: Demonstrations,
@@ -42,7 +42,7 @@ class ImagePool:
         """Allocate.
 
         Args:
-            context: The run, for its scene and its device.
+            stage: The stage, for its scene and its device.
             settings: How many images are kept, and how often each is used.
             vision: The images that the policy sees.
             demonstrations: The episodes.
@@ -66,11 +66,10 @@ class ImagePool:
             self._fresh = min(_AT_ONCE, len(steps))
         rows = len(steps) if self._whole else -(-settings.pool // self._fresh) * self._fresh
         self._count = -(-rows // self._fresh)
-        self._renderer = context.stage.color_renderer(
-            self._fresh, required_fields(context.cfg.reset), self._names
-        )
+        fields = required_fields(stage.cfg.reset)
+        self._renderer = stage.color_renderer(self._fresh, fields, self._names)
         self._generator = torch.Generator(device)
-        self._seed = _OWN + seed
+        self._seed = _FIRST_SEED + seed
         self.steps = torch.zeros(rows, dtype=torch.int64, device=device)
         self.images = [
             torch.zeros((rows, *vision.sizes[name], 3), dtype=torch.uint8, device=device)
@@ -80,12 +79,11 @@ class ImagePool:
     def fill(self, batch: int) -> None:
         """Draw what the pool has after a batch of this number."""
         if self._whole:
-            self.steps.copy_(self._from)
             for first in range(0, len(self.steps), self._fresh):
-                self._draw(slice(first, first + self._fresh))
-            return
-        for number in range(batch - self._count + 1, batch + 1):
-            self._draw_part(number)
+                self._draw(first, self._from[first : first + self._fresh])
+        else:
+            for number in range(batch - self._count + 1, batch + 1):
+                self._draw_part(number)
 
     def advance(self, batch: int) -> None:
         """Draw new images for a batch in the place of the oldest."""
@@ -94,23 +92,21 @@ class ImagePool:
 
     def _draw_part(self, number: int) -> None:
         """Draw the part of the pool that has this number."""
-        first = number % self._count * self._fresh
-        rows = slice(first, first + self._fresh)
         self._generator.manual_seed(self._seed + number + self._count)
-        chosen = torch.randint(
-            len(self._from), (self._fresh,), generator=self._generator, device=self.steps.device
-        )
-        self.steps[rows] = self._from[chosen]
-        self._draw(rows)
+        device = self.steps.device
+        size = (self._fresh,)
+        chosen = torch.randint(len(self._from), size, generator=self._generator, device=device)
+        self._draw(number % self._count * self._fresh, self._from[chosen])
 
-    def _draw(self, rows: slice) -> None:
-        """Draw the steps of some rows."""
-        steps = self.steps[rows]
+    def _draw(self, first: int, steps: Tensor) -> None:
+        """Draw steps into the rows from ``first`` on."""
+        rows = slice(first, first + len(steps))
+        self.steps[rows] = steps
         episodes = self._episode[steps]
         fields = {name: values[episodes] for name, values in self._fields.items()}
-        drawn = self._renderer.draw(self._qpos[steps], fields)
+        rendered = self._renderer.draw(self._qpos[steps], fields)
         for name, images in zip(self._names, self.images, strict=True):
-            images[rows] = drawn[f"images.{name}"]
+            images[rows] = rendered[f"images.{name}"]
 
     def close(self) -> None:
         """Give the worlds for drawing back."""
@@ -140,13 +136,12 @@ class Augmentation:
         """
         out = []
         for images, moves, tints in zip(pool, self._moves, self._tints, strict=True):
-            height, width = images.shape[1:3]
-            moves = moves - self._shift
-            y = torch.arange(height, device=rows.device) + moves[:, :1]
-            x = torch.arange(width, device=rows.device) + moves[:, 1:]
-            y = y.clamp(0, height - 1)[:, :, None]
-            x = x.clamp(0, width - 1)[:, None, :]
-            picked = images[rows[:, None, None], y, x].float()
+            moves = (moves - self._shift)[..., None]
+            y, x = (
+                (torch.arange(size, device=rows.device) + moves[:, axis]).clamp(0, size - 1)
+                for axis, size in enumerate(images.shape[1:3])
+            )
+            picked = images[rows[:, None, None], y[:, :, None], x[:, None, :]].float()
             # Of all colours, and of each
             change = 0.5 * self._color * (tints[..., :1] + tints[..., 1:])
             gain = 1.0 + change[:, None, None, 0]

@@ -1,28 +1,45 @@
 """Trainer *ppo*: a policy learns from the task's rewards, by rsl-rl-lib's PPO."""
 
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
 import torch
 
+from mjstack.config.check import starts_midway
 from mjstack.config.functions import resolve_func
 from mjstack.config.schema import Config, PpoJobCfg, TermCfg
-from mjstack.episodes.context import RunContext
-from mjstack.errors import ConfigError, PolicyError, UnknownName, renamed_keys
+from mjstack.drivers.driver import Driver
+from mjstack.envs import Env
+from mjstack.episodes.batches import BatchPlan, play_batches
+from mjstack.episodes.recorder import Channels, Read
+from mjstack.episodes.stage import Stage
+from mjstack.errors import ConfigError, FolderError, MjstackError, UnknownName, renamed_keys
 from mjstack.managers.term import check_params
+from mjstack.mdp.starts.expert_states import STATE as STATE_VIEWS
+from mjstack.mdp.starts.expert_states import write_states
 from mjstack.policy import Policy, load_policy
 from mjstack.policy.checkpoint import read_state
-from mjstack.train.expert_states import record_states, unrecorded, whole_starts, with_states
-from mjstack.train.ppo_learner import Learner, Plan
-from mjstack.train.trainer import LAST, STATE, Trained, Trainer, filled, observed_group, one_world
+from mjstack.train.ppo_learner import PpoLearner
+from mjstack.train.trainer import (
+    LAST,
+    STATE,
+    Trained,
+    Trainer,
+    observed_group,
+    one_world,
+    whole_starts,
+)
 
 _STATES = "expert_states.npz"  # in the training's folder
+_STRIDE = 5  # control steps between two states
 _TARGETS = "mjstack.mdp.action.JointTargets"
 
 
-def make_plan(cfg: Config) -> Plan:
-    """Find out what is trained.
+def _environment(cfg: Config) -> tuple[Config, Policy | None, str]:
+    """The configuration of the environment, the policy that training starts from, if one is named,
+    and the name of the observation group that the policy sees.
 
     Raises:
         MjstackError: There is no such group or term, or the policy to start from cannot be used.
@@ -31,7 +48,7 @@ def make_plan(cfg: Config) -> Plan:
     start = None
     name = job.group
     if job.start_from is None:
-        seen = observed_group(job, job.leave_out)
+        seen = observed_group(job)
     else:
         start = load_policy(Path(job.start_from))
         start.check_fit(cfg)
@@ -44,18 +61,17 @@ def make_plan(cfg: Config) -> Plan:
     for group in job.critic:
         if group not in cfg.observation:
             raise UnknownName("job.critic: observation group", group, cfg.observation)
-    others = {group: cfg.observation[group] for group in job.critic if group != name}
-    settings = filled(job, job.settings["random" if start is None else "start_from"])
-    return Plan(replace(cfg, observation={name: seen, **others}), start, name, settings)
+    critic = {group: cfg.observation[group] for group in job.critic if group != name}
+    return replace(cfg, observation={name: seen, **critic}), start, name
 
 
 def _acting_as(cfg: Config, policy: Policy) -> Config:
-    """The configuration with a policy's actions and rate. Of a clone, an action is the part of its
-    answer that it plays.
+    """The configuration with a policy's actions and rate. Of joint targets, an action is the part
+    of a chunk that the policy plays.
     """
     action = policy.action
     network = policy.network
-    if action is None:
+    if action == cfg.controller.action:
         params: dict[str, Any] = {
             name: network.get_buffer(f"action_{name}").double().tolist()
             for name in ("mean", "std", "low", "high")
@@ -63,85 +79,135 @@ def _acting_as(cfg: Config, policy: Policy) -> Config:
         params["steps"] = min(network.chunk, policy.execute)
         action = {"targets": TermCfg(func=_TARGETS, params=params)}
     elif network.chunk > 1:
-        raise PolicyError(
-            f"policy={policy.folder}: answers with {network.chunk} actions at once: expected 1, as"
-            " its actions are no joint targets",
+        raise FolderError(
+            f"policy={policy.folder}: has chunks of {network.chunk} actions: expected 1, as its"
+            " actions are no joint targets",
             "Name another policy",
         )
     timing = replace(cfg.timing, policy_decimation=policy.execute)
     return replace(cfg, action=action, timing=timing)
 
 
-def check_ppo(context: RunContext) -> range:
+def unrecorded(reset: dict[str, TermCfg]) -> bool:
+    """Whether a term starts worlds in the middle of an episode, and names no file of states."""
+    return any(starts_midway(t) and t.params.get("path") is None for t in reset.values())
+
+
+def with_states(cfg: Config, path: Path) -> Config:
+    """A configuration whose worlds start in the states of a file, where no other is named."""
+    reset = {
+        name: replace(term, params=term.params | {"path": str(path)})
+        if starts_midway(term) and term.params.get("path") is None
+        else term
+        for name, term in cfg.reset.items()
+    }
+    return replace(cfg, reset=reset)
+
+
+def _read_state(env: Env, driver: Driver) -> Read:
+    views = {name: getattr(env.sim, name) for name in STATE_VIEWS}
+    return lambda: {name: view for name, view in views.items() if view.shape[1]}
+
+
+def record_states(stage: Stage, worlds: int, path: Path) -> None:
+    """Play the expert in a batch of worlds, and write states of its accepted episodes, from all
+    phases.
+
+    Args:
+        stage: The stage; its starts are used, but for those in the middle of an episode.
+        worlds: How many episodes.
+        path: The file.
+
+    Raises:
+        MjstackError: No episode was accepted.
+        OSError: The file cannot be written.
+    """
+    cfg = stage.cfg
+    channels = Channels(_read_state, lambda steps: range(1, steps + 1, _STRIDE))
+    for batch in play_batches(
+        stage,
+        [BatchPlan(cfg.seed, range(worlds))],
+        [channels],
+        cfg=stage.driven(whole_starts(cfg.reset)),
+        label="steps of the expert",
+    ):
+        accepted = batch.succeeded.nonzero()[:, 0]
+        stage.progress.print_line(
+            f"train: {len(accepted)} of {worlds} episodes of the expert succeeded"
+        )
+        if not len(accepted):
+            raise MjstackError(
+                f"the expert succeeded in none of {worlds} episodes, expected some to start from",
+                "Look at why with gates=[success]",
+            )
+        states = {name: rows[:, accepted].flatten(0, 1) for name, rows in batch.rows.items()}
+        fields = {name: field[accepted] for name, field in batch.env.sim.fields.items()}
+        write_states(path, states, fields, len(accepted))
+
+
+def check_ppo(stage: Stage) -> range:
     """Check the terms, the policy to start from and the sizes; see `Trainer`."""
-    cfg = context.cfg
+    cfg = stage.cfg
     job = cast(PpoJobCfg, cfg.job)
     if job.iterations is None and job.minutes is None:
         raise ConfigError("job.iterations", None, "a number, or a limit in job.minutes")
-    worlds = cfg.nworld // context.ranks.size
+    worlds = cfg.nworld // stage.ranks.size
     if worlds * job.horizon < 2 * job.minibatches:
         expected = f"at most {worlds * job.horizon // 2}, so that each has two decisions"
         expected += f" (nworld={worlds} times job.horizon={job.horizon} are divided)"
         raise ConfigError("job.minibatches", job.minibatches, expected)
-    plan = make_plan(cfg)
-    first, least, most = plan.settings.std
+    env_cfg, start, group = _environment(cfg)
+    first, least, most = job.std
     if not least <= first <= most:
         expected = (
             "its value at the start, the smallest and the largest, the first within the others"
         )
-        raise ConfigError("job.std", plan.settings.std, expected)
+        raise ConfigError("job.std", job.std, expected)
     reset = cfg.reset
     if unrecorded(reset):
         for name in reset.keys() - whole_starts(reset).keys():
             label = f"reset.{name}"
             check_params(label, resolve_func(label, reset[name].func), reset[name].params, 1)
         reset = whole_starts(reset)
-    seen = f"observation.{plan.group}"
-    keys = {seen: f"job.{seen}"} if plan.start is None else {}
-    with renamed_keys(keys), one_world(context, replace(plan.cfg, reset=reset)) as env:
-        if plan.start is not None:
-            plan.start.check_widths(env.observation_manager.term_dims[plan.group])
+    seen = f"observation.{group}"
+    keys = {seen: f"job.{seen}"} if start is None else {}
+    with renamed_keys(keys), one_world(stage, replace(env_cfg, reset=reset)) as env:
+        if start is not None:
+            start.check_widths(env.observation_manager.term_dims[group])
     return range(cfg.seed, cfg.seed + 1)
 
 
-def train_ppo(context: RunContext, folder: Path) -> Trained:
+def train_ppo(stage: Stage, folder: Path) -> Trained:
     """Let worlds act and learn from it; see `Trainer`."""
-    cfg = context.cfg
+    cfg = stage.cfg
     job = cast(PpoJobCfg, cfg.job)
-    device = torch.device(context.backend[1])
-    ranks = context.ranks
+    device = torch.device(stage.backend[1])
+    ranks = stage.ranks
     states = folder / _STATES
     if unrecorded(cfg.reset):
-
-        def record() -> None:
-            if not states.exists():
-                record_states(context, job.expert_worlds, states)
-
-        ranks.from_first(record)
-    plan = make_plan(with_states(cfg, states))
+        ranks.from_first(
+            lambda: None if states.exists() else record_states(stage, job.expert_worlds, states)
+        )
+    environment = _environment(with_states(cfg, states))
     cards = [device] if device.type == "cuda" else []
     with torch.random.fork_rng(devices=cards):
         torch.manual_seed(cfg.seed + ranks.rank)
-        learner = Learner(context, plan, folder)
-        try:
+        with closing(PpoLearner(stage, *environment, folder)) as learner:
             if (folder / STATE).exists():
                 learner.restore(*read_state(folder / STATE))
             learner.learn()
-        finally:
-            learner.close()
     last = learner.curve[-1]
     return Trained(
         metrics={
             "iterations": learner.done,
             "decisions": last["decisions"],
             "training_s": learner.seconds,
-            "best_training_success": learner.best[0],
+            "best_training_success": max(map(learner.score, learner.curve))[0],
         },
         notes={"policy": str(folder / LAST), "seeds": str(cfg.seed)},
         curve=learner.curve,
         lines=["success", *(["progress"] if "progress" in last else [])],
         abscissa="iteration",
-        scale="linear",
     )
 
 

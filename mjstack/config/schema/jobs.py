@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Any
 
-from mjstack.config.fields import MOST_SEEDS, MOST_WORLDS, spec
+from mjstack.config.fields import MOST_SEEDS, spec
 
 
 @dataclass(slots=True)
@@ -14,47 +14,6 @@ class JobCfg:
     """Its name."""
     func: str = spec()
     """Dotted name of its ``mjstack.jobs.Job``."""
-
-
-@dataclass(slots=True)
-class ScalingJobCfg(JobCfg):
-    """Throughput over numbers of worlds, each in a process."""
-
-    nworlds: list[int] = spec(unit="worlds", ge=1, le=MOST_WORLDS)
-    """Numbers of worlds, each once."""
-    backends: list[str] | None = spec(None, choices=("mjwarp", "native"))
-    """Backends; null: native, and MJWarp where there is CUDA, as far as ``sim`` allows."""
-    repetitions: int = spec(ge=1)
-    """Repetitions of each measurement."""
-    large: int = spec(unit="worlds", ge=1)
-    """A run of more worlds makes ``repetitions_large`` repetitions."""
-    repetitions_large: int = spec(ge=1)
-    """Repetitions of each measurement of a large run."""
-    native_steps: int = spec(unit="steps", ge=1)
-    """Physics steps per repetition on native MuJoCo, whose worlds play no episode."""
-    native_env_steps: int = spec(unit="steps", ge=1)
-    """Environment steps per repetition on native MuJoCo."""
-    run_minutes: float = spec(unit="min", gt=0.0)
-    """A run that takes longer has failed."""
-    max_minutes: float | None = spec(None, unit="min", gt=0.0)
-    """Time budget of a call; the next one goes on. null: unlimited."""
-    retry: bool = spec()
-    """Whether runs that failed are repeated."""
-
-
-@dataclass(slots=True)
-class StudyJobCfg(JobCfg):
-    """Cost and success of settings of the solver."""
-
-    repetitions: int = spec(ge=1)
-    """Repetitions of each variant."""
-    steps: int = spec(unit="steps", ge=1)
-    """Control steps per repetition, or as many as fit into ``max_seconds``."""
-    max_seconds: float = spec(unit="s", gt=0.0)
-    """Time budget of a repetition."""
-    # Variants are untyped until `complete`, so that the command line may add one.
-    variants: dict[str, Any] = spec(factory=dict)
-    """Variants by name: the keys of ``solver`` that each changes."""
 
 
 @dataclass(slots=True)
@@ -108,30 +67,14 @@ class TrainJobCfg(JobCfg):
     """Folder of the training; null: ``outputs/train/<hash>`` of everything training depends on."""
     test_seed: int = spec(ge=0, le=MOST_SEEDS - 1)
     """First seed of the starts from which the policy is judged, gate.success.seeds of them."""
-
-
-@dataclass(slots=True)
-class CloneSizes:
-    """How much is trained; as the keys of the job of these names."""
-
-    episodes: int = spec(unit="episodes", ge=1)
-    """Episodes that the expert plays."""
-    noisy_episodes: int = spec(unit="episodes", ge=0)
-    """Episodes more with noise on the executed commands."""
-    hidden: list[int] = spec(ge=1, le=65536)
-    """Widths of the network's hidden layers."""
-    batches: int = spec(ge=1)
-    """Steps of the optimizer."""
-    batch_size: int = spec(ge=1)
-    """Answers of a batch."""
-    save_every: int = spec(unit="batches", ge=1)
-    """Batches between two saved policies."""
-    input_noise: float = spec(ge=0.0)
-    """Noise on the observations that training sees, in multiples of their terms' ``noise``."""
-    weight_decay: float = spec(ge=0.0)
-    """Of AdamW."""
+    observation: dict[str, Any] = spec(factory=dict, finite=False)
+    """Groups that the policy may see; ``observation@job.observation`` chooses them."""
+    group: str = spec()
+    """The group that it sees."""
     leave_out: list[str] = spec(factory=list)
-    """Terms of the observation group that the policy does not see."""
+    """Terms of the group that the policy does not see; NAME? if there is that one."""
+    observation_noise: bool = spec()
+    """Whether its observations have their noise."""
 
 
 @dataclass(slots=True)
@@ -157,16 +100,10 @@ class VisionCfg:
 
 @dataclass(slots=True)
 class CloneJobCfg(TrainJobCfg):
-    """A network learns to answer as the expert does. What is null is as ``sizes`` has it."""
+    """A network learns to act as the expert does."""
 
-    observation: dict[str, Any] = spec(factory=dict, finite=False)
-    """Groups that the policy may see; ``observation@job.observation`` chooses them."""
-    group: str = spec()
-    """The group that it sees."""
     dataset: str | None = spec(None)
     """Folder of a dataset from which it learns; null: from the expert, who plays now."""
-    observation_noise: bool = spec()
-    """Whether its observations have their noise."""
     command_noise: float = spec(unit="rad", ge=0.0)
     """Standard deviation of that noise, which changes slowly."""
     gripper_noise: float = spec(unit="share", ge=0.0)
@@ -179,28 +116,24 @@ class CloneJobCfg(TrainJobCfg):
     """Of AdamW at the start; a cosine brings it to 0."""
     averaging: float = spec(ge=0.0, le=1.0)
     """Share of the policy's weights that a batch keeps: they are an average."""
-    episodes: int | None = spec(None, unit="episodes", ge=1)
+    episodes: int = spec(unit="episodes", ge=1)
     """Episodes that the expert plays."""
-    noisy_episodes: int | None = spec(None, unit="episodes", ge=0)
+    noisy_episodes: int = spec(unit="episodes", ge=0)
     """Episodes more with noise on the executed commands; labels stay the expert's."""
-    hidden: list[int] | None = spec(None, ge=1, le=65536)
+    hidden: list[int] = spec(ge=1, le=65536)
     """Widths of the network's hidden layers."""
-    batches: int | None = spec(None, ge=1)
+    batches: int = spec(ge=1)
     """Steps of the optimizer."""
-    batch_size: int | None = spec(None, ge=1)
+    batch_size: int = spec(ge=1)
     """Answers of a batch."""
-    save_every: int | None = spec(None, unit="batches", ge=1)
+    save_every: int = spec(unit="batches", ge=1)
     """Batches between two saved policies."""
-    input_noise: float | None = spec(None, ge=0.0)
+    input_noise: float = spec(ge=0.0)
     """Noise on the observations that training sees, in multiples of their terms' ``noise``."""
-    weight_decay: float | None = spec(None, ge=0.0)
+    weight_decay: float = spec(ge=0.0)
     """Of AdamW."""
-    leave_out: list[str] | None = spec(None)
-    """Terms of the group that the policy does not see."""
     vision: VisionCfg = field(default_factory=VisionCfg)
     """Images that it sees."""
-    sizes: dict[str, CloneSizes] = spec(factory=dict)
-    """Values of the keys that are null above, for ``cuda`` and for ``cpu``."""
 
 
 @dataclass(slots=True)
@@ -220,35 +153,9 @@ class DaggerJobCfg(CloneJobCfg):
 
 
 @dataclass(slots=True)
-class PpoSettings:
-    """Settings of a random network, or of a policy to go on from. Each is a key of the job."""
-
-    std: list[float] = spec(length=3, gt=0.0)
-    """Standard deviation of the actions: at the start, smallest and largest."""
-    entropy: list[float] = spec(length=2, ge=0.0)
-    """Weight of the entropy at the start, and after ``entropy_iterations``."""
-    desired_kl: float = spec(gt=0.0)
-    """Change of the policy per iteration to which rsl_rl adapts the learning rate."""
-    learning_rate: float = spec(gt=0.0)
-    """Of the actor at the start."""
-    critic_iterations: int = spec(ge=0)
-    """First iterations, in which only the critic learns."""
-
-
-@dataclass(slots=True)
 class PpoJobCfg(TrainJobCfg):
-    """A policy learns from the task's rewards, by rsl_rl's PPO. What is null is as ``settings`` has
-    it.
-    """
+    """A policy learns from the task's rewards, by rsl_rl's PPO."""
 
-    observation: dict[str, Any] = spec(factory=dict, finite=False)
-    """Groups that the policy may see; ``observation@job.observation`` chooses them."""
-    group: str = spec()
-    """The group that it sees."""
-    leave_out: list[str] = spec(factory=list)
-    """Terms of the group that the policy does not see."""
-    observation_noise: bool = spec()
-    """Whether its observations have their noise."""
     critic: list[str] = spec(factory=list)
     """Observation groups that the critic sees besides the policy's."""
     start_from: str | None = spec(None)
@@ -285,26 +192,22 @@ class PpoJobCfg(TrainJobCfg):
     """Limit of the rewards, over the standard deviation of their discounted sum."""
     entropy_iterations: int = spec(ge=1)
     """Iterations over which the weight of the entropy changes."""
-    std: list[float] | None = spec(None, length=3, gt=0.0)
+    std: list[float] = spec(length=3, gt=0.0)
     """Standard deviation of the actions: at the start, smallest and largest."""
-    entropy: list[float] | None = spec(None, length=2, ge=0.0)
+    entropy: list[float] = spec(length=2, ge=0.0)
     """Weight of the entropy at the start, and after ``entropy_iterations``."""
-    desired_kl: float | None = spec(None, gt=0.0)
+    desired_kl: float = spec(gt=0.0)
     """Change of the policy per iteration to which rsl_rl adapts the learning rate."""
-    learning_rate: float | None = spec(None, gt=0.0)
+    learning_rate: float = spec(gt=0.0)
     """Of the actor at the start; it stays within a hundredth and ten times of it."""
-    critic_iterations: int | None = spec(None, ge=0)
+    critic_iterations: int = spec(ge=0)
     """First iterations, in which only the critic learns."""
-    settings: dict[str, PpoSettings] = spec(factory=dict)
-    """Values of the keys that are null above, for ``random`` and for ``start_from``."""
 
 
 # Trainers with keys of their own; the others have those of clone.
 TRAINER_SCHEMAS = {"dagger": DaggerJobCfg, "ppo": PpoJobCfg}
 # Jobs with keys of their own; the others have `JobCfg`.
 JOB_SCHEMAS = {
-    "study": StudyJobCfg,
-    "scaling": ScalingJobCfg,
     "reachability": ReachabilityJobCfg,
     "collect": CollectJobCfg,
     "play": PlayJobCfg,

@@ -5,7 +5,15 @@ from typing import Any
 
 from mjstack.config.fields import MOST_SEEDS, MOST_WORLDS, spec
 from mjstack.config.schema.jobs import JobCfg
-from mjstack.config.schema.run import BatchCfg, GateCfg, SimCfg, SolverCfg, TimingCfg, WebCfg
+from mjstack.config.schema.run import (
+    BatchCfg,
+    GateCfg,
+    SimCfg,
+    SolverCfg,
+    SweepCfg,
+    TimingCfg,
+    WebCfg,
+)
 from mjstack.config.schema.scene import ModelCfg, RobotCfg, SceneCfg
 from mjstack.config.schema.task import ControllerCfg, TaskCfg
 
@@ -64,8 +72,10 @@ class Config:
     """Write a video of the same; job=play without view does so."""
     web: WebCfg = field(default_factory=WebCfg)
     """Worlds in a browser."""
+    sweep: SweepCfg = field(default_factory=SweepCfg)
+    """What -m shows of its jobs."""
     starts: str | None = spec(None)
-    """reset=starts_file: a file with one row per world, from which all of them start."""
+    """reset=starts_file: an npz file with one row per world, from which all of them start."""
     policy: str | None = spec(None)
     """controller=policy, job=play, job=export: the folder of a trained policy."""
     run: str | None = spec(None)

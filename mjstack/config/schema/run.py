@@ -71,14 +71,10 @@ class BatchCfg:
     """Whether sizes that are null are measured first, as ``gate.capacity`` says."""
     nconmax: int | None = spec(None, unit="contacts per world", ge=1)
     """Contacts, as a mean over the worlds."""
-    naconmax: int | None = spec(None, unit="contacts", ge=1)
-    """Contacts of all worlds; takes precedence over nconmax."""
     njmax: int | None = spec(None, unit="rows per world", ge=1)
     """Constraint rows."""
     nccdmax: int | None = spec(None, unit="pairs per world", ge=1)
     """Pairs of convex geoms in collision, as a mean over the worlds."""
-    naccdmax: int | None = spec(None, unit="pairs", ge=1)
-    """Such pairs of all worlds; takes precedence over nccdmax."""
 
 
 @dataclass(slots=True)
@@ -89,11 +85,30 @@ class SimCfg:
     """Physics engine of batch and throughput: auto is MJWarp where there is CUDA."""
     device: str = spec()
     """auto, cpu or cuda:N."""
-    step: str = spec(choices=("auto", "fused", "arranged", "stock"))
-    """MJWarp's step. stock: ``mujoco_warp.step``; arranged: its stages as parallel branches; fused:
-    contact rows, the solver and smooth dynamics as a few kernels, too; auto: fused where it does
-    all that the model needs.
+    step: str = spec(choices=("auto", "stock"))
+    """MJWarp's step. stock: ``mujoco_warp.step``; auto: its stages as parallel branches, and
+    contact rows, the solver and smooth dynamics as a few kernels, where these do all that the model
+    needs.
     """
+
+
+@dataclass(slots=True)
+class SweepCfg:
+    """The table and the picture of a sweep, ``-m``. A name is that of a key of the command line, of
+    a metric of a gate, or ``job``, ``status`` or ``reason``.
+    """
+
+    title: str = ""
+    """Above both."""
+    over: str | None = None
+    """Name of the values over which the picture is drawn; null: of the first key with several."""
+    columns: dict[str, str] = spec(factory=dict)
+    """Names by the columns' titles; empty: the keys with several values, and the gates' results."""
+    panels: dict[str, dict[str, str]] = spec(factory=dict)
+    """Curves of each panel by its label: names by the curves' labels, or names with a factor, such
+    as ``NAME * 10``; empty: success and rates."""
+    notes: list[str] = spec(factory=list)
+    """Sentences below the table."""
 
 
 @dataclass(slots=True)
@@ -111,10 +126,10 @@ class WebCfg:
 
 @dataclass(slots=True)
 class GateFuncCfg:
-    """A gate: a function of the run's context, and its parameters."""
+    """A gate: a function of the run, and its parameters."""
 
     func: str = spec()
-    """Dotted name of the function: ``func(context) -> list[GateResult]``."""
+    """Dotted name of the function: ``func(run) -> list[GateResult]``."""
 
 
 @dataclass(slots=True)

@@ -1,11 +1,15 @@
 """Worlds that start in the middle of an expert's episode."""
 
+from collections.abc import Mapping
+from pathlib import Path
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from mjstack.config.fields import Count, Fraction
 from mjstack.errors import ParameterError, first_line
+from mjstack.files import write_npz
 from mjstack.managers.view import EnvView, offers, random_uniform, rows_of
 
 STATE = ("qpos", "qvel", "act", "ctrl")
@@ -88,11 +92,32 @@ class ExpertStates:
                 torch.where(into, values.index_select(0, rows), view, out=view)
 
 
+def write_states(
+    path: Path, states: Mapping[str, Tensor], fields: Mapping[str, Tensor], episodes: int
+) -> None:
+    """Write a file of states.
+
+    Args:
+        path: The file.
+        states: The views of `STATE` by name, each ``(times * episodes, width)``: all episodes at
+            one time, then all at the next.
+        fields: Model fields of the episodes' worlds by name, each ``(episodes, ...)``.
+        episodes: Number of the episodes.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    tensors = dict(states) | {FIELD + name: field for name, field in fields.items()}
+    arrays = {name: values.cpu().numpy() for name, values in tensors.items()}
+    times = len(arrays["qpos"]) // episodes
+    write_npz(path, arrays | {EPISODE: np.tile(np.arange(episodes), times)})
+
+
 def _matching(path: str, name: str, view: Tensor, values: Tensor | None) -> Tensor:
     """The values of a view or a model field, if each is of its shape."""
-    wanted = tuple(view.shape[1:])
-    found = None if values is None else tuple(values.shape[1:])
-    if values is None or found != wanted:
-        expected = f"states of this robot and scene: {name} of shape {wanted}, not {found}"
+    shape = tuple(view.shape[1:])
+    stored = None if values is None else tuple(values.shape[1:])
+    if values is None or stored != shape:
+        expected = f"states of this robot and scene: {name} of shape {shape}, not {stored}"
         raise ParameterError("path", path, expected, "Record them anew")
     return values.to(view)

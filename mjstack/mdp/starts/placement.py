@@ -3,7 +3,6 @@ fixed.
 """
 
 import itertools
-import math
 from collections.abc import Sequence
 from functools import lru_cache
 
@@ -32,13 +31,11 @@ def may_meet(scene: SceneCfg, region: Sequence[float], gap: float = GAP) -> bool
     """Whether free objects in a region around their nominal positions, of these half-widths [m],
     can be closer together than a gap [m].
     """
-    return any(
-        math.hypot(
-            *(max(abs(p - q) - 2 * r, 0) for p, q, r in zip(a.xy, b.xy, region, strict=True))
-        )
-        < a.footprint + b.footprint + gap
-        for a, b in itertools.combinations(scene.free.values(), 2)
-    )
+    for a, b in itertools.combinations(scene.free.values(), 2):
+        away = np.abs(np.subtract(a.xy, b.xy)) - 2.0 * np.array(region)
+        if np.linalg.norm(away.clip(min=0.0)) < a.footprint + b.footprint + gap:
+            return True
+    return False
 
 
 class Placement:
@@ -126,14 +123,10 @@ class Placement:
         hard = draws[~self.choose(draws[:, :, :_FIRST].double())[1]]
         lacking = sum(int((~self.choose(share.double())[1]).sum()) for share in hard.split(_SHARE))
         if lacking:
-            raise ParameterError(
-                "xy",
-                xy,
-                f"a region with a free position for every object; {candidates} draws found none in"
-                f" {lacking} of {_TRIALS} trials",
-                "Make the region smaller, the gap smaller, or move the objects"
-                " (scene.objects.NAME.xy)",
-            )
+            problem = f"{candidates} draws found none in {lacking} of {_TRIALS} trials"
+            expected = f"a region with a free position for every object; {problem}"
+            fix = "Make the region or the gap smaller, or move the objects (scene.objects.NAME.xy)"
+            raise ParameterError("xy", xy, expected, fix)
 
     def choose(self, draws: Tensor) -> tuple[Tensor, Tensor]:
         """The first candidates that fit together.
@@ -154,21 +147,20 @@ class Placement:
         free = ((places - center).abs() <= room[:, None]).all(-1)
         for number, around in enumerate(rectangles):
             if around.shape[0]:
-                away = (
-                    (places[:, number, :, None, :] - around[:, :2]).abs() - around[:, 2:4]
-                ).clamp_min(0.0)
-                free[:, number] &= (away.square().sum(-1) >= around[:, 4].square()).all(-1)
+                off = (places[:, number, :, None, :] - around[:, :2]).abs() - around[:, 2:4]
+                distance = off.clamp_min(0.0).square().sum(-1)
+                free[:, number] &= (distance >= around[:, 4].square()).all(-1)
         # The free candidates of each object first; the k-th of all objects are tried together
         order = (~free).to(torch.uint8).argsort(dim=2, stable=True)
-        good = free.take_along_dim(order, dim=2).all(1)
+        usable = free.take_along_dim(order, dim=2).all(1)
         offsets = offsets.take_along_dim(order[..., None], dim=2)
         places = nominal[None, :, None] + offsets
         for k, m in itertools.combinations(range(len(rectangles)), 2):
             x, y = (places[:, k] - places[:, m]).unbind(-1)
-            good &= x.square() + y.square() >= self._apart[k][m] ** 2
-        first = good.to(torch.uint8).argmax(1)
+            usable &= x.square() + y.square() >= self._apart[k][m] ** 2
+        first = usable.to(torch.uint8).argmax(1)
         chosen = offsets[torch.arange(len(first), device=first.device), :, first]
-        fits = good.any(1)
+        fits = usable.any(1)
         return torch.where(fits[:, None, None], chosen, 0.0), fits
 
 
@@ -177,7 +169,7 @@ def _trials(size: int) -> Tensor:
     """Draws of the imaginary worlds, shape ``(_TRIALS, size)``: a check tries several regions."""
     world = torch.arange(_TRIALS)
     zero = torch.zeros_like(world)
-    return uniform(seed=0, world=world, episode=zero, step=zero, stream=0, size=size)
+    return uniform(0, 0, world, zero, None, size)
 
 
 def _around(

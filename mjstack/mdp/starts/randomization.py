@@ -12,6 +12,7 @@ from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from mjstack.errors import ParameterError
 from mjstack.managers.view import EnvView
@@ -62,12 +63,12 @@ class ObjectMasses(Quantity):
         self.columns = [f"{name}_mass_kg" for name in env.index.objects]
         self.nominal = self._mass.nominal
 
+    @override
     def read(self) -> Tensor:
-        """See `Quantity`."""
         return self._mass.read()
 
+    @override
     def write(self, mask: Tensor, values: Tensor, at: Rows = ALL) -> None:
-        """See `Quantity`."""
         mass = values.to(self._mass.dtype)
         factor = mass.double() / self.nominal
         self._mass.write(mask, mass, at)
@@ -106,8 +107,8 @@ class SlidingFriction(Quantity):
         self._lowered = Columns(level, env.device)
         self._least = torch.tensor(least, dtype=self._view.dtype, device=env.device)
 
+    @override
     def read(self) -> Tensor:
-        """See `Quantity`."""
         return torch.stack([group.read(self._view)[:, 0] for group in self._groups], dim=1)
 
     def write(self, mask: Tensor, values: Tensor, at: Rows = ALL) -> None:
@@ -138,11 +139,11 @@ class ServoGains(Quantity):
         """See `Quantity`; float64."""
         return self._gain.read()[..., 0].double() / self._kp
 
+    @override
     def write(self, mask: Tensor, values: Tensor, at: Rows = ALL) -> None:
-        """See `Quantity`."""
-        held = (values.double() * self._kp).to(self._gain.dtype).double() / self._kp
-        self._gain.scale(mask, held, at)
-        self._bias.scale(mask, held, at)
+        factor = (values.double() * self._kp).to(self._gain.dtype).double() / self._kp
+        self._gain.scale(mask, factor, at)
+        self._bias.scale(mask, factor, at)
 
 
 def bounds(name: str, values: Sequence[float]) -> tuple[float, float]:

@@ -29,12 +29,10 @@ def require_reach(env: EnvView, region: Sequence[float]) -> None:
             for low, high in np.clip(ends, center - room, center + room).T
         ]
         xy = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-        if found := out_of_reach(env, thing, xy):
-            fix = (
-                f"Make the region smaller, or move the object (scene.objects.{thing}.xy);"
-                " job=reachability draws a map"
-            )
-            raise ParameterError("xy", region, f"a region that the arm reaches; {found[1]}", fix)
+        if failure := out_of_reach(env, thing, xy):
+            expected = f"a region that the arm reaches; {failure[1]}"
+            fix = f"Make the region smaller, or move the object (scene.objects.{thing}.xy)"
+            raise ParameterError("xy", region, expected, f"{fix}; job=reachability draws a map")
 
 
 def out_of_reach(env: EnvView, name: str, xy: np.ndarray) -> tuple[int, str] | None:
@@ -59,9 +57,9 @@ def out_of_reach(env: EnvView, name: str, xy: np.ndarray) -> tuple[int, str] | N
     openings = np.array([phase.spec.gripper for phase, _ in targets])
     for gripper in np.unique(openings):
         reach = PointReach(env.sim.model, env.cfg.robot, env.cfg.robot.grips[gripper])
-        some = openings == gripper
-        found = reach.solve(points[:, some].reshape(-1, 3)).distance
-        distances[:, some] = found.reshape(len(xy), -1)
+        columns = openings == gripper
+        solved = reach.solve(points[:, columns].reshape(-1, 3))
+        distances[:, columns] = solved.distance.reshape(len(xy), -1)
     if (distances <= env.cfg.controller.ik_tolerance).all():
         return None
 
@@ -71,10 +69,5 @@ def out_of_reach(env: EnvView, name: str, xy: np.ndarray) -> tuple[int, str] | N
     phase, target = targets[column]
     height = target.z - scene.table_top - scene.objects[name].half_height
     where = "at its centre" if abs(height) < 5e-4 else f"{1e3 * height:.0f} mm above its centre"
-    return (
-        row,
-        (
-            f"with {name} at ({x:.3f}, {y:.3f}) m the point {where} (phase {phase.name}) is "
-            f"{1e3 * distances[row, column]:.1f} mm out of reach"
-        ),
-    )
+    point = f"with {name} at ({x:.3f}, {y:.3f}) m the point {where} (phase {phase.name})"
+    return row, f"{point} is {1e3 * distances[row, column]:.1f} mm out of reach"

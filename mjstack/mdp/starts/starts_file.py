@@ -1,18 +1,16 @@
 """Worlds that start from the rows of a file, and a file of how worlds have started."""
 
-import csv
-import math
-import reprlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from mjstack.errors import ArgumentError, ConfigError, ParameterError, suggest
-from mjstack.files import to_csv, write_atomic
+from mjstack.files import write_npz
 from mjstack.managers.view import EnvView, offers, uses_fields
 from mjstack.mdp.geometry import Pose, place_xy, pose_w, robot, write_robot
 from mjstack.mdp.observation import joint_pos
@@ -27,108 +25,82 @@ from mjstack.mdp.starts.randomization import (
 from mjstack.mdp.starts.reach import out_of_reach
 from mjstack.scene.index import joint_limits
 
-# [m], and of a quaternion: how far off upright an object on the table may be
-_FLAT = 1e-5
+_FLAT = 1e-5  # [m], and of a quaternion: how far off upright an object on the table may be
 _OVER = 1e-6  # [m] how far an object may reach over the edge of the table
 
 
 class StartsTable:
-    """The content of a file, a CSV with a header and one row per world.
+    """The content of a starts file: an npz archive of arrays with a row per world.
 
     Attributes:
-        columns: Values by column name, each ``(worlds,)``, float64, with world w in row w.
-        lines: The line of each world in the file, ``(worlds,)``.
+        arrays: Values by name, float64, each of shape ``(worlds,)`` or ``(worlds, n)``.
+        worlds: How many there are.
     """
 
     def __init__(
-        self, path: str, key: str, required: Sequence[str], optional: Sequence[str]
+        self,
+        path: str,
+        key: str,
+        ranges: Mapping[str, tuple[ArrayLike, ArrayLike]],
+        required: Sequence[str],
     ) -> None:
-        """Read a file and check it cell by cell.
+        """Read a file and check the name, the shape and the numbers of every array.
 
         Args:
             path: The file.
             key: The configuration key that names it: ``starts``, or ``path`` of a term.
-            required: Names of columns that every file has, beside ``world``.
-            optional: Names of columns that a file may have.
+            ranges: Smallest and largest row of each array that a file may have, by its name.
+            required: The arrays that every file has.
 
         Raises:
-            ConfigError: The file cannot be read, or a column, a cell or a world is wrong.
+            ConfigError: The file cannot be read, or an array is missing or wrong.
         """
         self._path = path
         self._error = ConfigError if key == "starts" else ParameterError
         self._key = key
-        required = ["world", *required]
+        if Path(path).suffix == ".csv":
+            expected = "an npz file; CSV is of version 0.1 and is not read any more"
+            raise self.wrong(expected, "Make a new one with write_starts or numpy.savez")
         try:
-            with Path(path).open(encoding="utf-8-sig", newline="") as file:
-                reader = csv.reader(file)
-                header = [name.strip() for name in next(reader, [])]
-                rows = [(reader.line_num, cells) for cells in reader if "".join(cells).strip()]
-        except (OSError, UnicodeDecodeError, csv.Error) as error:
-            expected = "a CSV file with a header and one row per world; it cannot be read"
-            reason = getattr(error, "strerror", None) or error
-            raise self.wrong(f"{expected} ({reason})", "Name a file: starts=worlds.csv") from error
+            with np.load(path) as file:  # no pickles
+                arrays = {name: np.atleast_1d(file[name]) for name in file.files}
+        except Exception as error:  # a file can be anything
+            reason = getattr(error, "strerror", None) or "damaged, or of another format"
+            expected = f"an npz file with a row per world; it cannot be read ({reason})"
+            raise self.wrong(expected, "Name a file: starts=worlds.npz") from error
+        if missing := [name for name in required if name not in arrays]:
+            expected = f"arrays {', '.join(required)}; {', '.join(missing)} missing"
+            raise self.wrong(expected, "Add the missing arrays")
+        self.worlds = max(map(len, arrays.values()), default=0)
+        for name, values in arrays.items():
+            if name not in ranges:
+                fix = suggest(name, ranges).rstrip(".")
+                raise self.wrong(f"known names of arrays; {name!r} is none", fix)
+            low, high = map(np.asarray, ranges[name])
+            shape = (self.worlds, *low.shape)
+            if values.shape != shape or values.dtype.kind not in "fiu":
+                expected = f"numbers of shape {shape}, not {values.dtype} of shape {values.shape}"
+                raise self.wrong(expected, "Correct it; row w is world w", names=[name])
+            slack = 1e-6 * np.maximum(abs(low), abs(high))  # float32 does not hold the ends exactly
+            fits = np.isfinite(values) & (values >= low - slack) & (values <= high + slack)
+            for world, *at in np.argwhere(~fits).tolist():
+                expected = f"{low[*at]:.6g} to {high[*at]:.6g}, it is {values[world, *at]:.6g}"
+                fix = "Correct it; ranges of mass, friction and gain are in reset.starts.params"
+                raise self.wrong(expected, fix, world, [name])
+        self.arrays = {name: values.astype(np.float64) for name, values in arrays.items()}
 
-        known = [*required, *optional]
-        for name in header:
-            if name not in known or header.count(name) > 1:
-                expected = f"columns separated by commas, each once; {reprlib.repr(name)} is wrong"
-                raise self.wrong(expected, suggest(name, known).rstrip("."), 1)
-        if lacking := [name for name in required if name not in header]:
-            expected = f"columns {', '.join(required)}; {', '.join(lacking)} missing"
-            raise self.wrong(expected, "Add the missing columns", 1)
-
-        values = np.empty((len(rows), len(header)))
-        for row, (line, cells) in enumerate(rows):
-            if len(cells) != len(header):
-                expected = f"{len(header)} cells as in the header, it has {len(cells)}"
-                raise self.wrong(expected, "Correct it; the decimal mark is a point", line)
-            for column, cell in enumerate(cells):
-                try:
-                    values[row, column] = float(cell)
-                except ValueError:
-                    values[row, column] = math.nan
-                if not math.isfinite(values[row, column]):
-                    expected = f"a finite number, {reprlib.repr(cell)} is none"
-                    raise self.wrong(expected, "Correct it", line, [header[column]])
-
-        table = dict(zip(header, values.T, strict=True))
-        worlds = table.pop("world")
-        if missing := set(range(max(1, len(rows)))).difference(worlds):
-            expected = f"worlds numbered from 0, a row each; {min(missing)} is missing"
-            raise self.wrong(expected, "Number the rows anew", columns=["world"])
-        order = np.argsort(worlds)
-        self.columns = {name: column[order] for name, column in table.items()}
-        self.lines = np.array([line for line, _ in rows])[order]
-
-    def take(self, columns: Sequence[str]) -> np.ndarray:
-        """Columns side by side, NaN where the file has none, shape ``(worlds, n)``."""
-        missing = np.full(len(self.lines), math.nan)
-        return np.stack([self.columns.get(name, missing) for name in columns], axis=1)
-
-    def misfit(self, world: int, columns: Sequence[str], expected: str, fix: str) -> ConfigError:
-        """The error that some cells of a world's line cannot be used."""
-        return self.wrong(expected, fix, self.lines[world], columns)
-
-    def require_range(self, column: str, low: float, high: float, fix: str = "Correct it") -> None:
-        """Refuse a value outside a range, if the file has the column.
-
-        Raises:
-            ConfigError: There is one; names its line.
-        """
-        values = self.columns.get(column, np.empty(0))
-        slack = 1e-6 * max(abs(low), abs(high))  # float32 does not hold the ends exactly
-        for world in np.flatnonzero((values < low - slack) | (values > high + slack)).tolist():
-            expected = f"{low:.6g} to {high:.6g}, it is {values[world]:.6g}"
-            raise self.misfit(world, [column], expected, fix)
+    def take(self, names: Sequence[str]) -> np.ndarray:
+        """Arrays side by side, NaN where the file has none, shape ``(worlds, n)``."""
+        missing = np.full(self.worlds, np.nan)
+        columns = [self.arrays.get(name, missing).reshape(self.worlds, -1) for name in names]
+        return np.hstack([np.empty((self.worlds, 0)), *columns])
 
     def wrong(
-        self, expected: str, fix: str, line: int | None = None, columns: Sequence[str] = ()
+        self, expected: str, fix: str, world: int | None = None, names: Sequence[str] = ()
     ) -> ConfigError:
-        """The error that the file, or some columns of a line, cannot be used."""
-        where = self._path if line is None else f"{self._path}, line {line}"
-        if columns:
-            where += f", column{'s' if len(columns) > 1 else ''} {', '.join(columns)}"
-        return self._error(self._key, where, expected, fix)
+        """The error that the file, or a world's row of some arrays, cannot be used."""
+        where = [self._path, *([] if world is None else [f"world {world}"]), *names]
+        return self._error(self._key, ", ".join(where), expected, fix)
 
 
 @offers(reads_file=True)
@@ -136,8 +108,8 @@ class StartsTable:
 class FromStartsFile:
     """World w starts from row w of a file, at every reset.
 
-    Joints without a column are at a pose of the robot. Masses, friction and gains without one are
-    left alone, and places without columns are drawn.
+    Joints without an array are at a pose of the robot. Masses, friction and gains without one are
+    left alone, and places without one are drawn.
     """
 
     def __init__(
@@ -155,7 +127,7 @@ class FromStartsFile:
         Args:
             env: The environment.
             path: The file; see `StartsTable`.
-            pose: Of joints that have no column, ``home`` or ``start``.
+            pose: Of joints that have no array, ``home`` or ``start``.
             mass: Smallest and largest mass of an object, over the model's own.
             friction: Smallest and largest coefficient. Where the file has any, the table gets the
                 smallest.
@@ -168,76 +140,63 @@ class FromStartsFile:
         """
         if path is None:
             expected = "a file with one row per world, which reset=starts_file reads"
-            raise ConfigError("starts", "null", expected, "Set starts=worlds.csv")
-        # The table
-        ranges = {"mass": mass, "friction": friction, "gain": gain}
-        ends = {name: bounds(name, values) for name, values in ranges.items()}
-        quantities: dict[str, Quantity] = {
-            "mass": ObjectMasses(env),
-            "friction": SlidingFriction(env, ends["friction"][0]),
-            "gain": ServoGains(env),
-        }
+            raise ConfigError("starts", "null", expected, "Set starts=worlds.npz")
+        # What the file may have, each in its range
+        friction_ends = bounds("friction", friction)
+        quantities: list[tuple[Quantity, tuple[float, float]]] = [
+            (ObjectMasses(env), bounds("mass", mass)),
+            (SlidingFriction(env, friction_ends[0]), friction_ends),
+            (ServoGains(env), bounds("gain", gain)),
+        ]
+        scene = env.cfg.scene
         objects = list(env.index.objects)
-        names = env.cfg.robot.joints
-        joints = [f"joint_{name}" for name in names]
-        drawn = {name: _xy(name) for name in _drawn_places(env)}
-        columns = [column for held in quantities.values() for column in held.columns]
-        required = [column for name in objects for column in (*_xy(name), f"{name}_yaw_rad")]
-        optional = [*joints, *columns, *(column for pair in drawn.values() for column in pair)]
-        file = StartsTable(path, "starts" if path == env.cfg.starts else "path", required, optional)
-        table = file.columns
-        rows = len(file.lines)
+        joints = [f"joint_{name}" for name in env.cfg.robot.joints]
+        limits = joint_limits(env.sim.model, env.cfg.robot.joints)
+        ranges: dict[str, tuple[ArrayLike, ArrayLike]] = {}
+        ranges |= zip(joints, zip(*limits, strict=True), strict=True)
+        for quantity, ends in quantities:
+            nominal = np.outer(quantity.nominal.cpu(), ends)
+            ranges |= zip(quantity.columns, map(tuple, nominal), strict=True)
+        regions = dict.fromkeys(objects, (scene.table_center[:2], scene.table_half[:2]))
+        places = _drawn_places(env)
+        regions |= {name: (scene.places[name].xy, scene.places[name].random_xy) for name in places}
+        for name, region in regions.items():
+            ranges[f"{name}_xy"] = (np.subtract(*region), np.add(*region))
+        ranges |= {f"{name}_quat": (-np.ones(4), np.ones(4)) for name in objects}
+        poses = [f"{name}_{part}" for name in objects for part in ("xy", "quat")]
+        table = StartsTable(path, "starts" if path == env.cfg.starts else "path", ranges, poses)
         needed = max(env.nworld, env.cfg.nworld)
-        if rows < needed:
-            fix = f"Add rows, or set nworld={rows}"
-            raise file.wrong(f"at least {needed} worlds, it has {rows}", fix)
-
-        # Values within their ranges
-        for name, held in quantities.items():
-            low, high = ends[name]
-            fix = f"Correct it, or widen reset.starts.params.{name}"
-            for column, nominal in zip(held.columns, held.nominal.tolist(), strict=True):
-                file.require_range(column, nominal * low, nominal * high, fix)
-        limits = joint_limits(env.sim.model, names)
-        for column, low, high in zip(joints, *limits, strict=True):
-            file.require_range(column, low, high)
-        for name, pair in drawn.items():
-            if not table.keys() & set(pair):
-                continue
-            place = env.cfg.scene.places[name]
-            for column, at, width in zip(pair, place.xy, place.random_xy, strict=True):
-                if column not in table:
-                    raise file.misfit(0, pair, "both coordinates of a place", "Add a column")
-                file.require_range(column, at - width, at + width)
-            env.given_places[name] = _on(env, file.take(pair))
+        if table.worlds < needed:
+            fix = "Add rows" + f", or set nworld={table.worlds}" * bool(table.worlds)
+            raise table.wrong(f"at least {needed} worlds, it has {table.worlds}", fix)
 
         # Starts, which have to be free and within reach
-        given = file.take(joints)
-        command = np.where(np.isnan(given), getattr(robot(env), pose).double().cpu().numpy(), given)
-        poses = np.zeros((rows, len(objects), 6))  # x, y and the quaternion
+        values = table.take(joints)
+        fallback = getattr(robot(env), pose).double().cpu().numpy()
+        command = np.where(np.isnan(values), fallback, values)
+        starts = table.take(poses).reshape(table.worlds, len(objects), 6)
+        _check_worlds(env, table, starts, command)
         for number, name in enumerate(objects):
-            half = 0.5 * table[f"{name}_yaw_rad"]
-            poses[:, number, :2] = file.take(_xy(name))
-            poses[:, number, 2] = np.cos(half)
-            poses[:, number, 5] = np.sin(half)
-        _check_worlds(env, file, poses, command)
-        for number, name in enumerate(objects):
-            if found := out_of_reach(env, name, poses[:, number, :2]):
-                world, problem = found
+            if failure := out_of_reach(env, name, starts[:, number, :2]):
+                world, problem = failure
                 fix = "Move it closer; job=reachability draws a map"
-                raise file.misfit(world, _xy(name), f"a place that the arm reaches; {problem}", fix)
+                expected = f"a place that the arm reaches; {problem}"
+                raise table.wrong(expected, fix, world, [f"{name}_xy"])
 
         # All of it on the device
         self._command = _on(env, command)
-        self._poses = _on(env, poses)
-        self._given = [
-            (held, torch.from_numpy(file.take(held.columns)).to(env.device))
-            for held in quantities.values()
-            if table.keys() & set(held.columns)
+        self._poses = _on(env, starts)
+        self._quantities = [
+            (quantity, torch.from_numpy(table.take(quantity.columns)).to(env.device))
+            for quantity, _ in quantities
+            if table.arrays.keys() & set(quantity.columns)
         ]
+        for name in places:
+            if f"{name}_xy" in table.arrays:
+                env.given_places[name] = _on(env, table.arrays[f"{name}_xy"])
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
-        """Write qpos, ctrl and the model fields that the file has columns for."""
+        """Write qpos, ctrl and the model fields that the file has arrays for."""
         write_robot(env, mask, self._command.index_select(0, env.world))
         poses = self._poses.index_select(0, env.world)
         for number, (address, _) in enumerate(env.index.objects.values()):
@@ -245,15 +204,13 @@ class FromStartsFile:
             view = env.sim.qpos[:, address : address + 7]
             pose = torch.cat((xy, view[:, 2:3], quat), dim=1)  # its height stays
             torch.where(mask[:, None], pose, view, out=view)
-        for held, table in self._given:
+        for quantity, table in self._quantities:
             values = table.index_select(0, env.world)
-            held.write(mask, torch.where(values.isnan(), held.read().double(), values))
+            quantity.write(mask, torch.where(values.isnan(), quantity.read().double(), values))
 
 
 def write_starts(env: EnvView, path: str | Path) -> None:
     """Write how the worlds of an environment have just started, for ``reset=starts_file``.
-
-    Masses, friction and gains have columns if they differ from the model's in some world.
 
     Args:
         env: An environment after `reset`, before its first step.
@@ -263,51 +220,43 @@ def write_starts(env: EnvView, path: str | Path) -> None:
         ArgumentError: The worlds have moved on.
         OSError: The file cannot be written.
     """
-    write_rows(start_rows(env), path)
+    write_npz(Path(path), start_arrays(env))
 
 
-def write_rows(rows: Iterable[dict[str, object]], path: str | Path) -> None:
-    """Write rows of `start_rows`, of one environment or of several, one after the other.
+def start_arrays(env: EnvView) -> dict[str, np.ndarray]:
+    """How the worlds of an environment have just started, by the arrays of a starts file.
 
-    Raises:
-        OSError: The file cannot be written.
-    """
-    numbered = [row | {"world": world} for world, row in enumerate(rows)]
-    write_atomic(Path(path), to_csv(numbered))
-
-
-def start_rows(env: EnvView) -> list[dict[str, object]]:
-    """How the worlds of an environment have just started, by the columns of a starts file.
+    Masses, friction and gains have arrays if they differ from the model's in some world.
 
     Raises:
         ArgumentError: The worlds have moved on.
     """
     if bool((env.episode_step != 0).any()) or bool((env.episode < 0).any()):
-        found = "worlds that have moved on, or not started"
-        raise ArgumentError("env", found, "worlds at their start", "Call env.reset() before")
-    table: dict[str, np.ndarray] = {"world": np.arange(env.nworld)}
-
-    def add(columns: Sequence[str], values: Tensor) -> None:
-        table.update(zip(columns, values.cpu().numpy().T, strict=True))
-
+        problem = "worlds that have moved on, or not started"
+        raise ArgumentError("env", problem, "worlds at their start", "Call env.reset() before")
+    out: dict[str, Tensor] = {}
     for name, (address, _) in env.index.objects.items():
-        pose = pose_w(env, name).cpu().numpy()
-        off = np.abs(pose[:, [2, 4, 5]] - [env.sim.model.qpos0[address + 2], 0.0, 0.0]).max(axis=1)
+        pose = pose_w(env, name)
+        nominal = pose.new_tensor([env.sim.model.qpos0[address + 2], 0.0, 0.0])
+        off = (pose[:, [2, 4, 5]] - nominal).abs().amax(1)
         if off.max() > _FLAT:
-            found = f"{name} of world {off.argmax()} off the table"
-            raise ArgumentError("env", found, "objects that stand flat on it")
-        add(_xy(name), pose_w(env, name)[:, :2])
-        table[f"{name}_yaw_rad"] = _yaw(pose[:, 3], pose[:, 6])
-    add([f"joint_{name}" for name in env.cfg.robot.joints], joint_pos(env))
+            problem = f"{name} of world {int(off.argmax())} off the table"
+            raise ArgumentError("env", problem, "objects that stand flat on it")
+        out[f"{name}_xy"] = pose[:, :2]
+        out[f"{name}_quat"] = pose[:, 3:]
+    joints = [f"joint_{name}" for name in env.cfg.robot.joints]
+    out |= zip(joints, joint_pos(env).unbind(1), strict=True)
+    model = env.sim.model
+    varying = {
+        name
+        for name, field in env.sim.fields.items()
+        if bool((field != torch.from_numpy(getattr(model, name)).to(field)).any())
+    }
     quantities: tuple[type[Quantity], ...] = (ObjectMasses, SlidingFriction, ServoGains)
-    for quantity in quantities:
-        if _varies(env, quantity.fields):
-            held = quantity(env)
-            add(held.columns, held.read())
-    for name in _drawn_places(env):
-        add(_xy(name), place_xy(env, name))
-    # Python's and numpy's shortest text of a number is read back to the same bits.
-    return [dict(zip(table, cells, strict=True)) for cells in zip(*table.values(), strict=True)]
+    for quantity in (kind(env) for kind in quantities if varying & set(kind.fields)):
+        out |= zip(quantity.columns, quantity.read().unbind(1), strict=True)
+    out |= {f"{name}_xy": place_xy(env, name) for name in _drawn_places(env)}
+    return {name: values.double().cpu().numpy() for name, values in out.items()}
 
 
 def _drawn_places(env: EnvView) -> list[str]:
@@ -315,73 +264,46 @@ def _drawn_places(env: EnvView) -> list[str]:
     return [name for name, place in env.cfg.scene.places.items() if any(place.random_xy)]
 
 
-def _xy(name: str) -> list[str]:
-    """The columns of a position."""
-    return [f"{name}_x_m", f"{name}_y_m"]
-
-
 def _on(env: EnvView, values: np.ndarray) -> Tensor:
     """Numbers on the device of an environment, in the type of its floats."""
     return torch.from_numpy(values).to(env.device, env.sim.qpos.dtype)
 
 
-def _varies(env: EnvView, names: Sequence[str]) -> bool:
-    """Whether the value of a field differs from the model's in some world."""
-    return any(
-        bool((field != torch.from_numpy(getattr(env.sim.model, name)).to(field)).any())
-        for name, field in env.sim.fields.items()
-        if name in names
-    )
-
-
-def _yaw(w: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Rotation about z [rad] of quaternions (w, 0, 0, z), so that its cosine and sine round to
-    these very numbers.
-    """
-    # The half angles whose cosine rounds to w and those whose sine rounds to z overlap.
-    ends = np.array([[-0.5], [0.5]])
-    near_w = np.clip(w + ends * np.spacing(np.abs(w)), -1.0, 1.0)
-    near_z = np.clip(z + ends * np.spacing(np.abs(z)), -1.0, 1.0)
-    by_w = np.copysign(np.arccos(near_w), z)
-    by_z = np.arcsin(near_z)
-    by_z = np.where(w < 0.0, np.copysign(np.pi, z) - by_z, by_z)
-    low = np.maximum(by_w.min(axis=0), by_z.min(axis=0))
-    return low + np.minimum(by_w.max(axis=0), by_z.max(axis=0))
-
-
-def _check_worlds(env: EnvView, file: StartsTable, poses: np.ndarray, command: np.ndarray) -> None:
-    """Every object is above the table and touches nothing else."""
+def _check_worlds(
+    env: EnvView, table: StartsTable, starts: np.ndarray, command: np.ndarray
+) -> None:
+    """Every object stands upright above the table and touches nothing else."""
     model = env.sim.model
     scene = env.cfg.scene
     index = env.index
     data = mujoco.MjData(model)
     owner = {geom: name for name, geoms in index.geoms.items() for geom in geoms}
-    table = model.geom("table").id
-    for world, (objects, joints) in enumerate(zip(poses, command, strict=True)):
+    ground = model.geom("table").id
+    for world, (objects, joints) in enumerate(zip(starts, command, strict=True)):
         data.qpos[:] = model.qpos0
         data.qpos[index.robot_qpos] = joints
-        for (address, _), pose in zip(index.objects.values(), objects, strict=True):
-            data.qpos[address : address + 2] = pose[:2]
-            data.qpos[address + 3 : address + 7] = pose[2:]
+        for (name, (address, _)), start in zip(index.objects.items(), objects, strict=True):
+            data.qpos[address : address + 2] = start[:2]
+            data.qpos[address + 3 : address + 7] = start[2:]
+            if max(abs(start[3]), abs(start[4]), abs(np.linalg.norm(start[2:]) - 1.0)) > _FLAT:
+                expected = f"w, 0, 0, z of length 1, a rotation about z, it is {start[2:]}"
+                raise table.wrong(expected, "Correct it", world, [f"{name}_quat"])
         mujoco.mj_kinematics(model, data)
         for name in index.objects:
             centers, halves = world_boxes(data, index.geoms[name])
             over = np.abs(centers[:, :2] - scene.table_center[:2]) + halves[:, :2]
-            beyond = (over - scene.table_half[:2]).max(axis=0)
-            if beyond.max() > _OVER:
-                expected = f"all of {name} above the table, {1e3 * beyond.max():.1f} mm are not"
-                raise file.misfit(world, [_xy(name)[beyond.argmax()]], expected, "Move it")
+            beyond = (over - scene.table_half[:2]).max()
+            if beyond > _OVER:
+                expected = f"all of {name} above the table, {1e3 * beyond:.1f} mm are not"
+                raise table.wrong(expected, "Move it", world, [f"{name}_xy"])
         mujoco.mj_collision(model, data)
         for pair in data.contact.geom[: data.ncon].tolist():
-            if table in pair or not owner.keys() & set(pair):
+            if ground in pair or not owner.keys() & set(pair):
                 continue
             names = [
                 owner.get(g) or model.geom(g).name or model.body(model.geom_bodyid[g]).name
                 for g in pair
             ]
-            moved = [column for name in names if name in index.objects for column in _xy(name)]
-            expected = (
-                f"objects that touch nothing but the table; {' and '.join(names)} touch in world"
-                f" {world}"
-            )
-            raise file.misfit(world, moved, expected, "Move them apart")
+            expected = f"objects that touch nothing but the table; {' and '.join(names)} touch"
+            moved = [f"{name}_xy" for name in names if name in index.objects]
+            raise table.wrong(expected, "Move them apart", world, moved)

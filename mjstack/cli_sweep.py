@@ -1,0 +1,150 @@
+"""What `-m` does around the jobs of a sweep: it composes and checks them, claims their folder, and
+shows what they have left.
+"""
+
+import itertools
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf, open_dict
+
+from mjstack.config.explain import own_overrides, parse
+from mjstack.config.load import compose
+from mjstack.config.schema import SweepCfg
+from mjstack.config.session import quoted
+from mjstack.errors import ConfigError, MjstackError, is_out_of_memory
+from mjstack.files import check_unused, claim_folder
+from mjstack.report.record import Report
+from mjstack.report.table import Console
+
+if TYPE_CHECKING:  # what loads torch need not wait for a misspelt key
+    from mjstack.jobs.sweep_folder import SweepJob
+
+
+def expand(master: DictConfig, overrides: Sequence[str]) -> list[list[str]]:
+    """The jobs of a sweep as Hydra's basic sweeper makes them; none for another sweeper."""
+    if any(o.startswith("hydra/sweeper=") and o != "hydra/sweeper=basic" for o in overrides):
+        return []
+    params = OmegaConf.select(master, "hydra.sweeper.params") or {}
+    texts = [*(f"{key}={value}" for key, value in params.items()), *own_overrides(overrides)]
+    values: dict[str, list[str]] = {}  # of each key, the last override's
+    for override in map(parse, texts):
+        key = override.get_key_element()
+        if override.is_discrete_sweep():
+            values[key] = [f"{key}={value}" for value in override.sweep_string_iterator()]
+        elif override.is_sweep_override():  # a glob
+            raise MjstackError(f"{' '.join(overrides)}: expected a list of values.")
+        else:
+            values[key] = [f"{key}={override.get_value_element_as_str()}"]
+    jobs = [list(job) for job in itertools.product(*values.values())]
+    if not jobs:
+        raise MjstackError(f"{' '.join(overrides)}: has no jobs, expected at least one value.")
+    return jobs
+
+
+def check_jobs(
+    master: DictConfig,
+    jobs: Sequence[list[str]],
+    check: Callable[[DictConfig, list[str]], object],
+) -> list["SweepJob"]:
+    """Compose and check every job of a sweep's folder.
+
+    Jobs of a sweeper other than Hydra's basic one are not known before; each is checked as it runs.
+    Of jobs in processes of their own, one that needs more memory than there is stops no other.
+    """
+    from mjstack.jobs.sweep_folder import SweepJob
+
+    folder = hydra_path(master, "sweep.dir")
+    separate = not _launcher(master).endswith(".LocalLauncher")
+    numbers: dict[Path, int] = {}
+    for number, job in enumerate(jobs):
+        cfg = compose(job, sweep=master)
+        if cfg.devices is not None:
+            raise ConfigError(
+                "devices",
+                cfg.devices,
+                "null with -m",
+                "Leave it out: with hydra/launcher=gpus each job has one GPU, and"
+                " hydra.launcher.jobs is how many run at once",
+            )
+        try:
+            check(cfg, job)
+        except MjstackError as error:
+            if not (separate and is_out_of_memory(str(error))):
+                raise
+        with open_dict(cfg):
+            cfg.hydra.job.num = number
+            cfg.hydra.job.id = str(number)
+        path = Path(os.path.normpath(folder / hydra_path(cfg, "sweep.subdir")))
+        if not path.is_relative_to(folder):
+            check_unused(path, key="hydra.sweep.subdir")
+        first = numbers.setdefault(path, number)
+        if first != number:
+            raise MjstackError(
+                f"hydra.sweep.subdir: jobs {first} and {number} would both write into {path},"
+                " expected a folder for each job. Leave it out, or let it name what differs."
+            )
+    return [SweepJob(number, path, tuple(jobs[number])) for path, number in numbers.items()]
+
+
+def choose_launcher(master: DictConfig) -> None:
+    """Let a sweep go on in the command's own process, which Hydra's launcher would begin anew."""
+    if _launcher(master).endswith(".BasicLauncher"):
+        master.hydra.launcher._target_ = "hydra_plugins.mjstack_launcher.LocalLauncher"
+
+
+def _launcher(master: DictConfig) -> str:
+    """The class that launches the jobs of a sweep."""
+    return str(OmegaConf.select(master, "hydra.launcher._target_"))
+
+
+@contextmanager
+def claim_sweep(master: DictConfig, jobs: Sequence["SweepJob"]) -> Iterator[Path]:
+    """A sweep's folder, with the list of its jobs: a new one by the hour, or one in which the same
+    command goes on.
+    """
+    from mjstack.jobs.sweep import Queueing
+    from mjstack.jobs.sweep_folder import add_jobs, shared_sweep
+
+    folder = hydra_path(master, "sweep.dir")
+    queued = _launcher(master).endswith(".GpuLauncher")
+    if queued:
+        keys = ("jobs", "minutes", "retry")
+        Queueing(*(OmegaConf.select(master, f"hydra.launcher.{key}") for key in keys)).slots()
+    named = OmegaConf.to_container(master.hydra.sweep, resolve=False)
+    if "${now:" in str(cast(dict, named)["dir"]):
+        claim = claim_folder(folder, numbered=True, key="hydra.sweep.dir")
+    else:
+        claim = shared_sweep(folder, jobs, alone=not queued)
+    with claim as claimed:
+        master.hydra.sweep.dir = str(claimed)
+        master.hydra.overrides.hydra.append(f"hydra.sweep.dir={quoted(claimed)}")  # of its jobs
+        add_jobs(
+            claimed,
+            [replace(job, folder=claimed / os.path.relpath(job.folder, folder)) for job in jobs],
+        )
+        yield claimed
+
+
+def hydra_path(cfg: DictConfig, key: str) -> Path:
+    """A path below ``hydra``, as Hydra will find it."""
+    HydraConfig.instance().set_config(cfg)  # for what is interpolated
+    OmegaConf.set_readonly(cfg.hydra, None)
+    return Path(str(OmegaConf.select(cfg, f"hydra.{key}", throw_on_missing=True)))
+
+
+def print_sweep(folder: Path, sweep: SweepCfg, reports: dict[int, Report]) -> None:
+    """Write and print the table of a sweep: a row for each job."""
+    from mjstack.jobs.sweep_table import write_summary
+
+    console = Console(soft_wrap=True)
+    table, problem = write_summary(folder, sweep, reports, draw=True)
+    Console().print(table.to_console())
+    if problem:
+        console.print(problem)
+    console.print(f"summary: {folder}/summary.md")

@@ -1,0 +1,174 @@
+"""What the drivers with feedback share: where the objects are, where each phase leads from there,
+and batched inverse kinematics.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from mjstack.drivers.driver import Driver, require_actions
+from mjstack.drivers.tilt import CarryTilt, turn_about_z
+from mjstack.errors import ArgumentError
+from mjstack.kinematics.batched_ik import BatchedIk
+from mjstack.managers.view import EnvView
+from mjstack.mdp.geometry import gripper_opening, objects_in_hand, place_xy, pose_w, robot
+from mjstack.scene.phases import Target, build_phases, source_names
+
+STAY = 0.3  # how much a roll made so far weighs against the face that is nearer
+
+
+class State(NamedTuple):
+    """The measured state: joints; speed of the fastest joint of the arm; grasp point, closing and
+    approach axis; opening of the gripper; position of every object, and whether all jaws press on
+    it.
+    """
+
+    q: Tensor
+    speed: Tensor
+    point: Tensor
+    closing: Tensor
+    approach: Tensor
+    opening: Tensor
+    pos: Tensor
+    in_hand: Tensor
+
+
+class FeedbackDriver(Driver):
+    """Base class of drivers that give joint targets from where the objects of every world are."""
+
+    def __init__(self, env: EnvView, nominal: np.ndarray, *, clock: bool) -> None:
+        """Allocate for the environment's worlds.
+
+        Args:
+            env: The environment; its action terms must take absolute joint commands.
+            nominal: Commands at the end of each phase of the nominal plan, which redundant joints
+                keep close to, shape ``(phases, nu)``.
+            clock: Whether worlds go through the phases one after the other.
+
+        Raises:
+            MjstackError: The environment takes other actions, or worlds have moved on.
+        """
+        cfg = env.cfg
+        device = env.device
+        c = cfg.controller
+        require_actions(cfg, c.action, "absolute joint commands, which the expert gives")
+        if bool((env.episode_step != 0).any()):  # it begins where the environment's episodes do
+            value = "worlds that have moved on"
+            raise ArgumentError("env", value, "worlds at their start", "Call env.reset() before")
+        self._plan = build_phases(cfg)
+        if clock:
+            super().__init__(env.nworld, self._plan[-1].stop, device, self._plan)
+        else:
+            super().__init__(env.nworld, cfg.task.episode_steps, device)
+        self._env = env
+        self._cfg = cfg
+        self._worlds = torch.arange(env.nworld, device=device)
+        self._n_arm = env.index.n_arm
+        self._nominal = torch.as_tensor(nominal, dtype=torch.float32, device=device)
+
+        # Targets of the phases, a row per phase
+        targets = [phase.target or Target(0, -1, (0.0, 0.0), 0.0, 0.0) for phase in self._plan]
+        self._target = torch.tensor([[*t.offset, t.z] for t in targets], device=device)
+        self._source = torch.tensor([t.source for t in targets], device=device)
+        self._toward = torch.tensor([max(t.toward, 0) for t in targets], device=device)
+        self._turns = torch.tensor([float(t.toward >= 0) for t in targets], device=device)
+        grips = [cfg.robot.grips[phase.spec.gripper] for phase in self._plan]
+        self._grip = torch.tensor(grips, device=device)
+
+        # Inverse kinematics
+        self._ik = BatchedIk(
+            env.sim.model,
+            cfg.robot,
+            env.nworld,
+            device,
+            iterations=c.step_iterations,
+            posture_gain=c.posture_gain,
+            approach_gain=c.approach_gain,
+        )
+        # Where nothing is carried, the gripper points down as far as it can.
+        carries = any(phase.grasps is not None for phase in c.phases.values())
+        self._tilt: CarryTilt | None = None
+        if c.approach_gain > 0.0 and carries:
+            self._tilt = CarryTilt(env.sim.model, cfg, self._plan, self._ik, self._nominal)
+        self._aligns = c.yaw_alignment > 0.0
+        self._roll_column, self._roll_sign = self._find_roll() if self._aligns else (0, 1.0)
+
+        # Buffers: x, y and yaw of objects and places, and the last command
+        self._seen = torch.zeros((env.nworld, len(source_names(cfg.scene)), 3), device=device)
+        self._command = torch.zeros((env.nworld, len(cfg.robot.home)), device=device)
+
+    def _observe(self, due: Tensor) -> None:
+        """Measure the objects where that is due, shape ``(nworld, objects)``, bool; and all
+        places.
+        """
+        objects = self._cfg.scene.objects
+        for number, name in enumerate(objects):
+            pose = pose_w(self._env, name).float()
+            w, x, y, z = pose[:, 3:].unbind(1)
+            yaw = torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+            seen = torch.cat((pose[:, :2], yaw[:, None]), dim=1)
+            last = self._seen[:, number]
+            last.copy_(torch.where(due[:, number, None], seen, last))
+        for number, name in enumerate(self._cfg.scene.places, start=len(objects)):
+            self._seen[:, number, :2] = place_xy(self._env, name).float()
+
+    def _aim(self, phase: Tensor) -> Tensor:
+        """Target of each world's phase, from where its anchor was last seen [m], shape ``(nworld,
+        3)``.
+        """
+        table = self._target[phase]
+        seen = self._last_seen(self._source, phase)[:, :2]
+        offset = table[:, :2]
+        if any(spec.toward is not None for spec in self._cfg.controller.phases.values()):
+            away = self._last_seen(self._toward, phase)[:, :2] - seen
+            offset = turn_about_z(offset, torch.atan2(away[:, 1], away[:, 0]) * self._turns[phase])
+        return torch.cat((offset + seen, table[:, 2:]), dim=1)
+
+    def _last_seen(self, sources: Tensor, phase: Tensor) -> Tensor:
+        """x, y [m] and yaw [rad] of each world's source of a phase, shape ``(nworld, 3)``."""
+        return self._seen[self._worlds, sources[phase]]
+
+    def _measure(self) -> State:
+        """The state now."""
+        env = self._env
+        q = robot(env).qpos.read(env.sim.qpos).float()
+        pos = [pose_w(env, name)[:, :3].float() for name in self._cfg.scene.objects]
+        return State(
+            q,
+            robot(env).qvel.read(env.sim.qvel)[:, : self._n_arm].float().abs().amax(1),
+            *self._ik.forward(q),
+            opening=gripper_opening(env).float().amin(1),
+            pos=torch.stack(pos, dim=1),
+            in_hand=objects_in_hand(env.index, env.sim),
+        )
+
+    def _keep_finite(self, command: Tensor) -> Tensor:
+        """Keep the command for the next step. A world whose state is not finite keeps its last one,
+        and the check fails it.
+        """
+        return self._command.copy_(torch.where(torch.isfinite(command), command, self._command))
+
+    def _find_roll(self) -> tuple[int, float]:
+        """Column of the joint that rolls the gripper, and which way it turns the closing axis, seen
+        from above.
+        """
+        column = self._cfg.robot.joints.index(str(self._cfg.robot.roll_joint))
+        command = self._nominal[:1].expand(self._env.nworld, -1).clone()
+        closing = []
+        for turn in (0.0, 0.1):
+            command[:, column] += turn
+            closing.append(self._ik.forward(command)[1][0].double().cpu())
+        (x0, y0, _), (x1, y1, _) = closing
+        return column, math.copysign(1.0, float(x0 * y1 - y0 * x1))
+
+
+def servo_lag(model: mujoco.MjModel, actuators: Sequence[int]) -> float:
+    """Longest time constant of some position servos [s]: damping over stiffness."""
+    dof = model.jnt_dofadr[model.actuator_trnid[actuators, 0]]
+    damping = model.dof_damping[dof] - model.actuator_biasprm[actuators, 2]
+    return max(1e-6, float((damping / model.actuator_gainprm[actuators, 0]).max()))

@@ -1,0 +1,116 @@
+"""Batches of episodes: the only loop over seeds. Gates, datasets and trainings choose what is
+recorded, and what they keep of each batch.
+"""
+
+from collections.abc import Callable, Generator, Iterable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mjstack.config.schema import Config
+from mjstack.drivers.driver import Driver
+from mjstack.envs import Env
+from mjstack.episodes.recorder import Channels, Recorder
+from mjstack.episodes.rollout import Episode, Observer, play_episode, reset_worlds
+from mjstack.episodes.stage import Stage
+from mjstack.sim import Simulation
+
+
+@dataclass(frozen=True, slots=True)
+class BatchPlan:
+    """A batch to be played.
+
+    Attributes:
+        seed: Seed of its starts.
+        worlds: Numbers of its worlds, on which their starts depend.
+    """
+
+    seed: int
+    worlds: Sequence[int]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Batch:
+    """A batch that was played and judged. Its environment's worlds stand where the episode ended.
+
+    Attributes:
+        plan: Its plan.
+        env: The environment.
+        episode: The judged episode of every world.
+        rows: The recorded channels by name, each ``(rows, nworld, ...)``, on the device; empty as
+            soon as the next batch begins, which needs the memory.
+    """
+
+    plan: BatchPlan
+    env: Env
+    episode: Episode
+    rows: dict[str, Tensor]
+
+    @property
+    def succeeded(self) -> Tensor:
+        """Whether each world broke no rule, shape ``(nworld,)``, bool."""
+        return self.episode.result.failed == 0
+
+    def finite(self) -> Tensor:
+        """Whether all that was recorded of each world is finite, shape ``(nworld,)``, bool."""
+        parts = [rows.isfinite().flatten(2).all(2).all(0) for rows in self.rows.values()]
+        return torch.stack(parts).all(0)
+
+    def select(self, name: str, worlds: Tensor) -> Tensor:
+        """A channel's rows in some worlds, shape ``(worlds, rows, ...)``; ``worlds`` are numbers or
+        a mask of rows of the batch.
+        """
+        return self.rows[name][:, worlds].transpose(0, 1)
+
+
+def play_batches(
+    stage: Stage,
+    plans: Iterable[BatchPlan],
+    channels: Sequence[Channels] = (),
+    *,
+    cfg: Config | None = None,
+    sim: Simulation | None = None,
+    simulate: Callable[[int], Simulation] | None = None,
+    driver: Callable[[BatchPlan, Env], Driver] | None = None,
+    observers: Callable[[BatchPlan], Sequence[Observer]] = lambda plan: (),
+    label: str = "steps",
+) -> Generator[Batch, None, None]:
+    """Play and judge batch after batch. A plan is taken when the batch before it has been used, so
+    it may depend on that. Close the iterator to give the worlds back early.
+
+    Args:
+        stage: The stage.
+        plans: The batches.
+        channels: What is recorded.
+        cfg: Configuration of the environment, if not that of a driven episode.
+        sim: The worlds, which the caller closes; by default they are made, and closed at the end.
+        simulate: Makes so many worlds, if not those of the stage's batch.
+        driver: Makes the driver of worlds that have started, if not the configured one.
+        observers: More observers of a batch.
+        label: Name of the steps in the progress, before the seed.
+    """
+    cfg = cfg or stage.driven(stage.cfg.reset)
+    made: Simulation | None = None
+    try:
+        for plan in plans:
+            worlds = sim or made
+            if worlds is None or worlds.nworld != len(plan.worlds):
+                if made is not None:
+                    made.close()
+                worlds = made = (simulate or stage.batch_simulation)(len(plan.worlds))
+            env = Env(worlds, stage.index, cfg, check_faults=False)  # the check names lost worlds
+            reset_worlds(env, plan.seed, plan.worlds)
+            recorder = Recorder(*channels)
+            episode = play_episode(
+                env,
+                driver(plan, env) if driver else stage.driver(env),
+                [recorder, *observers(plan), *stage.observers],
+                advance=stage.progress.advance,
+                label=f"{label}, seed {plan.seed}",
+            )
+            yield Batch(plan, env, episode, recorder.rows)
+            recorder.rows.clear()
+    finally:
+        if made is not None:
+            made.close()

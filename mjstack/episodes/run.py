@@ -1,0 +1,131 @@
+"""A run: the stage on which it plays, its folder, its records, and the products of its gates."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from mjstack.config.schema import Backend, Config
+from mjstack.episodes.recorder import Snapshots, WorldRecorder
+from mjstack.episodes.rollout import NOMINAL, Episode, Observer, State
+from mjstack.episodes.stage import Stage, TextHook
+from mjstack.managers.view import offers
+from mjstack.report.page import Page
+from mjstack.report.record import GateResult, Status
+from mjstack.sim import Simulation, make_simulation
+
+needs_episode = offers(needs_episode=True)
+"""Marks a gate that plays judged episodes. It is skipped for a task that has none."""
+spread = offers(spread="worlds")
+"""Marks a gate whose ranks play their worlds and gather the results. Of others rank 0 alone plays
+all worlds.
+"""
+each_rank = offers(spread="ranks")
+"""Marks a gate that measures the worlds of a rank, in all of them at the same time."""
+
+
+@dataclass(eq=False, kw_only=True, slots=True)
+class NominalRun:
+    """The reference episode.
+
+    Attributes:
+        sim: Its world.
+        episode: The episode.
+        world: Its recording.
+        states: At the ends of the phases that gate *parity* compares, by step.
+    """
+
+    sim: Simulation
+    episode: Episode
+    world: WorldRecorder
+    states: dict[int, State]
+
+
+@dataclass(eq=False, kw_only=True, slots=True)
+class Artifacts:
+    """Products of gates that later gates and the report use.
+
+    Attributes:
+        results: Results so far, by gate.
+        carry_start: States of all worlds as the phase ``gate.throughput.from_phase`` begins, from
+            *batch*.
+        timed_episode: Time of the first seed's episode, from *batch*.
+        pictured: Title of the one-world episode that pictures show, and its positions, shape
+            ``(steps, nq)``.
+    """
+
+    results: dict[str, GateResult] = field(default_factory=dict)
+    carry_start: State | None = None
+    timed_episode: Episode | None = None
+    pictured: tuple[str, np.ndarray] | None = None
+
+
+@dataclass(eq=False)
+class Run:
+    """A run of a job: gates and jobs play on its stage, and hand their results to it.
+
+    Attributes:
+        stage: Scene, plan, and all that is made of them.
+        folder: Where the run's files go. None for none, such as of ranks that write nothing.
+        overrides: The command line of the run.
+        begin: Gets the name of each part of the run as it begins.
+        record: Gets each result as soon as there is one.
+        viewers: Look on at the one-world episode that is shown.
+        artifacts: Products of gates.
+        page: What the run shows besides its results.
+    """
+
+    stage: Stage
+    folder: Path | None = None
+    overrides: Sequence[str] = ()
+    begin: TextHook = lambda name: None
+    record: Callable[[GateResult], None] = lambda result: None
+    viewers: Sequence[Observer] = ()
+    artifacts: Artifacts = field(default_factory=Artifacts)
+    page: Page = field(default_factory=Page)
+
+    @property
+    def cfg(self) -> Config:
+        """The configuration."""
+        return self.stage.cfg
+
+    def print_line(self, line: str) -> None:
+        """Print a line, which has no markup."""
+        self.stage.progress.print_line(line)
+
+    def on(self, stage: Stage) -> "Run":
+        """The run on another stage, with artifacts of its own."""
+        return replace(self, stage=stage, artifacts=Artifacts())
+
+    @cached_property
+    def nominal(self) -> NominalRun:
+        """One native world's episode from the nominal starts: the reference of baseline
+        and parity.
+        """
+        stage = self.stage
+        sim = make_simulation(stage.model, self.cfg, 1, backend=Backend.native)
+        world = WorldRecorder()
+        snapshots = Snapshots(self.parity_steps.values())
+        viewers = () if "parity" in self.cfg.gates else self.viewers
+        episode = stage.play(sim, NOMINAL, [*viewers, world, snapshots])
+        return NominalRun(sim=sim, episode=episode, world=world, states=snapshots.states)
+
+    @property
+    def parity_steps(self) -> dict[str, int]:
+        """Steps after which gate *parity* takes its states, by their names: the last ones of
+        phases, or, without phases, of thirds of the episode.
+        """
+        stage = self.stage
+        if stage.phases:
+            states = self.cfg.gate.parity.states
+            return {name: stage.phase(phase).stop - 1 for name, phase in states.items()}
+        return {f"third_{k}": k * stage.episode_steps // 3 - 1 for k in (1, 2, 3)}
+
+    def judge_one(self, episode: Episode) -> tuple[Status, str, dict[str, float]]:
+        """Status, reason and metrics of a one-world episode."""
+        bits = int(episode.failed[0])
+        metrics = {name: float(values[0]) for name, values in episode.values.items()}
+        reason = f"failed: {self.stage.check.rules.describe(bits)}" if bits else ""
+        return Status.failed if bits else Status.passed, reason, metrics

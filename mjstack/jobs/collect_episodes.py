@@ -1,0 +1,227 @@
+"""Episodes of played worlds as a dataset takes them: their arrays, and images that are rendered
+after they have been judged.
+"""
+
+import itertools
+import math
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import torch
+
+from mjstack.config.schema import CollectJobCfg
+from mjstack.datasets import DatasetSpec, EpisodeData
+from mjstack.datasets.part import FILE_MB, Part, PartWriter
+from mjstack.datasets.spec import typed_episode
+from mjstack.drivers.driver import Driver
+from mjstack.envs import Env
+from mjstack.episodes.batches import Batch
+from mjstack.episodes.recorder import Channels, Read, start_and_every_step
+from mjstack.episodes.stage import Stage
+from mjstack.jobs.collect_plan import ACTION, IMAGES, REWARD, STATE
+from mjstack.managers.episode import required_fields
+from mjstack.sim import StateRenderer
+from mjstack.sim.cameras import with_outputs
+
+POSITIONS = "qpos"  # the channel from which images are rendered
+_CHUNK_BYTES = 128 * 2**20  # copied to the host at once
+_MOST_RENDERED = 4096  # states at once
+
+
+def demonstration_channels(stage: Stage) -> list[Channels]:
+    """What is recorded of an episode of a dataset: before each step the measured joints, the
+    observation and, with cameras, the positions; then the joint targets that went to the actuators
+    and the reward for where they led. All float32.
+    """
+
+    def read_before(env: Env, driver: Driver) -> Read:
+        qpos = env.sim.qpos
+        robot = env.index.on(env.device, qpos.dtype)
+        groups = {
+            f"observation.{name}": values for name, values in env.observation_manager.groups.items()
+        }
+        rendered = bool(stage.cfg.scene.cameras)
+        return lambda: {
+            STATE: robot.qpos.read(qpos).float(),
+            **groups,
+            **({POSITIONS: qpos.float()} if rendered else {}),
+        }
+
+    def read_step(env: Env, driver: Driver) -> Read:
+        ctrl = env.sim.ctrl
+        columns = env.index.on(env.device, ctrl.dtype).ctrl
+        reward = env.reward_manager.reward
+        return lambda: {ACTION: columns.read(ctrl).float(), REWARD: reward[:, None]}
+
+    return [Channels(read_before, start_and_every_step), Channels(read_step)]
+
+
+class EpisodeSource:
+    """Makes the episodes of played worlds. With cameras their images are rendered after they have
+    been judged, as many steps at once as there are worlds.
+
+    Attributes:
+        drawing: Time that images have taken [s].
+    """
+
+    def __init__(self, stage: Stage, spec: DatasetSpec, folder: Path) -> None:
+        """Take the stage, and the dataset's spec and folder."""
+        self._stage = stage
+        self._spec = spec
+        self._folder = folder
+        self._images_gib = cast(CollectJobCfg, stage.cfg.job).buffer_gib
+        self.drawing = 0.0
+        self._count = 0
+        self._renderer: StateRenderer | None = None
+        self._cameras = with_outputs(stage.cfg.scene.cameras, ["rgb"])
+        # Steps from one image to the next, as the environment draws them
+        hz = stage.cfg.task.control_hz
+        self._strides = {
+            name: round(hz / (camera.rate or hz)) for name, camera in self._cameras.items()
+        }
+
+    def close(self) -> None:
+        """Give back the renderer."""
+        if self._renderer is not None:
+            self._renderer.close()
+
+    def write(
+        self, batch: Batch, chosen: Sequence[int], episode: int, frame: int, task: int
+    ) -> list[Part]:
+        """Write a batch's episodes into hidden files of the dataset.
+
+        Args:
+            batch: This rank's worlds.
+            chosen: Numbers of the worlds of all ranks whose episodes are kept.
+            episode: Number of the first of these episodes in the dataset.
+            frame: Number of its first frame.
+            task: Number of the task.
+
+        Raises:
+            FolderError: An episode does not fit the spec.
+            OSError: A file cannot be written.
+        """
+        worlds = batch.plan.worlds
+        order = {world: number for number, world in enumerate(chosen) if world in worlds}
+        episodes = self.episodes(batch, [worlds.index(world) for world in order])
+        files: list[Part] = []
+        writer: PartWriter | None = None
+        try:
+            for count, (number, data) in enumerate(zip(order.values(), episodes, strict=True), 1):
+                if writer is None:
+                    name = f"rank{self._stage.ranks.rank:04d}-{len(files)}"
+                    writer = PartWriter(self._folder, self._spec, name, images_gib=self._images_gib)
+                first_frame = frame + number * len(data.arrays[STATE])
+                typed = typed_episode(self._spec, data)
+                writer.write(data, task, *typed, episode + number, first_frame)
+                if writer.is_full(FILE_MB):
+                    files.append(writer.complete())
+                    writer = None
+                label = f"episodes of seed {batch.plan.seed}"
+                self._stage.progress.advance(label, count, len(order))
+            return [*files, writer.complete()] if writer is not None else files
+        except BaseException:
+            if writer is not None:
+                writer.abandon()
+            raise
+
+    def episodes(self, batch: Batch, rows: Sequence[int]) -> Iterator[EpisodeData]:
+        """The episodes of some worlds of a batch, by their rows, with images if there are cameras.
+
+        Raises:
+            MjstackError: The worlds in which images are rendered do not fit into memory.
+        """
+        images: Iterator[dict[str, np.ndarray]] = itertools.repeat({})
+        if self._cameras and rows:
+            images = self._images(batch, rows)
+        for row, arrays, frames in zip(rows, self._arrays(batch, rows), images, strict=False):
+            yield self._episode(batch, row, arrays, frames)
+
+    def _arrays(self, batch: Batch, rows: Sequence[int]) -> Iterator[dict[str, np.ndarray]]:
+        """Steps of some worlds on the host, by column, each ``(steps, dim)``; copied in chunks."""
+        columns = {name: values for name, values in batch.rows.items() if name != POSITIONS}
+        steps = len(batch.rows[ACTION])
+        world_bytes = sum(values[:, 0].nbytes for values in columns.values())
+        size = max(1, _CHUNK_BYTES // world_bytes)
+        for first in range(0, len(rows), size):
+            chunk = torch.tensor(rows[first : first + size], device=batch.rows[ACTION].device)
+            host = {name: batch.select(name, chunk).cpu().numpy() for name in columns}
+            for number in range(len(chunk)):
+                yield {name: values[number, :steps] for name, values in host.items()}
+
+    def _episode(
+        self,
+        batch: Batch,
+        row: int,
+        arrays: dict[str, np.ndarray],
+        images: dict[str, np.ndarray],
+    ) -> EpisodeData:
+        """A world's steps and its result. `next.success` is true in the last step of a successful
+        episode alone.
+        """
+        task = self._stage.cfg.task
+        broken = self._stage.check.rules.describe(int(batch.episode.failed[row]))
+        last = np.arange(len(arrays[STATE])) == len(arrays[STATE]) - 1
+        return EpisodeData(
+            arrays={**arrays, "next.done": last, "next.success": last & (not broken)},
+            images=images,
+            task=task.instruction or task.name,
+            success=not broken,
+            seed=batch.plan.seed,
+            world=batch.plan.worlds[row],
+            values={
+                "retries": int(batch.episode.retries[row]),
+                "failed_rules": broken,
+                "config_sha256": self._spec.config_sha256,
+            },
+        )
+
+    def _images(self, batch: Batch, rows: Sequence[int]) -> Iterator[dict[str, np.ndarray]]:
+        """Images of some worlds' episodes on the host, by column, each ``(steps, height, width,
+        3)``, uint8.
+        """
+        if self._renderer is None:
+            self._count = min(_MOST_RENDERED, len(batch.plan.worlds))
+            self._renderer = self._stage.color_renderer(
+                self._count, required_fields(self._stage.cfg.reset)
+            )
+        steps = len(batch.rows[ACTION])
+        step = math.gcd(*self._strides.values())
+        states = batch.rows[POSITIONS][:steps:step]
+        at_once = max(1, self._count // len(states))
+        for first in range(0, len(rows), at_once):
+            began = time.perf_counter()
+            worlds = torch.tensor(rows[first : first + at_once])
+            chosen = states.index_select(1, worlds.to(states.device)).transpose(0, 1).flatten(0, 1)
+            fields = {
+                name: values[worlds.to(values.device)].repeat_interleave(len(states), 0)
+                for name, values in batch.env.sim.fields.items()
+            }
+            rendered = self._render(self._renderer, chosen, fields)
+            self.drawing += time.perf_counter() - began
+            for row in range(len(worlds)):
+                rows_of = slice(row * len(states), (row + 1) * len(states))
+                episode = {}
+                for name, stride in self._strides.items():
+                    images = rendered[name][rows_of][:: stride // step]
+                    if stride > 1:
+                        images = np.repeat(images, stride, axis=0)[:steps]
+                    episode[f"{IMAGES}.{name}"] = images
+                yield episode
+
+    def _render(
+        self, renderer: StateRenderer, qpos: torch.Tensor, fields: Mapping[str, torch.Tensor]
+    ) -> dict[str, np.ndarray]:
+        """Images of any number of states by camera, on the host."""
+        shapes = {name: (len(qpos), *camera.size, 3) for name, camera in self._cameras.items()}
+        out = {name: np.empty(shape, np.uint8) for name, shape in shapes.items()}
+        for first in range(0, len(qpos), self._count):
+            rows = slice(first, first + self._count)
+            looks = {name: values[rows] for name, values in fields.items()}
+            images = renderer.draw(qpos[rows], looks)
+            for name, whole in out.items():
+                torch.from_numpy(whole[rows]).copy_(images[f"images.{name}"])
+        return out

@@ -1,0 +1,311 @@
+"""The plan of a dataset of demonstrations: its columns, what its episodes depend on, and the record
+of the batches that were played.
+"""
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, cast
+
+import mujoco
+import torch
+
+from mjstack.config.check import places_objects
+from mjstack.config.fingerprint import config_content, config_hash, differences
+from mjstack.config.functions import offered
+from mjstack.config.schema import Backend, CollectJobCfg, Config, ObservationTermCfg
+from mjstack.datasets import DatasetSpec, Feature, Video
+from mjstack.datasets.reader import check_same, read_info
+from mjstack.datasets.spec import term_columns
+from mjstack.datasets.video import check_encoder
+from mjstack.envs import Env, build_env, demonstration_config
+from mjstack.episodes.stage import Stage
+from mjstack.errors import ConfigError, FolderError
+from mjstack.files import check_unused, lock_folder, reading
+from mjstack.jobs.runner import run_provenance
+from mjstack.mdp.starts.placement import GAP, SCHEMA, may_meet
+from mjstack.sim import resolve_backend
+
+NAME = "collect"
+DATASET = "dataset"  # within the job's folder
+BATCHES = "batches.json"  # likewise
+STATE = "observation.state"
+ACTION = "action"
+REWARD = "next.reward"
+IMAGES = "observation.images"
+# Changing one of these changes no episode. The action terms are the controller's, and nothing ends
+# an episode early.
+_WITHOUT_EFFECT = (
+    "action",
+    "termination",
+    "batch",
+    "nworld",
+    "gates",
+    "graph",
+    "view",
+    "video",
+    "run",
+    "world",
+    "gate",
+)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CollectPlan:
+    """A dataset to be collected.
+
+    Attributes:
+        home: The job's folder.
+        spec: The dataset's columns and provenance.
+        most: Largest number of worlds of a batch: those whose steps fit into the buffers of all
+            ranks.
+    """
+
+    home: Path
+    spec: DatasetSpec
+    most: int
+
+    @classmethod
+    def of(cls, stage: Stage, home: Path, env: Env) -> "CollectPlan":
+        """Plan from an environment of the demonstrations, with any number of worlds.
+
+        Raises:
+            ConfigError: The steps of not even one world fit into the buffer, or a column's name is
+                taken.
+        """
+        cfg = stage.cfg
+        gib = cast(CollectJobCfg, cfg.job).buffer_gib
+        provenance = run_provenance(stage)
+        # They differ between calls that make the same episodes.
+        del provenance["date"], provenance["config_sha256"]
+        spec = make_spec(env, cfg, provenance)
+        step = 4 * sum(column.dim for column in spec.features.values() if column.dtype == "float32")
+        if spec.videos:
+            step += 4 * stage.model.nq
+        world = stage.episode_steps * step / 2**30
+        if gib < world:
+            expected = f"at least {world:.2g}, which the steps of one world take"
+            raise ConfigError("job.buffer_gib", gib, expected)
+        return cls(home=home, spec=spec, most=min(cfg.nworld, stage.ranks.size * int(gib / world)))
+
+
+def collect_folder(cfg: Config) -> Path:
+    """Where a configuration's dataset is, so that another call finds it."""
+    name = config_hash(episode_config(cfg))[:12]
+    return Path(cast(CollectJobCfg, cfg.job).folder or f"outputs/collect/{name}")
+
+
+def plan_collection(stage: Stage) -> CollectPlan:
+    """Plan the configured dataset.
+
+    Raises:
+        MjstackError: Its episodes would not differ, do not fit into the buffer, or have images that
+            cannot be kept or encoded.
+    """
+    cfg = stage.cfg
+    played = demonstration_config(cfg, stage.action)
+    env = build_env(played, model=stage.model, nworld=2, backend=Backend.native, device="cpu")
+    with closing(env):
+        if cast(CollectJobCfg, cfg.job).episodes > 1:
+            _check_starts(env)
+        plan = CollectPlan.of(stage, collect_folder(cfg), env)
+    for name, camera in cfg.scene.cameras.items():
+        if "rgb" not in camera.outputs:
+            expected = "rgb among them, which a dataset keeps"
+            raise ConfigError(f"scene.cameras.{name}.outputs", list(camera.outputs), expected)
+    if plan.spec.videos:
+        check_encoder(plan.spec.videos, plan.spec.fps)
+    return plan
+
+
+def _check_starts(env: Env) -> None:
+    """Refuse starts that are the same in every world or under every seed: an episode would be in
+    the dataset twice.
+    """
+    starts = []
+    seed = env.cfg.seed
+    for start_seed in (seed, seed - 1 if seed else 1):
+        env.reset(seed=start_seed)
+        parts = (env.sim.qpos, env.sim.qvel, *env.sim.fields.values())
+        rows = torch.cat([part.double().flatten(1) for part in parts], dim=1)
+        starts += [row.numpy().tobytes() for row in rows]
+    if len(set(starts)) < len(starts):
+        raise ConfigError(
+            "reset",
+            f"[{', '.join(env.cfg.reset)}]",
+            "starts that differ from world to world and from seed to seed, so that no episode is"
+            " there twice",
+            "Use reset=randomized or reset=jitter",
+        )
+
+
+def check_folder(dataset: Path, spec: DatasetSpec) -> None:
+    """Refuse a dataset that is not this configuration's.
+
+    Raises:
+        FolderError: It is of another one.
+        FolderError: Another process is writing it, or the job's folder has a run of another job.
+    """
+    check_unused(dataset.parent, NAME, DATASET)
+    if not dataset.exists():
+        return
+    os.close(lock_folder(dataset))
+    info = read_info(dataset)
+    if info is None:
+        return
+    if info["mjstack"]["config_sha256"] != spec.config_sha256:
+        recorded = (info["mjstack"]["provenance"] or [{}])[-1].get("config", {})
+        changes = differences(recorded, spec.provenance["config"])
+        raise FolderError(
+            f"{dataset} has episodes of another configuration: {changes}. Set job.folder to another"
+            " folder, or these keys back"
+        )
+    check_same(dataset, info, spec)
+    read_batches(dataset.parent / BATCHES)
+
+
+@dataclass(kw_only=True, slots=True)
+class BatchRecord:
+    """One seed, played in some worlds.
+
+    Attributes:
+        seed: The seed.
+        worlds: Number of worlds.
+        succeeded: Number of worlds that the check passed.
+        episodes: Number of its episodes in the dataset.
+        retries: Grasps that were tried again, in all worlds.
+        broken: How many worlds broke each rule, by its words; among them those that are left out
+            only because a number in them is not finite.
+    """
+
+    seed: int
+    worlds: int
+    succeeded: int
+    episodes: int
+    retries: int
+    broken: dict[str, int]
+
+
+def read_batches(path: Path) -> list[BatchRecord]:
+    """The batches of earlier calls. Those of version 0.1 have ``kept`` for ``episodes``.
+
+    Raises:
+        FolderError: The file cannot be read.
+    """
+    if not path.exists():
+        return []
+    fix = f"Remove {BATCHES}: the expert's success rate is counted anew"
+    names = {item.name for item in fields(BatchRecord)}
+    with reading(path, fix):
+        return [
+            BatchRecord(**{name: value for name, value in record.items() if name in names})
+            for batch in json.loads(path.read_text())
+            for record in [{"episodes": batch.get("kept")} | batch]
+        ]
+
+
+def episode_config(cfg: Config) -> dict[str, Any]:
+    """Everything that episodes depend on, in JSON's types. A starts file counts by its content,
+    wherever it is.
+
+    Raises:
+        ConfigError: The starts file cannot be read.
+    """
+    config = config_content(cfg)
+    for key in _WITHOUT_EFFECT:
+        del config[key]
+    backend, _ = resolve_backend(cfg)
+    config["sim"] = {"backend": backend}
+    job = cast(CollectJobCfg, cfg.job)
+    config["job"] = {"keep_failures": job.keep_failures}
+    if cfg.scene.cameras:
+        config["job"]["codec"] = job.codec
+    placed = [term.params for term in cfg.reset.values() if places_objects(term)]
+    if any(may_meet(cfg.scene, params["xy"], params.get("gap", GAP)) for params in placed):
+        config["starts_schema"] = SCHEMA  # the others are drawn as ever
+    return config
+
+
+def make_spec(env: Env, cfg: Config, provenance: Mapping[str, Any]) -> DatasetSpec:
+    """Describe the dataset of demonstrations in an environment of `demonstration_config`, with any
+    number of worlds.
+
+    Raises:
+        ConfigError: An observation group has a name that is taken.
+    """
+    config = episode_config(cfg)
+    joints = tuple(cfg.robot.joints)
+    units = joint_units(env)
+    positions = Feature(dtype="float32", names=tuple(f"{name}.pos" for name in joints), units=units)
+    features = {STATE: positions}
+    for group in cfg.observation:
+        name = f"observation.{group}"
+        if name in features:
+            raise ConfigError(
+                f"observation.{group}",
+                "a group",
+                f"another name, because {name} are the measured joints",
+            )
+        features[name] = group_feature(env, group, units)
+    features |= {
+        ACTION: positions,
+        REWARD: Feature(dtype="float32", names=("reward",), units=("1",)),
+        "next.done": Feature(dtype="bool", names=("done",), units=("1",)),
+        "next.success": Feature(dtype="bool", names=("success",), units=("1",)),
+    }
+    codec = cast(CollectJobCfg, cfg.job).codec
+    videos = {
+        f"{IMAGES}.{name}": Video(height=camera.size[0], width=camera.size[1], codec=codec)
+        for name, camera in cfg.scene.cameras.items()
+    }
+    return DatasetSpec(
+        robot_type=cfg.robot.name,
+        fps=round(cfg.task.control_hz),
+        features=features,
+        videos=videos,
+        config_sha256=config_hash(config),
+        values={"retries": "int64", "failed_rules": "string", "config_sha256": "string"},
+        provenance={**provenance, "config": config},
+    )
+
+
+def joint_units(env: Env) -> tuple[str, ...]:
+    """Units of the robot's joints, arm then gripper: rad for hinges, m for slides."""
+    model = env.sim.model
+    kinds = dict(zip(model.jnt_qposadr.tolist(), model.jnt_type.tolist(), strict=True))
+    hinge = int(mujoco.mjtJoint.mjJNT_HINGE)
+    return tuple("rad" if kinds[int(address)] == hinge else "m" for address in env.index.robot_qpos)
+
+
+def group_feature(env: Env, group: str, joints: tuple[str, ...]) -> Feature:
+    """Name and unit of each column of an observation group: ``red_pose.2``, and ``red_pose.2.t-1``
+    one step before. ``joints`` are the joints' units.
+    """
+    names: list[str] = []
+    units: list[str] = []
+    for term, dim in env.observation_manager.term_dims[group].items():
+        cfg = cast(ObservationTermCfg, env.cfg.observation[group].terms[term])
+        width = dim // cfg.history
+        names += term_columns(term, dim, cfg.history)
+        units += cfg.history * _scaled(_term_units(cfg.func, width, joints), cfg.scale)
+    return Feature(dtype="float32", names=tuple(names), units=tuple(units))
+
+
+def _term_units(func: str, width: int, joints: tuple[str, ...]) -> Sequence[str]:
+    unit = offered(func, "unit") or "unknown"
+    if unit == "joint":  # or the actions of a policy, which need not be joint targets
+        return joints if width == len(joints) else ["1"] * width
+    if unit == "joint/s":
+        return [f"{joint}/s" for joint in joints]
+    return [unit] * width if isinstance(unit, str) else unit
+
+
+def _scaled(units: Sequence[str], scale: float) -> list[str]:
+    """Units of 1 after the scaling: ``10 rad/s`` where a speed is multiplied by 0.1."""
+    if scale == 0.0:
+        return ["unknown"] * len(units)
+    factor = "" if scale == 1.0 else f"{1.0 / scale:g} "
+    return [u if u == "unknown" else f"{factor}{u}".removesuffix(" 1") for u in units]

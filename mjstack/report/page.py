@@ -1,0 +1,111 @@
+"""The data of a run's page: its parts fill it in as they go, and the page's writers read it."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mjstack.report.table import Table
+
+MOST_WORLDS = 64  # in motion, of a page
+_RATE = 25.0  # frames per second
+
+
+@dataclass(kw_only=True, slots=True)
+class Map:
+    """Where an object stood at the starts and went, seen from above.
+
+    Attributes:
+        title: The object.
+        xy: Positions [m], shape ``(n, 2)``.
+        table: Centre and half size of the table in x and y [m].
+        ways: Its ways in some episodes: a label, whether that failed, and positions [m], shape
+            ``(frames, 2)``.
+    """
+
+    title: str
+    xy: np.ndarray
+    table: tuple[Sequence[float], Sequence[float]]
+    ways: Sequence[tuple[str, bool, np.ndarray]] = ()
+
+
+@dataclass(kw_only=True, slots=True)
+class Worlds:
+    """The episodes of a gate, for plots.
+
+    Attributes:
+        names: Of the episodes, as ``world=`` of job=replay takes them.
+        broken: The rules that each episode broke; empty where it succeeded.
+        rules: The rules in words, by name.
+        values: Measurements by name with unit, each of shape ``(n,)``.
+        maps: Where the objects stood.
+    """
+
+    names: Sequence[str]
+    broken: Sequence[Sequence[str]]
+    rules: Mapping[str, str]
+    values: Mapping[str, np.ndarray]
+    maps: list[Map] = field(default_factory=list)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class World:
+    """A world in motion.
+
+    Attributes:
+        label: Its text, short.
+        qpos: Positions at frames, shape ``(frames, nq)``; NaN where it was not played.
+        failed: Whether it failed, which colours its table.
+        twin: Whether it is native MuJoCo's copy of the one before.
+    """
+
+    label: str
+    qpos: np.ndarray
+    failed: bool = False
+    twin: bool = False
+
+
+@dataclass(kw_only=True, slots=True)
+class Page:
+    """What a run shows besides its report.
+
+    Attributes:
+        title: Robot and task.
+        motion: Whether it shows worlds in motion.
+        worlds: Episodes by gate.
+        worlds3d: Worlds in motion, by the part of the run that played them.
+        tables: Tables of the run, such as of job=scaling.
+        pictures: Files that parts of the run have drawn.
+        episode: Name of the file with the episode in 3-D; empty without one.
+        note: Why there is none.
+    """
+
+    title: str = "mjstack run"
+    motion: bool = False
+    worlds: dict[str, Worlds] = field(default_factory=dict)
+    worlds3d: dict[str, list[World]] = field(default_factory=dict)
+    tables: list[Table] = field(default_factory=list)
+    pictures: list[str] = field(default_factory=list)
+    episode: str = ""
+    note: str = ""
+
+    def show_world(
+        self, part: str, label: str, qpos: np.ndarray, step_dt: float, *, failed: bool
+    ) -> None:
+        """Add a world that was played alone, if worlds in motion are shown.
+
+        Args:
+            part: The part of the run that has played it.
+            label: Its text.
+            qpos: Positions at every step end, shape ``(steps, nq)``.
+            step_dt: A step [s].
+            failed: Whether it failed.
+        """
+        if self.motion:
+            frames = qpos[:: frame_stride(step_dt)]
+            self.worlds3d[part] = [World(label=label, qpos=frames, failed=failed)]
+
+
+def frame_stride(step_dt: float) -> int:
+    """Control steps per frame of worlds in motion."""
+    return max(1, round(1.0 / (_RATE * step_dt)))

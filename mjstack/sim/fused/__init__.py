@@ -1,0 +1,1 @@
+"""MJWarp's physics step in a few kernels of C++, where they do all that a model needs."""

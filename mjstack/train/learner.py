@@ -1,0 +1,198 @@
+"""What every learner does beside its loss: it counts steps, keeps a curve, saves policies and
+state, and goes on where it was stopped.
+"""
+
+import math
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
+from mjstack.config.schema import Config
+from mjstack.episodes.stage import Stage
+from mjstack.interrupt import check_interrupt
+from mjstack.policy import Policy, save_policy
+from mjstack.policy.checkpoint import write_state
+from mjstack.train.trainer import BEST, LAST, STATE
+
+
+class Learner(ABC):
+    """Makes the steps of a training, and goes on after the last one of an earlier call.
+
+    Now and then it saves: a row for the curve, the policy in the folder `LAST`, and in `BEST` where
+    no row before has a higher score, and everything with which a later call goes on.
+
+    A subclass sets ``_policy``, ``_networks`` and ``_optimizer``.
+
+    Attributes:
+        trainer: The trainer's name.
+        step: What a step is called.
+        done: Steps so far.
+        seconds: Time of them, in all calls [s].
+        curve: A row for each time that policies were saved.
+        row: A row that lacks figures which are not known yet.
+    """
+
+    trainer = ""
+    step = "batch"
+    _look_every = 1  # steps between two looks at the progress
+    _policy: Policy
+    _networks: nn.ModuleDict
+    _optimizer: Optimizer
+
+    def __init__(self, stage: Stage, cfg: Config, folder: Path, save_every: int) -> None:
+        """Begin without a step.
+
+        Args:
+            stage: The stage, for its progress and its ranks.
+            cfg: The configuration of the training.
+            folder: Where policies and state are.
+            save_every: Steps between two saves.
+        """
+        self._stage = stage
+        self._cfg = cfg
+        self._progress = stage.progress
+        self._ranks = stage.ranks
+        self._folder = folder
+        self._save_every = save_every
+        self.done = 0
+        self.seconds = 0.0
+        self.curve: list[dict[str, Any]] = []
+        self.row: dict[str, Any] | None = None
+        self._before = 0.0  # seconds of earlier calls
+
+    def learn(self) -> None:
+        """Make the missing steps, saving policies and state now and then.
+
+        Raises:
+            KeyboardInterrupt: The command was interrupted; the state is saved.
+        """
+        self._before = self.seconds
+        began = time.perf_counter()
+        try:
+            while not self._over():
+                self._step()
+                self.done += 1
+                self.seconds = self._before + time.perf_counter() - began
+                saves = self.done % self._save_every == 0 or self._over()
+                if saves:
+                    self._save()
+                if saves or self.done % self._look_every == 0:
+                    self._ranks.stop_together()
+                    self._show()
+                    check_interrupt()
+        except KeyboardInterrupt:
+            self._write_state()
+            raise
+
+    @cached_property
+    def _events(self) -> Any:
+        """Writer of the curve as TensorBoard's event files; None without the package."""
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ImportError:
+            missing = "train: no curves for TensorBoard, which pip install tensorboard brings"
+            self._progress.print_line(missing)
+            return None
+        # It leaves out what an earlier call has written from this step on.
+        return SummaryWriter(str(self._folder), purge_step=self.done)
+
+    def close(self) -> None:
+        """Complete what is written."""
+        if (events := vars(self).get("_events")) is not None:
+            events.close()
+
+    def score(self, row: Mapping[str, Any]) -> tuple[float, ...]:
+        """How good the policy of a row is: the first number decides, equal ones go by the next."""
+        raise NotImplementedError
+
+    @abstractmethod
+    def _over(self) -> bool:
+        """Whether there is no step left to make."""
+
+    @abstractmethod
+    def _step(self) -> None:
+        """Make a step."""
+
+    @abstractmethod
+    def _show(self) -> None:
+        """Show the progress."""
+
+    @abstractmethod
+    def _new_row(self) -> dict[str, Any]:
+        """Figures since the last row. The policy's network is up to date afterwards."""
+
+    def _notes(self) -> dict[str, Any]:
+        """What the policy's file says of its training beside the row."""
+        return {}
+
+    def _save(self) -> None:
+        """Write the policy with a row for the curve, and the state."""
+        self._keep_row()
+        self.conclude()
+
+    def _keep_row(self) -> None:
+        """Write the policy, with a row that is not part of the curve yet."""
+        self.row = self._new_row()
+        names = {"trainer": self.trainer, "seed": self._cfg.seed}
+        self._policy.training = names | self._notes() | _known(self.row)
+        if self._ranks.writes:
+            save_policy(self._folder / LAST, self._policy)
+
+    def conclude(self, **figures: Any) -> None:
+        """Add the row to the curve, with figures in front of it, and write the state."""
+        assert self.row is not None
+        row = figures | self.row
+        self.row = None
+        best = all(self.score(row) >= self.score(earlier) for earlier in self.curve)
+        self.curve.append(row)
+        if self._ranks.writes:
+            if self._events is not None:
+                for name, value in _known(row).items():
+                    self._events.add_scalar(f"train/{name}", value, self.done)
+                self._events.flush()
+            if best:
+                self._policy.training |= _known(row)
+                save_policy(self._folder / BEST, self._policy)
+        self._write_state()
+
+    def facts(self) -> dict[str, Any]:
+        """Everything of the training that is no tensor, in JSON's types."""
+        return {"done": self.done, "seconds": self.seconds, "curve": self.curve, "row": self.row}
+
+    def _tensors(self) -> dict[str, Tensor]:
+        """Weights, moments of the optimizer and the like, by name."""
+        state = dict(self._networks.state_dict())
+        for number, values in self._optimizer.state_dict()["state"].items():
+            state |= {f"optimizer.{number}.{name}": value for name, value in values.items()}
+        return state
+
+    def _write_state(self) -> None:
+        if self._ranks.writes:
+            write_state(self._folder / STATE, self._tensors(), self.facts())
+
+    def restore(self, state: dict[str, Tensor], facts: dict[str, Any]) -> None:
+        """Go on from the state and facts of an earlier call."""
+        self._networks.load_state_dict({name: state[name] for name in self._networks.state_dict()})
+        moments: dict[int, dict[str, Tensor]] = {}
+        for key, value in state.items():
+            owner, _, rest = key.partition(".")
+            if owner == "optimizer":
+                number, _, name = rest.partition(".")
+                moments.setdefault(int(number), {})[name] = value
+        self._optimizer.load_state_dict(self._optimizer.state_dict() | {"state": moments})
+        self.done = facts["done"]
+        self.seconds = facts["seconds"]
+        self.curve = facts["curve"]
+        self.row = facts.get("row")
+        self._progress.print_line(f"train: goes on after {self.step} {self.done}")
+
+
+def _known(row: Mapping[str, Any]) -> dict[str, Any]:
+    """The figures of a row without NaN, which JSON does not have."""
+    return {name: value for name, value in row.items() if not math.isnan(value)}

@@ -1,0 +1,147 @@
+"""The developers' tools: each does its work once, on a small scale."""
+
+from __future__ import annotations
+
+import json
+import runpy
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import bench_solver
+import mujoco
+import numpy as np
+import pytest
+import soak
+import verdicts
+from compositions import load_config
+from environments import one_second_episode
+from solver_states import FUSED, RANDOM, SCRIPTED, STOCK, Pipeline, Sample, record_states
+
+import mjstack
+from mjstack.config.schema import Backend
+from mjstack.episodes.stage import Stage
+from mjstack.sim.mjwarp import MjwarpSimulation
+from mjstack.sim.native import NativeSimulation
+
+TOOLS = Path(mjstack.__file__).parents[1] / "tools"
+NWORLD = 4
+Recorded = tuple[Stage, Pipeline, list[Sample]]
+
+pytestmark = pytest.mark.full
+
+
+@pytest.fixture(scope="module")
+def recorded() -> Iterator[Recorded]:
+    overrides = ("sim.device=cpu", f"nworld={NWORLD}", *one_second_episode())
+    stage = Stage(load_config(overrides))
+    sim = stage.simulation(NWORLD, Backend.mjwarp, "cpu")
+    assert isinstance(sim, MjwarpSimulation)
+    yield stage, Pipeline(sim), record_states(stage, sim, 10 * NWORLD)
+    sim.close()
+
+
+def test_states_are_of_both_kinds_of_episodes(recorded: Recorded) -> None:
+    _, _, samples = recorded
+    assert [sample.kind for sample in samples] == [SCRIPTED] * 5 + [RANDOM] * 5
+    ctrl = np.stack([s.state["ctrl"].numpy() for s in samples if s.kind == RANDOM])
+    assert len(np.unique(ctrl[..., 0])) == ctrl[..., 0].size  # a new target in each step and world
+
+
+def test_the_cost_is_mujocos(recorded: Recorded) -> None:
+    stage, pipeline, samples = recorded
+    model = stage.model
+    data = mujoco.MjData(model)
+    for sample in samples[::3]:
+        assert not pipeline.prepare(sample).any()
+        for scale in (1.0, -0.5, 30.0):
+            qacc = pipeline.array("qacc_smooth") * scale
+            costs = pipeline.cost(qacc).numpy()
+            for world in range(NWORLD):
+                for name, values in sample.state.items():
+                    getattr(data, name)[:] = values[world].numpy()
+                mujoco.mj_forward(model, data)
+                acceleration = qacc[world].double().numpy()
+                residual = np.zeros(data.nefc)
+                mujoco.mj_mulJacVec(model, data, residual, acceleration)
+                cost = np.zeros(1)
+                mujoco.mj_constraintUpdate(model, data, residual - data.efc_aref, cost, 0)
+                change = acceleration - data.qacc_smooth
+                product = np.zeros(model.nv)
+                mujoco.mj_mulM(model, data, product, change)
+                expected = cost[0] + 0.5 * change @ product
+                assert costs[world] == pytest.approx(expected, rel=2e-3, abs=1e-3)
+
+
+def test_a_wrong_solver_is_seen(recorded: Recorded, monkeypatch: pytest.MonkeyPatch) -> None:
+    stage, pipeline, samples = recorded
+    native = NativeSimulation(stage.model, NWORLD)
+
+    def wrong(m: object, d: object) -> None:
+        pipeline._solvers[STOCK](m, d)
+        forces = pipeline.array("qfrc_constraint")
+        forces[1] *= 1.01
+        pipeline.array("qacc")[2].fill_(np.nan)
+        pipeline.array("overflow")[3] |= 1 << 9
+
+    monkeypatch.setitem(pipeline._solvers, FUSED, wrong)
+    part = bench_solver.compare(pipeline, native, samples[-1])
+    native.close()
+    assert not part["other rows"].any()
+    assert max(part[f"qacc, {STOCK}"]) < 1e-3  # native MuJoCo's
+    assert (part["difference"] <= bench_solver.AGREEMENT).tolist() == [True, False, False, True]
+    assert part[f"qacc, {FUSED}"][2] == part["cost"][2] == np.inf
+    assert part["cost"][[0, 1, 3]].tolist() == [0.0] * 3
+    assert part[f"qfrc_constraint, {FUSED}"][1] > part[f"qfrc_constraint, {STOCK}"][1]
+    assert part[f"ITERATIONS, {FUSED}"].tolist() == [False, False, False, True]
+    assert not part[f"ITERATIONS, {STOCK}"].any()
+
+
+SMALL = ["sim=mjwarp", "sim.device=cpu", "nworld=2", "--repetitions", "2"]
+CAMERA = ["cameras=top", "scene.cameras.top.size=[32,32]"]
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "expected"),
+    [
+        ("bench_cameras", [*SMALL, *CAMERA, "--draws", "1"], "top 32 x 32"),
+        ("bench_ik", [*SMALL, "--nworld", "8", "--iterations", "40"], "1.0000"),
+        ("bench_physics", [*SMALL, "batch.njmax=200", "--steps", "2"], "bare mujoco_warp.step"),
+        ("bench_solver", [*SMALL[:3], "batch.njmax=200", "--states", "40"], "100.000 %"),
+    ],
+)
+def test_a_benchmark_prints_its_table(
+    name: str,
+    options: list[str],
+    expected: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("COLUMNS", "400")
+    short = one_second_episode() if name in ("bench_physics", "bench_solver") else ()
+    monkeypatch.setattr(sys, "argv", [name, *options, *short])
+    runpy.run_path(str(TOOLS / f"{name}.py"), run_name="__main__")
+    assert expected in capsys.readouterr().out
+
+
+def test_random_actions_for_a_while() -> None:
+    figures = soak.soak(["sim=native", "nworld=8", "task.episode_steps=40"], 120)
+    assert not figures["problems"]
+    assert figures["episodes"] >= 24
+
+
+def test_equal_runs_have_equal_verdicts(tmp_path: Path) -> None:
+    command = [sys.executable, str(TOOLS / "verdicts.py")]
+    files = []
+    for name in ("before", "after"):
+        files.append(tmp_path / f"{name}.json")
+        options = ["--only=so101_reach", f"--folder={tmp_path}/{name}", f"--out={files[-1]}"]
+        subprocess.run([*command, "--python", sys.executable, *options], check=True)
+    subprocess.run([*command, "--compare", *files], check=True)
+    before, after = (json.loads(file.read_text()) for file in files)
+    records = after["runs"]["so101_reach"]
+    assert {"worlds_seed0.npz", "success_seed0.npz"} == set(records)
+    records["worlds_seed0.npz"]["arrays"]["qpos"] = "other"
+    (line,) = verdicts.compare(before, after)
+    assert line.startswith("so101_reach/worlds_seed0.npz: qpos differs")

@@ -1,0 +1,98 @@
+"""Trainings that are refused: in one line, before anything is written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from environments import configure
+from policies import write_policy
+from test_pixels import CAMERAS, SMALL
+from test_ppo import REACH as PPO
+
+from mjstack.cli import run
+
+CLONE = ("job=train", "sim=native")
+PIXELS = ("job=train", "trainer=pixels", *SMALL)
+DAGGER = ("job=train", "trainer=dagger", "task=reach", "sim=native")
+BAD: dict[tuple[str, ...], list[tuple[list[str], str]]] = {
+    CLONE: [
+        (["task=reach", "task.check=null"], "task=reach: expected a task with phases and a check"),
+        (["job.group=nope"], "observation group 'nope' does not exist"),
+        (
+            ["job.trainer=os.getcwd"],
+            "job.trainer=os.getcwd: expected a mjstack.train.trainer.Trainer",
+        ),
+        (["job.test_seed=0"], "job.test_seed=0: expected seeds that training does not use"),
+        (
+            ["job.observation.policy.terms.headings.func=mjstack.mdp.observation.nope"],
+            "policy.terms.headings: func=mjstack.mdp.observation.nope: 'nope' does",
+        ),
+        (["job.leave_out=[joint_vle]"], "Did you mean 'joint_vel'?"),
+        (["observation@job.observation=nope"], "nope"),
+        (["job.batches=0"], "job.batches=0: expected an integer of at least 1"),
+        (["job.hidden=[0]"], "job.hidden=[0]"),
+        (["trainer=clon"], "Did you mean 'clone'?"),
+    ],
+    PPO: [
+        (
+            ["job.iterations=null"],
+            "job.iterations=null: expected a number, or a limit in job.minutes",
+        ),
+        (["job.minibatches=64"], "job.minibatches=64: expected at most 8"),
+        (["job.critic=[nope]"], "job.critic: observation group 'nope' does not exist"),
+        (["job.leave_out=[nope]"], "term of policy 'nope' does not exist"),
+        (
+            ["+job.observation.policy.terms.joint_pos.params.foo=1"],
+            ": job.observation.policy.terms.joint_pos: parameter 'foo' does not exist",
+        ),
+        (["job.start_from=/nowhere"], "policy=/nowhere: has no policy.json"),
+        (["job.start_from={rebot}"], "was trained with robot.name=rebot, and here it is so101"),
+        (["job.batch_size=3"], "'job.batch_size' does not exist"),
+        (
+            ["reset=expert_states", "reset.expert.params.path=/nowhere"],
+            "a file of states; it cannot",
+        ),
+        (["reset=expert_states", "reset.expert.params.share=2"], "reset.expert.params.share=2"),
+        (["job.std=[1,2]"], "job.std"),
+        (["job.std=[0.5,2.0,1.0]"], "job.std=[0.5, 2.0, 1.0]: expected its value at the start"),
+    ],
+    PIXELS: [
+        (["job.vision.cameras=[front,side]"], "job.vision.cameras: camera 'side' does not exist"),
+        (["job.vision.cameras=[front,front]"], "job.vision.cameras=['front', 'front']: expected"),
+        (["job.vision.channels=[]"], "job.vision.channels=[]: expected at least one number"),
+        (["scene.cameras.front.outputs=[depth]"], "expected rgb among them, which a policy sees"),
+        (["job.vision.pool=1000000000000"], "job.vision.pool=1000000000000: expected at most"),
+        (["job.dataset=outputs/demos"], "expected null, because images are drawn"),
+    ],
+    DAGGER: [
+        (["controller=closed_loop"], "controller=closed_loop: expected state_based, because"),
+        (["job.dataset=outputs"], "job.dataset=outputs: expected null"),
+        (["job.rounds=0"], "job.rounds=0"),
+        (["job.episodes=1"], "job.episodes=1: expected at least 2"),
+        ([*CAMERAS, "job.vision.cameras=[front]"], "trainer=dagger learns from numbers"),
+    ],
+}
+CASES = [(base, *case) for base, cases in BAD.items() for case in cases]
+
+
+@pytest.mark.parametrize(
+    ("base", "overrides", "says"), CASES, ids=[" ".join(overrides) for _, overrides, _ in CASES]
+)
+def test_bad_input_is_one_line(
+    base: tuple[str, ...],
+    overrides: list[str],
+    says: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    out = tmp_path / "out"
+    if "{rebot}" in overrides[0]:
+        other = write_policy(tmp_path / "other", configure("task=reach", robot="rebot"))
+        overrides = [f"job.start_from={other}"]
+    assert run([*base, *overrides, f"job.folder={out}"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert says in line
+    assert {path.name for path in tmp_path.iterdir()} <= {"other"}
