@@ -11,7 +11,8 @@ from mjstack.episodes.rollout import Observer, rollout
 from mjstack.episodes.stage import Stage, lacks_episode
 from mjstack.errors import MjstackError
 from mjstack.math import not_finite
-from mjstack.sim import LOST_PHYSICS, fused
+from mjstack.sim import LOST_PHYSICS
+from mjstack.sim.fused import constraints
 from mjstack.sim.mjwarp import MjwarpSimulation
 from mjstack.sim.mujoco_warp import mjw
 from mjstack.sim.warp_setup import torch_stream_scope, wp
@@ -121,8 +122,8 @@ class Pipeline:
         self.sim = sim
         self._m: Any = sim._m
         self._d: Any = sim._d
-        self._solvers = {STOCK: mjw.solve, FUSED: fused.solve}
-        if reason := fused.why_not(self._m, self._d):
+        self._solvers = {STOCK: mjw.solve, FUSED: constraints.solve}
+        if reason := constraints.why_not(self._m, self._d):
             raise MjstackError(f"the fused solver does not cover this model: {reason}")
 
     def array(self, name: str) -> torch.Tensor:
