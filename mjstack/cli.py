@@ -24,7 +24,6 @@ from omegaconf import DictConfig, OmegaConf
 import mjstack
 from mjstack.cli_sweep import (
     check_jobs,
-    choose_launcher,
     claim_sweep,
     expand,
     hydra_path,
@@ -53,7 +52,6 @@ from mjstack.interrupt import EXIT_CODE, begin_job
 from mjstack.process import is_rank
 from mjstack.report.record import Report, Status
 from mjstack.report.table import Console
-from mjstack.report.write import read_report
 
 if TYPE_CHECKING:
     from mjstack.jobs import CheckedJob
@@ -213,7 +211,6 @@ def _sweep(hydra: Any, overrides: list[str]) -> int:
         )
     overrides = [*overrides, "hydra.mode=MULTIRUN"]
     master = compose(overrides, RunMode.MULTIRUN)
-    choose_launcher(master)
     known = check_jobs(master, expand(master, overrides), _check)
     begin_job()
     from mjstack.jobs.sweep_folder import list_jobs
@@ -248,29 +245,32 @@ def run_job(cfg: DictConfig) -> Report:
     """Run a job in the folder that Hydra made. A launcher may call it in another process, where
     nothing has been checked yet.
     """
+    from mjstack.jobs.sweep_folder import SweepJob, add_jobs  # they load torch
+    from mjstack.jobs.sweep_table import sweep_config, update_summary
+
     logging.raiseExceptions = False  # a full disk would print a traceback for each line of run.log
     settings = HydraConfig.get()
     overrides = list(settings.overrides.task)
     with search_path(lacking_folders(settings.runtime.config_sources)):
         folder = Path(settings.runtime.output_dir)
-        sweeps = settings.mode is RunMode.MULTIRUN
-        earlier = read_report(folder, overrides) if sweeps else None  # of a call before this one
-        if earlier is not None and earlier.status is not Status.interrupted:
-            _save_config(cfg, folder)  # Hydra has just put one with interpolations there
-            return earlier
-        if earlier is not None and cfg.job.name == "gates":
-            cfg.resume = str(folder)
-            _checked.clear()
-            _save_config(cfg, folder)
+        sweep = Path(settings.sweep.dir) if settings.mode is RunMode.MULTIRUN else None
+        if sweep is not None:
+            job = SweepJob(settings.job.num, folder, tuple(overrides))
+            add_jobs(sweep, [job])  # a sweeper may bring it only now
+            if (done := job.result()) is not None:
+                print(f"job {job.number}: {done.status}, done before", flush=True)
+                _save_config(cfg, folder)  # Hydra has just put one with interpolations there
+                return done
+            earlier = job.clear()
+            if earlier is not None and earlier.resumes == cfg.job.name == "gates":
+                cfg.resume = str(folder)
+                _checked.clear()
         checked = _checked.pop(tuple(overrides), None) or _check(cfg, overrides)
         with suppress(OSError):  # the job's error
             _save_config(cfg, folder)
         result = checked.run(folder, overrides)
-        if sweeps:
-            from mjstack.jobs.sweep_table import sweep_config, update_summary
-
-            report = {settings.job.num: result}
-            update_summary(Path(settings.sweep.dir), sweep_config(cfg), report)
+        if sweep is not None:
+            update_summary(sweep, sweep_config(cfg), {settings.job.num: result})
     _results.append(result)
     if result.status is Status.interrupted:
         raise KeyboardInterrupt

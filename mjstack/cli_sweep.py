@@ -57,10 +57,9 @@ def check_jobs(
     Jobs of a sweeper other than Hydra's basic one are not known before; each is checked as it runs.
     Of jobs in processes of their own, one that needs more memory than there is stops no other.
     """
-    from mjstack.jobs.sweep_folder import SweepJob
-
     folder = hydra_path(master, "sweep.dir")
-    separate = not _launcher(master).endswith(".LocalLauncher")
+    separate = not _launcher(master).endswith(".BasicLauncher")
+    placed: list[SweepJob] = []
     numbers: dict[Path, int] = {}
     for number, job in enumerate(jobs):
         cfg = compose(job, sweep=master)
@@ -77,10 +76,8 @@ def check_jobs(
         except MjstackError as error:
             if not (separate and is_out_of_memory(str(error))):
                 raise
-        with open_dict(cfg):
-            cfg.hydra.job.num = number
-            cfg.hydra.job.id = str(number)
-        path = Path(os.path.normpath(folder / hydra_path(cfg, "sweep.subdir")))
+        placed.append(place_job(cfg, number, job))
+        path = placed[-1].folder
         if not path.is_relative_to(folder):
             check_unused(path, key="hydra.sweep.subdir")
         first = numbers.setdefault(path, number)
@@ -89,13 +86,18 @@ def check_jobs(
                 f"hydra.sweep.subdir: jobs {first} and {number} would both write into {path},"
                 " expected a folder for each job. Leave it out, or let it name what differs."
             )
-    return [SweepJob(number, path, tuple(jobs[number])) for path, number in numbers.items()]
+    return placed
 
 
-def choose_launcher(master: DictConfig) -> None:
-    """Let a sweep go on in the command's own process, which Hydra's launcher would begin anew."""
-    if _launcher(master).endswith(".BasicLauncher"):
-        master.hydra.launcher._target_ = "hydra_plugins.mjstack_launcher.LocalLauncher"
+def place_job(cfg: DictConfig, number: int, overrides: Sequence[str]) -> "SweepJob":
+    """Number a job of a sweep, in its composition too, which names its folder."""
+    from mjstack.jobs.sweep_folder import SweepJob
+
+    with open_dict(cfg):
+        cfg.hydra.job.num = number
+        cfg.hydra.job.id = str(number)
+    folder = hydra_path(cfg, "sweep.dir") / hydra_path(cfg, "sweep.subdir")
+    return SweepJob(number, Path(os.path.normpath(folder)), tuple(overrides))
 
 
 def _launcher(master: DictConfig) -> str:
@@ -114,8 +116,7 @@ def claim_sweep(master: DictConfig, jobs: Sequence["SweepJob"]) -> Iterator[Path
     folder = hydra_path(master, "sweep.dir")
     queued = _launcher(master).endswith(".GpuLauncher")
     if queued:
-        keys = ("jobs", "minutes", "retry")
-        Queueing(*(OmegaConf.select(master, f"hydra.launcher.{key}") for key in keys)).slots()
+        Queueing.of(master.hydra.launcher).slots()
     named = OmegaConf.to_container(master.hydra.sweep, resolve=False)
     if "${now:" in str(cast(dict, named)["dir"]):
         claim = claim_folder(folder, numbered=True, key="hydra.sweep.dir")

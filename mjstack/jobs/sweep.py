@@ -5,14 +5,16 @@ import os
 import stat
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO
+from typing import IO, Any, cast
 
 import torch
 
+from mjstack.config import spec
+from mjstack.config.complete import typed
 from mjstack.config.session import quoted, search_path_args
 from mjstack.errors import ConfigError, FolderError
 from mjstack.interrupt import interrupted
@@ -32,35 +34,35 @@ class Slot:
     lock: Path | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Queueing:
-    """How the jobs of a sweep run: the keys of ``hydra/launcher=gpus``.
+    """How the jobs of a sweep run: the keys of ``hydra/launcher=gpus``."""
 
-    Attributes:
-        jobs: How many at once; None for one per GPU, or one where there is none.
-        minutes: A job that takes longer is stopped, and has failed; None for no limit.
-        retry: Whether jobs that failed are repeated.
-    """
-
-    jobs: int | None = None
-    minutes: float | None = None
+    jobs: int | None = spec(None, ge=1)
+    """How many at once; null: one per GPU, or one where there is none."""
+    minutes: float | None = spec(None, unit="min", gt=0.0)
+    """A job that takes longer is stopped, and has failed; null: no limit."""
     retry: bool = False
+    """Whether jobs that failed are repeated."""
+
+    @classmethod
+    def of(cls, launcher: Mapping[str, Any]) -> "Queueing":
+        """Read the launcher's keys.
+
+        Raises:
+            ConfigError: A value is not accepted.
+        """
+        keys = {key: value for key, value in launcher.items() if key != "_target_"}
+        return cast(Queueing, typed("hydra.launcher", keys, cls))
 
     def slots(self) -> list[Slot]:
         """Places for jobs: GPUs, or shares of the cores.
 
         Raises:
-            ConfigError: A value cannot be, or there are not as many GPUs or cores.
+            ConfigError: There are not as many GPUs or cores.
             FolderError: Another user has the folder of the GPUs' locks.
         """
-        minutes = self.minutes
-        if minutes is not None and (type(minutes) not in (int, float) or not minutes > 0.0):
-            raise ConfigError("hydra.launcher.minutes", minutes, "null, or a number above 0")
-        if type(self.retry) is not bool:
-            raise ConfigError("hydra.launcher.retry", self.retry, "true or false")
         count = self.jobs
-        if count is not None and (type(count) is not int or count < 1):
-            raise ConfigError("hydra.launcher.jobs", count, "null, or an integer of at least 1")
         if gpus := torch.cuda.device_count():
             if (count or 1) > gpus:
                 raise ConfigError("hydra.launcher.jobs", count, f"at most {gpus}, a GPU for each")
@@ -133,7 +135,7 @@ def run_jobs(
         finish: Called with the reports so far, by the jobs' numbers, when a job has ended.
 
     Raises:
-        ConfigError: A value cannot be, or there are not as many GPUs.
+        ConfigError: There are not as many GPUs.
         FolderError: The folder has the jobs of another sweep.
         KeyboardInterrupt: The command was interrupted; so were its jobs.
     """

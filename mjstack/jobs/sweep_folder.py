@@ -38,8 +38,8 @@ class SweepJob:
         return report if report is not None and report.status in _ENDED else None
 
     def clear(self, *, anew: bool = False) -> Report | None:
-        """Make room for a run: remove what an earlier one has left, unless the job goes on with it
-        and shall not begin anew.
+        """Make room for a run: remove what an earlier one has left beside logs and Hydra's files,
+        unless the job goes on with it and shall not begin anew.
 
         Returns:
             The report of the run with which the job goes on.
@@ -47,8 +47,9 @@ class SweepJob:
         earlier = None if anew else self.report()
         if earlier is not None and earlier.resumes:
             return earlier
-        for path in [path for path in self.folder.glob("*") if path.name != LOG]:
-            (shutil.rmtree if path.is_dir() and not path.is_symlink() else os.remove)(path)
+        for path in [*self.folder.glob("*")]:
+            if path.name != ".hydra" and path.suffix != ".log":  # these may be open
+                (shutil.rmtree if path.is_dir() and not path.is_symlink() else os.remove)(path)
         return None
 
 
@@ -90,9 +91,11 @@ def add_jobs(folder: Path, jobs: Sequence[SweepJob]) -> None:
     Raises:
         FolderError: The list has another job of one of these numbers.
     """
-    listed = _all_jobs(folder, jobs)
-    folder.mkdir(parents=True, exist_ok=True)
-    write_atomic(folder / SWEEP, json.dumps(listed, indent=1) + "\n")
+    listed = json.dumps(_all_jobs(folder, jobs), indent=1) + "\n"
+    file = folder / SWEEP
+    if not file.exists() or file.read_text() != listed:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_atomic(file, listed)
 
 
 def list_jobs(folder: Path) -> list[SweepJob]:
