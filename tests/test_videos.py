@@ -187,15 +187,15 @@ def test_few_images_wait_for_the_encoders(tmp_path: Path, monkeypatch: pytest.Mo
         encode(images, *args)  # type: ignore[arg-type]
 
     monkeypatch.setattr(video_module, "encode", slow)
-    with DatasetWriter(tmp_path, SPEC, images_gib=2.0 * 7 * 32 * 48 * 3 / 2**30) as writer:
-        writer.add([episode(0)])  # does not wait
-        assert writer.committed == []
-        assert writer.pending == 1
-        threading.Timer(0.2, go.set).start()
-        writer.add([episode(1)])  # there is no room for both
-        assert go.is_set()
-    assert writer.waited > 0.0
-    assert writer.committed == [(7, 0), (7, 1)]
+    paths = {name: tmp_path / f"{name}.mp4" for name in SIZES}
+    encoder = video_module.VideoEncoder(SPEC.videos, SPEC.fps, paths, 2 * 7 * 32 * 48 * 3)
+    encoder.add(episode(0).images)  # does not wait
+    threading.Timer(0.2, go.set).start()
+    encoder.add(episode(1).images)  # there is no room for both
+    assert go.is_set()
+    encoder.complete()
+    assert encoder.waited > 0.0
+    assert all(path.exists() for path in paths.values())
 
 
 def test_images_that_do_not_fit_are_refused(tmp_path: Path) -> None:

@@ -68,21 +68,18 @@ class PartWriter:
             compression="snappy",
             use_dictionary=list(INDICES),
         )
-        self._videos: VideoEncoder | None = None
-        if spec.videos:
-            for video in spec.videos:
-                path = lerobot.shard_path(folder, lerobot.VIDEO, 0, video)
-                self.part.videos[video] = path.with_name(f".file-{name}.mp4")
-            most = int(images_gib * 2**30)
-            self._videos = VideoEncoder(spec.videos, spec.fps, self.part.videos, most)
+        for video in spec.videos:
+            path = lerobot.shard_path(folder, lerobot.VIDEO, 0, video)
+            self.part.videos[video] = path.with_name(f".file-{name}.mp4")
+        most = int(images_gib * 2**30)
+        self._videos = VideoEncoder(spec.videos, spec.fps, self.part.videos, most)
 
     def is_full(self, file_mb: int) -> bool:
         """Whether one more episode like these would make the data file larger than that [MiB], or a
         video larger than `lerobot.VIDEO_MB`.
         """
-        share = self._file.tell() / (file_mb * 2**20)
-        if self._videos is not None:
-            share = max(share, self._videos.megabytes() / lerobot.VIDEO_MB)
+        data = self._file.tell() / (file_mb * 2**20)
+        share = max(data, self._videos.megabytes() / lerobot.VIDEO_MB)
         return share * (1.0 + 1.0 / len(self.part.rows)) > 1.0
 
     def write(
@@ -116,8 +113,7 @@ class PartWriter:
         columns = columns | {name: values[:, None] for name, values in indices.items()}
         table = lerobot.frames_table(self._writer.schema, columns)
         self._writer.write_table(table, row_group_size=length)
-        if self._videos is not None:
-            self._videos.add(episode.images)
+        self._videos.add(episode.images)
         # float64 holds every type's values exactly, but int64's beyond 2^53.
         joined = np.concatenate([columns[name] for name in table.column_names], axis=1, dtype=float)
         named = self._statistics(joined, episode)
@@ -167,15 +163,13 @@ class PartWriter:
         self._file.flush()
         os.fsync(self._file.fileno())
         self._file.close()
-        if self._videos is not None:
-            self._videos.complete()
-            self.part.waited = self._videos.waited
+        self._videos.complete()
+        self.part.waited = self._videos.waited
         return self.part
 
     def abandon(self) -> None:
         """Close the files as they are."""
-        if self._videos is not None:
-            self._videos.abandon()
+        self._videos.abandon()
         self._writer.is_open = False  # its destructor would complete the file
         with contextlib.suppress(OSError):  # closing writes what is buffered
             self._file.close()

@@ -127,7 +127,7 @@ def read_info(folder: Path) -> dict[str, Any] | None:
             if file.is_file() and not file.name.startswith(begun):
                 raise FolderError(
                     f"{folder} has {file.relative_to(folder)} and no {lerobot.INFO}, expected a"
-                    " dataset or an empty folder. Give anfile"
+                    " dataset or an empty folder. Give another"
                 )
         return None
     with readable(path):

@@ -180,7 +180,7 @@ class VideoEncoder:
             sum(path.stat().st_size for path in parts if path.exists())
             for parts in self._parts.values()
         ]
-        return max(sizes) / 2**20
+        return max(sizes, default=0) / 2**20
 
     def complete(self) -> None:
         """Wait for the encoders, and write each video's file, which is on the disk then.

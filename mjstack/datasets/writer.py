@@ -3,17 +3,18 @@ committed.
 """
 
 import contextlib
+import io
 import json
 import os
 import weakref
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from mjstack.datasets import lerobot
-from mjstack.datasets.part import FILE_MB, IMAGES_GIB, Part, PartWriter
+from mjstack.datasets.part import FILE_MB, Part, PartWriter
 from mjstack.datasets.reader import (
     check_same,
     read_info,
@@ -50,26 +51,17 @@ class DatasetWriter:
         waited: Time for which commits have waited for images to be encoded [s].
     """
 
-    def __init__(
-        self,
-        folder: Path | str,
-        spec: DatasetSpec,
-        *,
-        file_mb: int = FILE_MB,
-        images_gib: float = IMAGES_GIB,
-    ) -> None:
+    def __init__(self, folder: Path | str, spec: DatasetSpec, *, file_mb: int = FILE_MB) -> None:
         """Open the folder, and begin a dataset in it if there is none.
 
         Args:
             folder: The dataset's own folder.
             spec: Its columns and provenance.
             file_mb: Size of a data file at which it is committed and the next one begins [MiB].
-            images_gib: Images that may wait for being encoded [GiB].
 
         Raises:
-            FolderError: Something else is there, or a dataset of another configuration.
-            FolderError: Another process is writing it.
-            FolderError: The folder cannot be written.
+            FolderError: Something else is there, or a dataset of another configuration; another
+                process is writing it; or it cannot be written.
         """
         self._pa, self._parquet = lerobot.require_pyarrow()
         self.folder = Path(folder)
@@ -78,7 +70,6 @@ class DatasetWriter:
         self.frames = 0
         self.waited = 0.0
         self._file_mb = file_mb
-        self._images_gib = images_gib
         self._open = True
         self._shards = 0
         self._provenance: list[dict[str, Any]] = []
@@ -86,8 +77,6 @@ class DatasetWriter:
         # Statistics of the committed frames, and the number of frames of each number
         self._statistics: tuple[np.ndarray, np.ndarray] | None = None
         self._part: PartWriter | None = None  # since the last commit
-        if self.folder.exists() and not self.folder.is_dir():
-            raise FolderError(f"{folder} is a file, expected a folder. Give another")
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             self._unlock = weakref.finalize(self, os.close, lock_folder(self.folder))
@@ -112,11 +101,6 @@ class DatasetWriter:
         """
         self.close()
 
-    @property
-    def pending(self) -> int:
-        """Episodes that were added and are not committed yet."""
-        return len(self._part.part.rows) if self._part is not None else 0
-
     def add(self, episodes: Sequence[EpisodeData]) -> None:
         """Add finished episodes; a batch that does not fit is refused as a whole.
 
@@ -128,15 +112,11 @@ class DatasetWriter:
             FolderError: It cannot be written; the writer is closed, and what was committed is
                 kept.
         """
-        self._check_open()
         checked = [typed_episode(self.spec, episode) for episode in episodes]
         for episode, (facts, columns) in zip(episodes, checked, strict=True):
             with self.guarded():
                 if self._part is None:
-                    name = f"{self._shards:06d}"
-                    self._part = PartWriter(
-                        self.folder, self.spec, name, images_gib=self._images_gib
-                    )
+                    self._part = PartWriter(self.folder, self.spec, f"{self._shards:06d}")
                 rows = self._part.part.rows
                 number = len(self.committed) + len(rows)
                 start = rows[-1]["dataset_to_index"] if rows else self.frames
@@ -145,33 +125,27 @@ class DatasetWriter:
             if self._part.is_full(self._file_mb):
                 self.flush()
 
-    def flush(self) -> None:
+    def flush(self, parts: Sequence[Part] = ()) -> None:
         """Commit what was added.
+
+        Args:
+            parts: Files that other writers have completed, whose episodes follow those and one
+                another.
 
         Raises:
             FolderError: It cannot be written; the writer is closed, and what was committed
                 before is kept.
         """
-        self.commit([])
-
-    def number_task(self, task: str) -> int:
-        """The number of a task in the dataset; a new one gets the next."""
-        return self._tasks.setdefault(task, len(self._tasks))
-
-    def commit(self, parts: Sequence[Part]) -> None:
-        """Commit what was added, and files that other writers have completed, whose episodes follow
-        those and one another.
-
-        Raises:
-            FolderError: As of `flush`.
-        """
-        self._check_open()
         with self.guarded():
             if self._part is not None:
                 parts = [self._part.complete(), *parts]
                 self._part = None
             if parts:
                 self._commit(parts)
+
+    def number_task(self, task: str) -> int:
+        """The number of a task in the dataset; a new one gets the next."""
+        return self._tasks.setdefault(task, len(self._tasks))
 
     def close(self) -> None:
         """Commit what was added, and let another writer in."""
@@ -237,9 +211,9 @@ class DatasetWriter:
 
     def _write_table(self, table: Any, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        buffer = self._pa.BufferOutputStream()
+        buffer = io.BytesIO()
         self._parquet.write_table(table, buffer)
-        write_atomic(path, buffer.getvalue().to_pybytes())
+        write_atomic(path, buffer.getvalue())
 
     def _count(self, row: dict[str, Any]) -> None:
         """Count an episode by its row."""
@@ -267,18 +241,18 @@ class DatasetWriter:
         )
         write_atomic(self.folder / lerobot.INFO, lerobot.to_json(info))
 
-    def _check_open(self) -> None:
+    @contextlib.contextmanager
+    def guarded(self) -> Iterator[None]:
+        """If something goes wrong, close the writer and remove what is not committed.
+
+        Raises:
+            FolderError: The writer is closed, or something cannot be written.
+        """
         if not self._open:
             raise FolderError(
                 f"{self.folder}: the writer is closed, expected an open one. Make another, which"
                 " goes on"
             )
-
-    @contextlib.contextmanager
-    def guarded(self) -> Iterator[None]:
-        """If something goes wrong, close the writer and remove what is not committed."""
-        episodes = len(self.committed)
-        frames = self.frames
         try:
             yield
         except BaseException as error:
@@ -286,10 +260,10 @@ class DatasetWriter:
             if self._part is not None:
                 self._part.abandon()
                 self._part = None
-            del self.committed[episodes:]
-            self.frames = frames
-            info = read_info(self.folder)
-            for path in uncommitted(self.folder, info["mjstack"]["shards"] if info else 0):
+            info = cast(dict[str, Any], read_info(self.folder))
+            del self.committed[info["total_episodes"] :]
+            self.frames = info["total_frames"]
+            for path in uncommitted(self.folder, info["mjstack"]["shards"]):
                 path.unlink()
             if isinstance(error, OSError):
                 raise self._unwritten(error) from error

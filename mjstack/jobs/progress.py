@@ -40,13 +40,13 @@ class ProgressBar:
             console=console,
             transient=True,
             disable=not console.is_terminal,
+            get_time=time.monotonic,
         )
         self._gate = ""
         self._unit = ""
-        self._task = self._progress.add_task("", visible=False, rate="")
-        self._first = 0
-        self._done = 0
-        self._began = self._spoke = time.monotonic()
+        self._progress.add_task("", visible=False, rate="")
+        (self._task,) = self._progress.tasks
+        self._spoke = time.monotonic()
 
     def __enter__(self) -> "ProgressBar":
         self._progress.start()
@@ -70,17 +70,14 @@ class ProgressBar:
     def advance(self, unit: str, done: int, total: int) -> None:
         """Show how much of something is done."""
         check_interrupt()
-        now = time.monotonic()
-        if unit != self._unit or done <= 1 or done < self._done:
+        if unit != self._unit or done <= 1 or done < self._task.completed:
             self._unit = unit
-            self._first = done  # work that goes on begins in the middle
-            self._began = now
             self._show(f"{self._gate}: {unit}", total)
-        self._done = done
-        made = done - self._first
-        speed = made / (now - self._began) if now > self._began else 0.0
+        self._progress.update(self._task.id, completed=done)
+        speed = self._task.speed or 0.0
         rate = f"{speed:.1f}/s" if speed > 0.0 else ""
-        self._progress.update(self._task, completed=done, rate=rate)
+        self._progress.update(self._task.id, rate=rate)
+        now = time.monotonic()
         if self._progress.disable and speed > 0.0 and now - self._spoke > 15.0:
             self._spoke = now
             left = (total - done) / speed
@@ -88,7 +85,7 @@ class ProgressBar:
 
     def finish(self, result: GateResult) -> None:
         """Print a gate's result."""
-        self._progress.update(self._task, visible=False)
+        self._progress.update(self._task.id, visible=False)
         color = STATUS_COLOR[result.status]
         self._progress.console.print(
             f"[{color}]{result.status:>4}[/] {result.name} ({result.seconds:.1f} s):"
@@ -98,4 +95,4 @@ class ProgressBar:
 
     def _show(self, text: str, total: int, rate: str = "") -> None:
         """Begin the bar anew."""
-        self._progress.reset(self._task, total=total, description=text, visible=True, rate=rate)
+        self._progress.reset(self._task.id, total=total, description=text, visible=True, rate=rate)
