@@ -664,17 +664,18 @@ def test_the_buffer_bounds_the_worlds() -> None:
 
 def test_steps_come_to_the_host_in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     stage = Stage(load_config(COMMAND))
-    source = EpisodeSource(stage, cast(DatasetSpec, None), Path())
+    source = EpisodeSource(stage, cast(DatasetSpec, SimpleNamespace(config_sha256="")), Path())
     plan = BatchPlan(0, range(7))
     rows = {"observation.state": torch.randn(6, 7, 3), "action": torch.randn(5, 7, 1)}
-    batch = Batch(plan, cast(Env, None), cast(Episode, None), rows)
+    results = SimpleNamespace(failed=np.zeros(7, np.int32), retries=np.zeros(7, np.int32))
+    batch = Batch(plan, cast(Env, None), cast(Episode, results), rows)
     for size in (1, 2 * (6 * 3 + 5) * 4, 10**6):  # one world, two and all at once
         monkeypatch.setattr("mjstack.jobs.collect_episodes._CHUNK_BYTES", size)
-        episodes = list(source._arrays(batch, [6, 0, 3]))
-        assert len(episodes) == 3
-        for world, arrays in zip([6, 0, 3], episodes, strict=True):
+        episodes = list(source.episodes(batch, [6, 0, 3]))
+        assert [episode.world for episode in episodes] == [6, 0, 3]
+        for episode in episodes:
             for name, values in rows.items():
-                assert np.array_equal(arrays[name], values[:5, world].numpy())
+                assert np.array_equal(episode.arrays[name], values[:5, episode.world].numpy())
 
 
 @pytest.mark.full

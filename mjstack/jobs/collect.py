@@ -91,11 +91,10 @@ def run_collect(plan: CollectPlan, run: Run, folder: Path) -> None:
     began = time.perf_counter()
     collection = Collection(plan, run.stage)
     ranks.from_first(lambda: None)  # the dataset is open
-    if not ranks.writes:
-        collection.play()
-        return
 
-    def conclude(status: Status, problem: str = "") -> None:
+    def conclude(status: Status, problem: str) -> None:
+        if not ranks.writes:
+            return
         result = collection.result(status, problem, time.perf_counter() - began)
         if collection.committed:
             _write_table(run.cfg, plan, folder, result)
@@ -139,8 +138,6 @@ class Collection:
         self._plan = plan
         self._job = cast(CollectJobCfg, stage.cfg.job)
         self._record_path = plan.home / BATCHES
-        self._problem = ""
-        self._played = 0
         self.path = plan.home / DATASET
         self._source = EpisodeSource(stage, plan.spec, self.path)
         self.batches: list[BatchRecord] = []
@@ -150,7 +147,14 @@ class Collection:
         if not (self.path / lerobot.INFO).exists():
             self._record_path.unlink(missing_ok=True)  # of a dataset that was removed
         self._writer = DatasetWriter(self.path, plan.spec)
-        self._before = self.committed
+        self._episodes_before = self.committed
+        # Those that are in the dataset, or brought no episode
+        episodes = Counter(seed for seed, _ in self.writer.committed)
+        for batch in read_batches(self._record_path):
+            if not batch.episodes or episodes[batch.seed]:
+                batch.episodes = episodes[batch.seed]
+                self.batches.append(batch)
+        self._batches_before = len(self.batches)
 
     @property
     def writer(self) -> DatasetWriter:
@@ -177,23 +181,24 @@ class Collection:
         cfg = demonstration_config(stage.cfg, stage.action)
         channels = demonstration_channels(stage)
         with closing(self._source), self._writer or nullcontext():
-            if self._writer is not None:
-                self.batches = self._read_batches()
             batches = play_batches(stage, self._batch_plans(), channels, cfg=cfg)
             with closing(batches):
                 for batch in batches:
                     self._add(batch)
-        return self._problem
+        return self._problem() if stage.ranks.writes else ""
 
-    def _read_batches(self) -> list[BatchRecord]:
-        """The batches of earlier calls that are in the dataset, or brought no episode."""
-        episodes = Counter(seed for seed, _ in self.writer.committed)
-        batches = []
-        for batch in read_batches(self._record_path):
-            if not batch.episodes or episodes[batch.seed]:
-                batch.episodes = episodes[batch.seed]
-                batches.append(batch)
-        return batches
+    def _problem(self) -> str:
+        """Why the last seeds of this call brought no episode; empty if they did."""
+        last = self.batches[self._batches_before :][-_MOST_EMPTY:]
+        if len(last) < _MOST_EMPTY or any(batch.episodes for batch in last):
+            return ""
+        rules = [
+            f"{text} in {count} of {last[-1].worlds}" for text, count in last[-1].broken.items()
+        ]
+        return (
+            f"{_MOST_EMPTY} seeds in a row brought no episode, the last because of:"
+            f" {'; '.join(rules)} worlds"
+        )
 
     def _batch_plans(self) -> Iterator[BatchPlan]:
         """This rank's worlds of the batches, as long as episodes are missing."""
@@ -204,15 +209,7 @@ class Collection:
     def _next_plan(self) -> BatchPlan | None:
         """The worlds of the next seed; None if enough episodes are there, or none is to come."""
         missing = self._job.episodes - self.committed
-        if missing <= 0:
-            return None
-        last = self.batches[-self._played :][-_MOST_EMPTY:] if self._played else []
-        if len(last) == _MOST_EMPTY and not any(batch.episodes for batch in last):
-            rules = [f"{text} in {n} of {last[-1].worlds}" for text, n in last[-1].broken.items()]
-            self._problem = (
-                f"{_MOST_EMPTY} seeds in a row brought no episode, the last because of:"
-                f" {'; '.join(rules)} worlds"
-            )
+        if missing <= 0 or self._problem():
             return None
         seeds = [seed for seed, _ in self.writer.committed] + [b.seed for b in self.batches]
         seed = max([self._stage.cfg.seed - 1, *seeds]) + 1
@@ -223,17 +220,22 @@ class Collection:
     def _add(self, batch: Batch) -> None:
         """Add a batch's episodes to the dataset."""
         ranks = self._stage.ranks
-        failed = batch.episode.failed
         finite = batch.finite().cpu().numpy()
-        parts = ranks.gather((failed, finite, int(batch.episode.retries.sum())))
-        chosen = ranks.from_first(partial(self._choose, batch.plan.seed, parts))
-        place = ranks.from_first(self._place)
+        parts = ranks.gather((batch.episode.failed, finite, int(batch.episode.retries.sum())))
+        chosen, *place = ranks.from_first(partial(self._choose, batch.plan.seed, parts))
         with self._writer.guarded() if self._writer is not None else nullcontext():
             files = ranks.gather(self._source.write(batch, chosen, *place))
         ranks.from_first(partial(self._commit, [file for group in files for file in group]))
 
-    def _choose(self, seed: int, parts: Sequence[tuple[np.ndarray, np.ndarray, int]]) -> list[int]:
-        """Record a batch, and choose the worlds whose episodes are kept."""
+    def _choose(
+        self, seed: int, parts: Sequence[tuple[np.ndarray, np.ndarray, int]]
+    ) -> tuple[list[int], int, int, int]:
+        """Record a batch, and choose the worlds whose episodes are kept.
+
+        Returns:
+            These worlds, and the numbers of the next episode and of the next frame of the dataset,
+            and of the task.
+        """
         failed = np.concatenate([bits for bits, _, _ in parts])
         finite = np.concatenate([flags for _, flags, _ in parts])
         candidates = (failed == 0) | self._job.keep_failures
@@ -252,21 +254,15 @@ class Collection:
             broken=broken,
         )
         self.batches.append(record)
-        self._played += 1
         records = [asdict(batch) for batch in self.batches]
         write_atomic(self._record_path, json.dumps(records, indent=1) + "\n")
-        return chosen
-
-    def _place(self) -> tuple[int, int, int]:
-        """Number of the next episode and of the next frame of the dataset, and of the task."""
         task = self._stage.cfg.task
         number = self.writer.number_task(task.instruction or task.name)
-        return self.committed, self.writer.frames, number
+        return chosen, self.committed, self.writer.frames, number
 
     def _commit(self, files: Sequence[Part]) -> None:
         """Commit the files of all ranks, and print what the batch has brought."""
-        if files:
-            self.writer.commit(files)
+        self.writer.flush(files)
         batch = self.batches[-1]
         self._stage.progress.print_line(
             f"collect, seed {batch.seed}: {batch.succeeded} of {batch.worlds} worlds succeeded,"
@@ -279,7 +275,7 @@ class Collection:
         ``problem`` says why it did not pass; ``seconds`` is the wall time of this call.
         """
         asked = self._job.episodes
-        new = self.committed - self._before
+        new = self.committed - self._episodes_before
         steps = self.writer.frames
         size = sum(path.stat().st_size for path in self.path.rglob("*") if path.is_file()) / 1e6
         notes = {"dataset": str(self.path), "config_sha256": self._plan.spec.config_sha256}
@@ -289,9 +285,8 @@ class Collection:
             "steps": steps,
             "megabytes": size,
         }
-        reasons = [problem] if problem else []
         there = f"{steps:,} steps, {size:.1f} MB"
-        reasons.append(f"{self.committed:,} episodes, {asked:,} asked for ({there})")
+        reasons = [problem, f"{self.committed:,} episodes, {asked:,} asked for ({there})"]
         details: list[str] = []
 
         if self.batches:
@@ -319,9 +314,9 @@ class Collection:
         elif self.committed >= asked:
             reasons.append("they were there already")
         return GateResult(
-            name="collect",
+            name=NAME,
             status=status,
-            reason="; ".join(reasons),
+            reason="; ".join(filter(None, reasons)),
             seconds=seconds,
             thresholds={"episodes": asked},
             metrics=metrics,

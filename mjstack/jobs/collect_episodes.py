@@ -2,10 +2,9 @@
 after they have been judged.
 """
 
-import itertools
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import cast
 
@@ -72,9 +71,8 @@ class EpisodeSource:
         self._stage = stage
         self._spec = spec
         self._folder = folder
-        self._images_gib = cast(CollectJobCfg, stage.cfg.job).buffer_gib
         self.drawing = 0.0
-        self._count = 0
+        self._most_rendered = 0  # states at once
         self._renderer: StateRenderer | None = None
         self._cameras = with_outputs(stage.cfg.scene.cameras, ["rgb"])
         # Steps from one image to the next, as the environment draws them
@@ -107,13 +105,14 @@ class EpisodeSource:
         worlds = batch.plan.worlds
         order = {world: number for number, world in enumerate(chosen) if world in worlds}
         episodes = self.episodes(batch, [worlds.index(world) for world in order])
+        images_gib = cast(CollectJobCfg, self._stage.cfg.job).buffer_gib
         files: list[Part] = []
         writer: PartWriter | None = None
         try:
             for count, (number, data) in enumerate(zip(order.values(), episodes, strict=True), 1):
                 if writer is None:
                     name = f"rank{self._stage.ranks.rank:04d}-{len(files)}"
-                    writer = PartWriter(self._folder, self._spec, name, images_gib=self._images_gib)
+                    writer = PartWriter(self._folder, self._spec, name, images_gib=images_gib)
                 first_frame = frame + number * len(data.arrays[STATE])
                 typed = typed_episode(self._spec, data)
                 writer.write(data, task, *typed, episode + number, first_frame)
@@ -130,27 +129,35 @@ class EpisodeSource:
 
     def episodes(self, batch: Batch, rows: Sequence[int]) -> Iterator[EpisodeData]:
         """The episodes of some worlds of a batch, by their rows, with images if there are cameras.
+        They come to the host in chunks.
 
         Raises:
             MjstackError: The worlds in which images are rendered do not fit into memory.
         """
-        images: Iterator[dict[str, np.ndarray]] = itertools.repeat({})
-        if self._cameras and rows:
-            images = self._images(batch, rows)
-        for row, arrays, frames in zip(rows, self._arrays(batch, rows), images, strict=False):
-            yield self._episode(batch, row, arrays, frames)
-
-    def _arrays(self, batch: Batch, rows: Sequence[int]) -> Iterator[dict[str, np.ndarray]]:
-        """Steps of some worlds on the host, by column, each ``(steps, dim)``; copied in chunks."""
-        columns = {name: values for name, values in batch.rows.items() if name != POSITIONS}
-        steps = len(batch.rows[ACTION])
-        world_bytes = sum(values[:, 0].nbytes for values in columns.values())
-        size = max(1, _CHUNK_BYTES // world_bytes)
+        if self._cameras and rows and self._renderer is None:
+            self._most_rendered = min(_MOST_RENDERED, len(batch.plan.worlds))
+            fields = required_fields(self._stage.cfg.reset)
+            self._renderer = self._stage.color_renderer(self._most_rendered, fields)
+        steps = range(len(batch.rows[ACTION]))
+        rendered_steps = steps[:: math.gcd(*self._strides.values()) or 1]
+        columns = [name for name in batch.rows if name != POSITIONS]
+        world_bytes = sum(batch.rows[name][:, 0].nbytes for name in columns)
+        size = _CHUNK_BYTES // world_bytes
+        if self._cameras:
+            size = self._most_rendered // len(rendered_steps)
+        size = max(1, size)
         for first in range(0, len(rows), size):
-            chunk = torch.tensor(rows[first : first + size], device=batch.rows[ACTION].device)
-            host = {name: batch.select(name, chunk).cpu().numpy() for name in columns}
-            for number in range(len(chunk)):
-                yield {name: values[number, :steps] for name, values in host.items()}
+            chunk = rows[first : first + size]
+            worlds = torch.tensor(chunk, device=batch.rows[ACTION].device)
+            host = {name: batch.select(name, worlds).cpu().numpy() for name in columns}
+            rendered = self._render(batch, worlds, rendered_steps) if self._cameras else {}
+            for number, row in enumerate(chunk):
+                arrays = {name: values[number, : len(steps)] for name, values in host.items()}
+                images = {}
+                for name, stride in self._strides.items():
+                    frame = np.array(steps) // stride * stride // rendered_steps.step
+                    images[f"{IMAGES}.{name}"] = rendered[name][number, frame]
+                yield self._episode(batch, row, arrays, images)
 
     def _episode(
         self,
@@ -179,49 +186,28 @@ class EpisodeSource:
             },
         )
 
-    def _images(self, batch: Batch, rows: Sequence[int]) -> Iterator[dict[str, np.ndarray]]:
-        """Images of some worlds' episodes on the host, by column, each ``(steps, height, width,
-        3)``, uint8.
+    def _render(self, batch: Batch, worlds: torch.Tensor, steps: range) -> dict[str, np.ndarray]:
+        """Images of some worlds before some steps, on the host, by camera: each ``(worlds, steps,
+        height, width, 3)``, uint8.
         """
-        if self._renderer is None:
-            self._count = min(_MOST_RENDERED, len(batch.plan.worlds))
-            self._renderer = self._stage.color_renderer(
-                self._count, required_fields(self._stage.cfg.reset)
-            )
-        steps = len(batch.rows[ACTION])
-        step = math.gcd(*self._strides.values())
-        states = batch.rows[POSITIONS][:steps:step]
-        at_once = max(1, self._count // len(states))
-        for first in range(0, len(rows), at_once):
-            began = time.perf_counter()
-            worlds = torch.tensor(rows[first : first + at_once])
-            chosen = states.index_select(1, worlds.to(states.device)).transpose(0, 1).flatten(0, 1)
-            fields = {
-                name: values[worlds.to(values.device)].repeat_interleave(len(states), 0)
-                for name, values in batch.env.sim.fields.items()
-            }
-            rendered = self._render(self._renderer, chosen, fields)
-            self.drawing += time.perf_counter() - began
-            for row in range(len(worlds)):
-                rows_of = slice(row * len(states), (row + 1) * len(states))
-                episode = {}
-                for name, stride in self._strides.items():
-                    images = rendered[name][rows_of][:: stride // step]
-                    if stride > 1:
-                        images = np.repeat(images, stride, axis=0)[:steps]
-                    episode[f"{IMAGES}.{name}"] = images
-                yield episode
-
-    def _render(
-        self, renderer: StateRenderer, qpos: torch.Tensor, fields: Mapping[str, torch.Tensor]
-    ) -> dict[str, np.ndarray]:
-        """Images of any number of states by camera, on the host."""
+        assert self._renderer is not None
+        began = time.perf_counter()
+        states = batch.rows[POSITIONS][list(steps)][:, worlds]
+        qpos = states.transpose(0, 1).flatten(0, 1)
+        fields = {
+            name: values[worlds.to(values.device)].repeat_interleave(len(steps), 0)
+            for name, values in batch.env.sim.fields.items()
+        }
         shapes = {name: (len(qpos), *camera.size, 3) for name, camera in self._cameras.items()}
         out = {name: np.empty(shape, np.uint8) for name, shape in shapes.items()}
-        for first in range(0, len(qpos), self._count):
-            rows = slice(first, first + self._count)
+        for first in range(0, len(qpos), self._most_rendered):
+            rows = slice(first, first + self._most_rendered)
             looks = {name: values[rows] for name, values in fields.items()}
-            images = renderer.draw(qpos[rows], looks)
+            images = self._renderer.draw(qpos[rows], looks)
             for name, whole in out.items():
                 torch.from_numpy(whole[rows]).copy_(images[f"images.{name}"])
-        return out
+        self.drawing += time.perf_counter() - began
+        return {
+            name: whole.reshape(len(worlds), len(steps), *whole.shape[1:])
+            for name, whole in out.items()
+        }
