@@ -8,6 +8,7 @@ import ast
 import json
 import runpy
 import sys
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -176,27 +177,22 @@ def test_a_task_that_brings_a_controller_takes_a_policy(
     assert checked.stage.cfg.controller.name == "policy"
 
 
-def refused(capsys: pytest.CaptureFixture[str]) -> str:
-    (line,) = capsys.readouterr().err.splitlines()
-    return line
-
-
 def test_bad_input_is_one_line(
     exported: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    error_line: Callable[[], str],
 ) -> None:
     policy = exported / "policy"
     assert export(policy, tmp_path / "out", "task=stack") == 2
-    assert "was trained with task.name=reach, and here it is stack" in refused(capsys)
+    assert "was trained with task.name=reach, and here it is stack" in error_line()
     before = (exported / "out" / "policy.onnx").read_bytes()
     assert export(policy, exported / "out", "task=reach") == 2
-    assert "expected a new or an empty folder" in refused(capsys)
+    assert "expected a new or an empty folder" in error_line()
     assert (exported / "out" / "policy.onnx").read_bytes() == before
     monkeypatch.setitem(sys.modules, "onnx", None)
     assert export(policy, tmp_path / "out", "task=reach") == 2
-    assert "job=export needs onnx, which is not installed" in refused(capsys)
+    assert "job=export needs onnx, which is not installed" in error_line()
     assert not (tmp_path / "out").exists()
 
 

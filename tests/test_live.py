@@ -30,7 +30,7 @@ from mjstack.cli import run
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env, build_env
 from mjstack.episodes.rollout import rollout
-from mjstack.episodes.stage import Stage
+from mjstack.episodes.stage import Progress, Stage
 from mjstack.jobs import check_job
 from mjstack.jobs.live import LiveView, read_worlds
 from mjstack.report.geometry import Shapes
@@ -226,7 +226,9 @@ def test_a_paused_run_goes_on_when_the_last_browser_leaves(
     env = build_env(configure("task=reach"), nworld=2)
     env.reset()
     lines: list[str] = []
-    view = LiveView(server, get_stage("so101"), lines.append)
+    stage = get_stage("so101").with_config(configure("task=reach"))
+    stage.progress = Progress(print_line=lines.append)
+    view = LiveView(server, stage)
     view.start(env, NoActions(env))
     view._toggle()
     began = time.perf_counter()

@@ -39,6 +39,9 @@ def test_a_unit_that_begins_in_the_middle_has_its_own_rate(clock: Clock) -> None
     clock.now += 10.0
     bar.advance("batches", 720, 1500)
     assert out.getvalue() == "train: batches 720/1500, 2.0/s, 390 s left\n"
+    clock.now += 90.0
+    bar.advance("batches", 750, 1500)
+    assert out.getvalue().endswith("\ntrain: batches 750/1500, 0.5/s, 1500 s left\n")
 
 
 def test_a_unit_that_starts_over_is_timed_anew(clock: Clock) -> None:

@@ -16,6 +16,8 @@ from mjstack.errors import ConfigError
 
 CONTENT = "sha256:"  # in front of what stands for a file
 _OF_THE_CALL = ("resume", "devices", "sweep", "web")  # they change no result
+# Changing one of these changes no dataset and no training.
+WITHOUT_EFFECT = ("batch", "gates", "gate", "graph", "view", "video", "run", "world")
 POLICY_FILE = "policy.json"  # of a policy's folder; it names the weights by their SHA-256
 MOST_TEXT = 2**24  # bytes of it; a stranger's may ask for more
 

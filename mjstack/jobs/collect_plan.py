@@ -14,7 +14,7 @@ import mujoco
 import torch
 
 from mjstack.config.check import places_objects
-from mjstack.config.fingerprint import config_content, config_hash, differences
+from mjstack.config.fingerprint import WITHOUT_EFFECT, config_content, config_hash, differences
 from mjstack.config.functions import offered
 from mjstack.config.schema import Backend, CollectJobCfg, Config, ObservationTermCfg
 from mjstack.datasets import DatasetSpec, Feature, Video
@@ -24,7 +24,7 @@ from mjstack.datasets.video import check_encoder
 from mjstack.envs import Env, build_env, demonstration_config
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, FolderError
-from mjstack.files import check_unused, lock_folder, reading
+from mjstack.files import lock_folder, reading
 from mjstack.jobs.runner import run_provenance
 from mjstack.mdp.starts.placement import GAP, SCHEMA, may_meet
 from mjstack.sim import resolve_backend
@@ -38,19 +38,7 @@ REWARD = "next.reward"
 IMAGES = "observation.images"
 # Changing one of these changes no episode. The action terms are the controller's, and nothing ends
 # an episode early.
-_WITHOUT_EFFECT = (
-    "action",
-    "termination",
-    "batch",
-    "nworld",
-    "gates",
-    "graph",
-    "view",
-    "video",
-    "run",
-    "world",
-    "gate",
-)
+_WITHOUT_EFFECT = (*WITHOUT_EFFECT, "action", "termination", "nworld")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -146,10 +134,8 @@ def check_folder(dataset: Path, spec: DatasetSpec) -> None:
     """Refuse a dataset that is not this configuration's.
 
     Raises:
-        FolderError: It is of another one.
-        FolderError: Another process is writing it, or the job's folder has a run of another job.
+        FolderError: It is of another one, or another process is writing it.
     """
-    check_unused(dataset.parent, NAME, DATASET)
     if not dataset.exists():
         return
     os.close(lock_folder(dataset))
@@ -198,13 +184,10 @@ def read_batches(path: Path) -> list[BatchRecord]:
     if not path.exists():
         return []
     fix = f"Remove {BATCHES}: the expert's success rate is counted anew"
-    names = {item.name for item in fields(BatchRecord)}
+    names = [item.name for item in fields(BatchRecord)]
     with reading(path, fix):
-        return [
-            BatchRecord(**{name: value for name, value in record.items() if name in names})
-            for batch in json.loads(path.read_text())
-            for record in [{"episodes": batch.get("kept")} | batch]
-        ]
+        batches = [{"episodes": old.get("kept")} | old for old in json.loads(path.read_text())]
+        return [BatchRecord(**{name: batch[name] for name in names}) for batch in batches]
 
 
 def episode_config(cfg: Config) -> dict[str, Any]:

@@ -3,23 +3,24 @@ MuJoCo.
 """
 
 from contextlib import closing
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import mujoco
-import numpy as np
 
 import mjstack
 from mjstack.config.schema import Backend, Config
 from mjstack.envs import build_env, driven_config
 from mjstack.episodes.rollout import POLICY as DRIVER
+from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
 from mjstack.errors import FolderError
 from mjstack.files import write_atomic
 from mjstack.gates.runner import run_guarded
 from mjstack.jobs.collect_plan import group_feature, joint_units
 from mjstack.jobs.gates import check_task
-from mjstack.jobs.runner import CheckedJob, Job
+from mjstack.jobs.runner import CheckedJob, Job, model_bytes
 from mjstack.policy import Policy
 from mjstack.policy.checkpoint import policy_facts
 from mjstack.policy.onnx import require_onnx, to_onnx
@@ -42,26 +43,23 @@ def check_export(cfg: Config) -> CheckedJob:
             "Play it with controller=policy",
         )
     title = f"task {cfg.task.name}, policy {stage.assets.policy.folder}"
-    return CheckedJob(
-        stage=stage,
-        title=title,
-        work=lambda run, folder: run_guarded(
-            run, NAME, lambda run: export_policy(run.stage, folder)
-        ),
-    )
+    return CheckedJob(stage=stage, title=title, work=_export)
+
+
+def _export(run: Run, folder: Path) -> None:
+    run_guarded(run, NAME, lambda run: export_policy(run.stage, folder))
 
 
 def export_policy(stage: Stage, folder: Path) -> list[GateResult]:
     """Write both files, or none."""
     policy = stage.assets.policy
     facts = export_facts(stage.cfg, policy)
-    files = {MODEL: _model_bytes(stage.model), POLICY: to_onnx(policy.network, facts)}
+    files = {MODEL: model_bytes(stage.model), POLICY: to_onnx(policy.network, facts)}
     try:
         for name, content in files.items():
             write_atomic(folder / name, content)
     except OSError as error:
-        for name in files:
-            (folder / name).unlink(missing_ok=True)
+        (folder / MODEL).unlink(missing_ok=True)
         raise FolderError(
             f"{folder} cannot be written ({error.strerror or error}), and nothing was exported",
             "Make room, or set hydra.run.dir to another",
@@ -88,7 +86,6 @@ def export_facts(cfg: Config, policy: Policy) -> dict:
         units = joint_units(env)
         columns = group_feature(env, policy.group, units)
         index = env.index
-    robot = cfg.robot
     network = policy.network
     return policy_facts(policy) | {
         "versions": policy.versions,
@@ -98,43 +95,29 @@ def export_facts(cfg: Config, policy: Policy) -> dict:
             name: network.get_buffer(name).tolist() for name, _ in network.named_buffers()
         },
         "robot": {
-            "name": robot.name,
-            "joints": robot.joints,
+            **_fields(cfg.robot, "name", "joints", "home", "start", "grasp_sites"),
             "units": units,
             "qpos": index.robot_qpos.tolist(),
             "qvel": index.robot_qvel.tolist(),
             "ctrl": index.ctrl.tolist(),
             "low": index.ctrl_range[:, 0].tolist(),
             "high": index.ctrl_range[:, 1].tolist(),
-            "home": robot.home,
-            "start": robot.start,
-            "grasp_sites": robot.grasp_sites,
         },
-        "task": {
-            name: value
-            for name, value in asdict(cfg.task).items()
-            if name in ("name", "instruction", "control_hz", "episode_steps", "params")
-        },
-        "timing": {
-            name: getattr(cfg.timing, name)
-            for name in ("physics_dt", "decimation", "command_delay")
-        },
+        "task": _fields(cfg.task, "name", "instruction", "control_hz", "episode_steps", "params"),
+        "timing": _fields(cfg.timing, "physics_dt", "decimation", "command_delay"),
         "objects": {
-            name: {"shape": thing.shape, "size": thing.size, "fixed": thing.fixed}
+            name: _fields(thing, "shape", "size", "fixed")
             for name, thing in cfg.scene.objects.items()
         },
         "places": {
-            name: {"xy": place.xy, "random_xy": place.random_xy}
-            for name, place in cfg.scene.places.items()
+            name: _fields(place, "xy", "random_xy") for name, place in cfg.scene.places.items()
         },
     }
 
 
-def _model_bytes(model: mujoco.MjModel) -> bytes:
-    """The compiled model as mujoco saves it: every number as physics has it, meshes included."""
-    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
-    mujoco.mj_saveModel(model, None, buffer)
-    return buffer.tobytes()
+def _fields(cfg: Any, *names: str) -> dict[str, Any]:
+    """Some fields of a configuration, by name."""
+    return {name: getattr(cfg, name) for name in names}
 
 
 JOB = Job(check_export)

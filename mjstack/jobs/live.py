@@ -5,7 +5,7 @@ images.
 import re
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
@@ -43,29 +43,21 @@ class LiveView(Observer):
         paused: Whether the run waits in its next step.
     """
 
-    def __init__(
-        self,
-        server: Any,
-        stage: Stage,
-        print_line: Callable[[str], None] = lambda line: None,
-    ) -> None:
+    def __init__(self, server: Any, stage: Stage) -> None:
         """Add the controls to a server.
 
         Args:
             server: Of `report.web.start_server`.
             stage: The scene. Its cameras are rendered here where the environment does not.
-            print_line: Prints a line.
         """
         self._server = server
         self._stage = stage
-        self._print_line = print_line
         self._renderer: StateRenderer | None = None
         self._fields: list[str] = []  # of the renderer's state
         self._view: SceneView | None = None
         self._nworld = 0
-        self._numbers: list[int] = []  # of the worlds in the picture
+        self._numbers = [0]  # of the worlds in the picture
         self._part = ""
-        self._chosen = ""
         self._choice = ("", 0)  # of the last picture: worlds and plotted world
         self._steps = 0  # that a click lets the run make
         self.paused = False
@@ -76,8 +68,7 @@ class LiveView(Observer):
         self._status = gui.add_markdown("waiting for the first step")
         self._pause = gui.add_button("Pause", visible=pausable)
         self._pause.on_click(lambda _: self._toggle())
-        self._step = gui.add_button("Step", visible=pausable)
-        self._step.on_click(lambda _: self._advance())
+        gui.add_button("Step", visible=pausable).on_click(lambda _: self._advance())
         self._pace = gui.add_dropdown("Pace", (_REAL, _FAST), initial_value=_FAST)
         self._worlds = gui.add_text("Worlds", "", hint=f"such as 0-15, 20; at most {MOST_WORLDS}")
         self._plotted = gui.add_number("Plotted world", 0, min=0, step=1)
@@ -97,8 +88,7 @@ class LiveView(Observer):
         self._due = time.perf_counter()
         if env.nworld != self._nworld:
             self._nworld = env.nworld
-            self._chosen = f"0-{min(_FIRST, env.nworld) - 1}" if env.nworld > 1 else "0"
-            self._worlds.value = self._chosen
+            self._worlds.value = f"0-{min(_FIRST, env.nworld) - 1}" if env.nworld > 1 else "0"
             self._pace.value = _REAL if env.nworld == 1 else _FAST
             self._plotted.max = env.nworld - 1
             self._view = None
@@ -132,7 +122,8 @@ class LiveView(Observer):
             if self._server.get_clients():
                 last_client = time.perf_counter()
             elif time.perf_counter() - last_client > _GRACE:
-                self._print_line("live view: the run was paused, and goes on without a browser")
+                line = "live view: the run was paused, and goes on without a browser"
+                self._stage.progress.print_line(line)
                 self._toggle()
             if self._choice != (self._worlds.value, self._plotted.value):
                 self._show(step + 1)
@@ -156,11 +147,19 @@ class LiveView(Observer):
         """Draw the chosen worlds, and what is known of the plotted one."""
         env = self.env
         self._last = time.perf_counter()
-        text, plotted = choice = (self._worlds.value, self._plotted.value)
+        text = self._worlds.value
+        plotted = self._plotted.value
         if plotted != self._choice[1]:
             self._history.clear()  # it is another world's
-        self._choice = choice
-        problem = self._choose(text.strip())
+        self._choice = (text, plotted)
+        problem = []
+        numbers = read_worlds(text.strip(), env.nworld)
+        if not numbers:
+            expected = f"numbers from 0 to {env.nworld - 1}, such as 0-15, 20"
+            problem.append(f"Worlds: {text!r} names none, expected {expected}")
+        elif numbers != self._numbers:
+            self._numbers = numbers
+            self._view = None
         index = torch.tensor(self._numbers, device=env.device)
         qpos = env.sim.qpos[index].double().cpu().numpy()
         if self._view is None:
@@ -180,10 +179,9 @@ class LiveView(Observer):
             if image.dtype != torch.uint8:
                 continue
             pixels = image.cpu().numpy()
-            if name in self._images:
-                self._images[name].image = pixels
-            else:
+            if name not in self._images:
                 self._images[name] = self._server.gui.add_image(pixels, label=name)
+            self._images[name].image = pixels
         title = f"**{self._part}**, step {step:,}, {env.nworld:,} worlds"
         self._status.content = "\n\n".join([title, f"world {world}: {terms}", *problem])
 
@@ -191,20 +189,6 @@ class LiveView(Observer):
     def _shapes(self) -> Shapes:
         """Geometry of the scene."""
         return Shapes(self._stage.assets.visual_model)
-
-    def _choose(self, text: str) -> list[str]:
-        """Take over the worlds of a text; return a line if it names none."""
-        if self._view is not None and text == self._chosen:
-            return []
-        count = self.env.nworld
-        if not (worlds := read_worlds(text, count)):
-            self._numbers = self._numbers or [0]
-            expected = f"numbers from 0 to {count - 1}, such as 0-15, 20"
-            return [f"Worlds: {text!r} names none, expected {expected}"]
-        self._chosen = text
-        self._numbers = worlds
-        self._view = None
-        return []
 
     def _values(self, world: int) -> tuple[str, dict[str, dict[str, float]]]:
         """A world's state in words, and the lines of the plots by title."""

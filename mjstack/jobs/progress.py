@@ -1,5 +1,6 @@
 """Shows how far a job is: a bar on a terminal, a line now and then elsewhere."""
 
+import math
 import time
 
 from rich.console import Console
@@ -41,6 +42,7 @@ class ProgressBar:
             transient=True,
             disable=not console.is_terminal,
             get_time=time.monotonic,
+            speed_estimate_period=math.inf,  # reports may be minutes apart
         )
         self._gate = ""
         self._unit = ""

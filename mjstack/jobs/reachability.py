@@ -84,10 +84,10 @@ def run_reachability(run: Run, folder: Path) -> None:
         began = time.perf_counter()
         levels.append(map_level(run, name, height, gripper))
         results.append(_level_result(levels[-1], time.perf_counter() - began))
-        _write(run, levels, [], results)
+        _write(run, levels, results, [])
         run.record(results[-1])
     regions = [find_region(cfg, levels, name) for name in cfg.scene.free]
-    _write(run, levels, regions, [*results, *regions], draw=True)
+    _write(run, levels, results, regions)
     for region in regions:
         run.record(region)
 
@@ -164,19 +164,16 @@ def find_region(cfg: Config, levels: list[ReachLevel], name: str) -> GateResult:
     rows, columns = np.nonzero(~np.logical_and.reduce([level.reached for level in levels]))
     blocked = np.stack((x[columns], y[rows]), axis=1)
     away = np.abs(blocked - place) - job.step - job.margin
-    edge = [
-        min(place[k] - axis[0], axis[-1] - place[k]) - job.margin for k, axis in enumerate((x, y))
-    ]
+    edge_x = min(place[0] - x[0], x[-1] - place[0]) - job.margin
+    edge_y = min(place[1] - y[0], y[-1] - place[1]) - job.margin
 
     def most_y(half_x: float) -> float:
         """How far a region of this half-width goes in y; negative where there is none."""
         beside = away[away[:, 0] <= half_x, 1]
-        return min(edge[1], beside.min(initial=math.inf)) if half_x <= edge[0] else -1.0
+        return beside.min(initial=edge_y) if half_x <= edge_x else -1.0
 
-    room = [
-        scene.table_half[k] - thing.footprint - abs(place[k] - scene.table_center[k])
-        for k in (0, 1)
-    ]
+    off_center = np.abs(place - scene.table_center[:2])
+    room = np.array(scene.table_half[:2]) - thing.footprint - off_center
     half_x = np.arange(0.0, max(room[0], 0.0) + 1e-9, _FINE)
     half_y = np.minimum(room[1], [most_y(half) for half in half_x])
     half_y = _FINE * np.floor(half_y / _FINE + 1e-9)
@@ -226,39 +223,33 @@ def _level_result(level: ReachLevel, seconds: float) -> GateResult:
 
 
 def _write(
-    run: Run,
-    levels: list[ReachLevel],
-    regions: list[GateResult],
-    results: list[GateResult],
-    draw: bool = False,
+    run: Run, levels: list[ReachLevel], results: list[GateResult], regions: list[GateResult]
 ) -> None:
-    """Write table and picture as far as they are known."""
+    """Write the table of levels and regions, and a picture as soon as there are regions."""
     cfg = run.cfg
-    margin = 1e3 * _job(cfg).margin
-    apart = 1e3 * _job(cfg).step
-    tolerance = 1e3 * cfg.controller.ik_tolerance
+    job = _job(cfg)
     title = f"{cfg.robot.title}, task {cfg.task.name}: what the arm reaches"
     notes = [
         "Half-widths in m, around the position. A region counts as reached if it still is with"
-        f" {margin:g} mm more all round, at every level; points are {apart:g} mm apart. Regions"
-        " keep objects of any yaw on the table.",
+        f" {1e3 * job.margin:g} mm more all round, at every level; points are {1e3 * job.step:g} mm"
+        " apart. Regions keep objects of any yaw on the table.",
         f"Reached: inverse kinematics of {', '.join(cfg.robot.ik_joints)} brings the grasp point"
-        f" within {tolerance:g} mm. Collisions are not looked at.",
+        f" within {1e3 * cfg.controller.ik_tolerance:g} mm. Collisions are not looked at.",
         "Tilt: the smallest angle between the gripper's approach axis and straight down that a"
         " solution has. A controller that goes on from where it is need not find that solution,"
         " and may stop at a joint limit short of a point that is reached.",
         "Reached does not mean grasped: how many worlds succeed, the gate success tells.",
     ]
-    picture = partial(_save_map, title=title, cfg=cfg, levels=levels, regions=regions)
+    draw = partial(_save_map, title=title, cfg=cfg, levels=levels, regions=regions)
+    table = summarize([*results, *regions])
     text = _points_csv(cfg, levels)
-    write_tables(
-        run, "reachability", title, summarize(results), notes, text, picture if draw else None
-    )
+    write_tables(run, "reachability", title, table, notes, text, draw if regions else None)
 
 
 def _points_csv(cfg: Config, levels: Sequence[ReachLevel]) -> str:
     """A row per point of the map; the tilt is ``nan`` where the arm does not get to."""
-    columns = dict(zip(("x_m", "y_m"), np.meshgrid(*axes(cfg)), strict=True))
+    x, y = np.meshgrid(*axes(cfg))
+    columns = {"x_m": x, "y_m": y}
     for level in levels:
         columns[f"{level.name}_reached"] = level.reached
         columns[f"{level.name}_residual_m"] = level.residual

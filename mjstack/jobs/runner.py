@@ -315,18 +315,22 @@ def write_tables(
 def run_provenance(stage: Stage) -> Provenance:
     """Versions, machine, device, and hashes of configuration and model."""
     backend, device = stage.backend
-    # The numbers of the compiled model: the physics sees these, not the files
-    buffer = np.empty(mujoco.mj_sizeModel(stage.model), np.uint8)
-    mujoco.mj_saveModel(stage.model, None, buffer)
     config = config_content(stage.cfg)
     return collect_provenance() | {
         "device": _device_name(backend, device),
         "driver": cuda_driver() if device.startswith("cuda") else "no CUDA device",
         "config_sha256": config_hash(config),
-        "model_sha256": hashlib.sha256(buffer.tobytes().hex().encode()).hexdigest(),
+        "model_sha256": hashlib.sha256(model_bytes(stage.model).hex().encode()).hexdigest(),
         "starts_schema": SCHEMA,
         **({"policy": config["policy"]} if stage.cfg.policy else {}),
     }
+
+
+def model_bytes(model: mujoco.MjModel) -> bytes:
+    """The compiled model as MuJoCo saves it: every number as physics has it, meshes included."""
+    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return buffer.tobytes()
 
 
 def _device_name(backend: Backend, device: str) -> str:

@@ -71,12 +71,11 @@ def draw_episode(
         files["episode.mp4"] = (save_video, model, qpos[None], cfg.timing.step_dt)
     pictures = []
     for name, call in files.items():
-        if problem := safely_write(folder / name, *call):
-            console.print(escape(problem))
-        elif name.endswith(".png"):
+        problem = safely_write(folder / name, *call)
+        if name.endswith(".png") and not problem:
             pictures.append(name)
         else:
-            console.print(escape(f"video: {folder}/{name}"))
+            console.print(escape(problem or f"video: {folder}/{name}"))
     return pictures
 
 
@@ -109,7 +108,7 @@ def serve_live_view(stage: Stage, console: Console) -> Iterator[LiveView | None]
     server = start_server(cfg.web.host, cfg.web.port)
     try:
         console.print(f"live view: http://{cfg.web.host}:{server.get_port()}")
-        with closing(LiveView(server, stage, console.print)) as live:
+        with closing(LiveView(server, stage)) as live:
             yield live
     finally:
         stop_server(server)

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import cast
 
-from mjstack.config.fingerprint import config_content, config_hash
+from mjstack.config.fingerprint import WITHOUT_EFFECT, config_content, config_hash, differences
 from mjstack.config.functions import find_object
 from mjstack.config.schema import Config, TrainJobCfg
 from mjstack.episodes.assets import Assets
@@ -18,7 +18,7 @@ from mjstack.episodes.rollout import POLICY
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage, require_episode
 from mjstack.errors import ConfigError, FolderError
-from mjstack.files import check_unused, reading, to_csv, write_atomic
+from mjstack.files import reading, to_csv, write_atomic
 from mjstack.gates.runner import run_guarded
 from mjstack.gates.success import run_success
 from mjstack.jobs.gates import check_task
@@ -31,17 +31,16 @@ from mjstack.train.trainer import LAST, STATE, Trained, Trainer, whole_starts
 
 NAME = "train"
 CONFIG = "training.json"  # the configuration of the training in the folder
-# Changing one of these changes no training.
-_KEYS_WITHOUT_EFFECT = ("batch", "gates", "gate", "graph", "view", "video", "run", "world")
-_JOB_KEYS_WITHOUT_EFFECT = ("folder", "test_seed", "iterations", "minutes", "max_minutes")
+# Keys of the job; changing one of these changes no training.
+_WITHOUT_EFFECT = ("folder", "test_seed", "iterations", "minutes", "max_minutes")
 
 
 def training_config(cfg: Config) -> dict:
     """Everything that a training depends on, in JSON's types."""
     config = config_content(cfg)
-    for key in _KEYS_WITHOUT_EFFECT:
+    for key in WITHOUT_EFFECT:
         del config[key]
-    for key in _JOB_KEYS_WITHOUT_EFFECT:
+    for key in _WITHOUT_EFFECT:
         config["job"].pop(key, None)
     return config
 
@@ -65,7 +64,6 @@ def check_train(cfg: Config) -> CheckedJob:
     name = config_hash(training_config(cfg))[:12]
     folder = Path(job.folder or f"outputs/train/{name}")
     if stage.ranks.writes:  # it may have begun there when the others come
-        check_unused(folder, NAME, STATE, "job.folder")
         _check_folder(folder, cfg)
     return CheckedJob(
         stage=stage,
@@ -84,13 +82,11 @@ def _check_folder(folder: Path, cfg: Config) -> None:
     if not path.exists():
         return
     with reading(path, "Set job.folder to another folder"):
-        earlier = json.loads(path.read_text())
-    config = json.loads(json.dumps(training_config(cfg)))
-    if earlier != config:
-        keys = sorted(key for key in earlier | config if earlier.get(key) != config.get(key))
+        changes = differences(json.loads(path.read_text()), training_config(cfg))
+    if changes:
         raise FolderError(
-            f"{folder} has the training of another configuration, which differs in"
-            f" {', '.join(keys)}. Set job.folder to another folder, or these keys back"
+            f"{folder} has the training of another configuration: {changes}. Set job.folder to"
+            " another folder, or these keys back"
         )
 
 
