@@ -66,7 +66,6 @@ _assisting = False  # whether this rank has begun with its part of a job
 
 def run(args: list[str]) -> int:
     """Run a command line and return its exit status."""
-    errors = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
     global _assisting
     _checked.clear()
     _results.clear()
@@ -87,10 +86,11 @@ def run(args: list[str]) -> int:
     except (Exception, SystemExit) as error:
         if os.environ.get("MJSTACK_DEBUG"):
             traceback.print_exception(error)
-        problem = describe_error(error, "MJSTACK_DEBUG=1 shows the traceback")
+        problem = describe_error(error)
         who = f"rank {os.environ['RANK']}: " if int(os.environ.get("RANK", 0)) else ""
         if not (isinstance(error, RankError) and error.printed):
-            errors.print(f"mjstack: {who}{problem}")
+            console = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
+            console.print(f"mjstack: {who}{problem}")
         return 1 if _results or _assisting else MjstackError.exit_code
 
 
@@ -133,30 +133,20 @@ def _run_one(hydra: Any, overrides: list[str]) -> int:
     if not is_rank():
         cfg, checked = _compose_one(overrides)
         from mjstack.distributed import launch  # they load torch
-        from mjstack.jobs import check_share, count_devices
+        from mjstack.jobs import count_devices
 
         if (count := count_devices(checked.stage.cfg)) > 1:
             _check_spreads(checked)
-            check_share(checked.stage.cfg, count)
             return launch([*overrides, *search_path_args()], count)
         return _run_checked(hydra, cfg, checked, overrides)
     from mjstack.distributed import joined
     from mjstack.jobs import check_ranks
 
     with joined() as ranks:
-        problem = ""
-        try:
-            cfg, checked = ranks.alike(lambda: _compose_one(overrides))
-            ranks.alike(lambda: _check_spreads(checked))
-            ranks.alike(lambda: check_ranks(checked.stage))
-            return _run_checked(hydra, cfg, checked, overrides)
-        except RankError:
-            raise
-        except Exception as error:
-            problem = describe_error(error, "MJSTACK_DEBUG=1 shows the traceback")
-            raise
-        finally:
-            ranks.end(problem)
+        cfg, checked = ranks.alike(lambda: _compose_one(overrides))
+        ranks.alike(lambda: _check_spreads(checked))
+        ranks.alike(lambda: check_ranks(checked.stage))
+        return _run_checked(hydra, cfg, checked, overrides)
 
 
 def _compose_one(overrides: list[str]) -> tuple[DictConfig, "CheckedJob"]:

@@ -59,10 +59,11 @@ def check_jobs(
     """
     folder = hydra_path(master, "sweep.dir")
     separate = not _launcher(master).endswith(".BasicLauncher")
+    of_hydra = cast(list, OmegaConf.to_container(master.hydra.overrides.hydra))
     placed: list[SweepJob] = []
     numbers: dict[Path, int] = {}
     for number, job in enumerate(jobs):
-        cfg = compose(job, sweep=master)
+        cfg = compose([*of_hydra, _sweep_dir(folder), *job])
         if cfg.devices is not None:
             raise ConfigError(
                 "devices",
@@ -105,26 +106,29 @@ def _launcher(master: DictConfig) -> str:
     return str(OmegaConf.select(master, "hydra.launcher._target_"))
 
 
+def _sweep_dir(folder: Path) -> str:
+    return f"hydra.sweep.dir={quoted(folder)}"
+
+
 @contextmanager
 def claim_sweep(master: DictConfig, jobs: Sequence["SweepJob"]) -> Iterator[Path]:
     """A sweep's folder, with the list of its jobs: a new one by the hour, or one in which the same
-    command goes on.
+    command goes on, with a queue also beside others.
     """
     from mjstack.jobs.sweep import Queueing
-    from mjstack.jobs.sweep_folder import add_jobs, shared_sweep
+    from mjstack.jobs.sweep_folder import SWEEP, add_jobs
 
     folder = hydra_path(master, "sweep.dir")
     queued = _launcher(master).endswith(".GpuLauncher")
     if queued:
         Queueing.of(master.hydra.launcher).slots()
-    named = OmegaConf.to_container(master.hydra.sweep, resolve=False)
-    if "${now:" in str(cast(dict, named)["dir"]):
-        claim = claim_folder(folder, numbered=True, key="hydra.sweep.dir")
-    else:
-        claim = shared_sweep(folder, jobs, alone=not queued)
-    with claim as claimed:
+    named = cast(dict, OmegaConf.to_container(master.hydra.sweep, resolve=False))
+    by_hour = "${now:" in str(named["dir"])
+    marker = "" if by_hour else SWEEP
+    key = "hydra.sweep.dir"
+    with claim_folder(folder, marker=marker, numbered=by_hour, shared=queued, key=key) as claimed:
         master.hydra.sweep.dir = str(claimed)
-        master.hydra.overrides.hydra.append(f"hydra.sweep.dir={quoted(claimed)}")  # of its jobs
+        master.hydra.overrides.hydra.append(_sweep_dir(claimed))  # of its jobs
         add_jobs(
             claimed,
             [replace(job, folder=claimed / os.path.relpath(job.folder, folder)) for job in jobs],

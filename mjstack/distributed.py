@@ -21,13 +21,12 @@ from torch import Tensor
 
 from mjstack.errors import MjstackError, RankError, describe_error, first_line
 from mjstack.interrupt import EXIT_CODE, interrupted, withdraw_interrupt
-from mjstack.process import is_rank, own_command
+from mjstack.process import available_cores, own_command
 
 T = TypeVar("T")
 _JOIN = timedelta(minutes=5)  # until all ranks must have joined
 _WORK = timedelta(days=30)  # a rank may wait for another one's whole gate
 _GRACE = 10.0  # s, in which a rank that has gone leaves its reason
-_KEY = "mjstack"
 _KILLED = " was killed"
 
 
@@ -98,9 +97,9 @@ class Ranks:
             dist.all_gather_object(values, value)
         except RuntimeError as error:
             until = time.monotonic() + _GRACE
-            while not (lost := self.lost()) and time.monotonic() < until:
+            while not self._losses() and time.monotonic() < until:
                 time.sleep(0.1)
-            raise self._gone(lost, error) from error
+            raise self._gone(error) from error
         return values
 
     def alike(self, work: Callable[[], T]) -> T:
@@ -132,7 +131,7 @@ class Ranks:
             result = work()
         except (Exception, SystemExit) as error:
             failure = error
-            text = describe_error(error, "MJSTACK_DEBUG=1 shows the traceback")
+            text = describe_error(error)
         problems, results = zip(*self.gather((text, result)), strict=True)
         failed = [rank for rank, problem in enumerate(problems) if problem is not None]
         if not failed:
@@ -147,48 +146,40 @@ class Ranks:
         has gone, as a user does.
         """
         stopped = interrupted() or isinstance(error, KeyboardInterrupt)
-        if not stopped or not (lost := self.lost()):
+        if not stopped or not self._losses():
             return error
         withdraw_interrupt()
-        return self._gone(lost, error)
+        return self._gone(error)
 
-    def end(self, problem: str = "") -> None:
-        """Leave word for the other ranks of how this one ended."""
-        with suppress(Exception):  # the rank that has the store may be gone
-            _store.set(f"{_KEY}/ended/{self.rank}", problem)
-
-    def lost(self) -> str:
-        """Why another rank has gone before its work was done; empty if none is known to be."""
-        return next(filter(None, map(self._loss_of, range(self.size))), "")
-
-    def _loss_of(self, rank: int) -> str:
-        """Why a rank has gone before its work was done; empty if it is not known to be."""
-        place = f"{_KEY}/place/{rank}"
-        ended = f"{_KEY}/ended/{rank}"
-        with suppress(Exception):  # there is no store, or the rank that has it may be gone
-            if rank != self.rank and _store.check([place]):
+    def _losses(self) -> dict[int, str]:
+        """Why other ranks have gone before their work was done, by rank, as far as it is known."""
+        losses = {}
+        for rank in range(self.size):
+            place = f"place/{rank}"
+            ended = f"ended/{rank}"
+            with suppress(Exception):  # there is no store, or the rank that has it may be gone
+                if rank == self.rank or not _store.check([place]):
+                    continue
                 host, pid = _store.get(place).decode().split()
                 # A rank that concludes says so before its process ends.
                 dead = host == socket.gethostname() and not _alive(int(pid))
                 who = f"rank {rank} of {self.size} ({host}"
                 if not _store.check([ended]):
-                    return f"{who}, process {pid}){_KILLED}" if dead else ""
-                if problem := _store.get(ended).decode():
-                    return f"{who}) failed: {problem}"
-        return ""
+                    if dead:
+                        losses[rank] = f"{who}, process {pid}){_KILLED}"
+                elif problem := _store.get(ended).decode():
+                    losses[rank] = f"{who}) failed: {problem}"
+        return losses
 
-    def _gone(self, lost: str, error: BaseException) -> RankError:
-        """The error of a rank that has gone: the lowest one that was not killed prints it.
-
-        Args:
-            lost: Why it has gone; empty if that is not known.
-            error: The error in which this rank has seen it.
+    def _gone(self, error: BaseException) -> RankError:
+        """The error of a rank that has gone, which another error has shown: the lowest one that was
+        not killed prints it.
         """
-        lower = map(self._loss_of, range(self.rank))
-        printed = bool(lost) and not all(loss.endswith(_KILLED) for loss in lower)
-        return RankError(
-            lost or f"another rank has gone ({first_line(error)})", printed=printed, gone=True
-        )
+        losses = self._losses()
+        lower = [losses.get(rank, "") for rank in range(self.rank)]
+        printed = bool(losses) and not all(loss.endswith(_KILLED) for loss in lower)
+        unknown = f"another rank has gone ({first_line(error)})"
+        return RankError(next(iter(losses.values()), unknown), printed=printed, gone=True)
 
 
 _current = Ranks()
@@ -210,25 +201,23 @@ def _alive(pid: int) -> bool:
 
 @contextmanager
 def joined() -> Iterator[Ranks]:
-    """Join the processes of the job inside, if torchrun has started several.
+    """Join the processes of the job that torchrun has started.
 
     Raises:
         MjstackError: Not all of them came, or the port is in use.
     """
     global _current, _store
-    if not is_rank():
-        yield _current
-        return
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if count:
         torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", 0)) % count)
     nccl = count > 0 and dist.is_nccl_available()
     try:
-        _store, rank, size = next(iter(dist.rendezvous("env://", timeout=_JOIN)))
-        _store.set(f"{_KEY}/place/{rank}", f"{socket.gethostname()} {os.getpid()}")
+        store, rank, size = next(iter(dist.rendezvous("env://", timeout=_JOIN)))
+        _store = dist.PrefixStore("mjstack", store)
+        _store.set(f"place/{rank}", f"{socket.gethostname()} {os.getpid()}")
         dist.init_process_group(
             "cpu:gloo,cuda:nccl" if nccl else "gloo",
-            store=dist.PrefixStore("group", _store),
+            store=dist.PrefixStore("group", store),
             rank=rank,
             world_size=size,
             timeout=_WORK,
@@ -236,10 +225,18 @@ def joined() -> Iterator[Ranks]:
     except (RuntimeError, ValueError) as error:  # torch's errors of the network are such
         raise _join_error(error) from error
     _current = Ranks(rank, size)
+    problem = ""  # of this rank, for the others
     try:
         yield _current
+    except RankError:
+        raise
+    except Exception as error:
+        problem = describe_error(error)
+        raise
     finally:
         _current = Ranks()
+        with suppress(Exception):  # the rank that has the store may be gone
+            _store.set(f"ended/{rank}", problem)
         with suppress(RuntimeError):
             dist.destroy_process_group()
 
@@ -271,8 +268,7 @@ def launch(args: Sequence[str], count: int) -> int:
     from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
     logging.disable(logging.CRITICAL)  # ranks say themselves what is wrong
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
-    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, cores // count)))
+    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, available_cores() // count)))
     config = LaunchConfig(
         min_nodes=1,
         max_nodes=1,

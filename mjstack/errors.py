@@ -166,7 +166,9 @@ class MissingExtra(MjstackError):
         )
 
 
-def describe_error(error: BaseException, traceback_at: str) -> str:
+def describe_error(
+    error: BaseException, traceback_at: str = "MJSTACK_DEBUG=1 shows the traceback"
+) -> str:
     """An error in one line: kind, text, the line of the user's own code, where the traceback is."""
     if isinstance(error, MjstackError):
         return " ".join(str(error).splitlines())  # a value in it may have several

@@ -89,6 +89,7 @@ def claim_folder(
     marker: str = "",
     *,
     numbered: bool = False,
+    shared: bool = False,
     key: str = _KEY,
 ) -> Iterator[Path]:
     """Make a run's folder, and keep other runs out of it until the block ends. If that fails before
@@ -99,6 +100,7 @@ def claim_folder(
         job: As of `check_unused`.
         marker: As of `check_unused`.
         numbered: Where the folder is there, make another: its name and ``-2``, ``-3``, ...
+        shared: Let in other runs that share it.
         key: As of `check_unused`.
 
     Yields:
@@ -121,7 +123,7 @@ def claim_folder(
                 if not numbered:
                     raise
             folder = folder.with_name(f"{name}-{number}")
-        handle = lock_folder(folder)
+        handle = lock_folder(folder, shared=shared)
         before = {*folder.iterdir()}
         check_unused(folder, job, marker, key)
         yield folder
@@ -189,17 +191,26 @@ def lock_folder(folder: Path, *, shared: bool = False) -> int:
         OSError: The folder cannot be opened.
     """
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        fcntl.flock(handle, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
-    except BlockingIOError as error:
+    if not lock(handle, shared=shared):
         os.close(handle)
         raise FolderError(
             f"{folder} is open in another writer, expected one at a time. Wait, or give another"
             " folder"
-        ) from error
-    except OSError:
-        pass  # a file system without locks
+        )
     return handle
+
+
+def lock(handle: int, *, shared: bool = False) -> bool:
+    """Lock an open file or folder until it is closed, and return whether that could be done. A file
+    system without locks lets it.
+    """
+    try:
+        fcntl.flock(handle, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        pass
+    return True
 
 
 def to_csv(rows: Sequence[Mapping[str, object]], columns: Sequence[str] = ()) -> str:

@@ -29,6 +29,12 @@ def is_rank() -> bool:
     return int(os.environ.get("WORLD_SIZE", 1)) > 1
 
 
+def available_cores() -> int:
+    """Cores that this process may use: under torchrun its share of the machine's."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return max(1, (cores or 1) // int(os.environ.get("LOCAL_WORLD_SIZE", 1)))
+
+
 def own_command(args: Sequence[str]) -> list[str]:
     """The command that runs this mjstack with some arguments, in a process of its own."""
     return [sys.executable, "-P", "-c", _START, *args]

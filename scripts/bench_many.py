@@ -19,11 +19,10 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from mjstack.files import write_atomic  # noqa: E402
+from mjstack.files import to_csv  # noqa: E402
 from mjstack.process import Child  # noqa: E402
-from mjstack.report.markdown import to_markdown  # noqa: E402
+from mjstack.report.markdown import save_tables  # noqa: E402
 from mjstack.report.picture import figure  # noqa: E402
-from mjstack.report.sections import Section  # noqa: E402
 from mjstack.report.table import Console, Table  # noqa: E402
 
 SPEEDS = {
@@ -92,43 +91,42 @@ def read(what: str, folder: Path, gpus: int, seconds: float) -> dict[str, float]
 
 def rows_of(runs: list[Run]) -> list[dict[str, Any]]:
     """A row for each measurement and figure: N GPUs over one, by neighbouring runs."""
+    keys = ("what", "worlds", "gpus", "round")
+    runs_by = {tuple(run[key] for key in keys): run for run in runs}
     rows = []
-    for what, worlds in dict.fromkeys((run["what"], run["worlds"]) for run in runs):
-        group = [run for run in runs if (run["what"], run["worlds"]) == (what, worlds)]
-        for gpus in sorted({run["gpus"] for run in group} - {1}):
-            names = dict.fromkeys(name for run in group for name in run if name in FIGURES)
-            for name in names:
-                pairs = [
-                    (single[name], several[name])
-                    for single in group
-                    for several in group
-                    if (single["gpus"], several["gpus"]) == (1, gpus)
-                    and single["round"] == several["round"]
-                    and name in single
-                    and name in several
-                ]
-                if pairs:
-                    ratios = sorted(large / small for small, large in pairs)
-                    rows.append(
-                        {
-                            "what": what,
-                            "worlds": worlds,
-                            "gpus": gpus,
-                            "figure": name,
-                            "one": statistics.median(small for small, _ in pairs),
-                            "many": statistics.median(large for _, large in pairs),
-                            "ratio": statistics.median(ratios),
-                            "range": f"{ratios[0]:.3f} to {ratios[-1]:.3f}",
-                            "rounds": len(pairs),
-                        }
-                    )
+    for what, worlds, gpus in sorted({key[:3] for key in runs_by if key[2] > 1}):
+        for name in FIGURES:
+            pairs = [
+                (single[name], several[name])
+                for (*kind, number), several in runs_by.items()
+                if kind == [what, worlds, gpus]
+                and (single := runs_by.get((what, worlds, 1, number)))
+                and name in single.keys() & several.keys()
+            ]
+            if not pairs:
+                continue
+            ratios = sorted(large / small for small, large in pairs)
+            rows.append(
+                {
+                    "what": what,
+                    "worlds": worlds,
+                    "gpus": gpus,
+                    "figure": name,
+                    "one": statistics.median(small for small, _ in pairs),
+                    "many": statistics.median(large for _, large in pairs),
+                    "ratio": statistics.median(ratios),
+                    "range": f"{ratios[0]:.3f} to {ratios[-1]:.3f}",
+                    "rounds": len(pairs),
+                }
+            )
     return rows
 
 
 def write(folder: Path, runs: list[Run]) -> None:
-    """Write many.md and many.png of all runs, and print the table."""
+    """Write many.md, many.csv and many.png of all runs, and print the table."""
+    title = "N GPUs over one"
     rows = rows_of(runs)
-    shown = [
+    texts = [
         row
         | {"one": f"{row['one']:,.0f}", "many": f"{row['many']:,.0f}"}
         | {"ratio": f"{row['ratio']:.3f}", "worlds": f"{row['worlds']:,}"}
@@ -136,23 +134,20 @@ def write(folder: Path, runs: list[Run]) -> None:
     ]
     columns = {"measurement": "what", "worlds": "worlds", "figure": "figure", "GPUs": "gpus"}
     columns |= {"one GPU": "one", "all": "many", "ratio": "ratio", "smallest to largest": "range"}
-    table = Table.of(columns | {"rounds": "rounds"}, shown, "N GPUs over one")
+    table = Table.of(columns | {"rounds": "rounds"}, texts, title)
     Console(soft_wrap=True).print(table.to_console())
-    pictures = []
-    if rows:
+
+    def draw(path: Path) -> None:
         names = [f"{r['what']} {r['worlds']:,}, {r['figure']}, {r['gpus']} GPUs" for r in rows]
-        size = (9, 1.2 + 0.3 * len(rows))
-        with figure(folder / "many.png", "N GPUs over one", 1, figsize=size) as (_, axes):
-            axes = axes[0] if hasattr(axes, "__len__") else axes
+        with figure(path, title, figsize=(9, 1.2 + 0.3 * len(rows))) as (_, axes):
             axes.barh(range(len(rows)), [row["ratio"] / row["gpus"] for row in rows])
             axes.set_yticks(range(len(rows)), names)
             axes.invert_yaxis()
             axes.axvline(1.0, color="0.3", linewidth=1.0)
             axes.set(xlabel="ratio over the number of GPUs (1: perfect)")
             axes.grid(alpha=0.3, axis="x")
-        pictures = [folder / "many.png"]
-    section = Section(title="N GPUs over one", parts=[table, *pictures], level=1)
-    write_atomic(folder / "many.md", to_markdown([section]))
+
+    save_tables(folder / "many", title, table, [], to_csv(rows), draw if rows else None)
 
 
 def main() -> None:

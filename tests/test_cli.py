@@ -89,6 +89,12 @@ observation.policy.terms.joint_pos.history=0
 reset=randomized reset.cubes.params.xy=[0.0,0.001] reset.cubes.params.gap=0.5
 -m robot=glob(*)
 -m nworld=range(4,1)
+-m experiment=scaling sim=native nworld=1,2 view=true
+-m experiment=scaling sim=native nworld=1,2 gate.throughput.measurements=[physic]
+-m experiment=scaling sim=native nworld=1,2 hydra.launcher.minutes=0
+-m experiment=scaling sim=native nworld=1,2 hydra.launcher.retry=perhaps
+-m experiment=scaling sim=native nworld=1,2 hydra.sweep.dir=afile/below
+-m experiment=scaling sim=mjwarp sim.device=cuda:77 nworld=1,2
 """
 FLAGS = ["--cfg nope", "-c", "--package", "--info x", "--version=1", "-m --cfg job", "-cn foo"]
 

@@ -64,7 +64,6 @@ with joined() as ranks:
     except RankError as error:
         assert "rank 1 of 2: ValueError: no" in str(error), error
         print("rank", ranks.rank, "silent" if error.printed else "prints")
-    ranks.end()
 """
 
 TRAP = """\

@@ -252,6 +252,7 @@ TRAINING = {"resumes": "train 12", "marker": "runs", "folder": Path("elsewhere")
         (COLLECT, ["job=reachability", RUN_DIR], TRAINING),
         ({"report.json": '{"resumes": "train 34"}'}, ["job=reachability", RUN_DIR], TRAINING),
         ({"notes.txt": "mine"}, [RUN_DIR], {}),
+        ({"notes.txt": "mine"}, ["-m", "seed=1,2", "hydra.sweep.dir=given"], {}),
         ({"report.json": '{"resumes": ""}'}, ["job=collect"], COLLECTING),
     ],
 )

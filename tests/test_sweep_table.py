@@ -254,34 +254,6 @@ def test_jobs_of_the_experiment() -> None:
     assert not mjwarp.gate.throughput.native_baseline
 
 
-BAD = [
-    ["nworld=0,1"],
-    ["nworld=many"],
-    ["nworlds=2"],
-    ["view=true"],
-    ["gate.throughput.measurements=[physic]"],
-    ["hydra.launcher.minutes=0", "nworld=1,2"],
-    ["hydra.launcher.retry=perhaps", "nworld=1,2"],
-    ["sim=mjwarp", "sim.device=cuda:77"],
-    ["hydra.sweep.dir=afile/below", "nworld=1,2"],
-    ["hydra.sweeper.params.seed=3"],
-]
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("args", BAD, ids=[" ".join(args) for args in BAD])
-def test_bad_input_is_one_line_and_writes_nothing(
-    args: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    Path("afile").write_text("")
-    assert run([*TINY, *args]) == 2
-    out, err = capsys.readouterr()
-    assert "Traceback" not in out + err
-    assert err.startswith("mjstack: ")
-    assert len(err.strip().splitlines()) == 1
-    assert [path.name for path in Path().rglob("*")] == ["afile"]
-
-
 PLOT = Plot(
     title="T",
     over="nworld",

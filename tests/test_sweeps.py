@@ -15,7 +15,7 @@ from test_ranks import SHORT, report_of, start
 from mjstack import process
 from mjstack.errors import ConfigError, FolderError
 from mjstack.jobs.sweep import Queueing, run_jobs
-from mjstack.jobs.sweep_folder import LOG, SWEEP, SweepJob, lock_file, shared_sweep
+from mjstack.jobs.sweep_folder import LOG, SWEEP, SweepJob, lock_file
 from mjstack.report.record import GateResult, Report, Status
 from mjstack.report.write import read_report, write_report
 
@@ -71,8 +71,6 @@ def test_a_queue(stub: Path, capsys: pytest.CaptureFixture[str]) -> None:
     refusal = "has another sweep, whose job 1 is seed=2"
     with pytest.raises(FolderError, match=refusal):
         run_jobs(stub, other)
-    with pytest.raises(FolderError, match=refusal), shared_sweep(stub, other):
-        pass
 
 
 def test_the_reason_is_not_an_earlier_processs(stub: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -135,8 +133,7 @@ def test_a_sweeper_brings_jobs_in_batches(stub: Path) -> None:
     ]
     for job in sweep:
         assert [report.status for report in run_jobs(stub, [job])] == ["pass"]
-    with shared_sweep(stub):
-        assert json.loads((stub / SWEEP).read_text())["1"] == ["so101/1", ["seed=4"]]
+    assert json.loads((stub / SWEEP).read_text())["1"] == ["so101/1", ["seed=4"]]
 
 
 @pytest.mark.parametrize("count", [0, -1, "x", 1.5])
@@ -196,12 +193,6 @@ def test_the_locks_of_gpus_are_the_users_own(
     (tmp_path / f"mjstack-gpus-{user + 1}").mkdir()
     with pytest.raises(FolderError, match="is another user's"):
         Queueing().slots()
-
-
-def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").touch()
-    with pytest.raises(FolderError, match=r"has notes\.txt"), shared_sweep(tmp_path):
-        pass
 
 
 @pytest.mark.full

@@ -144,22 +144,17 @@ def _policy_choices(overrides: Sequence[str]) -> list[str]:
     ]
 
 
-def compose(
-    overrides: Sequence[str], run_mode: RunMode = RunMode.RUN, sweep: DictConfig | None = None
-) -> DictConfig:
-    """Compose in a `hydra_session` without validating values, as a job of a sweep if there is one;
-    Hydra's part is in it, and errors are one line each.
+def compose(overrides: Sequence[str], run_mode: RunMode = RunMode.RUN) -> DictConfig:
+    """Compose in a `hydra_session` without validating values; Hydra's part is in it, and errors are
+    one line each.
     """
-    loader = GlobalHydra.instance().config_loader()
     if run_mode is RunMode.RUN:
         check_overrides(overrides)
+    loader = GlobalHydra.instance().config_loader()
     try:
-        if sweep is None:
-            cfg = loader.load_configuration(
-                config_name=CONFIG_NAME, overrides=list(overrides), run_mode=run_mode
-            )
-        else:
-            cfg = loader.load_sweep_config(sweep, list(overrides))
+        cfg = loader.load_configuration(
+            config_name=CONFIG_NAME, overrides=list(overrides), run_mode=run_mode
+        )
         if run_mode is RunMode.RUN:
             check_added(without_hydra(cfg), overrides)
             _drop_inherited(cfg, overrides)

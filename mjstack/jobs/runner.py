@@ -22,24 +22,22 @@ from mjstack.config.schema import Backend, Config
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Progress, Stage
 from mjstack.errors import ConfigError, MjstackError
-from mjstack.files import write_atomic
 from mjstack.gates.runner import log_error
 from mjstack.interrupt import check_interrupt, interrupted
 from mjstack.jobs.progress import STATUS_COLOR, ProgressBar
 from mjstack.jobs.showing import draw_episode, find_viewers, save_page, serve_live_view
 from mjstack.mdp.starts.placement import SCHEMA
+from mjstack.process import available_cores
 from mjstack.report.formats import FORMATS, write_formats
-from mjstack.report.markdown import to_markdown
+from mjstack.report.markdown import save_tables
 from mjstack.report.page import Page
 from mjstack.report.provenance import collect_provenance
 from mjstack.report.record import GateResult, Provenance, Report, Status
-from mjstack.report.sections import Part, Section, summarize
+from mjstack.report.sections import summarize
 from mjstack.report.table import Console, Table
 from mjstack.report.web import EPISODE, lacks_viser
-from mjstack.report.write import safely_write
 from mjstack.sim import resolve_backend
 from mjstack.sim.build import cuda_driver, cuda_uuid
-from mjstack.sim.native import available_cores
 
 log = logging.getLogger(__name__)
 
@@ -203,24 +201,25 @@ def count_devices(cfg: Config) -> int:
     """How many ranks ``devices`` asks for; one if it is null.
 
     Raises:
-        ConfigError: There are not as many GPUs, or cores where there is no GPU.
+        ConfigError: There are not as many GPUs, or cores where there is no GPU, or fewer worlds.
     """
     if cfg.devices is None:
         return 1
     backend, device = resolve_backend(cfg)
     on_cuda = device.startswith("cuda")
     there = torch.cuda.device_count() if on_cuda else available_cores()
-    if cfg.devices == "all":
-        return there if on_cuda else 1  # one process uses all cores
-    if int(cfg.devices) > there:
+    all_of_them = there if on_cuda else 1  # one process uses all cores
+    count = all_of_them if cfg.devices == "all" else int(cfg.devices)
+    if count > there:
         kind = "CUDA device" if on_cuda else "core"
         have = f"{there} {kind}{'s' * (there != 1)}"
         expected = f"at most {there}, as this machine has {have} for sim={backend}"
         raise ConfigError("devices", cfg.devices, expected)
-    return int(cfg.devices)
+    _check_share(cfg, count)
+    return count
 
 
-def check_share(cfg: Config, size: int) -> None:
+def _check_share(cfg: Config, size: int) -> None:
     """Raise a `ConfigError` if there are fewer worlds than ranks."""
     if cfg.nworld < size:
         expected = f"at least {size}, a world for each rank"
@@ -260,7 +259,7 @@ def check_ranks(stage: Stage) -> None:
                 f"ranks {holder} and {rank} ({place}) have one GPU, {unit}, expected one each",
                 "Start as many ranks as there are GPUs, with sim.device=auto",
             )
-    check_share(cfg, ranks.size)
+    _check_share(cfg, ranks.size)
 
 
 def check_job(cfg: Config, overrides: Sequence[str] = ()) -> CheckedJob:
@@ -293,23 +292,18 @@ def write_tables(
     csv: str,
     draw: Callable[[Path], object] | None = None,
 ) -> None:
-    """Replace ``name.csv``, ``name.md`` and, where ``draw`` is given, ``name.png`` of a run. A
-    picture that fails is a printed line.
+    """Replace ``name.csv``, ``name.md`` and, where ``draw`` is given, ``name.png`` of a run, and
+    show the table on its page. A picture that fails is a printed line.
 
     Raises:
         OSError: A file cannot be written.
     """
-    folder = cast(Path, run.folder)
-    picture = folder / f"{name}.png"
-    if draw is not None:
-        if problem := safely_write(picture, draw):
-            run.print_line(problem)
-        else:
-            run.page.pictures.append(picture.name)
+    path = cast(Path, run.folder) / name
+    if problem := save_tables(path, title, table, notes, csv, draw):
+        run.print_line(problem)
+    elif draw is not None:
+        run.page.pictures.append(f"{name}.png")
     run.page.tables.append(replace(table, title=table.title or title))
-    write_atomic(folder / f"{name}.csv", csv)
-    parts: list[Part] = [table, *([picture] if picture.exists() else []), list(notes)]
-    write_atomic(folder / f"{name}.md", to_markdown([Section(title=title, parts=parts, level=1)]))
 
 
 def run_provenance(stage: Stage) -> Provenance:

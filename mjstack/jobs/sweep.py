@@ -6,10 +6,10 @@ import stat
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import Any, cast
 
 import torch
 
@@ -85,20 +85,13 @@ class Queueing:
 class _Running:
     job: SweepJob
     child: Child
-    log: IO[bytes]
     logged: int  # bytes of earlier processes
-    gpu: IO[bytes] | None
+    locks: ExitStack  # of the job, and of its GPU
     late: bool = False
-
-    def close(self) -> None:
-        """Give the locks of the job and of its GPU back."""
-        self.log.close()
-        if self.gpu is not None:
-            self.gpu.close()
 
     def conclude(self, code: int) -> Report:
         """Give the locks back, and return the report of a process that has ended."""
-        self.close()
+        self.locks.close()
         job = self.job
         if (report := job.result()) is not None:
             return report
@@ -156,7 +149,7 @@ def run_jobs(
     finally:
         stop_all([running.child for running in queue.running.values()])
         for running in queue.running.values():
-            running.close()
+            running.locks.close()
     return [queue.reports[job.number] for job in jobs]
 
 
@@ -214,27 +207,31 @@ class _Queue:
 
     def _start(self, job: SweepJob, slot: Slot) -> bool:
         """Start a job, unless another command has it; return whether the slot could be had."""
-        log = lock_file(job.folder / LOG)
-        if log is None:
-            if job.number not in self._elsewhere:
-                self._elsewhere.add(job.number)
-                self._print(f"job {job.number}: another command is running it")
-            self._failed.discard(job.number)
-            return True
-        if job.number not in self._failed and job.result() is not None:  # just ended elsewhere
-            log.close()
-            return True
-        gpu = None if slot.lock is None else lock_file(slot.lock)
-        if slot.lock is not None and gpu is None:  # another sweep's
-            log.close()
-            self._slots.append(self._slots.pop(self._slots.index(slot)))
-            return False
-        earlier = job.clear(anew=job.number in self._failed)
-        key = "resume" if earlier is not None and earlier.resumes == "gates" else "hydra.run.dir"
-        args = [*job.overrides, f"{key}={quoted(job.folder)}", *search_path_args()]
-        logged = log.tell()
-        child = Child(args, log, env=slot.env, cores=slot.cores)
-        self.running[slot] = _Running(job, child, log, logged, gpu)
+        anew = job.number in self._failed
+        with ExitStack() as locks:
+            log = lock_file(job.folder / LOG)
+            if log is None:
+                if job.number not in self._elsewhere:
+                    self._elsewhere.add(job.number)
+                    self._print(f"job {job.number}: another command is running it")
+                self._failed.discard(job.number)
+                return True
+            locks.enter_context(log)
+            if not anew and job.result() is not None:  # just ended elsewhere
+                return True
+            if slot.lock is not None:
+                gpu = lock_file(slot.lock)
+                if gpu is None:  # another sweep's
+                    self._slots.append(self._slots.pop(self._slots.index(slot)))
+                    return False
+                locks.enter_context(gpu)
+            earlier = job.clear(anew=anew)
+            goes_on = earlier is not None and earlier.resumes == "gates"
+            key = "resume" if goes_on else "hydra.run.dir"
+            args = [*job.overrides, f"{key}={quoted(job.folder)}", *search_path_args()]
+            logged = log.tell()
+            child = Child(args, log, env=slot.env, cores=slot.cores)
+            self.running[slot] = _Running(job, child, logged, locks.pop_all())
         self._waiting.remove(job)
         text = " ".join(text for text in job.overrides if text not in self._common)
         self._print(f"job {job.number} on {slot.name}: {text}")

@@ -1,17 +1,16 @@
 """The folder of a sweep: its jobs, and what their runs have left in it so far."""
 
-import fcntl
 import json
 import os
 import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
 from mjstack.errors import FolderError
-from mjstack.files import lock_folder, write_atomic
+from mjstack.files import lock, write_atomic
 from mjstack.report.record import Report, Status
 from mjstack.report.write import read_report
 
@@ -53,49 +52,30 @@ class SweepJob:
         return None
 
 
-@contextmanager
-def shared_sweep(
-    folder: Path, jobs: Sequence[SweepJob] = (), *, alone: bool = False
-) -> Iterator[Path]:
-    """A sweep's folder in which one or several commands work off its jobs.
-
-    Args:
-        folder: The folder.
-        jobs: The jobs, as far as they are known.
-        alone: Whether no other command may work in it meanwhile.
-
-    Raises:
-        FolderError: It has something else, cannot be made, or another command has it.
-    """
-    names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
-    if names and SWEEP not in names:
-        raise FolderError(
-            f"{folder} has {min(names)}, expected a new or an empty folder, or one of a sweep that"
-            " this command goes on with. Set hydra.sweep.dir to another"
-        )
-    _all_jobs(folder, jobs)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        handle = lock_folder(folder, shared=not alone)
-    except OSError as error:
-        raise FolderError(f"{folder} cannot be written ({error.strerror})") from error
-    try:
-        yield folder
-    finally:
-        os.close(handle)
-
-
 def add_jobs(folder: Path, jobs: Sequence[SweepJob]) -> None:
     """Add jobs to the list of a sweep's folder. A sweeper may bring them in several batches.
 
     Raises:
         FolderError: The list has another job of one of these numbers.
     """
-    listed = json.dumps(_all_jobs(folder, jobs), indent=1) + "\n"
-    file = folder / SWEEP
-    if not file.exists() or file.read_text() != listed:
+    listed = {job.number: _entry(folder, job) for job in list_jobs(folder)}
+    before = dict(listed)
+    for job in jobs:
+        entry = _entry(folder, job)
+        if listed.setdefault(job.number, entry) != entry:
+            overrides = " ".join(listed[job.number][1])
+            raise FolderError(
+                f"{folder} has another sweep, whose job {job.number} is {overrides}, expected the"
+                f" same jobs, which are in {SWEEP}. Set hydra.sweep.dir to another folder"
+            )
+    if listed != before or not (folder / SWEEP).exists():
         folder.mkdir(parents=True, exist_ok=True)
-        write_atomic(file, listed)
+        write_atomic(folder / SWEEP, json.dumps(listed, indent=1) + "\n")
+
+
+def _entry(folder: Path, job: SweepJob) -> tuple[str, list[str]]:
+    """A job's folder and overrides in the list of a sweep's folder."""
+    return os.path.relpath(job.folder, folder), list(job.overrides)
 
 
 def list_jobs(folder: Path) -> list[SweepJob]:
@@ -114,28 +94,7 @@ def lock_file(path: Path) -> IO[bytes] | None:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     file = path.open("ab")
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        file.close()
-        return None
-    return file
-
-
-def _all_jobs(folder: Path, jobs: Sequence[SweepJob]) -> dict[str, list]:
-    """Folders and overrides of the jobs and of those in the sweep's list, by their numbers."""
-    listed, added = (
-        {
-            str(job.number): [os.path.relpath(job.folder, folder), list(job.overrides)]
-            for job in sweep
-        }
-        for sweep in (list_jobs(folder), jobs)
-    )
-    for number, job in added.items():
-        before = listed.get(number, job)
-        if before != job:
-            raise FolderError(
-                f"{folder} has another sweep, whose job {number} is {' '.join(before[1])}, expected"
-                f" the same jobs, which are in {SWEEP}. Set hydra.sweep.dir to another folder"
-            )
-    return listed | added
+    if lock(file.fileno()):
+        return file
+    file.close()
+    return None

@@ -12,16 +12,13 @@ from omegaconf import DictConfig, OmegaConf
 from mjstack.config.explain import parse
 from mjstack.config.schema import SweepCfg
 from mjstack.errors import is_out_of_memory
-from mjstack.files import to_csv, write_atomic
+from mjstack.files import to_csv
 from mjstack.jobs.sweep_folder import LOG, list_jobs
-from mjstack.report.markdown import to_markdown
+from mjstack.report.markdown import save_tables
 from mjstack.report.record import Report, Status
-from mjstack.report.sections import Part, Section
 from mjstack.report.sweep_picture import Plot, Row, describe_crossover, save_sweep
 from mjstack.report.table import Table
-from mjstack.report.write import safely_write
 
-_NAME = "summary"
 _HEADLINES = ("succeeded", "success_rate", "world_steps_per_s")
 _RATE = "_per_s.median"
 _TAIL = 4096  # characters of a log, in which the system or Warp says that memory ran out
@@ -72,17 +69,14 @@ def write_summary(
         lines=[key for key in swept if key != over] if over in swept else [],
         panels=sweep.panels or {name: {"": name} for name in _headlines(rows)[:_PANELS]},
     )
-    picture = folder / f"{_NAME}.png"
     drawable = draw and any(row["status"] != _NOT_RUN for row in rows) and plot.shows(rows)
-    save = partial(save_sweep, plot=plot, rows=rows)
-    problem = safely_write(picture, save, stops=False) if drawable else ""
+    save = partial(save_sweep, plot=plot, rows=rows) if drawable else None
     notes = [*filter(None, [describe_crossover(plot, rows)]), *sweep.notes]
     for key, name in (("backend", "hardware"), ("git_commit", "commit")):
         values = sorted({str(row[key]) for row in rows if row.get(key)})
         notes += [f"{name}: {value}" for value in values]
-    write_atomic(folder / f"{_NAME}.csv", to_csv(rows))
-    parts: list[Part] = [table, *([picture] if picture.exists() else []), notes]
-    write_atomic(folder / f"{_NAME}.md", to_markdown([Section(title=title, parts=parts, level=1)]))
+    csv = to_csv(rows)
+    problem = save_tables(folder / "summary", title, table, notes, csv, save, stops=False)
     return replace(table, title=title), problem
 
 
@@ -93,12 +87,10 @@ def sweep_rows(folder: Path, reports: Mapping[int, Report]) -> list[Row]:
     run), ``reason``, ``seconds`` of its gates, ``git_commit``, and of its gates each result in
     words, every metric and every note by name.
     """
-    listed = {job.number: job for job in list_jobs(folder)}
     rows = []
-    for number in sorted(listed.keys() | reports.keys()):
-        report = reports.get(number) or listed[number].report()
-        overrides = report.overrides if report is not None else listed[number].overrides
-        row: Row = {"job": number} | _values(overrides)
+    for job in list_jobs(folder):
+        report = reports.get(job.number) or job.report()
+        row: Row = {"job": job.number} | _values(job.overrides)
         if report is None:
             rows.append(row | {"status": _NOT_RUN, "reason": ""})
             continue

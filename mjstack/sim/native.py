@@ -1,7 +1,6 @@
 """Native MuJoCo over many worlds: one state row per world, stepped by MuJoCo's own threads."""
 
 import copy
-import os
 import platform
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -14,6 +13,7 @@ from typing_extensions import override
 from mjstack.config.schema import CameraCfg
 from mjstack.errors import MjstackError, first_line
 from mjstack.interrupt import check_interrupt
+from mjstack.process import available_cores
 from mjstack.sim.cameras import Cameras
 from mjstack.sim.model_fields import Fields, SimpleBodies, check_fields
 from mjstack.sim.native_cameras import NativeCameras
@@ -39,12 +39,6 @@ _POSES_ONLY = int(
     | mujoco.mjtDisableBit.mjDSBL_SENSOR
 )
 _STEPS = 4096  # of a thread in one call of MuJoCo's, which no interrupt ends: some 0.2 s
-
-
-def available_cores() -> int:
-    """Cores that this process may use: under torchrun its share of the machine's."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return max(1, (cores or 1) // int(os.environ.get("LOCAL_WORLD_SIZE", 1)))
 
 
 class NativeSimulation(Simulation):

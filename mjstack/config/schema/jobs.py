@@ -160,8 +160,7 @@ class PpoJobCfg(TrainJobCfg):
     """Observation groups that the critic sees besides the policy's."""
     start_from: str | None = spec(None)
     """Folder of a policy that training starts from, with its observation and its actions; null: a
-    random network.
-    """
+    random network."""
     iterations: int | None = spec(None, ge=1)
     """Iterations of the training, over all calls; null: as ``minutes`` says."""
     minutes: float | None = spec(None, unit="min", gt=0.0)

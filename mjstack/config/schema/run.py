@@ -25,8 +25,7 @@ class TimingCfg:
     """Physics steps of one control step."""
     policy_decimation: int = spec(1, unit="control steps", ge=1, le=1000)
     """Control steps in which an action of a policy is repeated, in training. A driver decides in
-    every control step; a policy that was trained so repeats its answers by itself.
-    """
+    every control step; a policy that was trained so repeats its answers by itself."""
     control_hz: float = spec(50.0, unit="Hz", gt=0.0, le=1e6)
     """Control rate that these make: ``task.control_hz`` of the built-in tasks."""
     command_delay: int = spec(0, unit="control steps", ge=0, le=1000)
@@ -88,8 +87,7 @@ class SimCfg:
     step: str = spec(choices=("auto", "stock"))
     """MJWarp's step. stock: ``mujoco_warp.step``; auto: its stages as parallel branches, and
     contact rows, the solver and smooth dynamics as a few kernels, where these do all that the model
-    needs.
-    """
+    needs."""
 
 
 @dataclass(slots=True)
@@ -139,8 +137,7 @@ class ParityCfg(GateFuncCfg):
     states: dict[str, str] = spec()
     """States from which both step: a name, and the phase at whose end the state is taken. Empty:
     the first phase, the one after the first grasp (without grasps, the last with a closed gripper),
-    and the last. A driver without phases has those after each third of its episode instead.
-    """
+    and the last. A driver without phases has those after each third of its episode instead."""
     step1: dict[str, float] = spec(unit="SI", ge=0.0)
     """Largest difference of each field after one physics step."""
     step50: dict[str, float] = spec(unit="SI", ge=0.0)
@@ -220,8 +217,7 @@ class ThroughputCfg(GateFuncCfg):
     """Time budget of each measurement on a CPU."""
     from_phase: str = spec()
     """Phase at whose start physics begins; it holds the joint target from there. Empty: the one
-    after the first grasp, or without grasps after the last phase with a closed gripper.
-    """
+    after the first grasp, or without grasps after the last phase with a closed gripper."""
     start_worlds: int = spec(unit="worlds", ge=1)
     """Worlds that are played to that phase where the batch gate has not; the others are copies."""
     native_baseline: bool = spec()

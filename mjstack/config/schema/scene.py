@@ -39,8 +39,7 @@ class BoxCfg:
     """Sliding, torsional and rolling coefficient."""
     floor_solref: list[float] = spec(length=2)
     """Contact parameters of the floor: time constant [s] and damping ratio, or, negative,
-    stiffness and damping.
-    """
+    stiffness and damping."""
     wall_solref: list[float] = spec(length=2)
     """Contact parameters of the walls."""
 

@@ -72,8 +72,7 @@ class TaskCfg:
     """Numbers that several terms of the task share, as ``${task.params.NAME}``."""
     check: dict[str, Any] | None = None
     """Judges an episode: ``func`` names a subclass of ``EpisodeCheck``, the other keys are its
-    thresholds; null: the task can be trained, not verified.
-    """
+    thresholds; null: the task can be trained, not verified."""
     success: TermCfg | None = None
     """Term that tells when the task is achieved; null: it never is."""
 
@@ -87,16 +86,14 @@ class PhaseCfg:
     level: str = spec("center", choices=("center", "table", "on_top"))
     """Height of the target: center (of the anchor as it stands; a place is on the table), table
     (its surface at the anchor), or on_top (centre of the object grasped last, standing on the
-    anchor).
-    """
+    anchor)."""
     offset: list[float] = spec(factory=lambda: [0.0, 0.0, 0.0], unit="m", length=3)
     """Added to the target in x, y and z."""
     h_scale: float = 0.0
     """How many ``robot.approach_height`` higher the target is."""
     toward: str | None = None
     """Object or place at which the offset's x axis points, as seen from the anchor; null: world
-    axes.
-    """
+    axes."""
     in_hand: bool = False
     """Whether ``scene.grasp_offset`` is added to the height."""
     gripper: str = spec(choices=("open", "closed"))
@@ -129,14 +126,12 @@ class ControllerCfg:
     """Iterations per solution of a plan."""
     step_iterations: int = spec(ge=1, le=1000)
     """Iterations of batched inverse kinematics per control step of closed_loop and
-    state_based.
-    """
+    state_based."""
     posture_gain: float = spec(ge=0.0, le=1.0)
     """How strongly redundant joints follow the nominal plan per iteration."""
     approach_gain: float = spec(ge=0.0, le=1.0)
     """How strongly the gripper takes the approach tilt that the release needs per
-    iteration.
-    """
+    iteration."""
     yaw_alignment: float = spec(ge=0.0, le=1.0)
     """Share of the turn of the jaws to an object's nearest face."""
     speed_limit: float = spec(ge=1.0, le=100.0)
