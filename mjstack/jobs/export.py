@@ -13,7 +13,6 @@ import mjstack
 from mjstack.config.schema import Backend, Config
 from mjstack.envs import build_env, driven_config
 from mjstack.episodes.rollout import POLICY as DRIVER
-from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
 from mjstack.errors import FolderError
 from mjstack.files import write_atomic
@@ -43,11 +42,13 @@ def check_export(cfg: Config) -> CheckedJob:
             "Play it with controller=policy",
         )
     title = f"task {cfg.task.name}, policy {stage.assets.policy.folder}"
-    return CheckedJob(stage=stage, title=title, work=_export)
-
-
-def _export(run: Run, folder: Path) -> None:
-    run_guarded(run, NAME, lambda run: export_policy(run.stage, folder))
+    return CheckedJob(
+        stage=stage,
+        title=title,
+        work=lambda run, folder: run_guarded(
+            run, NAME, lambda run: export_policy(run.stage, folder)
+        ),
+    )
 
 
 def export_policy(stage: Stage, folder: Path) -> list[GateResult]:

@@ -105,11 +105,8 @@ def _replay(
     failed = status is Status.failed
     agrees, comparison = _compare(plan, number, episode, qpos[-1], changes, run)
     label = f"{plan.world}, {backend}"
-    step_dt = run.cfg.timing.step_dt
-    run.page.show_world(f"replay_{backend}", label, qpos, step_dt, failed=failed)
-    if first:
-        title = f"world {plan.world} of seed {plan.seed}, replayed ({backend})"
-        run.artifacts.pictured = (title, qpos)
+    title = f"world {plan.world} of seed {plan.seed}, replayed ({backend})" if first else ""
+    run.show_world(f"replay_{backend}", label, qpos, failed=failed, title=title)
     lines += [_first_sign(monitor, episode) for monitor in monitors]
     for line in lines:
         run.print_line(f"  {line}")
@@ -163,14 +160,12 @@ def _compare(
     if same and exact:
         return True, "as recorded, and it ends bit for bit where it did"
 
-    # Why it need not end bit for bit where it did
-    reasons = []
-    if "cuda" in device + record.device:
-        reasons.append("runs on CUDA agree to rounding only")
-    if (bits | now) & rules["OVERFLOW"]:
-        reasons.append("a world alone shares no contact pool")
-    if changes:
-        reasons.append("not all is as it was in that run")
+    possible_reasons = {  # why it need not end bit for bit where it did
+        "runs on CUDA agree to rounding only": "cuda" in device + record.device,
+        "a world alone shares no contact pool": (bits | now) & rules["OVERFLOW"],
+        "not all is as it was in that run": changes,
+    }
+    reasons = [reason for reason, applies in possible_reasons.items() if applies]
     ends = "it ends bit for bit where it did"
     if not exact:
         apart = end - recorded_end

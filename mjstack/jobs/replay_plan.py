@@ -145,16 +145,14 @@ def check_start(plan: ReplayPlan) -> None:
     """
     stage = plan.stage
     recorded = plan.record.start[plan.world]
-    off = math.inf
     # MJWarp takes longer to load than the native start does to compute, and rounding may have it
     # draw otherwise.
     for backend, device in dict.fromkeys([_NATIVE, plan.where[0]]):
         with closing(simulate_alone(stage, backend, device)) as sim:
             stage.start(sim, stage.cfg.reset, seed=plan.seed, worlds=[plan.world])
             start = sim.qpos[0].cpu().numpy()
-            off = math.inf
-            if start.shape == recorded.shape:
-                off = float(np.abs(start - recorded).max())
+            same = start.shape == recorded.shape
+            off = float(np.abs(start - recorded).max()) if same else math.inf
         if off <= _SAME_START:
             return
     copies = ", ".join(copy_names(plan.run.cfg).values())
