@@ -173,7 +173,7 @@ def test_random_actions_from_every_start(robot: str, reset: str) -> None:
     scene = env.cfg.scene
     spread = {"nominal": (0.0, 0.0), "jitter": (0.002, 0.002), "randomized": scene.random_xy}[reset]
     for name, place in ((RED, scene.objects["red"].xy), (BLUE, scene.objects["blue"].xy)):
-        address, _ = env.index.object_address(name)
+        address, _ = env.index.objects[name]
         off = np.abs(env.sim.qpos[:, address : address + 2].numpy() - place)
         assert (off <= np.array(spread) + 1e-9).all()
     generator = torch.Generator().manual_seed(0)
@@ -189,7 +189,7 @@ def test_random_actions_from_every_start(robot: str, reset: str) -> None:
 
 
 def put(env: Env, name: str, place: list[float] | np.ndarray, worlds: list[int]) -> None:
-    address, velocity = env.index.object_address(name)
+    address, velocity = env.index.objects[name]
     for world in worlds:
         pose = torch.tensor([*place, 1.0, 0.0, 0.0, 0.0], dtype=env.sim.qpos.dtype)
         env.sim.qpos[world, address : address + 7] = pose
@@ -223,7 +223,7 @@ def test_terms_know_the_box(robot: str) -> None:
     grasp_point = 0.5 * sum(env.sim.site_xpos[0, s] for s in env.index.grasp_sites)
     value = progress(env).tolist()
     for world, name, start in ((0, RED, 0.0), (1, BLUE, 0.5)):
-        address, _ = env.index.object_address(name)
+        address, _ = env.index.objects[name]
         distance = float((env.sim.qpos[world, address : address + 3] - grasp_point).norm())
         part = (1.0 - math.tanh(distance / 0.2)) / 5.0
         assert value[world] == pytest.approx(start + 0.5 * part, abs=1e-6)
@@ -258,7 +258,7 @@ def test_success_needs_rest_in_the_box_an_open_gripper_and_the_whole_window(robo
     closed = torch.tensor(env.cfg.robot.gripper_closed, dtype=env.sim.qpos.dtype)
     env.sim.qpos[2, list(env.index.robot_qpos[env.index.n_arm :])] = closed
     env.sim.sensordata.zero_()
-    _, velocity = env.index.object_address(RED)
+    _, velocity = env.index.objects[RED]
     seen = []
     for step in range(window + 1):
         env.sim.qvel[3, velocity] = 0.05 if step % 20 == 10 else 0.0
@@ -365,6 +365,8 @@ def test_lowest_point_of_a_mesh_is_never_too_high() -> None:
         ("scene.objects.blue.xy=[0.35,0.0]", ["scene.objects.blue.xy", "beside the box"]),
         ("scene.random_xy=[0.1]", ["scene.random_xy", "2 numbers"]),
         ("scene.random_xy=[0.1,-0.1]", ["scene.random_xy", "at least 0"]),
+        ("task.check.places=[red_slot]", ["task.check.places", "each object"]),
+        ("task.check.places=[red_slot,lid]", ["task.check.places", "lid"]),
         ("task.check.window=0", ["task.check.window=0", "at least 1"]),
         ("task.check.window=2001", ["task.check.window=2001", "2000"]),
         ("task.check.open_fraction=1.2", ["task.check.open_fraction=1.2", "at most 1"]),

@@ -51,10 +51,11 @@ PATHS: dict[str, dict[str, str] | None] = {
     },
     "mdp/reset.py": {
         "": "home _write_objects",
-        "JointNoise JitterObjects RandomizeObjects _Randomized": "__call__",
+        "JointNoise JitterObjects RandomizeObjects": "__call__",
+        "ObjectMass ObjectFriction ActuatorGains": "read write",
     },
     "mdp/starts/randomization.py": {
-        "ObjectMasses SlidingFriction ServoGains": "read write",
+        "Randomized": "__call__",
         "Elements": "read write scale",
     },
     "mdp/starts/starts_file.py": {"FromStartsFile": "__call__"},
@@ -64,7 +65,7 @@ PATHS: dict[str, dict[str, str] | None] = {
     "mdp/starts/placement.py": {"Placement": "choose"},
     "tasks/check.py": {"EpisodeCheck": "update"},
     "tasks/view.py": {
-        "TaskView": "step judged clear",
+        "TaskView": "step clear",
         "Step": (
             "pose pos center quat velocity turn height bounds speed corner_speed pressed in_hand "
             "untouched narrowest supported judged _judged _sensed"
@@ -77,7 +78,7 @@ PATHS: dict[str, dict[str, str] | None] = {
         "AtLeast": "holds unlocked",
     },
     "tasks/placed.py": {"HeldSuccess": "__call__ reset"},
-    "tasks/stack.py": {"StackCheck": "on_goal placed goals", "StackSuccess": "_stands __call__"},
+    "tasks/stack.py": {"StackCheck": "placed goals", "StackSuccess": "_stands __call__"},
     "tasks/box.py": {
         "BoxCheck": "airborne resting outside over placed goals at_slot",
         "_CarriedOver _Release _Settled _Order": "update",

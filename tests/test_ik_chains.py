@@ -11,7 +11,7 @@ import torch
 from ik_arm import DEVICES, Arm, results, tensors
 
 from mjstack.config.schema import RobotCfg
-from mjstack.errors import ArgumentError, ConfigError, MjstackError, UnknownName
+from mjstack.errors import ArgumentError, ConfigError, MjstackError
 from mjstack.kinematics.batched_ik import BatchedIk
 
 
@@ -106,22 +106,6 @@ def test_the_narrower_of_both_ranges_holds() -> None:
         command, _ = results(arm.solver(1, iterations=60), arm.at_home(1), target)
         assert command[0, 0] == pytest.approx(limit, abs=1e-6)
         assert -0.1 <= command[0, 0] <= 0.3
-
-
-@pytest.mark.parametrize(
-    ("change", "name"),
-    [
-        ({"grasp_sites": ["a", "lost_site"]}, "site 'lost_site'"),
-        ({"arm_joints": ["lift", "lost_joint"]}, "joint 'lost_joint'"),
-        ({"arm_joints": ["lift", "passive"], "ik_joints": ["passive"]}, "actuator 'passive'"),
-        ({"approach_body": "plam"}, "body 'plam' does not exist. Did you mean 'palm'"),
-    ],
-)
-def test_missing_names_are_named(change: dict[str, list[str]], name: str) -> None:
-    arm = odd_arm()
-    with pytest.raises(UnknownName, match=name) as caught:
-        BatchedIk(arm.model, replace(arm.robot, **change), 2, "cpu")
-    assert "\n" not in str(caught.value)
 
 
 def test_an_approach_body_that_not_every_joint_moves_is_refused() -> None:

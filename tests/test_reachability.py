@@ -9,6 +9,7 @@ import json
 import math
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -229,8 +230,9 @@ def placement_of(cfg: Config, model: mujoco.MjModel | None = None, **options: An
     """A placement in the scene, by default within 50 mm and 10 mm apart from the start pose."""
     model = model or build_model(cfg)
     index = SceneIndex(model, cfg.robot, cfg.scene)
+    env: Any = SimpleNamespace(cfg=cfg, sim=SimpleNamespace(model=model), index=index)
     defaults = {"region": (0.05, 0.05), "gap": 0.01, "pose": cfg.robot.start}
-    return Placement(cfg, model, index, **(defaults | options))
+    return Placement(env, **(defaults | options))
 
 
 def random_draws() -> torch.Tensor:

@@ -77,9 +77,14 @@ def feed(
     """Plays recordings through the check, as of a driver with phases or without; the state also has
     one coordinate of an arm, and the gripper's.
     """
+
+    def columns(qpos: int, qvel: int) -> tuple[Columns, Columns]:
+        cpu = torch.device("cpu")
+        return Columns(range(qpos, qpos + 7), cpu), Columns(range(qvel, qvel + 6), cpu)
+
     closed = torch.tensor(rec.cfg.robot.gripper_closed, dtype=dtype)
     index = SimpleNamespace(
-        object_address={"red": (1, 1), "blue": (8, 7)}.__getitem__,
+        object_columns={"red": columns(1, 1), "blue": columns(8, 7)}.__getitem__,
         jaw_force=rec.jaw_force,
         support_force={},
         constant=lambda values, like: torch.tensor(values, dtype=like.dtype),

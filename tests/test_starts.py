@@ -246,9 +246,7 @@ def test_starts_in_the_box_scene_are_uniform_over_the_pairs_that_fit(robot: str)
     placed = np.concatenate(drawn) - nominal
 
     # Both on the table and clear of arm and walls, each by itself; and far enough apart
-    alone = Placement(
-        cfg, env.sim.model, env.index, region=region, gap=gap, pose=cfg.robot.start, noise=0.02
-    )
+    alone = Placement(env, region=region, gap=gap, pose=cfg.robot.start, noise=0.02)
     alone._apart = [[0.0, 0.0], [0.0, 0.0]]
     tried = np.random.default_rng(0).uniform(-1.0, 1.0, (200_000, 2, 1, 2))
     free = alone.choose(torch.from_numpy(tried))[1].numpy()

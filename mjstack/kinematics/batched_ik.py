@@ -74,7 +74,6 @@ class BatchedIk:
                 processors then share the worlds.
 
         Raises:
-            UnknownName: The model lacks a joint, actuator, site or body of the robot.
             MjstackError: A joint is neither hinge nor slide.
             ArgumentError: Fewer than 4 iterations with a gain.
         """

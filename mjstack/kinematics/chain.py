@@ -7,7 +7,7 @@ import warp as wp
 from mjstack.config.schema import RobotCfg
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.kinematics.ik_kernels import HINGE, SLIDE, Chain, Shape
-from mjstack.scene.index import approach_body, find, joint_limits
+from mjstack.scene.index import approach_body, joint_limits
 
 _KINDS = {int(mujoco.mjtJoint.mjJNT_HINGE): HINGE, int(mujoco.mjtJoint.mjJNT_SLIDE): SLIDE}
 _NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
@@ -27,14 +27,14 @@ def build_chain(model: mujoco.MjModel, robot: RobotCfg) -> tuple[Chain, Shape]:
         The chain, in Warp arrays on the current device, and its shape.
     """
     # Columns of the joint targets: the joint of each, those that move, and their limits
-    columns = {find(model, "joint", name): column for column, name in enumerate(robot.joints)}
+    columns = {model.joint(name).id: column for column, name in enumerate(robot.joints)}
     moved = [robot.arm_joints.index(name) for name in robot.ik_joints]
     limits = np.tile(np.array([[-np.inf], [np.inf]], dtype=np.float32), len(columns))
     for side, values in enumerate(joint_limits(model, robot.ik_joints)):
         limits[side, moved] = _round_inwards(values, 1.0 - 2.0 * side)
 
     # Links from the world to the jaws, and from there to each site
-    first, second = (find(model, "site", name) for name in robot.grasp_sites)
+    first, second = (model.site(name).id for name in robot.grasp_sites)
     first_path = _path(model, model.site_bodyid[first])
     second_path = _path(model, model.site_bodyid[second])
     shared = len([body for body in first_path if body in second_path])

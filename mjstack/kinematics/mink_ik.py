@@ -9,7 +9,7 @@ import numpy as np
 from mjstack.config.schema import ModelCfg, RobotCfg
 from mjstack.errors import ConfigError
 from mjstack.robots import robot_spec
-from mjstack.scene.index import find, locked_home
+from mjstack.scene.index import locked_home
 
 _POSTURE_COST = 1e-3  # pulls the redundant joints home; moves the grasp point by micrometres
 _CONVERGED = 0.1  # share of the tolerance: Newton's method squares the error, so that is enough
@@ -59,7 +59,7 @@ class GraspIk:
         self.model = spec.compile()
         self.tolerance = tolerance
         self._iterations = iterations
-        joints = [find(self.model, "joint", name) for name in robot.joints]
+        joints = [self.model.joint(name).id for name in robot.joints]
         for key in ("home", "gripper_open", "gripper_closed"):
             values = getattr(robot, key)
             for name, value in zip(robot.joints[-len(values) :], values, strict=True):
@@ -75,7 +75,7 @@ class GraspIk:
         moving = {int(self.model.joint(name).dofadr[0]) for name in robot.ik_joints}
         frozen = [dof for dof in range(self.model.nv) if dof not in moving]
         self._task = GraspPointTask(
-            [find(self.model, "site", s) for s in robot.grasp_sites], self.model.nv
+            [self.model.site(name).id for name in robot.grasp_sites], self.model.nv
         )
         self._posture = mink.PostureTask(self.model, cost=_POSTURE_COST)
         self._limits = [mink.ConfigurationLimit(self.model, gain=1.0)]

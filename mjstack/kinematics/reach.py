@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from mjstack.config.schema import RobotCfg
-from mjstack.scene.index import approach_body, find, joint_limits, locked_home
+from mjstack.scene.index import approach_body, joint_limits, locked_home
 
 _ITERATIONS = 60  # at most, per start
 _DAMPING = 1e-3  # [m/rad] of the steps towards a point
@@ -51,24 +51,21 @@ class PointReach:
             model: A compiled model that contains the robot, alone or in a scene. It is not kept.
             robot: The robot's profile.
             gripper: Joint positions of the gripper [rad, m].
-
-        Raises:
-            UnknownName: The model lacks a joint or site of the robot.
         """
         data = mujoco.MjData(model)
         home = locked_home(robot)
         home[len(robot.arm_joints) :] = gripper
-        data.qpos[[model.jnt_qposadr[find(model, "joint", name)] for name in robot.joints]] = home
+        data.qpos[[model.joint(name).qposadr[0] for name in robot.joints]] = home
         mujoco.mj_kinematics(model, data)
         joints = sorted(
-            (find(model, "joint", name) for name in robot.ik_joints),
+            (model.joint(name).id for name in robot.ik_joints),
             key=lambda j: int(model.jnt_bodyid[j]),
         )
         self._hinges = model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE
         self._home = data.qpos[model.jnt_qposadr[joints]]
         self._anchors = data.xanchor[joints].copy()
         self._axes = data.xaxis[joints].copy()
-        sites = [find(model, "site", name) for name in robot.grasp_sites]
+        sites = [model.site(name).id for name in robot.grasp_sites]
         self._tip = data.site_xpos[sites].mean(axis=0)
         turned = data.xmat[approach_body(model, robot)].reshape(3, 3)
         self._pointing = turned @ robot.approach_axis

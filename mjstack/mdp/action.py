@@ -22,7 +22,6 @@ class _Commands(ActionTerm):
     def _set_up(self, env: EnvView, chosen: Sequence[int], dim: int) -> None:
         self._ctrl = env.sim.ctrl
         self._columns = Columns(env.index.ctrl[list(chosen)], env.device)
-        self._part = self._columns.read(self._ctrl)  # its own memory, if they lie side by side
         self._low, self._high = robot(env).ctrl_range[list(chosen)].unbind(1)
         self.actuators = self._columns.indices
         self.dim = dim
@@ -31,10 +30,7 @@ class _Commands(ActionTerm):
 
     def _write_bounded(self, command: Tensor) -> None:
         """Write commands, kept within the actuators' ranges."""
-        if isinstance(self._columns.at, slice):
-            torch.clamp(command, self._low, self._high, out=self._part)
-        else:
-            self._columns.write(self._ctrl, torch.clamp(command, self._low, self._high))
+        self._columns.write(self._ctrl, torch.clamp(command, self._low, self._high))
 
 
 class JointPosition(_Commands):
@@ -151,20 +147,13 @@ class JointTargets(_Commands):
             low: Of every joint's targets [rad, m]: the smallest.
             high: Of every joint's targets [rad, m]: the largest.
             steps: Control steps for which there are targets.
-
-        Raises:
-            ParameterError: There are not as many numbers as joints.
         """
         joints = len(env.index.ctrl)
-        scaling = {"mean": mean, "std": std, "low": low, "high": high}
-        for key, values in scaling.items():
-            if len(values) != joints:
-                raise ParameterError(key, list(values), f"{joints} numbers, one per joint")
         self._set_up(env, range(joints), dim=steps * joints)
         self._steps = steps
         self._mean, self._std, least, most = (
             torch.tensor(values, dtype=self._ctrl.dtype, device=env.device)
-            for values in scaling.values()
+            for values in (mean, std, low, high)
         )
         self._low = torch.maximum(self._low, least)
         self._high = torch.minimum(self._high, most)

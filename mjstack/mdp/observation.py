@@ -131,6 +131,8 @@ def headings(env: EnvView, *, objects: list[str] | None = None) -> Tensor:
 @offers(unit=("m/s",) * 3 + ("rad/s",) * 3)
 def object_velocity(env: EnvView, *, object: str) -> Tensor:
     """Linear [m/s, world frame] and angular [rad/s, body frame] velocity, shape ``(nworld, 6)``."""
+    if object in env.index.fixed:
+        return env.index.constant([0.0] * 6, env.sim.qvel).expand(env.nworld, -1)
     return env.sim.part("qvel", env.index.object_columns(object)[1])
 
 

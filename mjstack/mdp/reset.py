@@ -4,10 +4,10 @@ values each time.
 
 import math
 from collections.abc import Sequence
-from typing import ClassVar
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from mjstack.config.fields import Count, NotNegative
 from mjstack.config.functions import offered
@@ -16,15 +16,9 @@ from mjstack.managers.view import EnvView, offers, random_uniform, rows_of, uses
 from mjstack.math import quat_from_yaw
 from mjstack.mdp.geometry import Pose, robot, write_robot
 from mjstack.mdp.starts.placement import GAP, Placement, may_meet
-from mjstack.mdp.starts.randomization import (
-    ObjectMasses,
-    Quantity,
-    ServoGains,
-    SlidingFriction,
-    bounds,
-)
+from mjstack.mdp.starts.randomization import Elements, Randomized, bounds
 from mjstack.mdp.starts.reach import require_reach
-from mjstack.scene.index import Columns, Rows, joint_limits
+from mjstack.scene.index import ALL, Columns, Rows, joint_limits
 
 
 def home(env: EnvView, mask: Tensor, *, pose: Pose = "home") -> None:
@@ -75,9 +69,7 @@ class JitterObjects:
             xy: Of x and y [m].
             yaw: Of the rotation about z [rad].
         """
-        placement = Placement(
-            env.cfg, env.sim.model, env.index, region=(xy, xy), gap=0.0, pose=env.cfg.robot.home
-        )
+        placement = Placement(env, region=(xy, xy), gap=0.0, pose=env.cfg.robot.home)
         placement.require_room(xy, candidates=1)
         self._xy = xy
         self._yaw = yaw
@@ -138,9 +130,7 @@ class RandomizeObjects:
         self._more = 3 * candidates if may_meet(env.cfg.scene, region, gap) else 0
         noisy = [term for term in env.cfg.reset.values() if offered(term.func, "joint_noise")]
         self._placement = Placement(
-            env.cfg,
-            env.sim.model,
-            env.index,
+            env,
             region=region,
             gap=gap,
             pose=getattr(robot(env), pose).tolist(),
@@ -162,51 +152,107 @@ class RandomizeObjects:
         _write_objects(env, mask, self._poses, offsets, self._yaw * first[..., 0], at)
 
 
-class _Randomized:
-    """A quantity of the model, drawn anew for each episode."""
+@uses_fields("body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0")
+class ObjectMass(Randomized):
+    """Scales each object's mass and inertia.
 
-    label = "reset.model"
-    kind: ClassVar[type[Quantity]]
+    An object is one body on a free joint, so that what the compiler derives from the mass scales
+    with it, and need not be computed anew.
+    """
 
     def __init__(self, env: EnvView, *, scale: Sequence[float]) -> None:
         """Take the smallest and largest factor."""
-        self._ends = bounds("scale", scale)
-        self._quantity = self.kind(env)
-        self._nominal = self._quantity.nominal.to(env.sim.qpos.dtype)
+        super().__init__(env, scale=scale)
+        bodies = [env.index.bodies[name] for name in env.index.objects]
+        dofs = [dof + i for _, dof in env.index.objects.values() for i in range(6)]
+        self._mass, *self._scaled, self._inverse, self._inverse_dofs = (
+            Elements(env, name, dofs if name.startswith("dof") else bodies)
+            for name in self.model_fields
+        )
+        self.columns = [f"{name}_mass_kg" for name in env.index.objects]
+        self.nominal = self._mass.nominal
 
-    def __call__(self, env: EnvView, mask: Tensor) -> None:
-        """Write the model fields."""
-        at = rows_of(mask)
-        factors = random_uniform(env, self.label, len(self._nominal), *self._ends, at=at)
-        self._quantity.write(mask, self._nominal * factors, at)
+    @override
+    def read(self) -> Tensor:
+        return self._mass.read()
+
+    @override
+    def write(self, mask: Tensor, values: Tensor, at: Rows = ALL) -> None:
+        mass = values.to(self._mass.dtype)
+        factor = mass.double() / self.nominal
+        self._mass.write(mask, mass, at)
+        for elements in self._scaled:
+            elements.scale(mask, factor, at)
+        self._inverse.scale(mask, 1.0 / factor, at)
+        self._inverse_dofs.scale(mask, (1.0 / factor).repeat_interleave(6, dim=1), at)
 
 
-@uses_fields(*ObjectMasses.fields)
-class ObjectMass(_Randomized):
-    """Scales each object's mass and inertia."""
+@uses_fields("geom_friction")
+class ObjectFriction(Randomized):
+    """Draws the sliding friction of each object, and of the grip where the jaws have a coefficient
+    that counts.
 
-    kind = ObjectMasses
-
-
-@uses_fields(*SlidingFriction.fields)
-class ObjectFriction(_Randomized):
-    """Draws the sliding friction of each object, and of the grip; see `SlidingFriction`."""
-
-    kind = SlidingFriction
+    MuJoCo takes the larger coefficient of the two geoms in a contact, or that of the geom with the
+    higher priority. So the table, and jaws of the objects' priority, get the smallest coefficient,
+    which leaves the object's in force. Jaws of higher priority (SO-101's) have one coefficient, the
+    same for both.
+    """
 
     def __init__(self, env: EnvView, *, sliding: Sequence[float]) -> None:
         """Take the smallest and largest coefficient."""
         super().__init__(env, scale=bounds("sliding", sliding))
-        self._quantity = SlidingFriction(env, self._ends[0])
+        model = env.sim.model
+        bodies = [model.body(name).id for name in env.cfg.robot.jaw_bodies]
+        jaws = [g for g in range(model.ngeom) if model.geom_bodyid[g] in bodies]
+        grip = [g for g in jaws if model.geom_priority[g] > 0]  # objects have 0
+        level = [model.geom("table").id, *(g for g in jaws if g not in grip)]
+        geoms = {name: env.index.geoms[name] for name in env.index.objects}
+        if grip:
+            geoms["grip"] = grip
+        self.columns = [f"{name}_friction" for name in geoms]
+        self.nominal = torch.ones(len(geoms), dtype=torch.float64, device=env.device)
+        self._view = env.sim.fields["geom_friction"][..., 0]
+        self._groups = [Columns(group, env.device) for group in geoms.values()]
+        self._lowered = Columns(level, env.device)
+        self._least = torch.tensor(self.ends[0], dtype=self._view.dtype, device=env.device)
+
+    @override
+    def read(self) -> Tensor:
+        return torch.stack([group.read(self._view)[:, 0] for group in self._groups], dim=1)
+
+    @override
+    def write(self, mask: Tensor, values: Tensor, at: Rows = ALL) -> None:
+        values = values.to(self._view.dtype)
+        for number, group in enumerate(self._groups):
+            group.write_masked(self._view, mask, values[:, number, None], at)
+        self._lowered.write_masked(self._view, mask, self._least, at)
 
 
-@uses_fields(*ServoGains.fields)
-class ActuatorGains(_Randomized):
+@uses_fields("actuator_gainprm", "actuator_biasprm")
+class ActuatorGains(Randomized):
     """Scales the stiffness and damping of each of the robot's position servos by one factor per
     servo.
     """
 
-    kind = ServoGains
+    def __init__(self, env: EnvView, *, scale: Sequence[float]) -> None:
+        """Take the smallest and largest factor."""
+        super().__init__(env, scale=scale)
+        servos = env.index.ctrl.tolist()
+        # A position servo's gain is kp and its bias (0, -kp, -kv): scaling all of them scales both.
+        self._gain, self._bias = (Elements(env, name, servos) for name in self.model_fields)
+        self._kp = self._gain.nominal[:, 0]
+        self.columns = [f"gain_{name}" for name in env.cfg.robot.joints]
+        self.nominal = torch.ones_like(self._kp)
+
+    @override
+    def read(self) -> Tensor:
+        return self._gain.read()[..., 0].double() / self._kp
+
+    @override
+    def write(self, mask: Tensor, values: Tensor, at: Rows = ALL) -> None:
+        factor = (values.double() * self._kp).to(self._gain.dtype).double() / self._kp
+        self._gain.scale(mask, factor, at)
+        self._bias.scale(mask, factor, at)
 
 
 def _object_poses(env: EnvView) -> Columns:

@@ -7,8 +7,7 @@ from torch import Tensor
 from mjstack.config.fields import Count, NotNegative
 from mjstack.managers.view import EnvView, offers
 from mjstack.mdp.geometry import lost_state, robot
-from mjstack.mdp.observation import joint_pos
-from mjstack.scene.index import Columns
+from mjstack.mdp.observation import joint_pos, positions
 from mjstack.sim import LOST_PHYSICS
 
 
@@ -28,20 +27,16 @@ class ObjectOffTable:
     def __init__(self, env: EnvView) -> None:
         """Read the table's place."""
         scene = env.cfg.scene
-        count = len(env.index.objects)
-        # x, y and z of every object that moves
-        columns = [qpos + i for qpos in env.index.object_qpos for i in range(3)]
-        self._columns = Columns(columns, env.device)
-        half = [*scene.table_half[:2], math.inf]
+        x, y, _ = scene.table_half
         constant = env.index.constant
-        self._center = constant([*scene.table_center[:2], 0.0] * count, env.sim.qpos)
-        self._low = constant([-half[0], -half[1], scene.table_top] * count, env.sim.qpos)
-        self._high = constant(half * count, env.sim.qpos)
+        self._center = constant([*scene.table_center[:2], 0.0], env.sim.qpos)
+        self._low = constant([-x, -y, scene.table_top], env.sim.qpos)
+        self._high = constant([x, y, math.inf], env.sim.qpos)
 
     def __call__(self, env: EnvView) -> Tensor:
         """True for worlds with an object off the table, shape ``(nworld,)``."""
-        offset = env.sim.part("qpos", self._columns) - self._center
-        return ((offset < self._low) | (offset > self._high)).any(1)
+        offset = positions(env).unflatten(1, (-1, 3)) - self._center
+        return ((offset < self._low) | (offset > self._high)).flatten(1).any(1)
 
 
 class JointLimit:

@@ -37,9 +37,6 @@ class Columns:
         if self.indices != tuple(range(first, stop)):
             self.at = torch.tensor(self.indices, dtype=torch.int64, device=device)
 
-    def __len__(self) -> int:
-        return len(self.indices)
-
     def read(self, view: torch.Tensor) -> torch.Tensor:
         """The columns, shape ``(nworld, n, ...)``. It may be the view's own memory: do not write
         into it.
@@ -126,23 +123,23 @@ class SceneIndex:
     """
 
     def __init__(self, model: mujoco.MjModel, robot: RobotCfg, scene: SceneCfg) -> None:
-        joints = [find(model, "joint", name) for name in robot.joints]
+        joints = [model.joint(name).id for name in robot.joints]
         self._robot = robot
         self._tensors: dict[tuple[torch.device, torch.dtype], RobotTensors] = {}
         self.robot_qpos = np.array([model.jnt_qposadr[j] for j in joints])
         self.robot_qvel = np.array([model.jnt_dofadr[j] for j in joints])
         self.robot_range = model.jnt_range[joints].copy()
-        self.ctrl = np.array([find(model, "actuator", name) for name in robot.joints])
+        self.ctrl = np.array([model.actuator(name).id for name in robot.joints])
         self.ctrl_range = model.actuator_ctrlrange[self.ctrl].copy()
         self.n_arm = len(robot.arm_joints)
-        self.grasp_sites = [find(model, "site", n) for n in robot.grasp_sites]
+        self.grasp_sites = [model.site(name).id for name in robot.grasp_sites]
         free = {name: model.joint(name) for name in scene.free}
         self.objects = {
             name: (int(joint.qposadr[0]), int(joint.dofadr[0])) for name, joint in free.items()
         }
         self.object_qpos = [qpos for qpos, _ in self.objects.values()]
         self.object_qvel = [qvel for _, qvel in self.objects.values()]
-        self.bodies = {name: find(model, "body", name) for name in scene.objects}
+        self.bodies = {name: model.body(name).id for name in scene.objects}
         self.fixed = {
             name: np.concatenate((model.body_pos[body], model.body_quat[body])).tolist()
             for name, body in self.bodies.items()
@@ -153,10 +150,14 @@ class SceneIndex:
             for name, body in self.bodies.items()
         }
         self._constants: dict[tuple, torch.Tensor] = {}
-        self._columns: dict[str, tuple[Columns, Columns]] = {}
+        host = torch.device("cpu")  # side by side, so that no device has anything of them
+        self._columns = {
+            name: (Columns(range(qpos, qpos + 7), host), Columns(range(qvel, qvel + 6), host))
+            for name, (qpos, qvel) in self.objects.items()
+        }
 
         def sensors(bodies: Iterable[tuple[str, str]]) -> list[int]:
-            return [int(model.sensor_adr[find(model, "sensor", force_sensor(*p))]) for p in bodies]
+            return [int(model.sensor(force_sensor(*pair)).adr[0]) for pair in bodies]
 
         pairs = list(combinations(scene.objects, 2))
         self.jaw_force = {
@@ -199,30 +200,8 @@ class SceneIndex:
         an error that lists those.
         """
         if name not in self._columns:
-            qpos, qvel = self.object_address(name)
-            here = torch.device("cpu")  # side by side, so that no device has anything of them
-            columns = (Columns(range(qpos, qpos + 7), here), Columns(range(qvel, qvel + 6), here))
-            self._columns[name] = columns
+            raise UnknownName("object", name, self._columns)
         return self._columns[name]
-
-    def object_address(self, name: str) -> tuple[int, int]:
-        """First qpos and qvel address of an object that moves; any other name is an error that
-        lists those.
-        """
-        if name not in self.objects:
-            raise UnknownName("object", name, self.objects)
-        return self.objects[name]
-
-
-def find(model: mujoco.MjModel, kind: str, name: str) -> int:
-    """Index of a named body, joint, actuator, site or sensor; an unknown name is an error that
-    lists the known ones.
-    """
-    index = mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)
-    if index < 0:
-        count = getattr(model, {"joint": "njnt", "actuator": "nu"}.get(kind, f"n{kind}"))
-        raise UnknownName(kind, name, [getattr(model, kind)(i).name for i in range(count)])
-    return index
 
 
 def joint_limits(model: mujoco.MjModel, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
@@ -235,8 +214,8 @@ def joint_limits(model: mujoco.MjModel, names: Sequence[str]) -> tuple[np.ndarra
     Returns:
         Low and high limits [rad, m], each of shape ``(n,)``; infinite where there is none.
     """
-    joints = [find(model, "joint", name) for name in names]
-    servos = [find(model, "actuator", name) for name in names]
+    joints = [model.joint(name).id for name in names]
+    servos = [model.actuator(name).id for name in names]
     limited = (model.jnt_limited[joints], model.actuator_ctrllimited[servos])
     spans = (model.jnt_range[joints], model.actuator_ctrlrange[servos])
     low, high = np.where(np.stack(limited)[..., None], spans, [-np.inf, np.inf]).transpose(2, 0, 1)
@@ -252,8 +231,8 @@ def locked_home(robot: RobotCfg) -> np.ndarray:
 def approach_body(model: mujoco.MjModel, robot: RobotCfg) -> int:
     """Index of the body with the robot's approach axis: the last arm joint's, if none is named."""
     if robot.approach_body:
-        return find(model, "body", robot.approach_body)
-    return int(model.jnt_bodyid[find(model, "joint", robot.arm_joints[-1])])
+        return int(model.body(robot.approach_body).id)
+    return int(model.joint(robot.arm_joints[-1]).bodyid[0])
 
 
 def turn_sign(model: mujoco.MjModel, robot: RobotCfg) -> float:
@@ -264,7 +243,7 @@ def turn_sign(model: mujoco.MjModel, robot: RobotCfg) -> float:
     """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    up = float(data.xaxis[find(model, "joint", robot.arm_joints[0])][2])
+    up = float(data.joint(robot.arm_joints[0]).xaxis[2])
     if abs(up) < 0.999:
         expected = f"0, because joint {robot.arm_joints[0]} does not turn about the vertical"
         raise ConfigError("robot.approach_gain", robot.approach_gain, expected)

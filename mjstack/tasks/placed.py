@@ -14,13 +14,7 @@ from mjstack.tasks.parts import Condition, released
 
 
 class HeldSuccess:
-    """Achieved while a condition has held for some steps in a row.
-
-    Attributes:
-        nowhere: Whether it was seen, on the CPU, that the condition holds in no world.
-    """
-
-    nowhere = False
+    """Achieved while a condition has held for some steps in a row."""
 
     def __init__(self, env: EnvView, condition: Callable[[], Tensor], steps: int) -> None:
         """Allocate the streaks.
@@ -36,12 +30,7 @@ class HeldSuccess:
 
     def __call__(self, env: EnvView) -> Tensor:
         """Process a step; shape ``(nworld,)``, bool."""
-        holds = self._condition()
-        self.nowhere = not holds.is_cuda and not bool(holds.any())
-        if self.nowhere:
-            self._length.zero_()
-            return holds
-        self._length.add_(1).mul_(holds)
+        self._length.add_(1).mul_(self._condition())
         return self._length >= self._steps
 
     def reset(self, mask: Tensor) -> None:

@@ -78,8 +78,6 @@ class Progress:
         self._sign = constant(-1.0, -1.0, -1.0, 1.0, 1.0)
         self._number = constant(0.0, 2.0, 3.0, 1.0, 4.0)
         self._least = constant(*[0.0] * 5)
-        shape = (env.nworld, len(names))
-        self._always = torch.ones(shape, dtype=torch.bool, device=env.device)
 
     def __call__(self, env: EnvView) -> Tensor:
         """The reward, shape ``(nworld,)``."""
@@ -100,7 +98,7 @@ class Progress:
         grasped = in_hand & (away <= self._within)
         lifted = grasped & (low >= self._height)
         over = (across <= self._near) & (above >= -BELOW)
-        reached = torch.stack((self._always, lifted, over, grasped, placed), dim=-1)
+        reached = torch.stack((torch.ones_like(lifted), lifted, over, grasped, placed), dim=-1)
 
         # How far it has got in each: the last one that it has got to is worth most
         opening = step.narrowest.expand_as(low)

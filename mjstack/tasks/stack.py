@@ -113,14 +113,9 @@ class StackCheck(EpisodeCheck):
         ]
 
     @once_per_step
-    def on_goal(self, step: Step) -> Tensor:
-        """Whether the object is on the other one, shape ``(nworld,)``, bool."""
-        return self.stacked(step)
-
-    @once_per_step
     def placed(self, step: Step) -> Tensor:
         """Whether the object is on the other one, and that one on the table."""
-        return torch.stack((self.on_goal(step), self.supported(step)), dim=1)
+        return torch.stack((self.stacked(step), self.supported(step)), dim=1)
 
     @override
     def goals(self, step: Step) -> dict[str, Tensor]:
@@ -169,33 +164,27 @@ class StackSuccess(HeldSuccess):
         """Take a step in place of the oldest one. `reset` may leave the ring alone: every slot is
         written anew before the streak can reach the window.
         """
-        self._step = step
         self._slot.add_(1).remainder_(self._steps)
-        stands = self._check.on_goal(step)
-        if stands.is_cuda or bool(stands.any()):
-            stands = self._check.placed(step).all(1) & self._check.released(step)[:, 0]
+        stands = self._check.placed(step).all(1) & self._check.released(step)[:, 0]
         if not stands.is_cuda and not bool(stands.any()):
             return stands  # no window that holds this step can pass: its slot is never judged
         self._pose.index_copy_(1, self._slot, step.pose[:, None])
         self._energy.index_copy_(1, self._slot, step.speed.square()[:, None])
         for ring in (self._far, self._turned):
             ring.index_fill_(1, self._slot, 0.0)
+
+        # The newest step against the others
+        torch.sub(self._pose[..., :3], step.pos[:, None], out=self._apart).square_()
+        torch.maximum(self._far, self._apart.sum(-1), out=self._far)
+        torch.mul(self._pose[..., 3:], step.quat[:, None], out=self._product)
+        torch.maximum(self._turned, 1.0 - self._product.sum(-1).abs(), out=self._turned)
         return stands
 
     def __call__(self, env: EnvView) -> Tensor:
         """Process a step; shape ``(nworld,)``, bool."""
         achieved = super().__call__(env)
-        if self.nowhere:
-            return achieved  # no window that holds this step can pass, in any world
-
-        # The newest step against the others
-        pos = self._step.pos[:, None]
-        quat = self._step.quat[:, None]
-        torch.sub(self._pose[..., :3], pos, out=self._apart).square_()
-        torch.maximum(self._far, self._apart.sum(-1), out=self._far)
-        torch.mul(self._pose[..., 3:], quat, out=self._product)
-        torch.maximum(self._turned, 1.0 - self._product.sum(-1).abs(), out=self._turned)
-
+        if not achieved.is_cuda and not bool(achieved.any()):
+            return achieved
         t = self._check.t
         rotation = 1.0 - math.cos(0.5 * math.radians(t.rest_rotation_deg))
         achieved &= (self._energy.mean(1) <= t.rest_speed**2).all(1)

@@ -3,7 +3,7 @@ alone, which are never stale.
 """
 
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, wraps
 from typing import Any
 
@@ -14,6 +14,7 @@ from mjstack.managers.term import current_term
 from mjstack.managers.view import EnvView
 from mjstack.math import lowest_point, quat_to_matrix
 from mjstack.mdp.geometry import LOADED, gripper_opening, pose_w
+from mjstack.mdp.observation import object_velocity
 from mjstack.scene.index import Columns
 from mjstack.scene.phases import Phase
 
@@ -53,6 +54,8 @@ class TaskView:
         objects: Names of the objects, the order of every dimension over objects.
         phased: Whether the driver has phases.
         count: Steps so far, shape ``(1,)``, int64.
+        stop: Steps from this one on count for no rule that names phases.
+        table: Whether a phase counts for a column of a key, shape ``(phases, n)``, bool.
         key: Equal to that of another view, if both see the same of the same environment.
     """
 
@@ -81,8 +84,8 @@ class TaskView:
         self.key = f"{id(env)} {force} {' '.join(objects)}"
         self.count = torch.zeros(1, dtype=torch.int64, device=env.device)
         self._phases = [phase.name for phase in phases]
-        self._stop = stop
-        self._table = torch.zeros((len(phases), 0), dtype=torch.bool, device=env.device)
+        self.stop = stop
+        self.table = torch.zeros((len(phases), 0), dtype=torch.bool, device=env.device)
         self._counters: list[Tensor] = []
         self._columns: dict[tuple[str, ...], Columns] = {}
 
@@ -93,17 +96,12 @@ class TaskView:
         self.half = torch.tensor([thing.half for thing in self.things], device=env.device)
         self.radius = torch.tensor([thing.radius for thing in self.things], device=env.device)
 
-        def columns(addresses: Iterable[int], width: int) -> Columns:
-            return Columns([a + i for a in addresses for i in range(width)], env.device)
+        def columns(forces: Mapping[str, Sequence[int]]) -> Columns:
+            addresses = itertools.chain(*(forces.get(name, ()) for name in objects))
+            return Columns([a + i for a in addresses for i in range(3)], env.device)
 
-        # Columns of the poses and velocities, if all of the objects can move
-        self.movable: list[Columns] = []
-        if not set(objects) & set(index.fixed):
-            first = zip(*map(index.object_address, objects), strict=True)
-            self.movable = [columns(at, width) for at, width in zip(first, (7, 6), strict=True)]
-        self.jaws = columns((a for name in objects for a in index.jaw_force[name]), 3)
-        supports = (index.support_force.get(name, []) for name in objects)
-        self.supports = columns(itertools.chain(*supports), 3)
+        self.jaws = columns(index.jaw_force)
+        self.supports = columns(index.support_force)
 
     def step(self, phase: Tensor | None = None) -> "Step":
         """The state now, computed where it is asked for, once."""
@@ -122,18 +120,9 @@ class TaskView:
             return slice(0, 0)
         rows = [[name in column for column in phases] for name in self._phases]
         new = torch.tensor(rows, dtype=torch.bool, device=self.env.device)
-        first = self._table.shape[1]
-        self._table = torch.cat((self._table, new), dim=1)
+        first = self.table.shape[1]
+        self.table = torch.cat((self.table, new), dim=1)
         return slice(first, first + len(phases))
-
-    def judged(self, phase: Tensor | None) -> Tensor:
-        """Every column of every key, shape ``(nworld, n)``; without phases whether the step
-        counts, shape ``(1, 1)``.
-        """
-        going = (self.count < self._stop)[:, None]
-        if phase is None or not self.phased:
-            return going
-        return self._table.index_select(0, phase) & going
 
     def constant(self, *values: float) -> Tensor:
         """Numbers on the device, copied there once, shape ``(n,)``, float32."""
@@ -178,10 +167,8 @@ class Step:
     @step_value
     def pose(self) -> Tensor:
         """Position [m] and quaternion (wxyz), shape ``(nworld, objects, 7)``."""
-        view = self.view
-        if view.movable:
-            return view.env.sim.part("qpos", view.movable[0], len(view.objects), 7).float()
-        return torch.stack([pose_w(view.env, name) for name in view.objects], dim=1).float()
+        poses = [pose_w(self.view.env, name) for name in self.view.objects]
+        return torch.stack(poses, dim=1).float()
 
     @step_value
     def pos(self) -> Tensor:
@@ -198,18 +185,8 @@ class Step:
         """Velocity as MuJoCo has it: linear [m/s] in the world, angular [rad/s] in the object's
         frame, shape ``(nworld, objects, 6)``.
         """
-        view = self.view
-        env = view.env
-        if view.movable:
-            return env.sim.part("qvel", view.movable[1], len(view.objects), 6).float()
-        still = view.constant(*[0.0] * 6).expand(env.nworld, -1)
-        parts = [
-            still
-            if name in env.index.fixed
-            else env.sim.part("qvel", env.index.object_columns(name)[1]).float()
-            for name in view.objects
-        ]
-        return torch.stack(parts, dim=1)
+        velocities = [object_velocity(self.view.env, object=name) for name in self.view.objects]
+        return torch.stack(velocities, dim=1).float()
 
     @step_value
     def turn(self) -> Tensor:
@@ -278,8 +255,7 @@ class Step:
         """How far the least open gripper joint is open as measured, 0 closed to 1 open, shape
         ``(nworld, 1)``, float32.
         """
-        opening = gripper_opening(self.view.env).float()
-        return opening if opening.shape[1] == 1 else opening.amin(1, keepdim=True)
+        return gripper_opening(self.view.env).float().amin(1, keepdim=True)
 
     @step_value
     def supported(self) -> Tensor:
@@ -294,7 +270,14 @@ class Step:
 
     @cached_property
     def _judged(self) -> Tensor:
-        return self.view.judged(self._phase)
+        """Every column of every key, shape ``(nworld, n)``; without phases whether the step
+        counts, shape ``(1, 1)``.
+        """
+        view = self.view
+        going = (view.count < view.stop)[:, None]
+        if self._phase is None or not view.phased:
+            return going
+        return view.table.index_select(0, self._phase) & going
 
     def _sensed(self, columns: Columns) -> Tensor:
         shape = (len(self.view.objects), -1, 3)

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from mjstack.config.schema import Config, ObjectCfg, SceneCfg
 from mjstack.errors import ParameterError
+from mjstack.managers.view import EnvView
 from mjstack.rng import uniform
-from mjstack.scene import SceneIndex
 
 SCHEMA = 2
 """How objects that may meet are placed: 1 was one after the other, 2 is all together."""
@@ -48,9 +48,7 @@ class Placement:
 
     def __init__(
         self,
-        cfg: Config,
-        model: mujoco.MjModel,
-        index: SceneIndex,
+        env: EnvView,
         *,
         region: Sequence[float],
         gap: float,
@@ -60,26 +58,25 @@ class Placement:
         """Find what could be in the way.
 
         Args:
-            cfg: The configuration.
-            model: The compiled scene.
-            index: Its addresses.
+            env: The environment.
             region: Half-widths of the region in x and y [m].
             gap: Free room between objects, and around what is fixed to the world [m], for fingers.
             pose: Where the robot's joints are [rad, m].
             noise: How far each arm joint may be from there [rad].
         """
-        scene = cfg.scene
+        scene = env.cfg.scene
+        model = env.sim.model
         objects = list(scene.free.values())
         radii = [thing.footprint for thing in objects]
         self._apart = [[a + b + gap for b in radii] for a in radii]
         data = mujoco.MjData(model)
-        data.qpos[index.robot_qpos] = pose
+        data.qpos[env.index.robot_qpos] = pose
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
         bolted = model.body_weldid[model.geom_bodyid] == 0
-        loose = np.isin(model.geom_bodyid, list(index.bodies.values()))
-        arm = _arm_boxes(cfg, data, np.flatnonzero(collides & ~bolted & ~loose), noise)
+        loose = np.isin(model.geom_bodyid, list(env.index.bodies.values()))
+        arm = _arm_boxes(env.cfg, data, np.flatnonzero(collides & ~bolted & ~loose), noise)
         # Floor, the only plane in a scene, and table are left out.
         ground = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
         ground[model.geom("table").id] = True

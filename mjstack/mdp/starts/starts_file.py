@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -14,19 +15,20 @@ from mjstack.files import write_npz
 from mjstack.managers.view import EnvView, offers, uses_fields
 from mjstack.mdp.geometry import Pose, place_xy, pose_w, robot, write_robot
 from mjstack.mdp.observation import joint_pos
+from mjstack.mdp.reset import ActuatorGains, ObjectFriction, ObjectMass
 from mjstack.mdp.starts.placement import world_boxes
-from mjstack.mdp.starts.randomization import (
-    ObjectMasses,
-    Quantity,
-    ServoGains,
-    SlidingFriction,
-    bounds,
-)
+from mjstack.mdp.starts.randomization import Randomized, bounds
 from mjstack.mdp.starts.reach import out_of_reach
 from mjstack.scene.index import joint_limits
 
 _FLAT = 1e-5  # [m], and of a quaternion: how far off upright an object on the table may be
 _OVER = 1e-6  # [m] how far an object may reach over the edge of the table
+# What a file may have of the model, and which parameter has its ends
+_RANDOMIZED: dict[Any, str] = {
+    ObjectMass: "scale",
+    ObjectFriction: "sliding",
+    ActuatorGains: "scale",
+}
 
 
 class StartsTable:
@@ -104,7 +106,7 @@ class StartsTable:
 
 
 @offers(reads_file=True)
-@uses_fields(*ObjectMasses.fields, *SlidingFriction.fields, *ServoGains.fields)
+@uses_fields(*(name for kind in _RANDOMIZED for name in kind.model_fields))
 class FromStartsFile:
     """World w starts from row w of a file, at every reset.
 
@@ -142,11 +144,10 @@ class FromStartsFile:
             expected = "a file with one row per world, which reset=starts_file reads"
             raise ConfigError("starts", "null", expected, "Set starts=worlds.npz")
         # What the file may have, each in its range
-        friction_ends = bounds("friction", friction)
-        quantities: list[tuple[Quantity, tuple[float, float]]] = [
-            (ObjectMasses(env), bounds("mass", mass)),
-            (SlidingFriction(env, friction_ends[0]), friction_ends),
-            (ServoGains(env), bounds("gain", gain)),
+        quantities: list[Randomized] = [
+            ObjectMass(env, scale=bounds("mass", mass)),
+            ObjectFriction(env, sliding=bounds("friction", friction)),
+            ActuatorGains(env, scale=bounds("gain", gain)),
         ]
         scene = env.cfg.scene
         objects = list(env.index.objects)
@@ -154,8 +155,8 @@ class FromStartsFile:
         limits = joint_limits(env.sim.model, env.cfg.robot.joints)
         ranges: dict[str, tuple[ArrayLike, ArrayLike]] = {}
         ranges |= zip(joints, zip(*limits, strict=True), strict=True)
-        for quantity, ends in quantities:
-            nominal = np.outer(quantity.nominal.cpu(), ends)
+        for quantity in quantities:
+            nominal = np.outer(quantity.nominal.cpu(), quantity.ends)
             ranges |= zip(quantity.columns, map(tuple, nominal), strict=True)
         regions = dict.fromkeys(objects, (scene.table_center[:2], scene.table_half[:2]))
         places = _drawn_places(env)
@@ -188,7 +189,7 @@ class FromStartsFile:
         self._poses = _on(env, starts)
         self._quantities = [
             (quantity, torch.from_numpy(table.take(quantity.columns)).to(env.device))
-            for quantity, _ in quantities
+            for quantity in quantities
             if table.arrays.keys() & set(quantity.columns)
         ]
         for name in places:
@@ -252,9 +253,10 @@ def start_arrays(env: EnvView) -> dict[str, np.ndarray]:
         for name, field in env.sim.fields.items()
         if bool((field != torch.from_numpy(getattr(model, name)).to(field)).any())
     }
-    quantities: tuple[type[Quantity], ...] = (ObjectMasses, SlidingFriction, ServoGains)
-    for quantity in (kind(env) for kind in quantities if varying & set(kind.fields)):
-        out |= zip(quantity.columns, quantity.read().unbind(1), strict=True)
+    for kind, ends in _RANDOMIZED.items():
+        if varying & set(kind.model_fields):
+            quantity = kind(env, **{ends: (1.0, 1.0)})  # to be read alone
+            out |= zip(quantity.columns, quantity.read().unbind(1), strict=True)
     out |= {f"{name}_xy": place_xy(env, name) for name in _drawn_places(env)}
     return {name: values.double().cpu().numpy() for name, values in out.items()}
 
