@@ -199,3 +199,23 @@ def test_a_fall_in_the_last_step_is_no_stack(recording: World) -> None:
 def test_a_jaw_that_touches_in_one_step_is_no_release(recording: World) -> None:
     recording.jaw(0)[-1, 2] = 2e-5
     assert judge(recording) == {"RELEASED"}
+
+
+def test_a_grip_that_slips_every_ninth_step_is_no_lift(recording: World) -> None:
+    for jaw in (0, 1):
+        recording.jaw(jaw)[::9] = 0.0
+    assert judge(recording) == {"LIFT", "CARRY"}
+    assert not feed([recording], recording.rec).failed.any()  # with phases the jaws do not count
+
+
+@pytest.mark.full
+def test_a_lift_in_the_settled_window_comes_too_late(recording: World) -> None:
+    """The same flight, shifted so that all of it but the last step before the window is in it."""
+    first = np.flatnonzero((recording.jaw(0) != 0.0).any(1))[0]
+    late = len(recording.pose) - recording.t.window - 9
+    for name in ("pose", "force"):
+        values = getattr(recording, name)
+        shifted = np.roll(values, late - first, axis=0)
+        shifted[:late] = values[0]
+        setattr(recording, name, shifted)
+    assert judge(recording) >= {"LIFT", "CARRY"}

@@ -147,11 +147,18 @@ def test_every_shape_stands_on_the_table(folder: Callable[[str], Path]) -> None:
     env.close()
 
 
-@pytest.mark.parametrize("shape", ["box", "cylinder", "sphere", "capsule"])
-def test_lowest_point_of_any_shape(shape: str) -> None:
+@pytest.mark.parametrize(
+    ("shape", "size"),
+    [
+        ("box", [0.03, 0.015, 0.02]),
+        ("box", [0.022, 0.022, 0.022]),
+        ("cylinder", [0.02, 0.03]),
+        ("sphere", [0.02]),
+        ("capsule", [0.015, 0.02]),
+    ],
+)
+def test_lowest_point_of_any_shape(shape: str, size: list[float]) -> None:
     """Against MuJoCo's distance from a plane far below."""
-    sizes = {"box": [0.03, 0.015, 0.02], "cylinder": [0.02, 0.03], "sphere": [0.02]}
-    size = sizes.get(shape, [0.015, 0.02])
     spec = mujoco.MjSpec()
     spec.worldbody.add_geom(name="plane", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])
     body = spec.worldbody.add_body()

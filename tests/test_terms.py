@@ -25,6 +25,7 @@ from mjstack.mdp import reset as reset_terms
 from mjstack.mdp import reward as reward_terms
 from mjstack.mdp import termination as termination_terms
 from mjstack.mdp.geometry import source_xy
+from mjstack.tasks.check import make_check
 from mjstack.tasks.reach import ReachSuccess
 from mjstack.tasks.stack import StackSuccess
 
@@ -401,58 +402,41 @@ def test_success_ends_a_scripted_episode(
     assert not run.truncated.any()
 
 
-# Success of the stack task against NumPy
+# Success of the stack task against its check
 
 
-def rested(
-    pose: np.ndarray,
-    velocity: np.ndarray,
-    opening: np.ndarray,
-    touched: np.ndarray,
-    cfg: Config,
-    since: np.ndarray,
-) -> np.ndarray:
-    """Rules 4 to 6 over the window that ends at each step.
+def rested(rec: SimpleNamespace, *views: torch.Tensor, since: np.ndarray) -> np.ndarray:
+    """Rules 4 to 6 of the check over the window that ends at each step, shape ``(steps,)``.
 
     Args:
-        pose: Shape ``(steps, 2, 7)``.
-        velocity: Shape ``(steps, 2, 6)``.
-        opening: Of every finger, shape ``(steps, n)``.
-        touched: Whether a jaw presses on red, shape ``(steps,)``.
-        cfg: Thresholds, table and cubes.
-        since: First frame of the episode that each step belongs to, shape ``(steps,)``.
+        rec: Configuration and addresses.
+        views: qpos, qvel and sensordata, each ``(steps, n)``.
+        since: First step of the episode that each step belongs to, shape ``(steps,)``.
     """
-    t = limits(cfg)
-    scene = cfg.scene
-    half = scene.objects["red"].half_height
-    top = table_top(cfg)
-    red = pose[:, RED]
-    blue = pose[:, BLUE]
-    good = np.linalg.norm(red[:, :2] - blue[:, :2], axis=1) <= t.xy_err
-    good &= (red[:, 2] - blue[:, 2] >= t.dz_min) & (red[:, 2] - blue[:, 2] <= t.dz_max)
-    for i, p in enumerate(blue):
-        good[i] &= bool(np.isfinite(p).all()) and abs(lowest_corner(p, half) - top) <= t.support_gap
-        off = np.abs(p[:2] - scene.table_center[:2])
-        good[i] &= bool((off <= np.array(scene.table_half[:2]) - half).all())
-    linear, angular = (np.linalg.norm(velocity[..., a : a + 3], axis=-1) for a in (0, 3))
-    speed = linear + math.sqrt(3.0) * half * angular
-    out = np.zeros(len(pose), dtype=bool)
-    for step in range(t.window - 1, len(pose)):
-        part = slice(step - t.window + 1, step + 1)
-        if part.start < since[step] or not good[part].all():
-            continue
-        if touched[part].any() or not (opening[part] >= 0.8).all():
-            continue
-        rms = np.sqrt(np.square(speed[part]).mean(0))
-        places = pose[part, :, :3]
-        turns = pose[part, :, 3:]
-        distance = np.linalg.norm(places[:, None] - places[None], axis=-1).max()
-        chords = (turns[:, None] - turns[None], turns[:, None] + turns[None])
-        chord = np.minimum(*(np.linalg.norm(each, axis=-1) for each in chords))
-        angle = 4.0 * np.arcsin(np.minimum(1.0, 0.5 * chord)).max()
-        still = (rms <= t.rest_speed).all() and distance <= t.rest_position
-        out[step] = still and angle <= math.radians(t.rest_rotation_deg)
-    return out
+    window = limits(rec.cfg).window
+    windows = len(views[0]) - window + 1
+    env = env_of(rec, windows)  # world w has the window that begins with step w
+    env.sim.step_count = env.sim.overflow = torch.zeros(windows, dtype=torch.int32)
+    env.sim.qpos, env.sim.qvel, env.sim.sensordata = (view[:windows] for view in views)
+    check = make_check(rec.cfg)
+    check.start(env, window)
+    for step in range(window):
+        at = slice(step, step + windows)
+        env.sim.qpos, env.sim.qvel, env.sim.sensordata = (view[at] for view in views)
+        check.update()
+    rules = {name: bit for name, bit in check.rules.items() if bit > check.rules["CARRY"]}
+    assert list(rules) == [
+        *("STACKED", "SUPPORTED", "REST_SPEED", "REST_POSITION", "REST_ROTATION", "RELEASED")
+    ]
+    out = np.zeros(len(since), dtype=bool)
+    out[window - 1 :] = (check.result().failed.numpy() & sum(rules.values())) == 0
+    return out & (np.arange(len(since)) - window + 1 >= since)
+
+
+def env_of(rec: SimpleNamespace, nworld: int) -> SimpleNamespace:
+    return SimpleNamespace(
+        nworld=nworld, device=torch.device("cpu"), cfg=rec.cfg, index=rec.index, sim=StubViews()
+    )
 
 
 FROM = 115  # where trajectories are altered: the world has been successful for a while
@@ -530,10 +514,7 @@ def assert_success(
     """
     names, *views = zip(*worlds, strict=True)
     state = [torch.stack(view, 1) for view in views]
-    cpu = torch.device("cpu")
-    env = SimpleNamespace(
-        nworld=len(names), device=cpu, cfg=rec.cfg, index=rec.index, sim=StubViews()
-    )
+    env = env_of(rec, len(names))
     env.sim.qpos, env.sim.qvel, env.sim.sensordata = (view[0] for view in state)
     term = StackSuccess(env)
     anew = torch.tensor(["anew" in name for name in names])
@@ -558,9 +539,6 @@ def test_stack_success_is_rules_four_to_six(
     closed, opened = map(np.array, ends)
     gripper = torch.from_numpy(rec.index.robot_qpos[rec.index.n_arm :])
 
-    def opening(qpos: torch.Tensor) -> np.ndarray:
-        return (qpos[:, gripper].numpy() - closed) / (opened - closed)
-
     whole = []
     expected = []
     for k in range(3):
@@ -568,9 +546,7 @@ def test_stack_success_is_rules_four_to_six(
         qvel = rec.qvel[:, k]
         force = rec.sensordata[:, k]
         whole.append((f"world {k}", qpos, qvel, force))
-        touched = (jaw_forces_of(rec, force) > 1e-5).any(1)
-        cubes = cubes_of(rec, qpos, qvel)
-        expected.append(rested(*cubes, opening(qpos), touched, rec.cfg, np.zeros(len(qpos))))
+        expected.append(rested(rec, qpos, qvel, force, since=np.zeros(len(qpos))))
         assert expected[-1][-1]
         assert not expected[-1][:480].any()
         assert rec.success[:, k].tolist() == expected[-1].tolist()  # what the environment said
@@ -585,7 +561,7 @@ def test_stack_success_is_rules_four_to_six(
     for name, (alterations, recovers) in VARIANTS.items():
         q = qpos.clone()
         v = qvel.clone()
-        fingers = opening(qpos)
+        fingers = (qpos[:, gripper].numpy() - closed) / (opened - closed)
         pose, velocity = cubes_of(rec, q, v)
         arrays = {"pose": pose, "velocity": velocity, "opening": fingers}
         for array, part, alter in alterations:
@@ -598,8 +574,7 @@ def test_stack_success_is_rules_four_to_six(
         pressed = force.clone()
         if name == "touched_for_one_step":
             pressed[FROM, rec.index.jaw_force["red"][1]] = 1.0
-        touched = (jaw_forces_of(rec, pressed) > 1e-5).any(1)
-        want = rested(pose, velocity, fingers, touched, rec.cfg, since)
+        want = rested(rec, q, v, pressed, since=since)
         unharmed = name in ("untouched", "other_sign", "kicked_gently")
         assert want[FROM - 2], name
         assert want[FROM + 44 : FROM + 48].tolist() == [unharmed] * 4, name
