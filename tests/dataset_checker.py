@@ -16,6 +16,15 @@ QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 INDICES = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 
 
+def contents(folder: Path) -> dict[str, bytes]:
+    """Every file below a folder, by its path in it."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
 def check_dataset(folder: Path) -> StoredDataset:
     """Types and dimensions are those of info.json; indices, timestamps and places run on without a
     gap; every number is finite; tasks, lengths and totals agree; the statistics of each episode and

@@ -23,7 +23,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from compositions import load_config, put
-from dataset_checker import check_dataset
+from dataset_checker import check_dataset, contents
 from environments import at_double_speed, one_second_episode, stack_starts
 from stubs import episodes_of, fake_batches, pairs
 
@@ -62,14 +62,6 @@ STEPS = 300  # of a demonstration at double speed
 def steps_of(dataset: Path, number: int) -> dict[str, np.ndarray]:
     table = pq.read_table(dataset / "data", filters=[("episode_index", "==", number)])
     return {name: np.array(table[name].to_pylist()) for name in table.column_names}
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
 
 
 def report_of(folder: Path) -> dict:
@@ -521,47 +513,46 @@ def test_seeds_without_an_episode_are_given_up(
 
 
 @pytest.mark.full
-def test_ctrl_c_keeps_finished_batches(folder: Path, play_nothing: PlayNothing) -> None:
-    def stop(seed: int, values: torch.Tensor) -> None:
-        if seed == 1:
-            raise KeyboardInterrupt
-
-    args = ["nworld=2", "job.episodes=5"]
-    play_nothing(lambda seed, world: False, stop)
-    assert collect(*args) == 130
-    assert pairs(folder / "dataset") == [(0, 0), (0, 1)]
-    report = report_of(folder)
-    assert report["status"] == "interrupted"
-    assert report["gates"][0]["reason"].startswith("interrupted; 2 episodes, 5 asked for")
-    play_nothing()
-    assert collect(*args) == 0
-    assert pairs(folder / "dataset") == [(0, 0), (0, 1), (1, 0), (1, 1), (2, 0)]
-
-
-@pytest.mark.full
-def test_a_full_disk_is_one_line(
+@pytest.mark.parametrize(
+    ("error", "status", "code"),
+    [
+        (KeyboardInterrupt(), "interrupted", 130),
+        (OSError(28, "No space left on device"), "fail", 1),
+    ],
+    ids=["Ctrl-C", "full disk"],
+)
+def test_finished_batches_are_kept(
+    error: BaseException,
+    status: str,
+    code: int,
     folder: Path,
     play_nothing: PlayNothing,
     monkeypatch: pytest.MonkeyPatch,
-    error_line: Callable[[], str],
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    add = PartWriter.write
+    """The second batch ends in the middle of its episodes."""
+    write = PartWriter.write
 
-    def full(self: PartWriter, *args: object) -> None:
-        if args[0].seed == 1 and len(self.part.rows) == 1:  # type: ignore[attr-defined]
-            raise OSError(28, "No space left on device")
-        add(self, *args)  # type: ignore[arg-type]
+    def broken(self: PartWriter, episode: Any, *args: Any) -> None:
+        if episode.seed == 1 and len(self.part.rows) == 1:
+            raise error
+        write(self, episode, *args)
 
     args = ["nworld=2", "job.episodes=5"]
     play_nothing()
-    monkeypatch.setattr(PartWriter, "write", full)
-    assert collect(*args) == 1
-    err = error_line()
-    assert "No space left on device" in err
-    assert "2 committed episodes are kept" in err
+    with monkeypatch.context() as inner:
+        inner.setattr(PartWriter, "write", broken)
+        assert collect(*args) == code
     assert pairs(folder / "dataset") == [(0, 0), (0, 1)]
-    assert report_of(folder)["status"] == "fail"
-    monkeypatch.setattr(PartWriter, "write", add)
+    report = report_of(folder)
+    assert report["status"] == status
+    if code == 1:
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "No space left on device" in line
+        assert "2 committed episodes are kept" in line
+    else:
+        assert report["gates"][0]["reason"].startswith("interrupted; 2 episodes, 5 asked for")
+    play_nothing()
     assert collect(*args) == 0
     assert pairs(folder / "dataset") == [(0, 0), (0, 1), (1, 0), (1, 1), (2, 0)]
 

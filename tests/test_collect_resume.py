@@ -8,7 +8,6 @@ import copy
 import json
 import os
 import shutil
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -97,7 +96,7 @@ def collect(home: Path, *overrides: str, **kwargs: Any) -> GateResult:
     """Plays to the end."""
     collection = collection_at(home, *overrides, **kwargs)
     assert collection.play() == ""
-    return collection.result(Status.passed, "", 1.0)
+    return collection.result(Status.passed, "")
 
 
 def left_in(home: Path, result: GateResult) -> dict[str, Any]:
@@ -151,7 +150,11 @@ def test_figures_of_the_uninterrupted_one(whole: dict[str, Any]) -> None:
     assert max(row["data/file_index"] for row in whole["left"]["rows"]) >= 2
 
 
-def break_write(call: int, error: Callable[[], None], monkeypatch: pytest.MonkeyPatch) -> None:
+CTRL_C = KeyboardInterrupt()
+FULL_DISK = OSError(28, "No space left on device")
+
+
+def break_write(call: int, error: BaseException, monkeypatch: pytest.MonkeyPatch) -> None:
     """Something goes wrong as the n-th episode is written."""
     write = PartWriter.write
     calls = []
@@ -159,26 +162,18 @@ def break_write(call: int, error: Callable[[], None], monkeypatch: pytest.Monkey
     def broken(self: PartWriter, *args: Any) -> None:
         calls.append(args)
         if len(calls) == call:
-            error()
+            raise error
         write(self, *args)
 
     monkeypatch.setattr(PartWriter, "write", broken)
 
 
-def press_ctrl_c() -> None:
-    raise KeyboardInterrupt
-
-
-def fill_disk() -> None:
-    raise OSError(28, "No space left on device")
-
-
 def play_broken(
-    home: Path, call: int, error: Callable[[], None], *overrides: str, **kwargs: Any
+    home: Path, call: int, error: BaseException, *overrides: str, **kwargs: Any
 ) -> Collection:
     """A collection in which an episode cannot be written."""
     collection = collection_at(home, *overrides, **kwargs)
-    expected = KeyboardInterrupt if error is press_ctrl_c else FolderError
+    expected = KeyboardInterrupt if error is CTRL_C else FolderError
     with pytest.MonkeyPatch.context() as monkeypatch:
         break_write(call, error, monkeypatch)
         with pytest.raises(expected):
@@ -186,10 +181,10 @@ def play_broken(
     return collection
 
 
-@pytest.mark.parametrize("error", [press_ctrl_c, fill_disk])
+@pytest.mark.parametrize("error", [CTRL_C, FULL_DISK], ids=["Ctrl-C", "full disk"])
 @pytest.mark.parametrize("call", [1, 6, 10])
 def test_a_batch_is_kept_as_a_whole(
-    call: int, error: Callable[[], None], whole: dict[str, Any], tmp_path: Path
+    call: int, error: BaseException, whole: dict[str, Any], tmp_path: Path
 ) -> None:
     """The next call plays an unfinished one again, and leaves what an uninterrupted one does."""
     kept = 0 if call < 8 else 9 if whole["keep_failures"] else 7
@@ -252,7 +247,7 @@ def test_no_room_for_the_record(
     def full(path: Path, content: str) -> None:
         calls.append(path.name)
         if len(calls) >= call:
-            raise OSError(28, "No space left on device")
+            raise FULL_DISK
         write(path, content)
 
     collection = collection_at(tmp_path)
@@ -322,7 +317,7 @@ def test_real_worlds_are_the_same_again(tmp_path: Path, monkeypatch: pytest.Monk
     quick = one_second_episode()
     options: dict[str, Any] = {"nworld": 2, "episodes": 2, "keep_failures": True}
     expected = left_in(tmp_path / "whole", collect(tmp_path / "whole", *quick, **options))
-    play_broken(tmp_path / "parts", 2, press_ctrl_c, *quick, **options)
+    play_broken(tmp_path / "parts", 2, CTRL_C, *quick, **options)
     assert_same(
         left_in(tmp_path / "parts", collect(tmp_path / "parts", *quick, **options)), expected
     )
@@ -337,7 +332,7 @@ def test_ctrl_c_on_cuda(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     command = ["job=collect", "job.folder=demos", "nworld=8", "sim=mjwarp", "sim.device=cuda:0"]
     args = [*command, "job.episodes=12", "job.keep_failures=true"]
     with pytest.MonkeyPatch.context() as inner:
-        break_write(11, press_ctrl_c, inner)
+        break_write(11, CTRL_C, inner)
         assert run(args) == 130
     first = episodes_of(Path("demos/dataset"))
     assert [(row["seed"], row["world"]) for row in first] == [(0, world) for world in range(8)]

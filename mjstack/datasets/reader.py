@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from mjstack.config.fingerprint import differences
 from mjstack.datasets import lerobot
 from mjstack.datasets.spec import DatasetSpec, Video
 from mjstack.datasets.video import decode
@@ -44,16 +45,12 @@ class StoredDataset:
 
         Raises:
             UnknownName: There are no such images.
-            FolderError: There is no such episode, or a file is missing or damaged.
+            IndexError: There is no such episode.
+            FolderError: A file is missing or damaged.
         """
         videos = _videos(self.info)
         if name not in videos:
             raise UnknownName("video", name, videos)
-        if not 0 <= episode < len(self.episodes):
-            raise FolderError(
-                f"{self.folder} has {len(self.episodes)} episodes, expected one with number"
-                f" {episode}. Give a smaller one"
-            )
         row = self.episodes[episode]
         place = {key: row[f"videos/{name}/{key}"] for key in ("chunk_index", "file_index")}
         path = self.folder / lerobot.VIDEO.format(video_key=name, **place)
@@ -168,27 +165,17 @@ def check_same(folder: Path, info: dict[str, Any], spec: DatasetSpec) -> None:
     Raises:
         FolderError: It has another configuration, or other columns.
     """
-    stored = _identity(info)
-    expected = _identity(lerobot.make_info(spec))
-    for key in stored | expected:
-        if stored.get(key) != expected.get(key):
-            raise FolderError(
-                f"{folder} has {key}={stored.get(key)}, expected {expected.get(key)}. Give another"
-                " folder, or what it was begun with"
-            )
+    if changes := differences(_identity(info), _identity(lerobot.make_info(spec))):
+        raise FolderError(
+            f"{folder} has {changes}", "Give another folder, or what it was begun with"
+        )
 
 
 def _identity(info: dict[str, Any]) -> dict[str, Any]:
     """Everything of info.json that stays while a dataset grows."""
-    block = info["mjstack"]
-    keys = ("codebase_version", "robot_type", "fps", "chunks_size")
-    return {
-        "config_sha256": block["config_sha256"],
-        **{key: info[key] for key in keys},
-        **{f"features['{name}']": feature for name, feature in info["features"].items()},
-        **{f"units['{name}']": units for name, units in block["units"].items()},
-        "values": block["values"],
-    }
+    block = {key: info["mjstack"][key] for key in ("config_sha256", "units", "values")}
+    keys = ("codebase_version", "robot_type", "fps", "chunks_size", "features")
+    return block | {key: info[key] for key in keys}
 
 
 def read_tasks(folder: Path, info: dict[str, Any]) -> list[str]:
@@ -247,12 +234,7 @@ def read_rows(folder: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
 
 def uncommitted(folder: Path, shards: int) -> list[Path]:
     """Files that an interrupted writer left: shards from this number on, and hidden ones."""
-    videos = [(lerobot.VIDEO, video.name) for video in folder.glob("videos/*")]
-    counted = {
-        lerobot.shard_path(folder, files, shard, video)
-        for files, video in [(lerobot.DATA, ""), (lerobot.EPISODES, ""), *videos]
-        for shard in range(shards)
-    }
+    counted = {lerobot.FILE.format(**lerobot.shard_indices(shard)) for shard in range(shards)}
     places = {"data": "parquet", "meta/episodes": "parquet", "videos/*": "mp4"}
     patterns = [
         f"{place}/chunk-*/{name}"
@@ -261,7 +243,8 @@ def uncommitted(folder: Path, shards: int) -> list[Path]:
     ]
     totals = (lerobot.INFO, lerobot.STATS, lerobot.TASKS)
     patterns += [f"meta/.{Path(name).name}.*" for name in totals]
-    return [path for name in patterns for path in folder.glob(name) if path not in counted]
+    paths = [path for pattern in patterns for path in folder.glob(pattern)]
+    return [path for path in paths if f"{path.parent.name}/{path.stem}" not in counted]
 
 
 def _read_table(path: Path, columns: Sequence[str] | None = None) -> Any:

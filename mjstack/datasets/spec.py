@@ -175,16 +175,20 @@ def typed_episode(
         FolderError: A value, a feature or images are missing, unknown, of another shape or type,
             or not finite.
     """
-    where = f"episode of seed {episode.seed}, world {episode.world}"
+
+    def misfit(name: str, problem: str, expected: object, fix: str) -> FolderError:
+        where = f"episode of seed {episode.seed}, world {episode.world}"
+        return FolderError(f"{where}: {name} {problem}, expected {expected}", fix)
+
     for noun, names, expected in (
         ("value", episode.values, spec.values),
         ("feature", episode.arrays, spec.features),
         ("video", episode.images, spec.videos),
     ):
         if names.keys() != expected.keys():
-            raise FolderError(
-                f"{where}: {noun} names are {', '.join(names) or 'missing'}, expected"
-                f" {', '.join(expected)}. Give these, or change the DatasetSpec"
+            problem = f"names are {', '.join(names) or 'missing'}"
+            raise misfit(
+                noun, problem, ", ".join(expected), "Give these, or change the DatasetSpec"
             )
 
     # Values of the row
@@ -193,10 +197,8 @@ def typed_episode(
     for name, dtype in {**OWN_VALUES, **spec.values}.items():
         kinds, convert = VALUE_DTYPES[dtype]
         if not isinstance(values[name], kinds):
-            raise FolderError(
-                f"{where}: {name} is {values[name]!r}, expected {dtype}. Convert it, or change the"
-                " DatasetSpec"
-            )
+            fix = "Convert it, or change the DatasetSpec"
+            raise misfit(name, f"is {values[name]!r}", dtype, fix)
         row[name] = convert(values[name])
 
     # Frames
@@ -206,31 +208,23 @@ def typed_episode(
         array = np.asarray(episode.arrays[name])
         rows = array[:, None] if array.ndim == feature.dim == 1 else array
         if rows.shape != (frames, feature.dim) or not frames:
-            raise FolderError(
-                f"{where}: {name} has shape {array.shape}, expected ({frames or 'frames'},"
-                f" {feature.dim}). Give every frame's {name}"
-            )
+            shape = f"({frames or 'frames'}, {feature.dim})"
+            raise misfit(name, f"has shape {array.shape}", shape, f"Give every frame's {name}")
         if not np.can_cast(rows.dtype, feature.dtype, "same_kind"):
-            raise FolderError(
-                f"{where}: {name} is {rows.dtype}, expected {feature.dtype}. Convert it, or change"
-                " the feature"
-            )
+            fix = "Convert it, or change the feature"
+            raise misfit(name, f"is {rows.dtype}", feature.dtype, fix)
         with np.errstate(over="ignore"):
             typed[name] = np.ascontiguousarray(rows, dtype=feature.dtype)
         infinite = np.flatnonzero(~np.isfinite(typed[name]).all(axis=1))
         if len(infinite):
-            raise FolderError(
-                f"{where}: {name} is not finite in {len(infinite)} of {frames} frames (first:"
-                f" {infinite[0]}), expected finite {feature.dtype}. Leave the episode out"
-            )
+            problem = f"is not finite in {len(infinite)} of {frames} frames (first: {infinite[0]})"
+            raise misfit(name, problem, f"finite {feature.dtype}", "Leave the episode out")
 
     # Images
     for name, video in spec.videos.items():
         images = episode.images[name]
-        shape = (frames, video.height, video.width, 3)
-        if images.shape != shape or images.dtype != np.uint8:
-            raise FolderError(
-                f"{where}: {name} is {images.dtype} of shape {images.shape}, expected uint8 of"
-                f" {shape}. Give an image for every frame"
-            )
+        size = (frames, video.height, video.width, 3)
+        if images.shape != size or images.dtype != np.uint8:
+            problem = f"is {images.dtype} of shape {images.shape}"
+            raise misfit(name, problem, f"uint8 of {size}", "Give an image for every frame")
     return row, typed

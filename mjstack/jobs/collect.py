@@ -88,14 +88,13 @@ def run_collect(plan: CollectPlan, run: Run, folder: Path) -> None:
     """Add the missing episodes to the dataset, and leave dataset.md in the folder."""
     run.begin(NAME)
     ranks = run.stage.ranks
-    began = time.perf_counter()
     collection = Collection(plan, run.stage)
     ranks.from_first(lambda: None)  # the dataset is open
 
     def conclude(status: Status, problem: str) -> None:
         if not ranks.writes:
             return
-        result = collection.result(status, problem, time.perf_counter() - began)
+        result = collection.result(status, problem)
         if collection.committed:
             _write_table(run.cfg, plan, folder, result)
             run.print_line(f"dataset: {collection.path}, described in {folder}/dataset.md")
@@ -134,6 +133,7 @@ class Collection:
 
     def __init__(self, plan: CollectPlan, stage: Stage) -> None:
         """Open the dataset of a plan; raises as `DatasetWriter` does."""
+        self._began = time.perf_counter()
         self._stage = stage
         self._plan = plan
         self._job = cast(CollectJobCfg, stage.cfg.job)
@@ -269,11 +269,11 @@ class Collection:
             f" {self.committed} of {self._job.episodes} episodes there"
         )
 
-    def result(self, status: Status, problem: str, seconds: float) -> GateResult:
-        """The dataset and the expert's success, as a result of the report.
-
-        ``problem`` says why it did not pass; ``seconds`` is the wall time of this call.
+    def result(self, status: Status, problem: str) -> GateResult:
+        """The dataset and the expert's success, as a result of the report; ``problem`` says why it
+        did not pass.
         """
+        seconds = time.perf_counter() - self._began
         asked = self._job.episodes
         new = self.committed - self._episodes_before
         steps = self.writer.frames

@@ -192,8 +192,7 @@ class EpisodeSource:
         """
         assert self._renderer is not None
         began = time.perf_counter()
-        states = batch.rows[POSITIONS][list(steps)][:, worlds]
-        qpos = states.transpose(0, 1).flatten(0, 1)
+        qpos = batch.select(POSITIONS, worlds)[:, list(steps)].flatten(0, 1)
         fields = {
             name: values[worlds.to(values.device)].repeat_interleave(len(steps), 0)
             for name, values in batch.env.sim.fields.items()
