@@ -3,7 +3,7 @@ first, each beside its copy on native MuJoCo.
 """
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -28,25 +28,22 @@ _MARKS = ("label", "failed", "twin")  # of a world, in the file beside its posit
 _TWINS = 8  # failing worlds that native MuJoCo plays too
 
 
-def _read_first(env: Env, driver: Driver) -> Read:
-    """Positions of as many of the first worlds as `_BYTES` hold."""
-    qpos = env.sim.qpos
-    frames = len(_frames(env.cfg.timing.step_dt)(driver.steps))
-    first = qpos[: max(1, _BYTES // (frames * qpos[0].nbytes))]
-    return lambda: {"qpos": first}
-
-
-def _frames(step_dt: float) -> Callable[[int], range]:
-    """The step ends that a page shows, for a number of steps."""
-    return lambda steps: range(0, steps + 1, frame_stride(step_dt))
-
-
 def motion_recorder(step_dt: float) -> Recorder:
     """Records the first worlds at the frames of a page, ``qpos`` of shape ``(frames, worlds, nq)``.
 
     ``step_dt`` is the control interval [s].
     """
-    return Recorder(Channels(_read_first, _frames(step_dt)))
+    stride = frame_stride(step_dt)
+
+    def bind(env: Env, driver: Driver) -> Read:
+        qpos = env.sim.qpos
+        first = qpos[: max(1, _BYTES // (len(ends(driver.steps)) * qpos[0].nbytes))]
+        return lambda: {"qpos": first}
+
+    def ends(steps: int) -> range:
+        return range(0, steps + 1, stride)
+
+    return Recorder(Channels(bind, ends))
 
 
 def show_batch(

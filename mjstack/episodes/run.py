@@ -12,7 +12,7 @@ from mjstack.episodes.recorder import Snapshots, WorldRecorder
 from mjstack.episodes.rollout import NOMINAL, Episode, Observer, State
 from mjstack.episodes.stage import Stage, TextHook
 from mjstack.managers.view import offers
-from mjstack.report.page import Page
+from mjstack.report.page import Page, World, frame_stride
 from mjstack.report.record import GateResult, Status
 from mjstack.sim import Simulation, make_simulation
 
@@ -129,3 +129,21 @@ class Run:
         metrics = {name: float(values[0]) for name, values in episode.values.items()}
         reason = f"failed: {self.stage.check.rules.describe(bits)}" if bits else ""
         return Status.failed if bits else Status.passed, reason, metrics
+
+    def show_world(
+        self, part: str, label: str, qpos: np.ndarray, *, failed: bool, title: str = ""
+    ) -> None:
+        """Show a world that was played alone, on the run's page if that has worlds in motion.
+
+        Args:
+            part: The part of the run that has played it.
+            label: Its text on the page.
+            qpos: Positions at every step end, shape ``(steps, nq)``.
+            failed: Whether it failed.
+            title: Title of the run's pictures, if they show it too.
+        """
+        if self.page.motion:
+            frames = qpos[:: frame_stride(self.cfg.timing.step_dt)]
+            self.page.worlds3d[part] = [World(label=label, qpos=frames, failed=failed)]
+        if title:
+            self.artifacts.pictured = (title, qpos)

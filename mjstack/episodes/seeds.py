@@ -5,7 +5,9 @@ import logging
 import socket
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
@@ -75,28 +77,25 @@ def play_seeds(
     return tally
 
 
+@dataclass
 class _Player:
-    """Plays seeds into a tally."""
+    """Plays seeds into a tally; the other attributes are arguments of `play_seeds`."""
 
-    def __init__(
-        self,
-        run: Run,
-        tally: EpisodeTally,
-        signs: bool,
-        observers: Callable[[int], Sequence[Observer]],
-    ) -> None:
-        """Arguments as of `play_seeds`."""
-        self._run = run
-        self._tally = tally
-        self._signs = signs
-        self._observers = observers
-        folder = run.folder
-        self._motion_path = folder and motion_path(folder, tally.gate) if run.page.motion else None
+    run: Run
+    tally: EpisodeTally
+    signs: bool
+    observers: Callable[[int], Sequence[Observer]]
+
+    @property
+    def _motion_path(self) -> Path | None:
+        """The file of worlds in motion, if they are shown."""
+        folder = self.run.folder
+        return folder and motion_path(folder, self.tally.gate) if self.run.page.motion else None
 
     def play(self, seeds: range, sim: Simulation) -> None:
         """Play or read back seed after seed, and count them."""
-        run = self._run
-        tally = self._tally
+        run = self.run
+        tally = self.tally
         missing = self._missing(seeds)
         try:
             for batch in play_batches(run.stage, missing, sim=sim, observers=self._observe):
@@ -122,32 +121,32 @@ class _Player:
 
     def _missing(self, seeds: range) -> Iterator[BatchPlan]:
         """The seeds that no earlier call of the run has played; its records are counted."""
-        run = self._run
+        run = self.run
         for seed in seeds:
             record = run.stage.ranks.from_first(partial(self._read, seed))
             if record is None:
                 yield BatchPlan(seed, run.stage.worlds)
                 continue
-            self._tally.again.append(seed)
+            self.tally.again.append(seed)
             if self._motion_path is not None and seed == run.cfg.seed:
-                restore_batch(run.page, self._motion_path, self._tally.gate)
+                restore_batch(run.page, self._motion_path, self.tally.gate)
             self._count(record)
 
     def _observe(self, plan: BatchPlan) -> list[Observer]:
         """The observers of a seed."""
-        cfg = self._run.cfg
+        cfg = self.run.cfg
         in_motion = self._motion_path is not None and plan.seed == cfg.seed
-        self._monitor = FailureMonitor() if self._signs else None
+        self._monitor = FailureMonitor() if self.signs else None
         self._motion = motion_recorder(cfg.timing.step_dt) if in_motion else None
-        watchers = [self._monitor, *self._observers(plan.seed), self._motion]
+        watchers = [self._monitor, *self.observers(plan.seed), self._motion]
         return [watcher for watcher in watchers if watcher is not None]
 
     def _count(self, record: EpisodeRecord) -> None:
         """Count a seed, and print where there are several."""
-        tally = self._tally
+        tally = self.tally
         tally.add(record)
         if tally.several:
-            self._run.print_line(
+            self.run.print_line(
                 f"{tally.gate}, seed {record.seed}: {int(record.succeeded.sum())} of"
                 f" {len(record.failed)} worlds succeeded, {tally.successes} of {tally.episodes}"
                 " so far"
@@ -155,11 +154,11 @@ class _Player:
 
     def _read(self, seed: int) -> EpisodeRecord | None:
         """The results of a seed that an earlier call of the run has left."""
-        cfg = self._run.cfg
-        folder = self._run.folder
+        cfg = self.run.cfg
+        folder = self.run.folder
         if cfg.resume is None or folder is None:
             return None
-        record = EpisodeRecord.read(folder, seed, self._tally.gate, whole=True)
+        record = EpisodeRecord.read(folder, seed, self.tally.gate, whole=True)
         if record is not None and len(record.failed) != cfg.nworld:
             raise FolderError(
                 f"resume={folder}: has {len(record.failed)} worlds of seed {seed}, expected"
@@ -171,7 +170,7 @@ class _Player:
         """Write the seed's record, before the next one can break or be stopped. A full disk takes
         no result back.
         """
-        tally = self._tally
+        tally = self.tally
         if tally.path is None:
             return
         try:

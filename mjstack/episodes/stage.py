@@ -3,8 +3,9 @@ them. All that a trainer or a benchmark needs of a run.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import mujoco
 
@@ -73,55 +74,36 @@ class MeasuredSizes:
     env: BatchSizes | None = None
 
 
+@dataclass(eq=False)
 class Stage:
     """Makes the simulations, environments and drivers of a configuration.
 
     Attributes:
         cfg: The configuration.
-        assets: Scene, plan and policy, which several configurations may share.
+        assets: Scene, plan and policy, which several configurations may share; by default those of
+            this one.
         ranks: The processes of the run.
         measured: Buffer sizes that were measured.
         progress: Where the run prints.
         observers: Look on at every rollout of many worlds, such as the live view.
     """
 
-    def __init__(
-        self,
-        cfg: Config,
-        assets: Assets | None = None,
-        *,
-        ranks: Ranks | None = None,
-        measured: MeasuredSizes | None = None,
-        progress: Progress | None = None,
-        observers: Sequence[Observer] = (),
-    ) -> None:
-        """Take the attributes; by default the assets are those of the configuration."""
-        self.cfg = cfg
-        self.assets = assets or Assets(cfg)
-        self.ranks = ranks or current_ranks()
-        self.measured = measured or MeasuredSizes()
-        self.progress = progress or Progress()
-        self.observers = observers
+    cfg: Config
+    assets: Assets = None  # type: ignore[assignment]
+    ranks: Ranks = field(default_factory=current_ranks)
+    measured: MeasuredSizes = field(default_factory=MeasuredSizes)
+    progress: Progress = field(default_factory=Progress)
+    observers: Sequence[Observer] = ()
 
-    def with_config(
-        self,
-        cfg: Config,
-        *,
-        assets: Assets | None = None,
-        ranks: Ranks | None = None,
-        measured: MeasuredSizes | None = None,
-    ) -> "Stage":
-        """A stage for another configuration, which shares scene and plan unless there are others.
-        It measures sizes itself: other starts, say, have other peaks.
+    def __post_init__(self) -> None:
+        """Make the assets of the configuration, if there are none."""
+        self.assets = self.assets or Assets(self.cfg)
+
+    def with_config(self, cfg: Config, **changes: Any) -> "Stage":
+        """A stage for another configuration, which shares all attributes that do not change. It
+        measures sizes itself unless it is given some: other starts, say, have other peaks.
         """
-        return Stage(
-            cfg,
-            assets or self.assets,
-            ranks=ranks or self.ranks,
-            measured=measured,
-            progress=self.progress,
-            observers=self.observers,
-        )
+        return replace(self, cfg=cfg, **({"measured": MeasuredSizes()} | changes))
 
     # What is built once
 

@@ -8,13 +8,12 @@ from mjstack.report.record import GateResult, Status
 def run_baseline(run: Run) -> list[GateResult]:
     """Run the nominal episode on native MuJoCo and judge it."""
     cfg = run.cfg
-    nominal = run.nominal
-    sim = nominal.sim
-    episode = nominal.episode
-    timing = episode.timing
+    sim = run.nominal.sim
+    episode = run.nominal.episode
     status, reason, metrics = run.judge_one(episode)
     headline = run.stage.check.headline(metrics)
     run.print_line(f"{cfg.task.name} check: {headline}")
+    timing = episode.timing
     metrics |= {
         "episode_s": timing.seconds,
         "world_steps_per_s": timing.steps * cfg.timing.decimation / timing.seconds,
@@ -27,9 +26,8 @@ def run_baseline(run: Run) -> list[GateResult]:
         metrics["path_error_m"] = run.stage.planner.path_error()
         thresholds["waypoint_error_m"] = cfg.controller.ik_tolerance
     failed = status is Status.failed
-    qpos = nominal.world.qpos
-    run.artifacts.pictured = ("baseline world", qpos)
-    run.page.show_world("baseline", "baseline, native", qpos, cfg.timing.step_dt, failed=failed)
+    qpos = run.nominal.world.qpos
+    run.show_world("baseline", "baseline, native", qpos, failed=failed, title="baseline world")
     result = GateResult(name="baseline", status=status, reason=reason or headline)
     result.thresholds = thresholds
     result.metrics = metrics

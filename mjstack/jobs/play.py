@@ -91,8 +91,7 @@ def play_worlds(run: Run) -> list[GateResult]:
                 outcome = outcome or f"succeeded, {stage.check.headline(metrics)}"
             positions.append(recorder.qpos)
             fields.append({name: value.clone() for name, value in sim.fields.items()})
-            page_world = (f"{NAME}_{world}", str(world), recorder.qpos, cfg.timing.step_dt)
-            run.page.show_world(*page_world, failed=failed)
+            run.show_world(f"{NAME}_{world}", str(world), recorder.qpos, failed=failed)
             details.append(f"world {world}: {outcome}")
             run.print_line(details[-1])
     result = GateResult(

@@ -105,11 +105,8 @@ def _replay(
     failed = status is Status.failed
     agrees, comparison = _compare(plan, number, episode, qpos[-1], changes, run)
     label = f"{plan.world}, {backend}"
-    step_dt = run.cfg.timing.step_dt
-    run.page.show_world(f"replay_{backend}", label, qpos, step_dt, failed=failed)
-    if first:
-        title = f"world {plan.world} of seed {plan.seed}, replayed ({backend})"
-        run.artifacts.pictured = (title, qpos)
+    title = f"world {plan.world} of seed {plan.seed}, replayed ({backend})" if first else ""
+    run.show_world(f"replay_{backend}", label, qpos, failed=failed, title=title)
     lines += [_first_sign(monitor, episode) for monitor in monitors]
     for line in lines:
         run.print_line(f"  {line}")

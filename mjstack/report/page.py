@@ -8,7 +8,6 @@ import numpy as np
 from mjstack.report.table import Table
 
 MOST_WORLDS = 64  # in motion, of a page
-_RATE = 25.0  # frames per second
 
 
 @dataclass(kw_only=True, slots=True)
@@ -89,23 +88,9 @@ class Page:
     episode: str = ""
     note: str = ""
 
-    def show_world(
-        self, part: str, label: str, qpos: np.ndarray, step_dt: float, *, failed: bool
-    ) -> None:
-        """Add a world that was played alone, if worlds in motion are shown.
 
-        Args:
-            part: The part of the run that has played it.
-            label: Its text.
-            qpos: Positions at every step end, shape ``(steps, nq)``.
-            step_dt: A step [s].
-            failed: Whether it failed.
-        """
-        if self.motion:
-            frames = qpos[:: frame_stride(step_dt)]
-            self.worlds3d[part] = [World(label=label, qpos=frames, failed=failed)]
-
-
-def frame_stride(step_dt: float) -> int:
-    """Control steps per frame of worlds in motion."""
-    return max(1, round(1.0 / (_RATE * step_dt)))
+def frame_stride(step_dt: float, rate: float = 25.0) -> int:
+    """Control steps per frame of worlds in motion, at a rate of frames [Hz] that is as near as
+    whole steps of ``step_dt`` [s] allow.
+    """
+    return max(1, round(1.0 / (rate * step_dt)))

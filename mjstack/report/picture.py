@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,7 @@ from PIL import Image, features
 from mjstack.errors import MissingExtra, MjstackError
 from mjstack.interrupt import check_interrupt
 from mjstack.report.gl import open_renderer
+from mjstack.report.page import frame_stride
 
 if TYPE_CHECKING:
     from matplotlib.patches import Rectangle
@@ -123,7 +125,7 @@ def save_video(
         MjstackError: This machine cannot draw offscreen, or lacks what writes the format.
     """
     write = require_video(path.suffix)
-    skip = max(1, round(1.0 / (fps * step_dt)))
+    skip = frame_stride(step_dt, fps)
     states = qpos[:, ::skip].swapaxes(0, 1)
     count, worlds, nq = states.shape
     columns = math.ceil(math.sqrt(worlds))
@@ -168,19 +170,17 @@ def require_video(ending: str = ".mp4") -> Callable[[Path, Frames, int, float], 
         if ending == ".webp" and not features.check("webp"):
             raise MjstackError("Pillow here writes no WebP", "Use job.format=gif or job.format=mp4")
         return partial(_write_loop, options=_LOOPS[ending])
-    try:
-        import imageio_ffmpeg
-    except ImportError as error:
-        raise MissingExtra("video=true", "imageio-ffmpeg", "video") from error
-    return partial(_write_mp4, imageio_ffmpeg.write_frames)
+    if find_spec("imageio_ffmpeg") is None:
+        raise MissingExtra("video=true", "imageio-ffmpeg", "video")
+    return _write_mp4
 
 
-def _write_mp4(
-    writer_of: Callable[..., Any], path: Path, frames: Frames, count: int, dt: float
-) -> None:
+def _write_mp4(path: Path, frames: Frames, count: int, dt: float) -> None:
+    from imageio_ffmpeg import write_frames
+
     images = frames(range(count))
     first = next(images)
-    writer = writer_of(str(path), first.size, fps=1.0 / dt, macro_block_size=16)
+    writer = write_frames(str(path), first.size, fps=1.0 / dt, macro_block_size=16)
     writer.send(None)
     for image in itertools.chain([first], images):
         writer.send(image.tobytes())
