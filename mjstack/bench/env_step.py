@@ -37,7 +37,7 @@ from mjstack.bench.timing import (
 from mjstack.config.functions import offered
 from mjstack.envs import Env
 from mjstack.envs.buffers import Advance
-from mjstack.episodes.rollout import State, restore, snapshot
+from mjstack.episodes.rollout import restore, snapshot
 from mjstack.sim.cameras import image_bytes
 from mjstack.sim.graph import StepGraph
 
@@ -82,18 +82,15 @@ def measure_env_step(
     step_seconds = parts.warm_up()
     steps = steps_that_fit(steps, seconds, _COST * (repetitions + 1) * step_seconds)
 
-    # The repetitions
+    # The repetitions; the first one warms up
     times: list[list[float]] = []
     ended = 0.0
-    start = snapshot(sim)
-    for repetition in range(repetitions + 1):
-        start, spent, episodes = parts.play(start, steps, meter)
-        if not repetition:  # it warms up
-            meter.clear()
-            continue
+    parts.play(steps, NO_METER)
+    for repetition in range(repetitions):
+        spent, episodes = parts.play(steps, meter)
         ended += episodes
         times.append(spent)
-        advance(f"{name}, repetitions", repetition, repetitions)
+        advance(f"{name}, repetitions", repetition + 1, repetitions)
 
     # The result
     out = Measurement(name=name)
@@ -131,7 +128,8 @@ def measure_env_step(
 
 
 class _Parts:
-    """Plays the parts of a repetition, each from the same state.
+    """Plays the parts of a repetition, each from the same state. The next repetition goes on where
+    the whole steps ended.
 
     Attributes:
         graphs: Physics, managers and, with cameras, images, as `Env.parts` has them.
@@ -163,20 +161,19 @@ class _Parts:
             for graph in self.graphs:
                 for _ in range(WARM_UP):
                     graph()
+        self._start = snapshot(env.sim)
         return seconds[-1]
 
-    def play(
-        self, start: State, steps: int, meter: EnergyMeter
-    ) -> tuple[State, list[float], float]:
+    def play(self, steps: int, meter: EnergyMeter) -> tuple[list[float], float]:
         """Play one repetition.
 
         Returns:
-            The state after the whole steps; seconds of env, physics, managers and images; and the
-            number of episodes that ended.
+            Seconds of env, physics, managers and images; and the number of episodes that ended.
         """
         env = self._env
         sim = env.sim
-        ages = (env.episode_step, env.episode)
+        start = self._start
+        ages = torch.stack((env.episode_step, env.episode))
         physics, managers, *images = self.graphs
         actions = self._actions(steps)
         targets = [torch.empty_like(sim.ctrl) for _ in actions]
@@ -203,13 +200,12 @@ class _Parts:
 
         # The whole step
         restore(sim, start)
-        start_ages = [age.clone() for age in ages]
         env.read_statistics()
         times = [timed(sim, play_whole, meter)]
         counted = env.read_statistics()
         self._find_losses(counted)
-        end = snapshot(sim)
-        end_ages = [age.clone() for age in ages]
+        self._start = snapshot(sim)
+        end_ages = torch.stack((env.episode_step, env.episode))
 
         # Physics alone, with the same joint targets
         restore(sim, start)
@@ -218,12 +214,16 @@ class _Parts:
 
         # The managers alone
         restore(sim, start)
-        _set_ages(ages, start_ages)
+        self._set_ages(ages)
         times.append(timed(sim, play_managers))
         env.faults.raise_first()
-        _set_ages(ages, end_ages)
+        self._set_ages(end_ages)
         times.append(timed(sim, play_images) if images else 0.0)
-        return end, times, counted["episodes"]
+        return times, counted["episodes"]
+
+    def _set_ages(self, ages: torch.Tensor) -> None:
+        for counter, age in zip((self._env.episode_step, self._env.episode), ages, strict=True):
+            counter.copy_(age)
 
     def _actions(self, count: int) -> list[torch.Tensor]:
         shape = (count, self._env.nworld, len(self._span))
@@ -241,8 +241,3 @@ class _Parts:
                 f"worlds ended by {', '.join(ended)}: raise batch.nconmax or batch.njmax, or act"
                 " more gently"
             )
-
-
-def _set_ages(ages: Sequence[torch.Tensor], values: Sequence[torch.Tensor]) -> None:
-    for age, value in zip(ages, values, strict=True):
-        age.copy_(value)

@@ -61,17 +61,12 @@ def measure_episode(
     ):
         before = None
 
-    # About how long a repetition takes
-    estimate = step_seconds * steps
-    if before is not None:
-        estimate = max(estimate, before.timing.seconds)
+    # The repetitions, and about how long one takes. Bare steps are measured once at least.
+    played = [before] if before is not None else []
+    estimate = max([step_seconds * steps, *(episode.timing.seconds for episode in played)])
+    rounds = repetitions - len(played)
     if mjwarp:
         estimate *= 2
-
-    # The repetitions
-    played = [before] if before is not None else []
-    rounds = repetitions - len(played)
-    if mjwarp:  # bare steps are measured once at least
         rounds = max(1, rounds)
     began = time.perf_counter()
     meter.clear()
@@ -96,11 +91,11 @@ def measure_episode(
     times = [timing.seconds for timing in timings]
     out.samples = {"seconds": times, **out.samples}
     out.facts = {
-        "of_the_batch_gate": sum(p is before for p in played),
+        "of_the_batch_gate": int(before is not None),
         "succeeded": sim.nworld - len(failed),
     }
-    used = meter if any(p is not before for p in played) else NO_METER
-    captured = all(p.captured for p in timings)
+    used = meter if played[-1] is not before else NO_METER
+    captured = all(timing.captured for timing in timings)
     out.add_repetitions(sim, cfg, times, steps, used, *timings, captured=captured)
     out.headline = f"{statistics.median(times):.3g} s"
     if "bare_ratio" in out.samples:
