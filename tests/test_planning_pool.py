@@ -46,7 +46,7 @@ def layouts(stage: Stage, nworld: int) -> np.ndarray:
 
 def plan_alone(cfg: Config, xy: np.ndarray) -> list[Plan]:
     planner = OpenLoopPlanner(cfg)
-    return [(world, *planner.plan_world(world, at)) for world, at in enumerate(xy)]
+    return [planner.plan_world(world, at) for world, at in enumerate(xy)]
 
 
 @pytest.mark.usefixtures("two_processes")
@@ -59,7 +59,7 @@ def test_plans_are_those_of_one_process(get_stage: GetStage) -> None:
     planner = OpenLoopPlanner(stage.cfg)
     planner.plan_world = None  # type: ignore[assignment,method-assign]  # nothing is planned here
     shared = planner.plan(xy, told.append)
-    for world, knots, error in plan_alone(stage.cfg, xy):
+    for world, (knots, error) in enumerate(plan_alone(stage.cfg, xy)):
         assert shared.knots[world].numpy().tobytes() == knots.tobytes()
         assert shared.waypoint_error[world] == error
     assert len(told) == 22
@@ -97,7 +97,7 @@ def test_kept_processes_serve_every_plan(get_stage: GetStage) -> None:
         shared = planner.plan(xy)
         assert {child.pid for child in active_children()} == started
     assert len(started) == 2
-    knots = [plan for _, plan, _ in plan_alone(stage.cfg, xy)]
+    knots = [plan for plan, _ in plan_alone(stage.cfg, xy)]
     assert shared.knots.numpy().tobytes() == np.array(knots).tobytes()
 
 
@@ -215,7 +215,7 @@ def test_processes_by_cores_and_distinct_worlds(
         made.append(count)
         yield
 
-    monkeypatch.setattr(planner, "_plans", lambda worlds, _: [(world, *plan) for world in worlds])
+    monkeypatch.setattr(planner, "_plans", lambda worlds, _: [plan] * len(worlds))
     monkeypatch.setattr(open_loop, "_start_processes", start)
     monkeypatch.setattr(open_loop, "available_cores", lambda: cores)
     trajectory = planner.plan(layouts(stage, distinct)[np.arange(nworld) % distinct])

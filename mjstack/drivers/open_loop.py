@@ -20,8 +20,8 @@ from mjstack.config.schema import Config
 from mjstack.errors import MjstackError, Unreachable
 from mjstack.interrupt import check_interrupt
 from mjstack.kinematics.mink_ik import GraspIk
+from mjstack.process import available_cores
 from mjstack.scene.phases import build_phases, nominal_xy, target_xy
-from mjstack.sim.native import available_cores
 
 # Distinct worlds: some 6 s of planning; a process needs 3 s before its first plan.
 PARALLEL_FROM = 512
@@ -32,8 +32,8 @@ _CHUNK = 8  # worlds, 0.1 s of planning: messages cost little beside it
 # Variables of a planning process, each 1: no threads, and no imports from the working folder.
 _VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "PYTHONSAFEPATH")
 
-# World, commands at the knots (n, nu), largest distance [m] from a target.
-Plan = tuple[int, np.ndarray, float]
+# Commands at the knots (n, nu), and the largest distance [m] from a target.
+Plan = tuple[np.ndarray, float]
 
 _planner: "OpenLoopPlanner"  # of a process that plans for another one
 
@@ -123,7 +123,7 @@ class OpenLoopPlanner:
     def plan(
         self,
         sources_xy: np.ndarray,
-        progress: Callable[[int], None] | None = None,
+        progress: Callable[[int], None] = lambda done: None,
         names: Sequence[int] | None = None,
     ) -> JointTrajectory:
         """Plan one trajectory per world; worlds that start alike share the work.
@@ -142,22 +142,21 @@ class OpenLoopPlanner:
         if self._last is not None and np.array_equal(self._last[0], sources_xy):
             return self._last[1]  # the gates of one run play the same batch
         nworld = sources_xy.shape[0]
-        numbers = range(nworld) if names is None else names
         flat = sources_xy.reshape(nworld, -1)
         _, first, kind = np.unique(flat, axis=0, return_index=True, return_inverse=True)
         twin = first[kind.reshape(-1)]
         worlds = sorted(first.tolist())
         done = np.cumsum(np.bincount(twin)[worlds]).tolist()
-        plans: dict[int, list[Any]] = {}
+        plans: dict[int, Plan] = {}
         try:
             with self.processes(len(worlds)):
-                batch = self._plans(worlds, sources_xy)
-                for count, (world, *plan) in zip(done, batch, strict=True):
+                batch = zip(worlds, done, self._plans(worlds, sources_xy), strict=True)
+                for world, count, plan in batch:
                     plans[world] = plan
-                    if progress is not None:
-                        progress(count)
+                    progress(count)
         except Unreachable as unreachable:
-            unreachable.world = numbers[unreachable.world]
+            if names is not None:
+                unreachable.world = names[unreachable.world]
             raise
         parts = zip(*(plans[world] for world in twin), strict=True)
         knots, error = (np.array(part) for part in parts)
@@ -170,7 +169,7 @@ class OpenLoopPlanner:
         """The plan of each world, in their order."""
         if self._pool is not None:
             return plan_in_parallel(self._pool, worlds, sources_xy)
-        return ((world, *self.plan_world(world, sources_xy[world])) for world in worlds)
+        return (self.plan_world(world, sources_xy[world]) for world in worlds)
 
     @contextmanager
     def processes(self, worlds: int) -> Iterator[None]:
@@ -201,7 +200,7 @@ class OpenLoopPlanner:
             worst = max(worst, float(np.linalg.norm(at - (start + s * (end - start))[:3])))
         return worst
 
-    def plan_world(self, world: int, xy: np.ndarray) -> tuple[np.ndarray, float]:
+    def plan_world(self, world: int, xy: np.ndarray) -> Plan:
         """Plan one world, starting from the nominal plan, so that its neighbours do not matter.
 
         Args:
@@ -313,10 +312,9 @@ def _start_processes(cfg: Config, count: int) -> Iterator[ProcessPoolExecutor]:
     # Processes are not forks: this one may hold a CUDA context and threads.
     with _as_programs():
         pool = ProcessPoolExecutor(count, get_context("spawn"), _start_process, (cfg,))
+        for _ in range(count):  # a process starts where a job finds none idle
+            pool.submit(int)
     try:
-        with _as_programs():
-            for _ in range(count):  # a process starts where a job finds none idle
-                pool.submit(int)
         yield pool
     finally:
         for process in set(active_children()).difference(before):
@@ -358,7 +356,7 @@ def _end_with_parent() -> None:
 
 
 def _plan(worlds: Sequence[int], xy: np.ndarray) -> list[Plan]:
-    return [(w, *_planner.plan_world(w, row)) for w, row in zip(worlds, xy, strict=True)]
+    return [_planner.plan_world(world, row) for world, row in zip(worlds, xy, strict=True)]
 
 
 def smoothstep(u: Any) -> Any:

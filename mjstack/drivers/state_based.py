@@ -113,8 +113,7 @@ class StateBasedDriver(FeedbackDriver):
         self._reach = torch.tensor(size, device=device)
 
         # Heights of targets: over an anchor that may stand anywhere, or over the table
-        targets = [phase.target for phase in plan]
-        above = [0.0 if target is None else target.above for target in targets]
+        above = [phase.target.above if phase.target else 0.0 for phase in plan]
         self._above = torch.tensor(above, device=device)
         follows = [follows_anchor(phase, things) for phase in plan]
         self._follows = torch.tensor(follows, device=device)
