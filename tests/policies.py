@@ -12,6 +12,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from compositions import load_config
@@ -72,6 +73,18 @@ def report(folder: Path) -> dict:
     """The gates of a run's report by name."""
     gates = json.loads((folder / "report.json").read_text())["gates"]
     return {gate["name"]: gate for gate in gates}
+
+
+def curve(folder: Path) -> np.ndarray:
+    """The rows of a training's curve, by column."""
+    return np.genfromtxt(folder / "train.csv", delimiter=",", names=True)
+
+
+def assert_drives(policy: Path, out: Path, *overrides: str, nworld: int = 2) -> None:
+    """A policy drives gate *batch*, in which every world may fail."""
+    drive = ["controller=policy", f"policy={policy}", "gates=[batch]", "sim=native"]
+    limits = [f"nworld={nworld}", f"gate.batch.failed_worlds={nworld}"]
+    assert run([*drive, *limits, *overrides, f"hydra.run.dir={out}"]) == 0
 
 
 def weights(folder: Path) -> dict[str, torch.Tensor]:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from policies import interrupted, report, same
+from policies import curve, interrupted, report, same
 
 import mjstack.train.dagger as dagger
 from mjstack.cli import run
+from mjstack.drivers.driver import Driver
 from mjstack.policy import load_policy
 from mjstack.train.clone_learner import CloneLearner
 
@@ -29,7 +29,7 @@ def test_rounds_leave_a_policy_and_go_on_bit_for_bit(tmp_path: Path) -> None:
     gates = report(whole)
     figures = gates["train"]["metrics"]
     assert (figures["rounds"], figures["batches"], figures["episodes"]) == (2, 40, 8)
-    rows = np.genfromtxt(whole / "train.csv", delimiter=",", names=True)
+    rows = curve(whole)
     assert rows["round"].tolist() == [1.0, 2.0]
     policy = load_policy(whole / "last")
     assert (policy.network.chunk, policy.execute, policy.training["trainer"]) == (1, 1, "dagger")
@@ -41,7 +41,7 @@ def test_rounds_leave_a_policy_and_go_on_bit_for_bit(tmp_path: Path) -> None:
         interrupted([*TINY, f"job.folder={parts}"], CloneLearner, number)
     assert run([*TINY, f"job.folder={parts}"]) == 0
     assert same(whole / "last", parts / "last")
-    other = np.genfromtxt(parts / "train.csv", delimiter=",", names=True)
+    other = curve(parts)
     for name in ("success", "validation_loss"):
         assert rows[name].tolist() == other[name].tolist()
 
@@ -56,18 +56,16 @@ def test_the_share_of_the_expert() -> None:
     env = mjstack.make_env(cfg, nworld=40)
     env.reset(seed=0)
 
-    class Constant:
-        phases: list = []  # noqa: RUF012
-        steps = 150
-
+    class Constant(Driver):
         def __init__(self, value: float) -> None:
+            super().__init__(40, 150, env.device)
             self.value = torch.full((40, len(env.index.ctrl)), value)
 
         def command(self) -> torch.Tensor:
             return self.value
 
     expert, policy = Constant(1.0), Constant(2.0)
-    driver = dagger.MixedDriver(expert, policy, env, 0.5, 10)  # type: ignore[arg-type]
+    driver = dagger.MixedDriver(expert, policy, env, 0.5, 10)
     seen = []
     for step in range(0, 1000, 25):
         env.episode_step.fill_(step)

@@ -12,7 +12,16 @@ import numpy as np
 import pytest
 import torch
 from environments import at_double_speed, configure, mask_of, on_new_sim
-from policies import interrupted, make_policy, report, run_as_torchrun, same, write_policy
+from policies import (
+    assert_drives,
+    curve,
+    interrupted,
+    make_policy,
+    report,
+    run_as_torchrun,
+    same,
+    write_policy,
+)
 
 import mjstack.mdp.starts.expert_states as expert_states
 from mjstack.cli import run
@@ -37,7 +46,7 @@ def test_a_training_leaves_policies_a_curve_and_a_judgement(tmp_path: Path) -> N
     gates = report(out)
     assert gates["train"]["metrics"]["iterations"] == 4
     assert gates["success"]["metrics"]["episodes"] == 4
-    rows = np.genfromtxt(out / "train.csv", delimiter=",", names=True)
+    rows = curve(out)
     assert rows["iteration"].tolist() == [2.0, 4.0]
     assert rows["decisions"].tolist() == [32.0, 64.0]
     assert np.isfinite(rows["return_"]).all()  # ends are spread out, so that some end early
@@ -53,11 +62,7 @@ def test_a_training_leaves_policies_a_curve_and_a_judgement(tmp_path: Path) -> N
     assert policy.action == configure("task=reach").action
     assert (policy.network.chunk, policy.execute) == (1, 5)
     assert policy.widths["headings"] == 4
-    drive = ["controller=policy", f"policy={out}/last", "gates=[batch]", "sim=native", "nworld=2"]
-    status = run(
-        ["task=reach", *drive, "gate.batch.failed_worlds=2", f"hydra.run.dir={tmp_path / 'gates'}"]
-    )
-    assert status == 0
+    assert_drives(out / "last", tmp_path / "gates", "task=reach")
 
 
 @pytest.mark.parametrize(("wanted", "bound"), [(1e-9, 0.01), (1e9, 10.0)], ids=["fall", "rise"])
@@ -68,7 +73,7 @@ def test_the_actors_learning_rate_adapts_before_every_step(
     out = tmp_path / "out"
     keys = [f"job.desired_kl={wanted}", "job.learning_rate=0.0002"]
     assert run([*REACH, *keys, f"job.folder={out}"]) == 0
-    rows = np.genfromtxt(out / "train.csv", delimiter=",", names=True)
+    rows = curve(out)
     assert rows["learning_rate"][-1] == pytest.approx(0.0002 * bound)
 
 
@@ -84,7 +89,7 @@ def test_a_training_goes_on_after_ctrl_c(tmp_path: Path) -> None:
     shutil.copytree(out, again)
     for folder in (out, again):
         assert run([*REACH, f"job.folder={folder}"]) == 0
-        rows = np.genfromtxt(folder / "train.csv", delimiter=",", names=True)
+        rows = curve(folder)
         assert rows["iteration"].tolist() == [2.0, 4.0]
     assert same(out / "last", again / "last")
 
@@ -123,7 +128,7 @@ def test_two_processes_learn_one_policy(tmp_path: Path) -> None:
     assert "iteration 4" in texts[0]
     assert "iteration" not in texts[1]
     assert not list((tmp_path / "1").iterdir())
-    rows = np.genfromtxt(out / "train.csv", delimiter=",", names=True)
+    rows = curve(out)
     assert rows["decisions"].tolist() == [32.0, 64.0]  # nworld is of both
 
 

@@ -11,7 +11,15 @@ import pytest
 import torch
 from compositions import load_config
 from environments import at_double_speed, configure, on_new_sim
-from policies import interrupted, report, run_as_torchrun, same, weights
+from policies import (
+    assert_drives,
+    curve,
+    interrupted,
+    report,
+    run_as_torchrun,
+    same,
+    weights,
+)
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import mjstack.policy.checkpoint as checkpoint
@@ -27,7 +35,7 @@ from mjstack.policy import load_policy
 from mjstack.policy.checkpoint import read_state, write_state
 from mjstack.train.clone_learner import CloneLearner, draw_seed
 from mjstack.train.demonstrations import Demonstrations, lead_gripper, play_expert
-from mjstack.train.trainer import STATE, observed_group
+from mjstack.train.trainer import STATE
 
 TINY = (
     *("job=train", "sim=native", "nworld=4", "job.episodes=4", "job.noisy_episodes=2"),
@@ -51,7 +59,7 @@ def test_a_training_leaves_policies_a_curve_and_a_judgement(
     assert success["episodes"] == 4
     assert 0.0 <= success["success_rate_low95"] <= success["success_rate_high95"] <= 1.0
     assert "success:" not in gates["success"]["reason"]  # job=replay takes runs of job=gates
-    rows = np.genfromtxt(out / "train.csv", delimiter=",", names=True)
+    rows = curve(out)
     assert rows["batch"].tolist() == [10.0, 20.0, 30.0]
     assert rows["validation_loss"][-1] < rows["validation_loss"][0]
     for name in ("train.png", "train.md", "best/policy.json", "last/policy.json"):
@@ -75,11 +83,7 @@ def test_a_training_leaves_policies_a_curve_and_a_judgement(
     assert run([*REACH, f"job.folder={out}"]) == 0
     assert report(out)["train"]["metrics"] == train
     assert all(torch.equal(v, before[k]) for k, v in weights(out / "last").items())
-    drive = ["controller=policy", f"policy={out}/last", "gates=[batch]", "sim=native", "nworld=3"]
-    status = run(
-        ["task=reach", *drive, "gate.batch.failed_worlds=3", f"hydra.run.dir={tmp_path / 'gates'}"]
-    )
-    assert status == 0
+    assert_drives(out / "last", tmp_path / "gates", "task=reach", nworld=3)
 
 
 @pytest.mark.parametrize("after", [7, 10])
@@ -93,11 +97,7 @@ def test_a_training_goes_on_where_it_was_interrupted(after: int, tmp_path: Path)
     assert (parts / "training.safetensors").exists()
     assert run([*REACH, f"job.folder={parts}"]) == 0
     assert same(whole / "last", parts / "last")
-    curves = [
-        np.genfromtxt(folder / "train.csv", delimiter=",", names=True)["loss"]
-        for folder in (whole, parts)
-    ]
-    np.testing.assert_allclose(*curves, rtol=1e-5)
+    np.testing.assert_allclose(curve(whole)["loss"], curve(parts)["loss"], rtol=1e-5)
 
 
 @pytest.mark.full
@@ -200,11 +200,7 @@ def test_a_clone_of_stack_drives_the_batch(tmp_path: Path) -> None:
     policy = load_policy(out / "last")
     assert policy.widths["joint_pos"] == 12
     assert policy.execute == 5
-    drive = ["controller=policy", f"policy={out}/last", "gates=[batch]", "sim=native", "nworld=2"]
-    status = run(
-        [*fast, *drive, "gate.batch.failed_worlds=2", f"hydra.run.dir={tmp_path / 'gates'}"]
-    )
-    assert status == 0
+    assert_drives(out / "last", tmp_path / "gates", *fast)
 
 
 def test_noise_moves_the_arm_alone_and_labels_lack_it() -> None:
@@ -212,7 +208,7 @@ def test_noise_moves_the_arm_alone_and_labels_lack_it() -> None:
     noisy = ["job.command_noise=0.02", "job.episodes=2", "nworld=2"]
     cfg = load_config([*REACH, *noisy, "task.check.distance=0.2", "job.leave_out=[]"])
     stage = Stage(cfg)
-    data = play_expert(stage, observed_group(cfg.job))
+    data = play_expert(stage)
     assert data.source == "the expert, seeds 0 to 1"
     assert data.ends.tolist() == [150, 300, 450, 600]
     labels = data.labels.unflatten(0, (4, 150))
@@ -234,8 +230,6 @@ def test_jaws_are_led_to_where_they_will_stand() -> None:
         labels=torch.stack((arm, torch.tensor(first + second)), dim=1),
         ends=torch.tensor([9, 12]),
         widths={"positions": 3},
-        played=2,
-        source="a test",
     )
     led = lead_gripper(data, 1).labels
     assert torch.equal(led[:, 0], arm)

@@ -14,16 +14,16 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from compositions import load_config
+from policies import report
 
 from mjstack.cli import run
 from mjstack.distributed import Ranks
 from mjstack.episodes.stage import Progress, Stage
 from mjstack.errors import MjstackError
 from mjstack.jobs.train import check_train
-from mjstack.train import clone
 from mjstack.train.dataset import read_demonstrations
 from mjstack.train.demonstrations import Demonstrations, play_expert
-from mjstack.train.trainer import observed_group
+from mjstack.train.trainer import observed_widths
 
 REACH = ("task=reach", "sim=native", "nworld=3")
 TRAIN = (
@@ -44,16 +44,16 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_dataset_has_what_the_expert_would_show(dataset: Path) -> None:
     """The same starts, so the same steps; torchrun's processes share the episodes."""
-    cfg = load_config([*TRAIN, "job.episodes=3", "job.noisy_episodes=0"])
+    sizes = ["job.episodes=3", "job.noisy_episodes=0"]
+    cfg = load_config([*TRAIN, *sizes, f"job.dataset={dataset}"])
     stage = Stage(cfg)
-    group = observed_group(cfg.job)
-    played = play_expert(stage, group)
-    read = read_demonstrations(dataset, stage, group, played.widths)
+    played = play_expert(stage)
+    read = read_demonstrations(stage, played.widths)
     assert torch.equal(read.ends, played.ends)
     torch.testing.assert_close(read.seen, played.seen)
     torch.testing.assert_close(read.labels, played.labels)
     parts = [
-        read_demonstrations(dataset, part, group, played.widths)
+        read_demonstrations(part, played.widths)
         for part in (stage.with_config(cfg, ranks=Ranks(rank, 2)) for rank in range(2))
     ]
     assert [len(part.ends) for part in parts] == [2, 1]
@@ -72,7 +72,7 @@ def test_a_policy_learns_from_a_dataset(
     folder = copied(dataset, tmp_path, change)
     out = tmp_path / "out"
     assert run([*TRAIN, f"job.dataset={folder}", f"job.folder={out}"]) == 0
-    train = json.loads((out / "report.json").read_text())["gates"][0]
+    train = report(out)["train"]
     assert train["metrics"]["expert_episodes"] == 3
     assert train["notes"]["demonstrations"] == str(folder)
 
@@ -133,11 +133,8 @@ def read(folder: Path, lines: list[str] | None = None) -> Demonstrations:
     """What the training reads."""
     cfg = load_config([*TRAIN, f"job.dataset={folder}"])
     stage = Stage(cfg, progress=Progress((lines if lines is not None else []).append))
-    group = observed_group(cfg.job)
-    with clone._started_world(stage) as env:
-        widths = clone.ObservationManager(env, {"policy": group}).term_dims["policy"]
     assert check_train(cfg)
-    return read_demonstrations(folder, stage, group, widths)
+    return read_demonstrations(stage, observed_widths(stage))
 
 
 def copied(
@@ -205,12 +202,11 @@ def test_a_dataset_is_checked_before_anything_is_written(
 
 
 def test_degrees_are_refused(dataset: Path, tmp_path: Path) -> None:
+    def in_degrees(table: pa.Table) -> pa.Table:
+        degrees = np.rad2deg(np.array(table["action"].to_pylist(), np.float32)).reshape(-1)
+        column = pa.FixedSizeListArray.from_arrays(pa.array(degrees), 6)
+        return table.set_column(table.column_names.index("action"), "action", column)
+
     folder = copied(dataset, tmp_path)
-    path = folder / "data/chunk-000/file-000.parquet"
-    table = pq.read_table(path)
-    number = table.column_names.index("action")
-    degrees = np.rad2deg(np.array(table["action"].to_pylist(), np.float32)).reshape(-1)
-    column = pa.FixedSizeListArray.from_arrays(pa.array(degrees), 6)
-    pq.write_table(table.set_column(number, "action", column), path)
-    says = refused([f"job.dataset={folder}"])
-    assert "expected absolute joint targets within" in says
+    change_table(folder, in_degrees)
+    assert "expected absolute joint targets within" in refused([f"job.dataset={folder}"])

@@ -31,14 +31,8 @@ class Network(MLPModel):
 def make_ppo(
     env: RslRlVecEnv, job: PpoJobCfg, ranks: Ranks, group: str, hidden: Sequence[int]
 ) -> PPO:
-    """Make actor, critic, storage and algorithm, with random weights.
-
-    Args:
-        env: The environment, whose observation groups the critic sees.
-        job: Sizes and settings.
-        ranks: The processes of the training, which have joined.
-        group: The observation group that the actor sees.
-        hidden: Widths of the actor's layers.
+    """Make actor, critic, storage and algorithm, with random weights. The actor sees one
+    observation group and has its own widths of hidden layers, the critic sees all groups.
     """
     device = str(env.device)
     obs = env.get_observations()

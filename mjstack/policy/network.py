@@ -79,14 +79,8 @@ class PolicyNetwork(nn.Module):
         hidden: Sequence[int],
         vision: Vision | None = None,
     ) -> None:
-        """Make the layers, with random weights of torch's generator.
-
-        Args:
-            inputs: Width of an observation.
-            width: Numbers of one action.
-            chunk: Actions of one query.
-            hidden: Widths of the hidden layers.
-            vision: Images that it sees besides.
+        """Make the layers, with random weights of torch's generator. ``inputs`` is the width of an
+        observation without its images; the rest are the attributes.
         """
         super().__init__()
         self.chunk = chunk

@@ -2,44 +2,30 @@
 
 import math
 import time
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
-from dataclasses import replace
+from contextlib import closing
 from pathlib import Path
 from typing import Any, cast
 
 import torch
 
 from mjstack.config.schema import CloneJobCfg
-from mjstack.envs import Env, driven_config
 from mjstack.episodes.stage import Stage
-from mjstack.errors import ConfigError, MjstackError, UnknownName, renamed_keys
-from mjstack.managers.observation import ObservationManager
+from mjstack.errors import ConfigError, MjstackError, UnknownName
 from mjstack.sim.memory import free_memory
 from mjstack.train.clone_learner import CloneLearner
 from mjstack.train.dataset import check_dataset, read_demonstrations
 from mjstack.train.demonstrations import batches_of, lead_gripper, play_expert
-from mjstack.train.trainer import (
-    LAST,
-    Trained,
-    Trainer,
-    earlier_state,
-    observed_group,
-    one_world,
-)
+from mjstack.train.trainer import LAST, Trained, Trainer, earlier_state, observed_widths
 
 
 def check_clone(stage: Stage) -> range:
     """Check the observation, the sizes and the dataset; see `Trainer`."""
     cfg = stage.cfg
     job = cast(CloneJobCfg, cfg.job)
-    group = observed_group(job)
     _check_vision(stage, job)
-    with _started_world(stage) as env:
-        with renamed_keys({"observation": "job.observation"}):
-            widths = ObservationManager(env, {job.group: group}).term_dims[job.group]
-        if job.dataset is not None:
-            return check_dataset(Path(job.dataset), env, group, widths)
+    widths = observed_widths(stage)
+    if job.dataset is not None:
+        return check_dataset(stage, widths)
     return range(cfg.seed, cfg.seed + len(batches_of(job, cfg.nworld)))
 
 
@@ -70,19 +56,10 @@ def _check_vision(stage: Stage, job: CloneJobCfg) -> None:
         raise ConfigError("job.vision.pool", job.vision.pool, expected, "Or make images smaller")
 
 
-@contextmanager
-def _started_world(stage: Stage) -> Iterator[Env]:
-    """One started world of the task."""
-    with one_world(stage, driven_config(stage.cfg, reset={})) as env:
-        env.reset()
-        yield env
-
-
 def train_clone(stage: Stage, folder: Path) -> Trained:
     """Play the expert or read a dataset, and fit a network to its answers; see `Trainer`."""
     # An earlier call's training, which may be complete
-    cfg = stage.cfg
-    job = cast(CloneJobCfg, cfg.job)
+    job = cast(CloneJobCfg, stage.cfg.job)
     earlier = earlier_state(stage, folder)
     if earlier and earlier[1]["done"] == job.batches:
         stage.progress.print_line(f"train: {folder} is trained already, and is judged anew")
@@ -90,21 +67,17 @@ def train_clone(stage: Stage, folder: Path) -> Trained:
 
     # Demonstrations
     began = time.perf_counter()
-    group = observed_group(job)
-    cfg = replace(cfg, observation={job.group: group})
     if job.dataset is None:
-        demonstrations = play_expert(stage, group)
+        demonstrations = play_expert(stage)
     else:
-        with _started_world(stage) as env:
-            widths = ObservationManager(env, {job.group: group}).term_dims[job.group]
-        demonstrations = read_demonstrations(Path(job.dataset), stage, group, widths)
+        demonstrations = read_demonstrations(stage, observed_widths(stage))
     if len(demonstrations.ends) < 2:
         raise MjstackError(
             f"{demonstrations.source}: {len(demonstrations.ends)} of {demonstrations.played}"
             " episodes succeeded, expected two at least",
             "Ask for more (job.episodes), or look at why with gates=[success]",
         )
-    demonstrations = lead_gripper(demonstrations, len(cfg.robot.gripper_joints))
+    demonstrations = lead_gripper(demonstrations, len(stage.cfg.robot.gripper_joints))
     counts = demonstrations.ends.new_tensor([len(demonstrations.ends), demonstrations.played])
     stage.ranks.sum_(counts)
     facts = {
@@ -115,7 +88,7 @@ def train_clone(stage: Stage, folder: Path) -> Trained:
     }
 
     # Batches
-    with closing(CloneLearner(stage, cfg, demonstrations, folder, facts)) as learner:
+    with closing(CloneLearner(stage, demonstrations, folder, facts)) as learner:
         if earlier:
             learner.restore(*earlier)
         learner.learn()

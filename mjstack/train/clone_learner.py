@@ -4,8 +4,7 @@ stopped.
 
 import copy
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -15,7 +14,7 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from mjstack.config.fingerprint import config_content
-from mjstack.config.schema import CloneJobCfg, Config
+from mjstack.config.schema import CloneJobCfg
 from mjstack.episodes.stage import Stage
 from mjstack.policy import Policy, PolicyNetwork
 from mjstack.sim.graph import StepGraph
@@ -23,7 +22,7 @@ from mjstack.train.clone_network import input_noise, make_network
 from mjstack.train.demonstrations import Demonstrations
 from mjstack.train.images import Augmentation, ImagePool
 from mjstack.train.learner import Learner
-from mjstack.train.trainer import made_with
+from mjstack.train.trainer import made_with, with_observation
 
 _VALIDATION_SHARE = 20  # of so many episodes one is for validation
 _VALIDATED = 65536  # steps at once
@@ -45,28 +44,18 @@ class CloneLearner(Learner):
     def __init__(
         self,
         stage: Stage,
-        cfg: Config,
         demonstrations: Demonstrations,
         folder: Path,
         expert: dict[str, Any],
     ) -> None:
-        """Make the network.
-
-        Args:
-            stage: The stage, for its progress and its ranks.
-            cfg: The configuration with the policy's observation.
-            demonstrations: The expert's episodes.
-            folder: Where policies and state are.
-            expert: Figures of the demonstrations.
-        """
+        """Make the network; ``expert`` has figures of the demonstrations, by name."""
+        cfg = with_observation(stage.cfg)
         self._job = job = cast(CloneJobCfg, cfg.job)
         super().__init__(stage, cfg, folder, job.save_every)
-        self._made_with = made_with(stage)
         self._expert = expert
         ranks = stage.ranks
         device = demonstrations.seen.device
         size = max(1, job.batch_size // ranks.size)
-        self._batch_size = size
 
         # The network, its average and its optimizer
         self._network = make_network(cfg, demonstrations, ranks).to(device)
@@ -101,10 +90,10 @@ class CloneLearner(Learner):
             self._augment = Augmentation(job.vision, len(vision.sizes), size, device)
         seen = cfg.observation[job.group]
         facts = (demonstrations.widths, job.execute, config_content(cfg), cfg.controller.action)
-        self._policy = Policy(self._average, job.group, seen, *facts)
+        self.policy = Policy(self._average, job.group, seen, *facts)
 
         self._sum = torch.zeros((), device=device)  # of losses since the last row
-        self._count = 0
+        self._networks.register_buffer("sum", self._sum)  # so it is part of the state
         self._first = 0
         self._total = job.batches
         self._batch: Callable[[], None] = self._fit
@@ -116,8 +105,8 @@ class CloneLearner(Learner):
         self._average.set_range(*demonstrations.labels.aminmax(dim=0))
         self._seen = demonstrations.seen
         self._labels = demonstrations.labels
-        self._last = demonstrations.last()
         episode = demonstrations.episode()
+        self._last = demonstrations.ends[episode] - 1  # steps of their episodes
         share = min(_VALIDATION_SHARE, len(demonstrations.ends))
         validates = episode % _VALIDATION_SHARE == share - 1
         self._training = (~validates).nonzero()[:, 0]
@@ -140,10 +129,13 @@ class CloneLearner(Learner):
             mode = self._cfg.graph
             name = "a batch of the training"
             self._batch = StepGraph(self._fit, self._seen.device, mode, name=name, scratch=False)
+        precision = torch.get_float32_matmul_precision()
+        if self._seen.is_cuda:  # TF32, which training does not notice, and which slows a CPU down
+            torch.set_float32_matmul_precision("high")
         try:
-            with _fast_products(self._seen.device):
-                super().learn()
+            super().learn()
         finally:
+            torch.set_float32_matmul_precision(precision)
             for pool in self._pools:
                 pool.close()
 
@@ -159,7 +151,7 @@ class CloneLearner(Learner):
         """
         share = (self.done - self._first) / (self._total - self._first)
         rate = 0.5 * (1.0 + math.cos(math.pi * share))
-        seed = draw_seed(self._policy.config["seed"], self._ranks.rank, self.done)
+        seed = draw_seed(self._cfg.seed, self._ranks.rank, self.done)
         self._generator.manual_seed(seed)
         count = len(self._steps)
         torch.randint(count, self._chosen.shape, generator=self._generator, out=self._chosen)
@@ -173,7 +165,6 @@ class CloneLearner(Learner):
         for group in self._optimizer.param_groups:
             group["lr"].fill_(self._job.learning_rate * rate)
         self._batch()
-        self._count += 1
 
     def _fit(self) -> None:
         """Learn from the drawn steps."""
@@ -230,7 +221,7 @@ class CloneLearner(Learner):
         """The average network's loss in the episodes that are held out."""
         losses = []
         pools = self._pools[1:]
-        size = self._batch_size if pools else _VALIDATED
+        size = len(self._chosen) if pools else _VALIDATED
         for first in range(0, len(self._validation), size):
             rows = slice(first, first + size)
             images = [image[rows].float() for pool in pools for image in pool.images]
@@ -244,7 +235,8 @@ class CloneLearner(Learner):
     def _new_row(self) -> dict[str, Any]:
         """A row of the curve. The next one has other batches."""
         loss = self._validate()
-        mean = self._sum / max(1, self._count)
+        earlier = self.curve[-1]["batch"] if self.curve else 0
+        mean = self._sum / max(1, self.done - earlier)
         self._ranks.sum_(mean)
         row = {
             "batch": self.done,
@@ -253,7 +245,6 @@ class CloneLearner(Learner):
             "training_s": self.seconds,
         }
         self._sum.zero_()
-        self._count = 0
         return row
 
     @override
@@ -265,32 +256,9 @@ class CloneLearner(Learner):
 
     @override
     def facts(self) -> dict[str, Any]:
-        facts = {"made_with": self._made_with, "expert": self._expert, "count": self._count}
-        return super().facts() | facts
-
-    def _tensors(self) -> dict[str, Tensor]:
-        return super()._tensors() | {"sum": self._sum}
-
-    @override
-    def restore(self, state: dict[str, Tensor], facts: dict[str, Any]) -> None:
-        super().restore(state, facts)
-        self._sum.copy_(state["sum"])
-        self._count = facts["count"]
+        return super().facts() | {"made_with": made_with(self._stage), "expert": self._expert}
 
 
 def draw_seed(seed: int, rank: int, batch: int) -> int:
     """Seed of what a rank draws for a batch: no other batch or rank of the training has it."""
     return 1_000_003 * (seed + rank) + batch
-
-
-@contextmanager
-def _fast_products(device: torch.device) -> Iterator[None]:
-    """On CUDA products of float32 matrices with TF32, which training does not notice. On a CPU that
-    would be slower.
-    """
-    before = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("high" if device.type == "cuda" else before)
-    try:
-        yield
-    finally:
-        torch.set_float32_matmul_precision(before)

@@ -18,12 +18,8 @@ _LEAST = 0.1  # scale of a column, of the largest one of its term
 
 
 def make_network(cfg: Config, demonstrations: Demonstrations, ranks: Ranks) -> PolicyNetwork:
-    """A network with random weights, on the CPU. Its scale is that of all ranks' demonstrations.
-
-    Args:
-        cfg: The training's configuration; its seed gives the weights.
-        demonstrations: Those of this rank.
-        ranks: The processes of the training.
+    """A network with random weights by the configured seed, on the CPU. Its scale is that of the
+    demonstrations of all ranks.
     """
     job = cast(CloneJobCfg, cfg.job)
     seen = demonstrations.seen
@@ -47,12 +43,8 @@ def input_noise(cfg: Config, model: mujoco.MjModel, widths: Mapping[str, int]) -
     """Half-width of the noise on each column of the observation in a training, shape ``(n,)``.
 
     Measured jaws have more of it. Their joint target depends on where they are more than any other,
-    and a policy that answers with where they are lets them drift.
-
-    Args:
-        cfg: The training's configuration.
-        model: The scene's.
-        widths: Numbers of each term of the observation.
+    and a policy that answers with where they are lets them drift. ``widths`` are the numbers of
+    each term.
     """
     job = cast(CloneJobCfg, cfg.job)
     robot = cfg.robot

@@ -4,7 +4,7 @@ have done in the states to which that leads.
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
+from contextlib import closing
 from pathlib import Path
 from typing import Any, cast
 
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from mjstack.config.schema import CloneJobCfg, DaggerJobCfg
+from mjstack.config.schema import DaggerJobCfg
 from mjstack.drivers.driver import Driver
 from mjstack.drivers.policy import PolicyDriver
 from mjstack.envs import Env
@@ -25,19 +25,16 @@ from mjstack.policy import Policy
 from mjstack.policy.checkpoint import read_state, write_state
 from mjstack.train.clone import check_clone
 from mjstack.train.clone_learner import CloneLearner
-from mjstack.train.demonstrations import Demonstrations, demonstration_channels, observed_config
-from mjstack.train.trainer import LAST, Trained, Trainer, earlier_state, observed_group
+from mjstack.train.demonstrations import Demonstrations, LabelDriver, demonstration_channels
+from mjstack.train.trainer import LAST, Trained, Trainer, earlier_state, with_observation
 
 _TENSORS = ("seen", "labels", "ends")  # of `Demonstrations`, in the file of a round
 _SPELL = 0.5  # s, for which the expert or the policy drives before it is drawn anew
 
 
-class MixedDriver(Driver):
+class MixedDriver(LabelDriver):
     """The expert or the policy drives, as a draw for every world and spell says. In some worlds the
     policy drives alone.
-
-    Attributes:
-        label: The expert's joint targets of the last step, shape ``(nworld, nu)``.
     """
 
     def __init__(
@@ -52,14 +49,11 @@ class MixedDriver(Driver):
             beta: Share of the time in which the expert drives.
             alone: Number of worlds, the first ones, in which the policy drives alone.
         """
-        super().__init__(env.nworld, expert.steps, env.device)
-        self._expert = expert
+        super().__init__(expert, env)
         self._policy = policy
-        self._env = env
         self._beta = beta
         self._spell = max(1, round(_SPELL / env.cfg.timing.step_dt))
         self._alone = torch.arange(env.nworld, device=env.device) < alone
-        self.label = torch.zeros((env.nworld, len(env.index.ctrl)), device=env.device)
 
     def command(self) -> Tensor:
         """Joint targets of the next step, shape ``(nworld, nu)``."""
@@ -80,11 +74,6 @@ class RoundLearner(CloneLearner):
 
     trainer = "dagger"
 
-    @property
-    def policy(self) -> Policy:
-        """The policy so far."""
-        return self._policy
-
     def begin(self, demonstrations: Demonstrations) -> None:
         """Begin a round with the demonstrations of all rounds so far."""
         self.process(demonstrations)
@@ -94,10 +83,14 @@ class RoundLearner(CloneLearner):
     def score(self, row: Mapping[str, Any]) -> tuple[float, ...]:
         return row["success"], -row["round"]
 
-    def _save(self) -> None:
-        """See `Learner`; `conclude` is called when the success is known."""
-        self._keep_row()
+    @override
+    def _save(self, **figures: Any) -> None:
+        """Write the state alone: `conclude` is called when the success is known."""
         self._write_state()
+
+    def conclude(self, number: int, success: float) -> None:
+        """End a round, with the success of its policy."""
+        super()._save(round=number, success=success)
 
 
 def check_dagger(stage: Stage) -> range:
@@ -122,12 +115,7 @@ def check_dagger(stage: Stage) -> range:
     if job.episodes < 2:
         expected = "at least 2, because one of them is for validation"
         raise ConfigError("job.episodes", job.episodes, expected)
-    return range(cfg.seed, cfg.seed + (job.rounds + 1) * _batches(job, cfg.nworld))
-
-
-def _batches(job: CloneJobCfg, nworld: int) -> int:
-    """Batches of worlds of a round."""
-    return math.ceil(job.episodes / nworld)
+    return range(cfg.seed, cfg.seed + (job.rounds + 1) * math.ceil(job.episodes / cfg.nworld))
 
 
 def train_dagger(stage: Stage, folder: Path) -> Trained:
@@ -139,37 +127,20 @@ def train_dagger(stage: Stage, folder: Path) -> Trained:
         stage.progress.print_line(f"train: {folder} is trained already, and is judged anew")
         return _trained(folder, earlier[1])
 
-    # Rounds: the last one shows the success of the policy alone
-    learner: RoundLearner | None = None
-    parts: list[Demonstrations] = []
-    for number in range(job.rounds + 1):
-        path = folder / f"round-{number}.safetensors"
-        if not path.exists():  # a later call reads what an earlier one has played
-            policy = learner.policy if learner else None
-            write_state(path, *_play_round(stage, policy, number))
-        tensors, facts = read_state(path)
-        seen, labels, ends = (tensors[name].to(stage.backend[1]) for name in _TENSORS)
-        part = Demonstrations(
-            seen=seen,
-            labels=labels,
-            ends=ends,
-            widths=facts["widths"],
-            played=len(ends),
-            source=path.name,
-        )
-        parts.append(part)
-        if learner is None:  # its scale is that of the first round
-            cfg = replace(stage.cfg, observation={job.group: observed_group(job)})
-            learner = RoundLearner(stage, cfg, parts[0], folder, {})
-            if earlier:
-                learner.restore(*earlier)
-        elif learner.row is not None and learner.done == number * job.batches:
-            learner.conclude(round=number, success=facts["success"])
-        if number < job.rounds:
-            learner.begin(Demonstrations.join(parts, "all rounds"))
-            learner.learn(number * job.batches, (number + 1) * job.batches)
-    assert learner is not None
-    learner.close()
+    # Rounds: the expert plays the first one, which gives the scale; in the worlds of the next one
+    # the policy of a round shows its success.
+    first, _ = _round(stage, folder, None, 0)
+    parts = [first]
+    with closing(RoundLearner(stage, first, folder, {})) as learner:
+        if earlier:
+            learner.restore(*earlier)
+        for number in range(1, job.rounds + 1):
+            learner.begin(Demonstrations.join(parts))
+            learner.learn((number - 1) * job.batches, number * job.batches)
+            part, success = _round(stage, folder, learner.policy, number)
+            parts.append(part)
+            if len(learner.curve) < number:
+                learner.conclude(number, success)
     for path in folder.glob("round-*.safetensors"):
         path.unlink()
     return _trained(folder, learner.facts())
@@ -191,6 +162,23 @@ def _trained(folder: Path, facts: dict[str, Any]) -> Trained:
     return Trained(metrics=metrics, notes=notes, curve=curve, abscissa="round")
 
 
+def _round(
+    stage: Stage, folder: Path, policy: Policy | None, number: int
+) -> tuple[Demonstrations, float]:
+    """Play a round, or read it where an earlier call has played it.
+
+    Returns:
+        Its steps with the expert's labels, and the share of successes of the policy alone.
+    """
+    path = folder / f"round-{number}.safetensors"
+    if not path.exists():
+        write_state(path, *_play_round(stage, policy, number))
+    tensors, facts = read_state(path)
+    seen, labels, ends = (tensors[name].to(stage.backend[1]) for name in _TENSORS)
+    part = Demonstrations(seen=seen, labels=labels, ends=ends, widths=facts["widths"])
+    return part, facts["success"]
+
+
 def _play_round(
     stage: Stage, policy: Policy | None, number: int
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -206,7 +194,7 @@ def _play_round(
     beta = job.beta * job.beta_decay ** (number - 1) if policy else 1.0
     share = 1.0 if number in (0, job.rounds) else job.alone
     alone = math.ceil(share * nworld)
-    batches = _batches(job, nworld)
+    batches = math.ceil(job.episodes / nworld)
     first = cfg.seed + number * batches
 
     def drive(plan: BatchPlan, env: Env) -> Driver:
@@ -219,20 +207,20 @@ def _play_round(
         stage,
         [BatchPlan(seed, range(nworld)) for seed in range(first, first + batches)],
         demonstration_channels(job),
-        cfg=observed_config(stage, observed_group(job)),
+        cfg=with_observation(stage.driven(cfg.reset)),
         driver=drive,
         label=f"steps of round {number} of {job.rounds}",
     ):
         successes += int(batch.succeeded[:alone].sum())
         # Nothing is learned from a world whose state is not finite
         finite = batch.finite().nonzero()[:, 0]
-        parts.append(Demonstrations.of(batch, finite, job, nworld))
+        parts.append(Demonstrations.of(batch, finite, job))
     who = "the policy alone" if policy else "the expert"
     episodes = alone * batches
     stage.progress.print_line(
         f"train: round {number}: {who} succeeded in {successes} of {episodes} episodes"
     )
-    played = Demonstrations.join(parts, f"round {number}")
+    played = Demonstrations.join(parts)
     tensors = {name: getattr(played, name) for name in _TENSORS}
     return tensors, {"widths": played.widths, "success": successes / episodes}
 

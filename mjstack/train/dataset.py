@@ -10,14 +10,12 @@ from typing import Any, cast
 import numpy as np
 import torch
 
-from mjstack.config.schema import CloneJobCfg, Config, ObservationGroupCfg
+from mjstack.config.schema import CloneJobCfg, Config
 from mjstack.datasets import lerobot
 from mjstack.datasets.reader import readable
 from mjstack.datasets.spec import term_columns
-from mjstack.envs import Env
 from mjstack.episodes.stage import Stage
 from mjstack.errors import FolderError
-from mjstack.mdp.geometry import robot
 from mjstack.train.demonstrations import Demonstrations
 
 _ACTION = "action"
@@ -29,16 +27,9 @@ _BEYOND = 1e-3  # rad, m: how far a joint target may be out of its actuator's ra
 Place = tuple[str, int]  # a feature, and which of its numbers
 
 
-def check_dataset(
-    folder: Path, env: Env, group: ObservationGroupCfg, widths: Mapping[str, int]
-) -> range:
-    """Check that a policy can learn from a dataset.
-
-    Args:
-        folder: The dataset.
-        env: An environment of the task.
-        group: The observation of the policy.
-        widths: Numbers of each of its terms.
+def check_dataset(stage: Stage, widths: Mapping[str, int]) -> range:
+    """Check that a policy can learn from the job's dataset. ``widths`` are the numbers of each term
+    of its observation.
 
     Returns:
         The seeds of the dataset's starts, as far as it names them.
@@ -46,13 +37,14 @@ def check_dataset(
     Raises:
         MjstackError: It is no dataset, lacks columns, or is of another robot, task or rate.
     """
-    cfg = env.cfg
+    cfg = stage.cfg
+    folder = _folder(cfg)
     info = _read_info(folder)
-    places = _find_columns(folder, info, cfg, group, widths)
-    _task_number(folder, cfg)
+    places = _find_columns(info, cfg, widths)
+    _task_number(cfg)
     # The ranges of the first file: degrees, say, are far out of them
     action = _read(_files(folder, info)[0], {_ACTION: places[_ACTION]})[_ACTION]
-    low, high = robot(env).ctrl_range.float().cpu().numpy().T
+    low, high = stage.index.ctrl_range.T
     worst = np.maximum(low - action, action - high).max(0)
     joint = int(worst.argmax())
     if worst[joint] > _BEYOND:
@@ -66,24 +58,18 @@ def check_dataset(
     return range(min(seeds), max(seeds) + 1) if seeds else range(0)
 
 
-def read_demonstrations(
-    folder: Path, stage: Stage, group: ObservationGroupCfg, widths: dict[str, int]
-) -> Demonstrations:
-    """The episodes of a dataset that succeeded, on the device of the training. Without a column
-    ``next.success`` all are taken to have succeeded.
-
-    Args:
-        folder: The dataset.
-        stage: The stage. Each rank reads its share of the episodes.
-        group: The observation of the policy.
-        widths: Numbers of each of its terms.
+def read_demonstrations(stage: Stage, widths: dict[str, int]) -> Demonstrations:
+    """The episodes of the job's dataset that succeeded, on the device of the training; each rank
+    reads its share. Without a column ``next.success`` all are taken to have succeeded. ``widths``
+    are the numbers of each term of the policy's observation.
 
     Raises:
         FolderError: A file is missing or damaged.
     """
     cfg = stage.cfg
+    folder = _folder(cfg)
     info = _read_info(folder)
-    places = _find_columns(folder, info, cfg, group, widths)
+    places = _find_columns(info, cfg, widths)
     facts = [_EPISODE, _TASK, *({_SUCCESS} & info["features"].keys())]
     places |= {name: [(name, 0)] for name in facts}
     parts = [_read(path, places) for path in _files(folder, info)]
@@ -92,7 +78,7 @@ def read_demonstrations(
     # Episodes of the task that succeeded
     ends = np.flatnonzero(np.diff(columns[_EPISODE][:, 0], append=-1)) + 1
     starts = np.concatenate([[0], ends[:-1]])
-    usable = columns[_TASK][ends - 1, 0] == _task_number(folder, cfg)
+    usable = columns[_TASK][ends - 1, 0] == _task_number(cfg)
     if _SUCCESS in columns:
         usable &= columns[_SUCCESS][ends - 1, 0] != 0.0
     ranks = stage.ranks
@@ -122,6 +108,10 @@ def read_demonstrations(
     )
 
 
+def _folder(cfg: Config) -> Path:
+    return Path(str(cast(CloneJobCfg, cfg.job).dataset))
+
+
 def _read_info(folder: Path) -> dict[str, Any]:
     """The content of info.json of a LeRobotDataset v3."""
     lerobot.require_pyarrow()
@@ -145,17 +135,14 @@ def _read_info(folder: Path) -> dict[str, Any]:
 
 
 def _find_columns(
-    folder: Path,
-    info: Mapping[str, Any],
-    cfg: Config,
-    group: ObservationGroupCfg,
-    widths: Mapping[str, int],
+    info: Mapping[str, Any], cfg: Config, widths: Mapping[str, int]
 ) -> dict[str, list[Place]]:
     """Where the numbers of the observation and of the action are.
 
     Raises:
         FolderError: One is missing, or the dataset is of another robot or rate.
     """
+    folder = _folder(cfg)
     expected = {"robot_type": cfg.robot.name, "fps": round(cfg.task.control_hz)}
     for key, value in expected.items():
         if info[key] != value:
@@ -163,39 +150,37 @@ def _find_columns(
                 f"job.dataset={folder}: has {key}={info[key]}, expected {value}. Give another"
                 " dataset, or set robot and task to its own"
             )
-    name = f"observation.{cast(CloneJobCfg, cfg.job).group}"
-    observations = [key for key in info["features"] if key.startswith("observation.")]
-    observed = _places(sorted(observations, key=lambda key: key != name), info["features"])
-    numbers = [
-        column
-        for term, width in widths.items()
-        for column in term_columns(term, width, group.terms[term].history)
-    ]
-    targets = [f"{joint}.pos" for joint in cfg.robot.joints]
-    commanded = _places([_ACTION], info["features"])
-    for columns, places, where in ((numbers, observed, name), (targets, commanded, _ACTION)):
+
+    def locate(features: Sequence[str], columns: Sequence[str]) -> list[Place]:
+        """The place of each column in these features; of one name, the first."""
+        places: dict[str, Place] = {}
+        for feature in features:
+            content = info["features"].get(feature, {})
+            if str(content.get("dtype")).startswith("float"):
+                for number, column in enumerate(_names(content.get("names"))):
+                    places.setdefault(str(column), (feature, number))
         for column in columns:
             if column not in places:
                 raise FolderError(
-                    f"job.dataset={folder}: has no column {column} in {where}, expected all that"
-                    " the policy sees. Collect it with job=collect observation=state, or choose"
-                    " observation@job.observation"
+                    f"job.dataset={folder}: has no column {column} in {features[0]}, expected all"
+                    " that the policy sees. Collect it with job=collect observation=state, or"
+                    " choose observation@job.observation"
                 )
+        return [places[column] for column in columns]
+
+    job = cast(CloneJobCfg, cfg.job)
+    terms = job.observation[job.group].terms
+    numbers = [
+        column
+        for term, width in widths.items()
+        for column in term_columns(term, width, terms[term].history)
+    ]
+    name = f"observation.{job.group}"
+    beside = [key for key in info["features"] if key.startswith("observation.") and key != name]
     return {
-        "observation": [observed[column] for column in numbers],
-        _ACTION: [commanded[column] for column in targets],
+        "observation": locate([name, *beside], numbers),
+        _ACTION: locate([_ACTION], [f"{joint}.pos" for joint in cfg.robot.joints]),
     }
-
-
-def _places(names: Sequence[str], features: Mapping[str, Any]) -> dict[str, Place]:
-    """Where each number of some features is; the first one of a name."""
-    places: dict[str, Place] = {}
-    for name in names:
-        feature = features.get(name, {})
-        if str(feature.get("dtype")).startswith("float"):
-            for number, column in enumerate(_names(feature.get("names"))):
-                places.setdefault(str(column), (name, number))
-    return places
 
 
 def _names(value: object) -> list[object]:
@@ -226,12 +211,13 @@ def _seeds(folder: Path) -> list[int]:
     return seeds
 
 
-def _task_number(folder: Path, cfg: Config) -> int:
+def _task_number(cfg: Config) -> int:
     """Number of the task in the dataset.
 
     Raises:
         FolderError: The dataset does not have it.
     """
+    folder = _folder(cfg)
     path = folder / lerobot.TASKS
     with readable(path):
         table = lerobot.require_pyarrow()[1].ParquetFile(path).read()

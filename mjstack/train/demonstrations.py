@@ -11,38 +11,47 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from mjstack.config.schema import CloneJobCfg, Config, ObservationGroupCfg
+from mjstack.config.schema import CloneJobCfg
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.batches import Batch, BatchPlan, play_batches
 from mjstack.episodes.recorder import Channels, Read, start_and_every_step
 from mjstack.episodes.stage import Stage
 from mjstack.managers.view import random_uniform
+from mjstack.train.trainer import with_observation
 
 NOISE_SECONDS = 0.5  # in which the noise of a joint is forgotten
 _STANDS = 1e-4  # of a joint target's range: by less it moves in no step
 
 
-class NoisyDriver(Driver):
-    """An expert whose arm is pushed off its way: a slow random offset is added to the joint targets
-    of the arm, and the expert answers to where that leads.
+class LabelDriver(Driver):
+    """Base class of drivers that leave an expert's way, and keep what the expert does there.
 
     Attributes:
         label: The expert's joint targets of the last step, shape ``(nworld, nu)``.
     """
 
-    def __init__(self, expert: Driver, env: Env, noise: float) -> None:
-        """Take the expert, and the standard deviation of the offsets [rad]."""
+    def __init__(self, expert: Driver, env: Env) -> None:
+        """Take the expert, whose phases, errors and retries are those of the driver."""
         super().__init__(env.nworld, expert.steps, env.device, expert.phases)
         self.phase = expert.phase
         self.error = expert.error
         self.retries = expert.retries
         self._expert = expert
         self._env = env
+        self.label = torch.zeros((env.nworld, len(env.index.ctrl)), device=env.device)
+
+
+class NoisyDriver(LabelDriver):
+    """An expert whose arm is pushed off its way: a slow random offset is added to the joint targets
+    of the arm, and the expert answers to where that leads.
+    """
+
+    def __init__(self, expert: Driver, env: Env, noise: float) -> None:
+        """Take the expert, and the standard deviation of the offsets [rad]."""
+        super().__init__(expert, env)
         self._arm = env.index.n_arm
-        shape = (env.nworld, len(env.index.ctrl))
-        self.label = torch.zeros(shape, device=env.device)
-        self._command = torch.zeros(shape, device=env.device)
+        self._command = torch.zeros_like(self.label)
         self._offset = torch.zeros((env.nworld, self._arm), device=env.device)
         self._decay = math.exp(-env.cfg.timing.step_dt / NOISE_SECONDS)
         # A uniform number from -1 to 1 has a variance of 1/3.
@@ -67,24 +76,16 @@ def demonstration_channels(job: CloneJobCfg) -> list[Channels]:
 
     def read_before(env: Env, driver: Driver) -> Read:
         observations = env.observation_manager.groups[job.group]
+        if not job.vision.cameras:
+            return lambda: {"observation": observations}
         qpos = env.sim.qpos
-        states = {"qpos": qpos} if job.vision.cameras else {}
-        return lambda: {
-            "observation": observations,
-            **{name: state.float() for name, state in states.items()},
-        }
+        return lambda: {"observation": observations, "qpos": qpos.float()}
 
     def read_label(env: Env, driver: Driver) -> Read:
-        label = cast(NoisyDriver, driver).label
+        label = cast(LabelDriver, driver).label
         return lambda: {"label": label}
 
     return [Channels(read_before, start_and_every_step), Channels(read_label)]
-
-
-def observed_config(stage: Stage, group: ObservationGroupCfg) -> Config:
-    """The configuration of a driven episode in which a policy's group is observed."""
-    job = cast(CloneJobCfg, stage.cfg.job)
-    return replace(stage.driven(stage.cfg.reset), observation={job.group: group})
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -96,7 +97,7 @@ class Demonstrations:
         labels: The expert's joint targets, shape ``(steps of all episodes, nu)``.
         ends: The step after the last one of each episode, shape ``(episodes,)``, int64.
         widths: Numbers of each term of the observation, in order.
-        played: Episodes that were played.
+        played: Episodes that were played, successful or not.
         source: Where they come from, in words.
         qpos: Positions before each step, from which images are drawn, shape ``(steps of all
             episodes, nq)``, float32; None where there are none.
@@ -107,14 +108,14 @@ class Demonstrations:
     labels: Tensor
     ends: Tensor
     widths: dict[str, int]
-    played: int
-    source: str
+    played: int = 0
+    source: str = ""
     qpos: Tensor | None = None
     fields: Mapping[str, Tensor] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, batch: Batch, worlds: Tensor, job: CloneJobCfg, played: int) -> "Demonstrations":
-        """Those of a batch's worlds with these numbers, of so many that were played."""
+    def of(cls, batch: Batch, worlds: Tensor, job: CloneJobCfg) -> "Demonstrations":
+        """Those of a batch's worlds with these numbers."""
         rows = {name: batch.select(name, worlds) for name in batch.rows}
         labels = rows.pop("label")
         steps = labels.shape[1]
@@ -125,14 +126,14 @@ class Demonstrations:
             labels=labels.flatten(0, 1),
             ends=steps * torch.arange(1, len(worlds) + 1, device=worlds.device),
             widths=batch.env.observation_manager.term_dims[job.group],
-            played=played,
-            source=f"seed {batch.plan.seed}",
             qpos=before.get("qpos"),
             fields={name: fields[name][worlds] for name in fields},
         )
 
     @classmethod
-    def join(cls, parts: Sequence["Demonstrations"], source: str) -> "Demonstrations":
+    def join(
+        cls, parts: Sequence["Demonstrations"], played: int = 0, source: str = ""
+    ) -> "Demonstrations":
         """The episodes of all parts, in their order."""
         first = [0, *itertools.accumulate(len(part.seen) for part in parts)]
         states = [part.qpos for part in parts if part.qpos is not None]
@@ -141,7 +142,7 @@ class Demonstrations:
             labels=torch.cat([part.labels for part in parts]),
             ends=torch.cat([part.ends + at for part, at in zip(parts, first, strict=False)]),
             widths=parts[0].widths,
-            played=sum(part.played for part in parts),
+            played=played,
             source=source,
             qpos=torch.cat(states) if states else None,
             fields={
@@ -151,17 +152,8 @@ class Demonstrations:
 
     def episode(self) -> Tensor:
         """The episode that each step belongs to, shape ``(steps,)``, int64."""
-        return torch.arange(len(self.ends), device=self.ends.device).repeat_interleave(
-            self.lengths()
-        )
-
-    def lengths(self) -> Tensor:
-        """Steps of each episode, shape ``(episodes,)``, int64."""
-        return self.ends.diff(prepend=self.ends.new_zeros(1))
-
-    def last(self) -> Tensor:
-        """The last step of the episode that each step belongs to, shape ``(steps,)``, int64."""
-        return (self.ends - 1).repeat_interleave(self.lengths())
+        lengths = self.ends.diff(prepend=self.ends.new_zeros(1))
+        return torch.arange(len(lengths), device=lengths.device).repeat_interleave(lengths)
 
 
 def lead_gripper(demonstrations: Demonstrations, fingers: int) -> Demonstrations:
@@ -197,12 +189,9 @@ def batches_of(job: CloneJobCfg, nworld: int) -> list[tuple[int, float]]:
     ]
 
 
-def play_expert(stage: Stage, group: ObservationGroupCfg) -> Demonstrations:
-    """Play the expert, and keep the episodes that the task's check accepts.
-
-    Args:
-        stage: The stage; starts and expert are the configured ones. Each rank plays its worlds.
-        group: What a policy will see.
+def play_expert(stage: Stage) -> Demonstrations:
+    """Play the configured expert, each rank in its worlds, and keep the episodes that the task's
+    check accepts.
     """
     cfg = stage.cfg
     job = cast(CloneJobCfg, cfg.job)
@@ -210,22 +199,25 @@ def play_expert(stage: Stage, group: ObservationGroupCfg) -> Demonstrations:
     worlds = stage.ranks.share(nworld)
     batches = dict(enumerate(batches_of(job, nworld), start=cfg.seed))
     parts = []
+    played = 0
     for batch in play_batches(
         stage,
         [BatchPlan(seed, worlds) for seed in batches],
         demonstration_channels(job),
-        cfg=observed_config(stage, group),
+        cfg=with_observation(stage.driven(cfg.reset)),
         driver=lambda plan, env: NoisyDriver(stage.driver(env), env, batches[plan.seed][1]),
         label="steps of the expert",
     ):
         count, noise = batches[batch.plan.seed]
         counted = range(worlds.start, min(worlds.stop, count))
         accepted = batch.succeeded[: len(counted)].nonzero()[:, 0]
-        parts.append(Demonstrations.of(batch, accepted, job, len(counted)))
+        parts.append(Demonstrations.of(batch, accepted, job))
+        played += len(counted)
         condition = f"noise of {noise:g} rad" if noise else "no noise"
         succeeded = sum(stage.ranks.gather(len(accepted)))
         stage.progress.print_line(
             f"train: seed {batch.plan.seed}, {condition}: {succeeded} of {count} episodes of the"
             " expert succeeded"
         )
-    return Demonstrations.join(parts, f"the expert, seeds {min(batches)} to {max(batches)}")
+    source = f"the expert, seeds {min(batches)} to {max(batches)}"
+    return Demonstrations.join(parts, played, source)

@@ -27,33 +27,26 @@ class Learner(ABC):
     Now and then it saves: a row for the curve, the policy in the folder `LAST`, and in `BEST` where
     no row before has a higher score, and everything with which a later call goes on.
 
-    A subclass sets ``_policy``, ``_networks`` and ``_optimizer``.
+    A subclass sets ``policy``, ``_networks`` and ``_optimizer``.
 
     Attributes:
         trainer: The trainer's name.
         step: What a step is called.
+        policy: The policy so far.
         done: Steps so far.
         seconds: Time of them, in all calls [s].
         curve: A row for each time that policies were saved.
-        row: A row that lacks figures which are not known yet.
     """
 
     trainer = ""
     step = "batch"
     _look_every = 1  # steps between two looks at the progress
-    _policy: Policy
+    policy: Policy
     _networks: nn.ModuleDict
     _optimizer: Optimizer
 
     def __init__(self, stage: Stage, cfg: Config, folder: Path, save_every: int) -> None:
-        """Begin without a step.
-
-        Args:
-            stage: The stage, for its progress and its ranks.
-            cfg: The configuration of the training.
-            folder: Where policies and state are.
-            save_every: Steps between two saves.
-        """
+        """Begin without a step; ``save_every`` steps lie between two saves in the folder."""
         self._stage = stage
         self._cfg = cfg
         self._progress = stage.progress
@@ -63,7 +56,6 @@ class Learner(ABC):
         self.done = 0
         self.seconds = 0.0
         self.curve: list[dict[str, Any]] = []
-        self.row: dict[str, Any] | None = None
         self._before = 0.0  # seconds of earlier calls
 
     def learn(self) -> None:
@@ -107,9 +99,9 @@ class Learner(ABC):
         if (events := vars(self).get("_events")) is not None:
             events.close()
 
+    @abstractmethod
     def score(self, row: Mapping[str, Any]) -> tuple[float, ...]:
         """How good the policy of a row is: the first number decides, equal ones go by the next."""
-        raise NotImplementedError
 
     @abstractmethod
     def _over(self) -> bool:
@@ -131,39 +123,27 @@ class Learner(ABC):
         """What the policy's file says of its training beside the row."""
         return {}
 
-    def _save(self) -> None:
-        """Write the policy with a row for the curve, and the state."""
-        self._keep_row()
-        self.conclude()
-
-    def _keep_row(self) -> None:
-        """Write the policy, with a row that is not part of the curve yet."""
-        self.row = self._new_row()
-        names = {"trainer": self.trainer, "seed": self._cfg.seed}
-        self._policy.training = names | self._notes() | _known(self.row)
-        if self._ranks.writes:
-            save_policy(self._folder / LAST, self._policy)
-
-    def conclude(self, **figures: Any) -> None:
-        """Add the row to the curve, with figures in front of it, and write the state."""
-        assert self.row is not None
-        row = figures | self.row
-        self.row = None
+    def _save(self, **figures: Any) -> None:
+        """Add a row to the curve, with figures in front of it, and write policies and state."""
+        row = figures | self._new_row()
         best = all(self.score(row) >= self.score(earlier) for earlier in self.curve)
         self.curve.append(row)
+        # JSON has no NaN
+        known = {name: value for name, value in row.items() if not math.isnan(value)}
+        names = {"trainer": self.trainer, "seed": self._cfg.seed}
+        self.policy.training = names | self._notes() | known
         if self._ranks.writes:
+            for folder in [LAST, BEST] if best else [LAST]:
+                save_policy(self._folder / folder, self.policy)
             if self._events is not None:
-                for name, value in _known(row).items():
+                for name, value in known.items():
                     self._events.add_scalar(f"train/{name}", value, self.done)
                 self._events.flush()
-            if best:
-                self._policy.training |= _known(row)
-                save_policy(self._folder / BEST, self._policy)
         self._write_state()
 
     def facts(self) -> dict[str, Any]:
         """Everything of the training that is no tensor, in JSON's types."""
-        return {"done": self.done, "seconds": self.seconds, "curve": self.curve, "row": self.row}
+        return {"done": self.done, "seconds": self.seconds, "curve": self.curve}
 
     def _tensors(self) -> dict[str, Tensor]:
         """Weights, moments of the optimizer and the like, by name."""
@@ -189,10 +169,4 @@ class Learner(ABC):
         self.done = facts["done"]
         self.seconds = facts["seconds"]
         self.curve = facts["curve"]
-        self.row = facts.get("row")
         self._progress.print_line(f"train: goes on after {self.step} {self.done}")
-
-
-def _known(row: Mapping[str, Any]) -> dict[str, Any]:
-    """The figures of a row without NaN, which JSON does not have."""
-    return {name: value for name, value in row.items() if not math.isnan(value)}

@@ -88,20 +88,10 @@ def _acting_as(cfg: Config, policy: Policy) -> Config:
     return replace(cfg, action=action, timing=timing)
 
 
-def unrecorded(reset: dict[str, TermCfg]) -> bool:
-    """Whether a term starts worlds in the middle of an episode, and names no file of states."""
-    return any(starts_midway(t) and t.params.get("path") is None for t in reset.values())
-
-
-def with_states(cfg: Config, path: Path) -> Config:
-    """A configuration whose worlds start in the states of a file, where no other is named."""
-    reset = {
-        name: replace(term, params=term.params | {"path": str(path)})
-        if starts_midway(term) and term.params.get("path") is None
-        else term
-        for name, term in cfg.reset.items()
-    }
-    return replace(cfg, reset=reset)
+def _unrecorded(reset: dict[str, TermCfg]) -> dict[str, TermCfg]:
+    """Terms that start worlds in the middle of an episode, and name no file of states."""
+    terms = {name: term for name, term in reset.items() if starts_midway(term)}
+    return {name: term for name, term in terms.items() if term.params.get("path") is None}
 
 
 def _read_state(env: Env, driver: Driver) -> Read:
@@ -109,20 +99,16 @@ def _read_state(env: Env, driver: Driver) -> Read:
     return lambda: {name: view for name, view in views.items() if view.shape[1]}
 
 
-def record_states(stage: Stage, worlds: int, path: Path) -> None:
-    """Play the expert in a batch of worlds, and write states of its accepted episodes, from all
-    phases.
-
-    Args:
-        stage: The stage; its starts are used, but for those in the middle of an episode.
-        worlds: How many episodes.
-        path: The file.
+def _record_states(stage: Stage, path: Path) -> None:
+    """Play the expert in a batch of worlds from whole starts, and write states of its accepted
+    episodes, from all phases.
 
     Raises:
         MjstackError: No episode was accepted.
         OSError: The file cannot be written.
     """
     cfg = stage.cfg
+    worlds = cast(PpoJobCfg, cfg.job).expert_worlds
     channels = Channels(_read_state, lambda steps: range(1, steps + 1, _STRIDE))
     for batch in play_batches(
         stage,
@@ -163,12 +149,11 @@ def check_ppo(stage: Stage) -> range:
             "its value at the start, the smallest and the largest, the first within the others"
         )
         raise ConfigError("job.std", job.std, expected)
-    reset = cfg.reset
-    if unrecorded(reset):
-        for name in reset.keys() - whole_starts(reset).keys():
-            label = f"reset.{name}"
-            check_params(label, resolve_func(label, reset[name].func), reset[name].params, 1)
-        reset = whole_starts(reset)
+    unrecorded = _unrecorded(cfg.reset)  # there is no file to build them with yet
+    for name, term in unrecorded.items():
+        label = f"reset.{name}"
+        check_params(label, resolve_func(label, term.func), term.params, 1)
+    reset = {name: term for name, term in cfg.reset.items() if name not in unrecorded}
     seen = f"observation.{group}"
     keys = {seen: f"job.{seen}"} if start is None else {}
     with renamed_keys(keys), one_world(stage, replace(env_cfg, reset=reset)) as env:
@@ -180,15 +165,14 @@ def check_ppo(stage: Stage) -> range:
 def train_ppo(stage: Stage, folder: Path) -> Trained:
     """Let worlds act and learn from it; see `Trainer`."""
     cfg = stage.cfg
-    job = cast(PpoJobCfg, cfg.job)
     device = torch.device(stage.backend[1])
     ranks = stage.ranks
     states = folder / _STATES
-    if unrecorded(cfg.reset):
-        ranks.from_first(
-            lambda: None if states.exists() else record_states(stage, job.expert_worlds, states)
-        )
-    environment = _environment(with_states(cfg, states))
+    reset = dict(cfg.reset)
+    for name, term in _unrecorded(reset).items():
+        ranks.from_first(lambda: None if states.exists() else _record_states(stage, states))
+        reset[name] = replace(term, params=term.params | {"path": str(states)})
+    environment = _environment(replace(cfg, reset=reset))
     cards = [device] if device.type == "cuda" else []
     with torch.random.fork_rng(devices=cards):
         torch.manual_seed(cfg.seed + ranks.rank)

@@ -46,14 +46,8 @@ class PpoLearner(Learner):
     def __init__(
         self, stage: Stage, cfg: Config, start: Policy | None, group: str, folder: Path
     ) -> None:
-        """Build the environment and the networks.
-
-        Args:
-            stage: The stage, for its model, its device, its progress and its ranks.
-            cfg: The configuration of the environment.
-            start: The policy that training starts from; None for random weights.
-            group: Name of the observation group that the policy sees.
-            folder: Where policies and state are.
+        """Build the environment of a configuration, and the networks of a policy that sees the
+        group: with random weights, or those of ``start``.
         """
         self._job = job = cast(PpoJobCfg, cfg.job)
         super().__init__(stage, cfg, folder, job.save_every)
@@ -76,15 +70,15 @@ class PpoLearner(Learner):
         hidden = job.hidden if start is None else start.network.hidden
         self._alg = alg = make_ppo(self._worlds, job, stage.ranks, group, hidden)
         self._value_loss = math.nan  # of the last iteration
-        self._policy = self._make_policy(start, group, hidden)
+        self.policy = self._make_policy(start, group, hidden)
         if start is not None:
             self._begin_with(start)
         self._networks = nn.ModuleDict({"actor": alg.actor, "critic": alg.critic})
+        self._networks.register_buffer("rewards", self._scale.sums)  # so it is part of the state
         groups = [{"params": list(net.parameters())} for net in self._networks.values()]
         self._optimizer = alg.optimizer = torch.optim.Adam(groups)
         alg.optimizer.register_step_pre_hook(lambda *_: self._set_rates())
         self.change = math.nan
-        self._spreads = True  # the ends of episodes, in the first iteration of a call
 
     def close(self) -> None:
         """Give the worlds back too."""
@@ -95,6 +89,10 @@ class PpoLearner(Learner):
         """See `Learner`. A training without an iteration leaves policies too."""
         if self._ranks.size > 1:
             self._alg.broadcast_parameters()
+        # Episodes do not all end at once
+        worlds = self._worlds
+        steps = worlds.episode_length_buf
+        worlds.episode_length_buf = torch.randint_like(steps, high=worlds.max_episode_length)
         super().learn()
         if not self.curve:
             self._save()
@@ -133,10 +131,6 @@ class PpoLearner(Learner):
     def _roll_out(self) -> None:
         """Let the worlds act for an iteration, and compute returns."""
         worlds = self._worlds
-        if self._spreads:
-            steps = worlds.episode_length_buf
-            worlds.episode_length_buf = torch.randint_like(steps, high=worlds.max_episode_length)
-            self._spreads = False
         obs = worlds.get_observations()
         for _ in range(self._job.horizon):
             obs, rewards, dones, extras = worlds.step(self._alg.act(obs))
@@ -175,8 +169,9 @@ class PpoLearner(Learner):
             total = round(60.0 * (job.minutes or 0.0))
             self._progress.advance("seconds of training", min(total, round(self.seconds)), total)
 
-    def _save(self) -> None:
-        super()._save()
+    @override
+    def _save(self, **figures: Any) -> None:
+        super()._save(**figures)
         row = self.curve[-1]
         self._progress.print_line(
             f"train: iteration {self.done}: success {row['success']:.3f}, return"
@@ -250,7 +245,7 @@ class PpoLearner(Learner):
     def _take_weights(self) -> None:
         """Copy the actor's weights and the scale of its observation into the policy."""
         actor = self._alg.actor
-        network = self._policy.network
+        network = self.policy.network
         network.layers.load_state_dict(actor.mlp.state_dict())
         scale = actor.obs_normalizer
         network.set_scale("observation", scale.mean.cpu(), scale.std.cpu() + scale.eps)
@@ -264,10 +259,10 @@ class PpoLearner(Learner):
     @override
     def _tensors(self) -> dict[str, Tensor]:
         env = self._env
-        state = {"random": torch.get_rng_state(), "rewards": self._scale.sums}
+        state = {"random": torch.get_rng_state(), "episode": env.episode}
         if env.device.type == "cuda":
             state["random_cuda"] = torch.cuda.get_rng_state(env.device)
-        return super()._tensors() | state | {"episode": env.episode}
+        return super()._tensors() | state
 
     @override
     def facts(self) -> dict[str, Any]:
@@ -278,7 +273,6 @@ class PpoLearner(Learner):
         super().restore(state, facts)
         env = self._env
         self._alg.learning_rate = facts["learning_rate"]
-        self._scale.sums.copy_(state["rewards"])
         if self._ranks.writes:  # the others have their own
             torch.set_rng_state(state["random"])
             if "random_cuda" in state and env.device.type == "cuda":

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from torch import Tensor
 
@@ -17,9 +17,9 @@ from mjstack.config.schema import (
     PpoJobCfg,
     TermCfg,
 )
-from mjstack.envs import Env, build_env
+from mjstack.envs import Env, build_env, driven_config
 from mjstack.episodes.stage import Stage
-from mjstack.errors import FolderError, UnknownName
+from mjstack.errors import FolderError, UnknownName, renamed_keys
 from mjstack.policy.checkpoint import read_state
 
 # In the folder of a training: two policies, and what it needs to go on.
@@ -95,6 +95,19 @@ def observed_group(job: CloneJobCfg | PpoJobCfg) -> ObservationGroupCfg:
     return replace(group, noise=job.observation_noise, terms=terms)
 
 
+def with_observation(cfg: Config) -> Config:
+    """The configuration, with the observation group of a new policy in place of its groups."""
+    job = cast(CloneJobCfg, cfg.job)
+    return replace(cfg, observation={job.group: observed_group(job)})
+
+
+def observed_widths(stage: Stage) -> dict[str, int]:
+    """Numbers of each term of a new policy's observation, in order."""
+    cfg = with_observation(driven_config(stage.cfg, reset={}))
+    with renamed_keys({"observation": "job.observation"}), one_world(stage, cfg) as env:
+        return env.observation_manager.term_dims[cast(CloneJobCfg, cfg.job).group]
+
+
 def made_with(stage: Stage) -> dict[str, Any]:
     """The machine's part of a training, which goes on only with the same."""
     return {"device": stage.backend[1].partition(":")[0], "processes": stage.ranks.size}
@@ -110,7 +123,7 @@ def earlier_state(stage: Stage, folder: Path) -> tuple[dict[str, Tensor], dict[s
         return None
     tensors, facts = read_state(folder / STATE)
     now = made_with(stage)
-    before = {name: facts["made_with"].get(name, value) for name, value in now.items()}
+    before = facts["made_with"]
     if before != now:
         raise FolderError(
             f"{folder} has a training with {before}, and this one has {now}. Set job.folder to"
