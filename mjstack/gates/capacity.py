@@ -2,6 +2,7 @@
 they be?
 """
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -55,8 +56,8 @@ def run_capacity(run: Run) -> list[GateResult]:
 
     # Environments first: each start is planned once, for both of its runs, and the plan of the
     # task's is kept for the gates that follow. Planning processes load during random actions.
-    planned = 0 if cfg.controller.name in FEEDBACK else nworld
-    with run.stage.planner.processes(planned) if planned else nullcontext():
+    planned = cfg.controller.name not in FEEDBACK
+    with run.stage.planner.processes(nworld) if planned else nullcontext():
         env, broken_env = _measure(
             run,
             result,
@@ -77,11 +78,11 @@ def run_capacity(run: Run) -> list[GateResult]:
     run.stage.measured.task = None if task.lost else task.advice
     run.stage.measured.env = None if env.lost else env.advice
     problems = [text for _, text in _shortages(task)]
-    for keys, text in _shortages(env):
-        # Sizes that were set may be meant for the batch alone; those of the robot's profile should
+    for key, text in _shortages(env):
+        # A size that was set may be meant for the batch alone; those of the robot's profile should
         # do for both.
-        chosen = any(getattr(cfg.batch, key) is not None for key in keys)
-        (result.details if chosen else problems).append(f"environments: {text}")
+        remarks = result.details if key in configured_sizes(cfg.batch) else problems
+        remarks.append(f"environments: {text}")
     problems += broken_env + broken_task
     if nworld < cfg.nworld:
         result.details.append(
@@ -106,10 +107,6 @@ def run_capacity(run: Run) -> list[GateResult]:
         mjwarp = run.stage.backend[0] is Backend.mjwarp
         size = image_bytes(run.stage.model, cameras, cfg.nworld, mjwarp=mjwarp)
         result.metrics["memory.images_mb"] = size / 1e6
-        result.details.append(
-            f"environments: images of {', '.join(cameras)} take {size / 1e6:,.0f} MB in"
-            f" {cfg.nworld} worlds, beside the buffers"
-        )
     if task.runs["task"].sizes is None:
         result.notes["rerun"] = "sizes were not tried: native MuJoCo has no fixed buffers"
     elif task.lost or env.lost:
@@ -243,28 +240,27 @@ def _report(run: Run, name: str, group: _Group, result: GateResult) -> None:
             result.metrics[f"memory.{name}.{which}_mb"] = size / 1e6
 
 
-def _shortages(group: _Group) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Buffers in force that are too small for a group's peaks: the keys that limit each, and a
-    sentence; or the physics that was lost. Exactly at capacity fits.
+def _shortages(group: _Group) -> Iterator[tuple[str, str]]:
+    """Buffers in force that are too small for a group's peaks: the key of each, and a sentence; or
+    the physics that was lost. Exactly at capacity fits.
     """
     if group.lost:
-        yield (), group.lost
+        yield "", group.lost
         return
     peaks = group.peaks
-    sizes = group.sizes
-    # MJWarp counts what all worlds hold at once. Fewer worlds than the batch has have fewer peaks
-    # to even out.
-    convex = peaks.convex_share or 0.0
-    # Buffer, keys of which the first is the remedy, room of a world, most needed, use of worlds
-    buffers: list[tuple[str, tuple[str, ...], int, float, np.ndarray]] = [
-        ("njmax", ("njmax",), sizes.njmax, peaks.rows.max(), peaks.rows),
-        ("contact pool", ("nconmax",), sizes.nconmax, peaks.share, peaks.contacts),
-        ("convex pairs", ("nccdmax", "nconmax"), sizes.convex_room, convex, np.zeros(0)),
-    ]
-    for name, keys, room, need, used in buffers:
+    rooms = configured_sizes(group.sizes)
+    # Buffer, most needed per world, and use of each world. MJWarp counts what all worlds hold at
+    # once. Convex pairs are in the contact pool too, so without a size of their own they fit.
+    needs: dict[str, tuple[str, float, np.ndarray]] = {
+        "njmax": ("njmax", peaks.rows.max(), peaks.rows),
+        "nconmax": ("contact pool", peaks.share, peaks.contacts),
+        "nccdmax": ("convex pairs", peaks.convex_share or 0.0, np.zeros(0)),
+    }
+    for key, (name, need, used) in needs.items():
+        room = rooms.get(key, math.inf)
         if need > room:
             worlds = np.flatnonzero(used > room).tolist()
             where = f" in {name_worlds(worlds, len(used))}" if worlds else ""
-            fix = f"Raise it: batch.{keys[0]}={getattr(group.advice, keys[0])}"
+            fix = f"Raise it: batch.{key}={getattr(group.advice, key)}"
             problem = f"{name} overflow{where}; room for {room:g} per world, {need:g} needed"
-            yield keys, f"{problem}. {fix}"
+            yield key, f"{problem}. {fix}"
