@@ -220,7 +220,7 @@ def test_a_rank_that_breaks(env: dict[str, str], why: str, trap: list[str], tmp_
     report = report_of(folder)
     (gate,) = report["gates"]
     assert gate["metrics"]["episodes"] == 20
-    assert "an earlier call has played seeds 0 to 1" in gate["details"]
+    assert "an earlier call has played 2 of 4 seeds (0, 1)" in gate["details"]
     assert len(report["provenance"]["earlier_calls"]) == 1
 
 

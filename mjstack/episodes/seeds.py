@@ -1,6 +1,5 @@
 """Episodes of a gate, played and counted seed after seed, and the record of each seed."""
 
-import itertools
 import logging
 import socket
 from collections.abc import Callable, Iterator, Sequence
@@ -19,7 +18,7 @@ from mjstack.episodes.rollout import Observer
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
 from mjstack.episodes.tally import EpisodeTally
-from mjstack.errors import FolderError, first_line
+from mjstack.errors import FolderError, first_line, name_worlds
 from mjstack.interrupt import check_interrupt
 from mjstack.report.page import Map, Worlds
 from mjstack.sim import Simulation
@@ -70,8 +69,8 @@ def play_seeds(
         finally:
             tally.write_failing()  # once: its rows grow with the seeds
     if tally.again:
-        seeds = ", ".join(_ranges(tally.again))
-        tally.details.append(f"an earlier call has played seeds {seeds}")
+        seeds = name_worlds(tally.again, count, what="seeds")
+        tally.details.append(f"an earlier call has played {seeds}")
     if cfg.nworld > 1:
         run.page.worlds[gate] = _worlds(tally, run)
     return tally
@@ -238,10 +237,3 @@ def _record(stage: Stage, batch: Batch, monitor: FailureMonitor | None) -> Episo
         steps=int(sim.step_count.sum()),
         ranks={stage.worlds.start: place} if stage.ranks.size > 1 else {},
     )
-
-
-def _ranges(numbers: Sequence[int]) -> Iterator[str]:
-    """Ascending numbers in words, neighbours as ``3 to 7``."""
-    for _, group in itertools.groupby(enumerate(numbers), lambda pair: pair[1] - pair[0]):
-        run = [number for _, number in group]
-        yield str(run[0]) if len(run) == 1 else f"{run[0]} to {run[-1]}"

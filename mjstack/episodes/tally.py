@@ -239,12 +239,10 @@ class EpisodeTally:
         """Tables of the report: seeds, and first signs of failure."""
         tables = []
         if self.places:
-            worlds = len(self.succeeded[0])
+            firsts = [*self.places, len(self.succeeded[0])]
             rows = [
                 [f"{first:,} to {end - 1:,}", where]
-                for (first, where), end in zip(
-                    self.places.items(), [*list(self.places)[1:], worlds], strict=True
-                )
+                for (first, where), end in zip(self.places.items(), firsts[1:], strict=True)
             ]
             title = f"Which rank played which world (seed {self.seeds[-1]})"
             tables.append(Table(title=title, header=["worlds", "where"], rows=rows))

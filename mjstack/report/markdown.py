@@ -55,7 +55,14 @@ def _blocks(part: Part, level: int) -> list[str]:
             return [f"![{part.name}]({part.name})"]
         case Table():
             title = [f"{'#' * level} {part.title}"] if part.title else []
-            return [*title, "\n".join(part.to_markdown())]
+            rule = ["---"] * len(part.header)
+            return [*title, "\n".join(map(_row, [part.header, rule, *part.rows]))]
         case Plots():
             return []
     return ["\n".join(f"- {line}" for line in part)]
+
+
+def _row(cells: Sequence[str]) -> str:
+    """A row of a table, each cell in one line."""
+    texts = (cell.replace("|", "\\|").replace("\n", " ") for cell in cells)
+    return f"| {' | '.join(texts)} |"

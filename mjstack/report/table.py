@@ -1,4 +1,4 @@
-"""Tables of text cells, as Markdown and on a terminal."""
+"""Tables of text cells, and their writer for a terminal."""
 
 import os
 import re
@@ -73,12 +73,6 @@ class Table:
         cells = [[format_value(row.get(key, "-")) for key in columns.values()] for row in rows]
         return cls(header=list(columns), rows=cells, title=title)
 
-    def to_markdown(self) -> list[str]:
-        """Lines of a Markdown table without its title."""
-        rule = ["---"] * len(self.header)
-        rows = ([_escape(cell) for cell in row] for row in (self.header, rule, *self.rows))
-        return [f"| {' | '.join(cells)} |" for cells in rows]
-
     def to_console(self, colors: Mapping[str, str] | None = None) -> rich.table.Table:
         """The table for a terminal, with colours of whole cells by their text."""
         known = colors or {}
@@ -90,8 +84,3 @@ class Table:
                 *(f"[{known[c]}]{escape(c)}[/]" if c in known else escape(c) for c in row)
             )
         return table
-
-
-def _escape(cell: str) -> str:
-    """Text as a cell of a Markdown table."""
-    return cell.replace("|", "\\|").replace("\n", " ")
