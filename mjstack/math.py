@@ -17,6 +17,18 @@ _Z_ROW_SIGNS = torch.tensor([2.0, 2.0, -2.0, -2.0, 2.0, -2.0])
 _Z_ROW_ADDED = torch.tensor([0.0, 0.0, 1.0])
 
 
+def atan2(y: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+    """Angle [rad] of the direction (x, y), shape ``(...)``, alike in tensors of any size.
+
+    On CPUs `torch.atan2` has two routines, which round differently: one for whole vectors of packed
+    elements, and one for the rest. A world's angle would depend on the number of worlds. Elements
+    that are not packed all take the second one.
+    """
+    if y.device.type == "cpu":
+        y = torch.stack((y, y), dim=-1)[..., 0]
+    return torch.atan2(y, x)
+
+
 def quat_mul(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """Hamilton product ``a b``, shape ``(..., 4)``."""
     aw, ax, ay, az = a.unbind(-1)
@@ -54,7 +66,7 @@ def quat_angle(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """
     conj = torch.cat((a[..., :1], -a[..., 1:]), dim=-1)
     rel = quat_mul(conj, b)
-    return 2.0 * torch.atan2(torch.linalg.vector_norm(rel[..., 1:], dim=-1), rel[..., 0].abs())
+    return 2.0 * atan2(torch.linalg.vector_norm(rel[..., 1:], dim=-1), rel[..., 0].abs())
 
 
 def quat_z_row(quat: torch.Tensor) -> torch.Tensor:

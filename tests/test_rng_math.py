@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from mjstack.managers.view import rows_of
-from mjstack.math import not_finite, quat_angle, quat_from_yaw, quat_mul, quat_z_row
+from mjstack.math import atan2, not_finite, quat_angle, quat_from_yaw, quat_mul, quat_z_row
 from mjstack.rng import philox, uniform
 from mjstack.scene.index import Columns
 
@@ -99,6 +99,15 @@ def test_quat_angle_is_mujocos_whatever_the_signs(quats: np.ndarray) -> None:
     for sign in (1.0, -1.0):
         got = quat_angle(torch.from_numpy(quats), torch.from_numpy(sign * other)).numpy()
         np.testing.assert_allclose(got, np.minimum(turns, 2 * np.pi - turns), atol=1e-7)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_an_angle_does_not_depend_on_the_number_of_worlds(dtype: torch.dtype) -> None:
+    y, x = torch.randn((2, 1000), dtype=dtype, generator=torch.Generator().manual_seed(0))
+    angles = atan2(y, x)
+    alone = [atan2(y[n : n + 1], x[n : n + 1]) for n in range(1000)]
+    assert torch.equal(angles, torch.cat(alone))
+    np.testing.assert_allclose(angles.numpy(), np.arctan2(y.numpy(), x.numpy()), rtol=1e-6)
 
 
 def test_small_angles_keep_their_precision_in_float32() -> None:

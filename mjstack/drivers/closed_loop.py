@@ -12,6 +12,7 @@ from mjstack.drivers.feedback import STAY, FeedbackDriver
 from mjstack.drivers.open_loop import OpenLoopPlanner, smoothstep
 from mjstack.envs import Env
 from mjstack.managers.view import EnvView
+from mjstack.math import atan2
 from mjstack.mdp.geometry import objects_in_hand, robot
 from mjstack.tasks.check import make_check
 
@@ -145,15 +146,13 @@ class ClosedLoopDriver(FeedbackDriver):
         command[:, self._roll_column] = column + self._roll
         _, closing, approach = self._ik.forward(command)
         yaw = self._last_seen(self._source, self.phase)[:, 2]
-        off = yaw - torch.atan2(closing[:, 1], closing[:, 0])
+        off = yaw - atan2(closing[:, 1], closing[:, 0])
         off = off - _QUARTER * torch.round(off / _QUARTER)
         # Two faces are in question, a quarter turn apart; what has been turned so far counts for
         # its own.
         faces = torch.stack((off, off - torch.copysign(torch.full_like(off, _QUARTER), off)))
         upright = (-approach[:, 2]).clamp(min=0.2)
-        rolls = self._roll + self._roll_sign * torch.atan2(
-            torch.sin(faces), torch.cos(faces) * upright
-        )
+        rolls = self._roll + self._roll_sign * atan2(torch.sin(faces), torch.cos(faces) * upright)
         cost = (rolls - STAY * self._roll).abs()
         goal = torch.where(cost[0] <= cost[1], rolls[0], rolls[1])
         step = self._cfg.controller.yaw_alignment * goal - self._roll

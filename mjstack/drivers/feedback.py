@@ -16,6 +16,7 @@ from mjstack.drivers.tilt import CarryTilt, turn_about_z
 from mjstack.errors import ArgumentError
 from mjstack.kinematics.batched_ik import BatchedIk
 from mjstack.managers.view import EnvView
+from mjstack.math import atan2
 from mjstack.mdp.geometry import gripper_opening, objects_in_hand, place_xy, pose_w, robot
 from mjstack.scene.phases import Target, build_phases, source_names
 
@@ -110,7 +111,7 @@ class FeedbackDriver(Driver):
         for number, name in enumerate(objects):
             pose = pose_w(self._env, name).float()
             w, x, y, z = pose[:, 3:].unbind(1)
-            yaw = torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+            yaw = atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
             seen = torch.cat((pose[:, :2], yaw[:, None]), dim=1)
             last = self._seen[:, number]
             last.copy_(torch.where(due[:, number, None], seen, last))
@@ -126,7 +127,7 @@ class FeedbackDriver(Driver):
         offset = table[:, :2]
         if any(spec.toward is not None for spec in self._cfg.controller.phases.values()):
             away = self._last_seen(self._toward, phase)[:, :2] - seen
-            offset = turn_about_z(offset, torch.atan2(away[:, 1], away[:, 0]) * self._turns[phase])
+            offset = turn_about_z(offset, atan2(away[:, 1], away[:, 0]) * self._turns[phase])
         return torch.cat((offset + seen, table[:, 2:]), dim=1)
 
     def _last_seen(self, sources: Tensor, phase: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from typing_extensions import override
 from mjstack.drivers.feedback import STAY, FeedbackDriver, State, servo_lag
 from mjstack.drivers.roles import Role, find_roles, follows_anchor
 from mjstack.managers.view import EnvView
-from mjstack.math import quat_to_matrix
+from mjstack.math import atan2, quat_to_matrix
 from mjstack.mdp.geometry import pose_w, robot
 from mjstack.tasks.check import make_check
 
@@ -302,14 +302,14 @@ class StateBasedDriver(FeedbackDriver):
         # horizontal. From there on the way to a face does not depend on the roll now. So the face
         # that is chosen is still the nearer one after the next step.
         x, y, z = state.approach.unbind(1)
-        level = torch.where(torch.hypot(x, y) > _UPRIGHT, torch.atan2(x, -y), 0.0)
+        level = torch.where(torch.hypot(x, y) > _UPRIGHT, atan2(x, -y), 0.0)
         axis = torch.stack((torch.cos(level), torch.sin(level), torch.zeros_like(z)), dim=1)
         side = torch.linalg.cross(state.approach, axis)
-        now = torch.atan2((state.closing * side).sum(1), (state.closing * axis).sum(1))
+        now = atan2((state.closing * side).sum(1), (state.closing * axis).sum(1))
         faces = (yaw - level) + self._quarters
-        there = torch.atan2(-torch.sin(faces), torch.cos(faces) * (-z).clamp(min=0.2))
+        there = atan2(-torch.sin(faces), torch.cos(faces) * (-z).clamp(min=0.2))
         change = there - now
-        change = -self._roll_sign * torch.atan2(torch.sin(change), torch.cos(change))
+        change = -self._roll_sign * atan2(torch.sin(change), torch.cos(change))
         rolls = roll + change
         low, high = self._rolls
         beyond = (low - rolls).clamp(min=0.0) + (rolls - high).clamp(min=0.0)

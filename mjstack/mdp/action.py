@@ -10,6 +10,7 @@ from mjstack.config.fields import Count, Fraction, NotNegative, Positive
 from mjstack.errors import ParameterError, UnknownName
 from mjstack.managers.action import ActionTerm
 from mjstack.managers.view import EnvView
+from mjstack.math import atan2
 from mjstack.mdp.geometry import Pose, robot
 from mjstack.scene.index import Columns
 
@@ -257,6 +258,6 @@ class EndEffectorDelta(_Commands):
         """
         goal = 0.5 * (action + 1.0) * self._tilt
         away = point[:, :2] / torch.linalg.vector_norm(point[:, :2], dim=1, keepdim=True)
-        now = torch.atan2((approach[:, :2] * away).sum(1), -approach[:, 2])
+        now = atan2((approach[:, :2] * away).sum(1), -approach[:, 2])
         angle = now + (goal - now).clamp(-_TILT_STEP, _TILT_STEP)
         return torch.cat((torch.sin(angle)[:, None] * away, -torch.cos(angle)[:, None]), dim=1)
