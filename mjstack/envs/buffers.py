@@ -41,8 +41,7 @@ class Peaks:
     """The most that worlds used over all physics steps of a run, and what they lost.
 
     Worlds that start anew in between are counted on: the simulation keeps what a masked reset
-    erases (`Simulation.lasting_peaks`). So nothing is read while
-    the run goes on.
+    erases (`Simulation.lasting_peaks`). So nothing is read while the run goes on.
 
     Attributes:
         contacts: Contacts of each world, shape ``(nworld,)``.

@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any
 
 import mujoco
+import numpy as np
 
 from mjstack.config.schema import Backend, Config, TermCfg
 from mjstack.distributed import Ranks, current_ranks
@@ -243,7 +244,6 @@ class Stage:
         backend: Backend,
         device: str,
         *,
-        reset: Reset | None = None,
         sizes: BatchSizes | None = None,
     ) -> Simulation:
         """Worlds that can start as the configuration says.
@@ -252,7 +252,6 @@ class Stage:
             nworld: How many.
             backend: Native or MJWarp.
             device: ``cpu`` or ``cuda:N``.
-            reset: How they start, if not as configured.
             sizes: Buffer sizes, if not those of the batch.
         """
         if sizes is None and backend is Backend.mjwarp:
@@ -263,7 +262,7 @@ class Stage:
             nworld,
             backend=backend,
             device=device,
-            fields=required_fields(self.cfg.reset if reset is None else reset),
+            fields=required_fields(self.cfg.reset),
             sizes=sizes,
         )
 
@@ -299,20 +298,20 @@ class Stage:
         on_cuda = self.backend[1].startswith("cuda")
         return self.cfg.nworld if on_cuda else min(self.cfg.nworld, most)
 
-    def measuring_simulation(self, sizes: BatchSizes, reset: Reset | None = None) -> Simulation:
+    def measuring_simulation(self, sizes: BatchSizes) -> Simulation:
         """Worlds that size the buffers."""
-        return self.simulation(self.measuring_nworld, *self.backend, reset=reset, sizes=sizes)
+        return self.simulation(self.measuring_nworld, *self.backend, sizes=sizes)
 
     def play_task(self, reset: Reset, sizes: BatchSizes | None = None) -> Workload:
         """Play the driven task once, in worlds of exactly these sizes; without, with room to
         spare.
         """
-        return play_workload(
-            self.cfg,
-            lambda sizes: self.measuring_simulation(sizes, reset),
-            lambda sim: self.play(sim, reset).failed,
-            sizes,
-        )
+        stage = self.with_config(replace(self.cfg, reset=reset))
+
+        def play(sim: Simulation) -> np.ndarray:
+            return stage.play(sim, reset).failed
+
+        return play_workload(self.cfg, stage.measuring_simulation, play, sizes)
 
     def color_renderer(
         self, count: int, fields: Sequence[str], cameras: Sequence[str] | None = None

@@ -73,7 +73,7 @@ class Page:
         motion: Whether it shows worlds in motion.
         worlds: Episodes by gate.
         worlds3d: Worlds in motion, by the part of the run that played them.
-        tables: Tables of the run, such as of job=scaling.
+        tables: Tables of the run, such as of job=train.
         pictures: Files that parts of the run have drawn.
         episode: Name of the file with the episode in 3-D; empty without one.
         note: Why there is none.
