@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from mjstack.errors import MjstackError
 
 __all__ = ["Config", "Env", "MjstackError", "load_config", "make_env"]
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 
 _HOMES = {
     "Config": "mjstack.config",

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+import mjstack
 from mjstack.errors import FolderError, MjstackError, first_line
 
 _KEY = "hydra.run.dir (job=collect, job=train: job.folder)"
@@ -177,9 +178,20 @@ def check_unused(folder: Path, job: str = "", marker: str = "", key: str = _KEY)
         if job and json.loads((folder / "report.json").read_text())["resumes"] == job:
             return
     raise FolderError(
-        f"{folder} has {used[0]}, expected a new or an empty folder, or one with which this job can"
-        f" go on. Set {key} to another"
+        f"{folder} has {used[0]}{made_by(folder)}, expected a new or an empty folder, or one with"
+        f" which this job can go on. Set {key} to another"
     )
+
+
+def made_by(folder: Path) -> str:
+    """The version of mjstack that made a run's or a sweep's folder, to follow its name; empty if it
+    is this one, or no report has it.
+    """
+    for report in (folder / "report.json", *sorted(folder.glob("*/report.json"))):
+        with suppress(OSError, ValueError, LookupError, TypeError, RecursionError):
+            version = json.loads(report.read_text())["provenance"]["versions"]["mjstack"]
+            return "" if version == mjstack.__version__ else f" of mjstack {str(version)[:40]}"
+    return ""
 
 
 def lock_folder(folder: Path, *, shared: bool = False) -> int:

@@ -159,7 +159,7 @@ def test_a_process_may_come_when_the_first_one_has_begun(
 ) -> None:
     (tmp_path / "training.json").write_text("{}")
     cfg = load_config([*REACH, f"job.folder={tmp_path}"])
-    with pytest.raises(MjstackError, match="has the training of another configuration"):
+    with pytest.raises(MjstackError, match="has a training of another configuration"):
         check_train(cfg)
     monkeypatch.setattr("mjstack.distributed._current", Ranks(1, 2))
     assert check_train(cfg).folder == tmp_path

@@ -8,19 +8,20 @@ from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
 
+import mjstack
 from mjstack.report.record import Provenance
 
-PACKAGES = ("mjstack", "mujoco", "mujoco-warp", "warp-lang", "torch", "mink", "hydra-core", "numpy")
+PACKAGES = ("mujoco", "mujoco-warp", "warp-lang", "torch", "mink", "hydra-core", "numpy")
 
 
 def collect_provenance() -> Provenance:
     """Date, versions, processor and commit."""
-    versions: dict[str, str] = {"python": platform.python_version()}
+    versions = {"python": platform.python_version(), "mjstack": mjstack.__version__}
     for name in PACKAGES:
         try:
             versions[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
-            versions[name] = "from a checkout" if name == "mjstack" else "not installed"
+            versions[name] = "not installed"
     return {
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC"),
         "versions": versions,
