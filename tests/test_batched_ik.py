@@ -282,7 +282,7 @@ def test_a_posture_is_approached_as_far_as_the_target_allows(
     posture = arm.home.copy()
     posture[arm.moved] += 0.3
     ik = arm.solver(1000, device, iterations=100, posture_gain=0.3)
-    given, goal, wanted = tensors(device, start, targets, posture)
+    given, goal, wanted = tensors(device, start, targets, np.tile(posture, (1000, 1)))
     command = ik.solve(given, goal, wanted)[0].cpu().numpy().astype(float)
     plain, _ = results(arm.solver(1000, device, iterations=100), start, targets)
     left = (posture - command)[:, arm.moved]
@@ -386,17 +386,16 @@ def test_a_start_at_its_target_still_goes_to_the_posture(
     assert (after <= before + 0.01).all()
 
 
-def test_postures_of_all_worlds_or_each(arm: Arm, device: str) -> None:
+def test_postures_of_each_world(arm: Arm, device: str) -> None:
     start = arm.anywhere(16, 30)
     target = arm.grasp_point(arm.anywhere(16, 31))
     ik = arm.solver(16, device, iterations=20, posture_gain=0.3)
-    given, goal, home, other = tensors(device, start, target, arm.home, arm.anywhere(16, 32))
+    given, goal, home, other = tensors(device, start, target, arm.at_home(16), arm.anywhere(16, 32))
     by_default = ik.solve(given, goal)[0].clone()
     assert torch.equal(ik.solve(given, goal, home)[0], by_default)
-    assert torch.equal(ik.solve(given, goal, home.repeat(16, 1))[0], by_default)
     each = ik.solve(given, goal, other)[0].clone()
     assert not torch.allclose(each, by_default, atol=1e-3)
-    first = ik.solve(given, goal, other[0])[0].clone()
+    first = ik.solve(given, goal, other[:1].repeat(16, 1))[0].clone()
     assert torch.equal(each[0], first[0])
     assert not torch.allclose(each[1:], first[1:], atol=1e-3)
     assert torch.equal(ik.solve(given, goal)[0], by_default)  # home again
@@ -631,7 +630,7 @@ def test_the_robot_alone_is_the_robot_in_its_scene(
 def test_a_cuda_graph_holds_it(arm: Arm, cuda: str, gain: float) -> None:
     """Replays follow their inputs, among torch's own operations, as eager calls do."""
     ik = arm.solver(256, cuda, posture_gain=gain, approach_gain=gain)
-    posture = tensors(cuda, arm.home)[0] if gain else None
+    posture = tensors(cuda, arm.at_home(256))[0] if gain else None
     command, goal = tensors(cuda, arm.at_home(256), arm.grasp_point(arm.anywhere(256, 20)))
     out = torch.zeros_like(ik.solve(command, goal)[0])
     stream = torch.cuda.Stream()

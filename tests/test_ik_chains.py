@@ -33,6 +33,7 @@ ODD = """
           <geom size="0.01"/>
           <body name="palm" pos="0.1 0.1 0.05">
             <joint name="bend" axis="1 0 1" pos="0 0.01 0" range="-150 150"/>
+            <joint name="sway" axis="0 1 0.3" pos="-0.1 0 0.02" range="-120 120"/>
             <geom size="0.01"/>
             <body name="finger" pos="0 0 0.15">
               <joint name="first_finger" axis="1 0 0" pos="0 0 0.02" ref="-30" range="-90 90"/>
@@ -53,6 +54,7 @@ ODD = """
     <position name="lift" joint="lift" ctrlrange="-0.1 0.5"/>
     <position name="turn" joint="turn"/>
     <position name="bend" joint="bend"/>
+    <position name="sway" joint="sway"/>
     <position name="first_finger" joint="first_finger"/>
     <position name="second_finger" joint="second_finger"/>
   </actuator>
@@ -64,13 +66,14 @@ def odd_arm() -> Arm:
     """Slides and hinges beside their body's origin, two in one body, reference angles, one without
     a command, a fork.
     """
+    joints = ["lift", "turn", "bend", "sway"]
     robot = RobotCfg(
-        arm_joints=["lift", "turn", "bend", "first_finger", "second_finger"],
-        gripper_joints=[],
-        home=[0.1, 0.2, 0.3, 0.1, 0.0],
-        gripper_open=[],
-        gripper_closed=[],
-        ik_joints=["lift", "turn", "bend", "first_finger", "second_finger"],
+        arm_joints=joints,
+        gripper_joints=["first_finger", "second_finger"],
+        home=[0.1, 0.2, 0.3, 0.1, 0.1, 0.0],
+        gripper_open=[0.1, 0.0],
+        gripper_closed=[0.0, 0.0],
+        ik_joints=joints,
         locked={},
         grasp_sites=["a", "b"],
         approach_body="palm",
@@ -82,7 +85,7 @@ def odd_arm() -> Arm:
 def test_any_chain_of_hinges_and_slides(device: str) -> None:
     """Its Jacobian is right if a solve from close by converges as fast as Newton's method."""
     arm = odd_arm()
-    commands = np.random.default_rng(18).uniform(arm.low, arm.high, (100, 5))
+    commands = np.random.default_rng(18).uniform(arm.low, arm.high, (100, 6))
     commands[:, 0] = np.clip(commands[:, 0], -0.09, 0.29)
     ik = arm.solver(100, device, iterations=5)
     (given,) = tensors(device, commands)
@@ -91,6 +94,7 @@ def test_any_chain_of_hinges_and_slides(device: str) -> None:
         assert np.abs(found.cpu().numpy() - expected).max() <= 2e-6
     nudge = np.random.default_rng(19).normal(scale=0.005, size=commands.shape)
     near = np.clip(commands + nudge, arm.low, arm.high)
+    near[:, 4:] = commands[:, 4:]
     near[:, 0] = np.clip(near[:, 0], -0.1, 0.3)
     command, distance = results(ik, commands, arm.grasp_point(near))
     assert np.quantile(distance, 0.95) <= 1e-6
@@ -108,6 +112,15 @@ def test_the_narrower_of_both_ranges_holds() -> None:
         assert -0.1 <= command[0, 0] <= 0.3
 
 
+def test_joints_that_move_one_site_alone_are_refused() -> None:
+    arm = odd_arm()
+    for joints in ([*arm.robot.ik_joints, "second_finger"], []):
+        robot = replace(arm.robot, arm_joints=arm.robot.joints, gripper_joints=[], ik_joints=joints)
+        says = "robot.ik_joints=.*: expected joints that move both grasp sites, a and b"
+        with pytest.raises(ConfigError, match=says):
+            BatchedIk(arm.model, robot, 2, "cpu")
+
+
 def test_an_approach_body_that_not_every_joint_moves_is_refused() -> None:
     arm = odd_arm()
     for body in ("shoulder", "finger"):
@@ -118,11 +131,9 @@ def test_an_approach_body_that_not_every_joint_moves_is_refused() -> None:
 
 @pytest.mark.full
 def test_a_gain_counts_in_any_chain(device: str) -> None:
-    """With moved joints on one side of the fork, a slide among them, and an approach axis that is
-    none of theirs.
-    """
+    """With a slide among the moved joints, and an approach axis that is none of theirs."""
     arm = odd_arm()
-    start = np.random.default_rng(37).uniform(0.5 * arm.low, 0.5 * arm.high, (100, 5))
+    start = np.random.default_rng(37).uniform(0.5 * arm.low, 0.5 * arm.high, (100, 6))
     start[:, 0] = np.clip(start[:, 0], -0.05, 0.1)
     at = arm.grasp_point(start)
     for gains in ({"posture_gain": 0.2}, {"approach_gain": 0.2}):
@@ -137,20 +148,20 @@ def test_a_gain_counts_in_any_chain(device: str) -> None:
 
 
 def test_other_joint_types_are_refused() -> None:
-    hinge = '<joint name="bend" axis="1 0 1" pos="0 0.01 0" range="-150 150"/>'
+    hinge = '<joint name="sway" axis="0 1 0.3" pos="-0.1 0 0.02" range="-120 120"/>'
     assert hinge in ODD
-    model = mujoco.MjModel.from_xml_string(ODD.replace(hinge, '<joint name="bend" type="ball"/>'))
-    with pytest.raises(MjstackError, match="joint 'bend' is of type ball, expected hinge or slide"):
+    model = mujoco.MjModel.from_xml_string(ODD.replace(hinge, '<joint name="sway" type="ball"/>'))
+    with pytest.raises(MjstackError, match="joint 'sway' is of type ball, expected hinge or slide"):
         BatchedIk(model, odd_arm().robot, 2, "cpu")
 
 
 def test_shapes_are_not_broadcast() -> None:
     ik = odd_arm().solver(3, posture_gain=0.1)
-    q = torch.zeros(3, 5)
+    q = torch.zeros(3, 6)
     goal = torch.zeros(3, 3)
-    postures = [(q, goal, torch.zeros(shape)) for shape in ((4,), (1, 5), (3, 4), (1, 3, 5))]
+    postures = [(q, goal, torch.zeros(shape)) for shape in ((6,), (1, 6), (3, 4), (1, 3, 6))]
     for arguments, says in (
-        ((torch.zeros(1, 5), goal), r"q: found shape \(1, 5\), expected shape \(3, 5\)"),
+        ((torch.zeros(1, 6), goal), r"q: found shape \(1, 6\), expected shape \(3, 6\)"),
         ((q, torch.zeros(3)), r"target: found shape \(3,\), expected shape \(3, 3\)"),
         *((posture, "posture: found shape") for posture in postures),
     ):

@@ -91,11 +91,26 @@ class BatchedIk:
         self._settings = [iterations, guided, _DAMPING, _MAX_STEP, posture_gain, approach_gain]
         self._settings.append(_NEAR if gained else -1.0)
 
-        # Memory and kernels
-        self._allocate(model, robot)
-        q = self._view["q"]
-        self.forward(q)  # compiles and loads the kernels: a capture may do neither
-        self.solve(q, self._view["target"])
+        # The chain and all buffers, each a Warp array and a torch view of it
+        with wp.ScopedDevice(self._device):
+            self._chain, shape = build_chain(model, robot)
+            self._array = {
+                "home": wp.array(np.tile(locked_home(robot), (nworld, 1)), dtype=float),
+                "down": wp.full(nworld, wp.vec3(0.0, 0.0, -1.0), dtype=wp.vec3),
+                "distance": wp.zeros(nworld, dtype=float),
+            }
+            for name in ("q", "posture", "solution"):
+                self._array[name] = wp.zeros((nworld, len(robot.joints)), dtype=float)
+            for name in ("target", "approach", "point", "closing", "pointing"):
+                self._array[name] = wp.zeros(nworld, dtype=wp.vec3)
+        self._view = {name: wp.to_torch(array) for name, array in self._array.items()}
+        # The buffers are filled before torch's stream writes into them.
+        wp.synchronize_device(self._device)
+
+        # Kernels are compiled and loaded here: a capture may do neither.
+        self._kernel = solve_kernel(shape)
+        self.forward(self._view["q"])
+        self.solve(self._view["q"], self._view["target"])
         wp.synchronize_device(self._device)
 
     def forward(self, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -130,9 +145,8 @@ class BatchedIk:
         Args:
             q: Joint positions to start from [rad, m], shape ``(nworld, n_arm + n_gripper)``.
             target: Target of the grasp point [m], shape ``(nworld, 3)``.
-            posture: Joint positions that ``posture_gain`` draws the ik joints to [rad, m], shape
-                ``(n_arm + n_gripper,)`` for all worlds or ``(nworld, n_arm + n_gripper)``; the
-                robot's home if None. Without a gain it has no effect.
+            posture: Joint positions that ``posture_gain`` draws the ik joints to [rad, m], of the
+                same shape; the robot's home if None. Without a gain it has no effect.
             approach: Desired approach axis of ``approach_gain``, unit vectors, shape ``(nworld,
                 3)``; down if None. Without a gain it has no effect.
 
@@ -145,34 +159,15 @@ class BatchedIk:
         """
         self._copy_in("q", q)
         self._copy_in("target", target)
+        names = ["q", "target", "home", "down"]
         if posture is not None:
-            same = posture.dim() == 1
-            self._copy_in("posture", posture.expand(self.nworld, -1) if same else posture)
+            self._copy_in("posture", posture)
+            names[2] = "posture"
         if approach is not None:
             self._copy_in("approach", approach)
-        goal_posture = "home" if posture is None else "posture"
-        names = ["q", "target", goal_posture, "down" if approach is None else "approach"]
+            names[3] = "approach"
         self._launch(self._kernel, names, self._settings, ["solution", "distance"])
         return self._view["solution"], self._view["distance"]
-
-    def _allocate(self, model: mujoco.MjModel, robot: RobotCfg) -> None:
-        """Make the chain, the kernel and all buffers, each a Warp array and a torch view of it."""
-        n = self.nworld
-        with wp.ScopedDevice(self._device):
-            self._chain, shape = build_chain(model, robot)
-            self._array = {
-                "home": wp.array(np.tile(locked_home(robot), (n, 1)), dtype=float),
-                "down": wp.full(n, wp.vec3(0.0, 0.0, -1.0), dtype=wp.vec3),
-                "distance": wp.zeros(n, dtype=float),
-            }
-            for name in ("q", "posture", "solution"):
-                self._array[name] = wp.zeros((n, len(robot.joints)), dtype=float)
-            for name in ("target", "approach", "point", "closing", "pointing"):
-                self._array[name] = wp.zeros(n, dtype=wp.vec3)
-        self._kernel = solve_kernel(shape)
-        self._view = {name: wp.to_torch(array) for name, array in self._array.items()}
-        # The buffers are filled before torch's stream writes into them.
-        wp.synchronize_device(self._device)
 
     def _launch(
         self, kernel: wp.Kernel, names: list[str], settings: list[Any], results: list[str]

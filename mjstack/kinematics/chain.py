@@ -83,8 +83,11 @@ def build_chain(model: mujoco.MjModel, robot: RobotCfg) -> tuple[Chain, Shape]:
     chain.column = wp.array(column, dtype=int)
     chain.low = wp.array(limits[0, column], dtype=float)
     chain.high = wp.array(limits[1, column], dtype=float)
-    shape = Shape(tuple(kinds), tuple(c in moved for c in column), chain.trunk, chain.fork)
-    return chain, shape
+    ik_links = tuple(c in moved for c in column)
+    if not any(ik_links) or any(ik_links[chain.trunk :]):
+        expected = f"joints that move both grasp sites, {' and '.join(robot.grasp_sites)}"
+        raise ConfigError("robot.ik_joints", robot.ik_joints, expected)
+    return chain, Shape(tuple(kinds), ik_links, chain.trunk, chain.fork, chain.end)
 
 
 def _read_link(model: mujoco.MjModel, joint: int, pose: _Pose, column: int) -> _Link:

@@ -49,9 +49,10 @@ class Shape:
     """
 
     kinds: tuple[int, ...]  # HINGE or SLIDE, of each link
-    moved: tuple[bool, ...]  # whether inverse kinematics moves it
+    moved: tuple[bool, ...]  # whether inverse kinematics moves it; of the trunk alone
     trunk: int
     fork: int
+    end: int
 
 
 @wp.func
@@ -113,17 +114,11 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
     """Compile the kernel that moves every world's grasp point towards its target.
 
     Joints behind the last moved one, such as the wrist's roll and the fingers, are followed once
-    per solve. An iteration then follows the moved links alone.
+    per solve. An iteration then follows the END links up to it.
     """
-    n = len(shape.kinds)
-    forked = any(shape.moved[shape.trunk :])
-    # Links that an iteration follows: these up to TRUNK carry both sites, and so on as in Chain.
-    TRUNK = shape.trunk if forked else max((i + 1 for i in range(n) if shape.moved[i]), default=0)
-    FORK, END = (shape.fork, n) if forked else (TRUNK, TRUNK)
-    # The first links after them on the way to the first site and to the second
-    FIRST_REST, SECOND_REST = (shape.fork, n) if forked else (shape.trunk, shape.fork)
-    Values = wp.types.vector(length=max(END, 1), dtype=float)
-    Rows = wp.types.matrix(shape=(max(END, 1), 3), dtype=float)  # a vector per link
+    END = max(i + 1 for i, moved in enumerate(shape.moved) if moved)
+    Values = wp.types.vector(length=END, dtype=float)
+    Rows = wp.types.matrix(shape=(END, 3), dtype=float)  # a vector per link
 
     @wp.func
     def find_step(
@@ -206,9 +201,9 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
             distance[w] = NAN
             return
         # Links behind the moved ones
-        rest = follow(chain, start, w, TRUNK, wp.static(shape.trunk), wp.transform_identity())
-        first_end = follow(chain, start, w, FIRST_REST, wp.static(shape.fork), rest)
-        second_end = follow(chain, start, w, SECOND_REST, wp.static(n), rest)
+        rest = follow(chain, start, w, END, wp.static(shape.trunk), wp.transform_identity())
+        first_end = follow(chain, start, w, wp.static(shape.trunk), wp.static(shape.fork), rest)
+        second_end = follow(chain, start, w, wp.static(shape.fork), wp.static(shape.end), rest)
         first_site = wp.transform_point(first_end, chain.first_site)
         second_site = wp.transform_point(second_end, chain.second_site)
         approach = wp.transform_vector(rest, chain.approach)
@@ -216,28 +211,17 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
         nearest = wp.float32(0.0)
         # Iterations, and one more forward pass for the last one's distance
         for iteration in range(iterations + 1):
-            # Forward kinematics: trunk, first branch, second branch
+            # Forward kinematics
             anchors = Rows()
             axes = Rows()
-            trunk = wp.transform(wp.vec3(), wp.quat_identity())
-            first_branch = trunk
-            second_branch = trunk
+            link = wp.transform(wp.vec3(), wp.quat_identity())
             for i in range(END):
-                link = first_branch
-                if wp.static(i >= FORK):
-                    link = second_branch
                 pose = wp.transform_multiply(link, chain.frame[i])
                 anchors[i] = wp.transform_get_translation(pose)
                 axes[i] = wp.transform_vector(pose, chain.axis[i])
                 link = turn(pose, chain.axis[i], wp.static(shape.kinds[i]), q[i])
-                if wp.static(i < TRUNK):
-                    trunk = link
-                if wp.static(i < FORK):
-                    first_branch = link
-                if wp.static(i < TRUNK or i >= FORK):
-                    second_branch = link
-            first = wp.transform_point(first_branch, first_site)
-            second = wp.transform_point(second_branch, second_site)
+            first = wp.transform_point(link, first_site)
+            second = wp.transform_point(link, second_site)
             midpoint = wp.lerp(first, second, 0.5)
             error = goal - midpoint
             left = wp.length(error)
@@ -249,28 +233,18 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
                 jacobian = Rows()
                 for i in range(END):
                     if wp.static(shape.moved[i]):
-                        # Behind the trunk a joint moves one site only, and so the midpoint by half
-                        # as much.
-                        point = midpoint
-                        share = wp.float32(1.0)
-                        if wp.static(i >= FORK):
-                            point = second
-                            share = wp.float32(0.5)
-                        elif wp.static(i >= TRUNK):
-                            point = first
-                            share = wp.float32(0.5)
                         direction = axes[i]
                         if wp.static(shape.kinds[i] == HINGE):
-                            direction = wp.cross(direction, point - anchors[i])
-                        jacobian[i] = share * direction
+                            direction = wp.cross(direction, midpoint - anchors[i])
+                        jacobian[i] = direction
                 # Null-space motion, and the step
                 guide = Values()
                 if iteration < guided:
-                    lever = wp.cross(wp.transform_vector(trunk, approach), desired[w])
+                    lever = wp.cross(wp.transform_vector(link, approach), desired[w])
                     for i in range(END):
                         if wp.static(shape.moved[i]):
                             guide[i] = posture_gain * (home[i] - q[i])
-                            if wp.static(shape.kinds[i] == HINGE and i < TRUNK):
+                            if wp.static(shape.kinds[i] == HINGE):
                                 guide[i] += approach_gain * wp.dot(axes[i], lever)
                 step = find_step(jacobian, q, guide, low, high, error, damping)
                 largest = wp.float32(0.0)
