@@ -74,10 +74,13 @@ def test_an_overflow_names_the_size_that_is_in_force() -> None:
         env.faults.raise_first()
 
 
-def test_ctrl_c_leaves_no_thread_at_work(get_stage: Callable[[str], Stage]) -> None:
-    from mjstack.sim.native import NativeSimulation
+def test_ctrl_c_leaves_no_thread_at_work(
+    get_stage: Callable[[str], Stage], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from mjstack.sim import native
 
-    sim = NativeSimulation(get_stage("so101").model, 64, nthread=2)
+    monkeypatch.setattr(native, "available_cores", lambda: 2)
+    sim = native.NativeSimulation(get_stage("so101").model, 64)
     timer = threading.Timer(0.2, lambda: signal.raise_signal(signal.SIGINT))
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:

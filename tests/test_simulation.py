@@ -410,9 +410,10 @@ def test_native_worlds_that_mujoco_warns_of_take_every_step(
     from mjstack.sim import native
 
     monkeypatch.setattr(native, "_STEPS", most)
+    monkeypatch.setattr(native, "available_cores", lambda: 2)
     finals = []
     for calls in (1, 20):
-        sim = native.NativeSimulation(mujoco.MjModel.from_xml_string(CROWD), 5, nthread=2)
+        sim = native.NativeSimulation(mujoco.MjModel.from_xml_string(CROWD), 5)
         sim.qpos[2, ::7] += 1e3 * torch.arange(30)
         sim.qvel[1, 0] = 1e12
         for _ in range(3):
@@ -426,12 +427,14 @@ def test_native_worlds_that_mujoco_warns_of_take_every_step(
         assert torch.equal(one.nan_to_num(7.0), other.nan_to_num(7.0))
 
 
-def test_native_threads_do_not_matter(make_sim: Make, get_stage: GetStage) -> None:
-    from mjstack.sim.native import NativeSimulation
+def test_native_threads_do_not_matter(get_stage: GetStage, monkeypatch: pytest.MonkeyPatch) -> None:
+    from mjstack.sim import native
 
     finals = []
     for nthread in (1, 3):
-        sim = NativeSimulation(get_stage("so101").model, 5, nthread=nthread)
+        monkeypatch.setattr(native, "available_cores", lambda nthread=nthread: nthread)
+        sim = native.NativeSimulation(get_stage("so101").model, 5)
+        assert sim.nthread == nthread
         start(sim, get_stage("so101"))
         sim.step(20)
         finals.append(sim.qpos.clone())

@@ -24,18 +24,11 @@ _ALIGNMENT = 512  # bytes
 
 log = logging.getLogger(__name__)
 
-_nesting = 0
+_nesting = 0  # of graphs that are warming up or being captured
 # The rest of a broken capture is kept: torch counts its memory as in use until the process ends.
 _abandoned: list[tuple[torch.cuda.CUDAGraph, torch.cuda.MemPool]] = []
 _capture_streams: dict[str, torch.cuda.Stream] = {}
 _side_streams: dict[str, list[torch.cuda.Stream]] = {}
-
-
-def inside_graph() -> bool:
-    """Whether the work going on belongs to a graph that is warming up or being captured: inner
-    graphs then step aside.
-    """
-    return _nesting > 0
 
 
 @contextmanager
@@ -53,10 +46,10 @@ class StepGraph:
 
     The first call runs it eagerly, which compiles kernels and makes allocations happen. The second
     captures it, and from then on a call replays it. Whatever the work bakes in (a Python number, a
-    solver option, an address) stays as it was at the capture, until `drop` or a new version.
+    solver option, an address) stays as it was at the capture, until `drop` or a new version. A
+    graph that is called while another one warms up or is captured only does its work.
 
     Attributes:
-        captured: Whether the next call replays.
         warm_up_seconds: Time of the eager call, compilation included [s].
         capture_seconds: Time of the capture [s].
     """
@@ -103,6 +96,9 @@ class StepGraph:
 
     def __call__(self) -> None:
         """Do the work, in one way or another; between two calls a command can be interrupted."""
+        if _nesting:
+            self._work()
+            return
         check_interrupt()
         if self._version() != self._seen:
             self.drop()

@@ -8,6 +8,7 @@ from functools import cache, partial
 
 import mujoco
 import torch
+from typing_extensions import override
 
 from mjstack.config.schema import CameraCfg
 from mjstack.errors import MjstackError, first_line
@@ -15,7 +16,7 @@ from mjstack.sim.cameras import Cameras
 from mjstack.sim.fused.launch import arguments
 from mjstack.sim.fused.smooth import positions
 from mjstack.sim.fused.step import StepPlan, plan_step, rearranged_step
-from mjstack.sim.graph import StepGraph, inside_graph, side_by_side
+from mjstack.sim.graph import StepGraph, side_by_side
 from mjstack.sim.mjwarp_cameras import MjwarpCameras
 from mjstack.sim.model_fields import PLACING_FIELDS, Fields, check_fields
 from mjstack.sim.mujoco_warp import mjw
@@ -69,7 +70,6 @@ class MjwarpSimulation(Simulation):
         self._graphs: dict[tuple[int, bool], StepGraph] = {}
         names = check_fields(fields)
         self._placing = not PLACING_FIELDS.isdisjoint(names)
-        name = self._device.name if self._device.is_cuda else "Warp's CPU device"
 
         # The model and its data on the device
         with wp.ScopedDevice(self._device):
@@ -85,14 +85,14 @@ class MjwarpSimulation(Simulation):
             self._m.opt.disableflags |= int(mjw.DisableBit.NATIVECCD)
             self._m.opt.warn_overflow = 0
             self._d = mjw.make_data(model, nworld=nworld, **sizes.as_kwargs())
-            stock = step == "stock"
-            self.plan = StepPlan() if stock else plan_step(model, self._m, self._d)
+            self.plan = StepPlan() if step == "stock" else plan_step(model, self._m, self._d)
             self._usage = Usage(model, nworld, self.device)
 
         if self.plan.reason:
             _log_once(f"sim.step: {self.plan}")
+        hardware = self._device.name if self._device.is_cuda else "Warp's CPU device"
         self.description = (
-            f"MuJoCo Warp {mjw.__version__}, Warp {wp.__version__}, {name}, {self.plan}"
+            f"MuJoCo Warp {mjw.__version__}, Warp {wp.__version__}, {hardware}, {self.plan}"
         )
 
         # Views of state, fields and counters
@@ -123,18 +123,16 @@ class MjwarpSimulation(Simulation):
         self.reset()
         self.synchronize()
 
+    @override
     def step(self, n: int = 1, *, kinematics: bool = False) -> None:
-        """Advance every world by n physics steps under the current ctrl; the poses follow with
-        kinematics.
-        """
         with torch_stream_scope(self._device):
-            if n == 0 or inside_graph():
-                self._decimation(n, kinematics)
-            else:
+            if n:
                 self.graph_of(n, kinematics=kinematics)()
+            elif kinematics:
+                self._pose()
 
+    @override
     def forward(self) -> None:
-        """Compute everything that derives from the state, without advancing time."""
         with torch_stream_scope(self._device):
             self._place()
             mjw.forward(self._m, self._d)
@@ -146,10 +144,8 @@ class MjwarpSimulation(Simulation):
         with torch_stream_scope(self._device):
             self._pose()
 
+    @override
     def reset(self, mask: torch.Tensor | None = None) -> None:
-        """Put the masked worlds back to qpos0, at rest, and clear their counters and overflow
-        bits.
-        """
         self.check_mask(mask)
         self._keep_peaks(mask)
         if mask is None:
@@ -161,8 +157,8 @@ class MjwarpSimulation(Simulation):
             mjw.reset_data(self._m, self._d, reset=self._selected)
         self._usage.clear(self._mask)
 
+    @override
     def option_values(self) -> dict[str, float | int | str]:
-        """The physics options as uploaded."""
         opt = self._m.opt
         primitive = bool(int(opt.disableflags) & int(mjw.DisableBit.NATIVECCD))
         return {
@@ -173,8 +169,8 @@ class MjwarpSimulation(Simulation):
             "box_box": "primitive" if primitive else "convex",
         }
 
+    @override
     def make_cameras(self, cameras: Mapping[str, CameraCfg]) -> Cameras:
-        """See `Simulation`; compiles the renderer."""
         return MjwarpCameras(self.model, self._m, self._d, self.fields, cameras)
 
     def bare_step(self) -> StepGraph:
@@ -188,8 +184,8 @@ class MjwarpSimulation(Simulation):
 
         return StepGraph(work, self.device, self._graph_mode, name="a bare step", scratch=False)
 
+    @override
     def graph_of(self, n: int = 1, *, kinematics: bool = False) -> StepGraph:
-        """The graph that `step(n)` replays."""
         key = (n, kinematics)
         if key not in self._graphs:
             work = partial(self._decimation, *key)
@@ -201,12 +197,12 @@ class MjwarpSimulation(Simulation):
         with torch_stream_scope(self._device):
             self._usage.count(self._m, self._d, steps=0)
 
+    @override
     def synchronize(self) -> None:
-        """Wait for the device."""
         wp.synchronize_device(self._device)
 
+    @override
     def close(self) -> None:
-        """Drop the graphs; buffers go with the object."""
         self._graphs.clear()
 
     def _decimation(self, n: int, kinematics: bool) -> None:

@@ -57,16 +57,9 @@ class NativeSimulation(Simulation):
 
     backend = "native"
 
-    def __init__(
-        self,
-        model: mujoco.MjModel,
-        nworld: int,
-        *,
-        fields: Sequence[str] = (),
-        nthread: int | None = None,
-    ) -> None:
-        """Allocate the worlds at qpos0, for some threads, by default all cores; other arguments as
-        of `make_simulation`.
+    def __init__(self, model: mujoco.MjModel, nworld: int, *, fields: Sequence[str] = ()) -> None:
+        """Allocate the worlds at qpos0, for a thread on each core; arguments as of
+        `make_simulation`.
 
         Raises:
             UnknownName: A field does not exist, or cannot differ.
@@ -78,7 +71,7 @@ class NativeSimulation(Simulation):
         m.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         self.nworld = nworld
         self.device = torch.device("cpu")
-        self.nthread = nthread = max(1, min(nthread or available_cores(), nworld))
+        self.nthread = nthread = min(available_cores(), nworld)
         self.description = (
             f"MuJoCo {mujoco.__version__} on {nthread} thread{'s' if nthread > 1 else ''},"
             f" {platform.machine()} CPU"
@@ -138,12 +131,12 @@ class NativeSimulation(Simulation):
         elif kinematics:
             self.kinematics()
 
+    @override
     def forward(self) -> None:
-        """See `Simulation`; warm starts stay as they are."""
         self._compute(0, kinematics=False)
 
+    @override
     def kinematics(self, mask: torch.Tensor | None = None) -> None:
-        """See `Simulation`; the other worlds are not visited."""
         for worlds in self._visit(self._finite_worlds(self._poses, mask), 1):
             self._pose(worlds)
 
@@ -169,14 +162,14 @@ class NativeSimulation(Simulation):
         arrays = (self.batch.state, *self._derived, *self._fields.values())
         return sum(array.nbytes for array in arrays) // self.nworld
 
+    @override
     def option_values(self) -> dict[str, float | int | str]:
-        """The physics options of the model."""
         option = self.model.opt
         numbers = {name: getattr(option, name) for name in ("timestep", "impratio", "tolerance")}
         return {**numbers, **named_options(option), "box_box": "primitive"}
 
+    @override
     def make_cameras(self, cameras: Mapping[str, CameraCfg]) -> Cameras:
-        """See `Simulation`; their OpenGL contexts open with the first image."""
         return NativeCameras(self.model, self.qpos.numpy(), self._fields, cameras)
 
     def _rows(self, mask: torch.Tensor | None) -> np.ndarray:
