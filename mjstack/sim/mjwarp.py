@@ -3,7 +3,7 @@
 # No `from __future__ import annotations` here: Warp reads the annotations as objects.
 import logging
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache, partial
 
 import mujoco
@@ -217,12 +217,10 @@ class MjwarpSimulation(Simulation):
             return
         # The use of a step is counted while the next one begins, which touches neither contacts nor
         # rows.
-        beside: tuple[Callable[[], None], ...] = ()
         step = partial(rearranged_step, self._m, self._d, self.device, self.plan)
         for i in range(n):
-            step(sensors=i == n - 1, beside_kinematics=beside)
-            beside = (count,)
-        side_by_side(self.device, *((self._pose,) if kinematics else ()), *beside)
+            step(sensors=i == n - 1, beside_kinematics=(count,) if i else ())
+        side_by_side(self.device, *((self._pose,) if kinematics else ()), count)
 
     def _pose(self) -> None:
         """Poses of the current qpos, and nothing that a later step would start from: its forward

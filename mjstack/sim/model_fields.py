@@ -86,10 +86,6 @@ class SimpleBodies:
     Native MuJoCo does not compute the mass matrix of a body that it calls simple, such as a free
     cube: it reads ``dof_M0``, which the compiler made from mass, inertia and armature. A body whose
     mass is changed would weigh more and resist no more, so ``dof_M0`` has to follow.
-
-    Attributes:
-        dof_M0: Diagonal of the mass matrix at qpos0 [kg, kg m2], shape ``(nworld, nv)``, written
-            in place.
     """
 
     FIELDS = ("body_mass", "body_inertia", "dof_armature")
@@ -102,9 +98,10 @@ class SimpleBodies:
         Args:
             model: The compiled model.
             fields: Every world's values of the fields that differ.
-            dof_M0: The attribute.
+            dof_M0: Diagonal of the mass matrix at qpos0 [kg, kg m2], shape ``(nworld, nv)``, which
+                `update` writes.
         """
-        self.dof_M0 = dof_M0
+        self._dof_M0 = dof_M0
         self._dofs = np.flatnonzero(model.dof_simplenum)
         self._bodies = model.dof_bodyid[self._dofs]
         self._sources = [fields.get(name, getattr(model, name)[None]) for name in self.FIELDS]
@@ -126,6 +123,6 @@ class SimpleBodies:
         """Compute dof_M0 from what the fields hold now."""
         mass, inertia, armature = self._sources
         spin = (inertia[:, self._bodies] * self._b).sum(-1)
-        self.dof_M0[:, self._dofs] = (
+        self._dof_M0[:, self._dofs] = (
             armature[:, self._dofs] + mass[:, self._bodies] * self._a + spin
         )

@@ -19,12 +19,8 @@ from mjstack.sim.sizes import BatchSizes
 
 
 class Overflow(IntFlag):
-    """Physics that a world lost because a buffer was too small.
-
-    The values are MJWarp's ``OverflowType``.
-
-    Iteration limits are not here: they say how far the solver converged, not that physics was
-    dropped.
+    """Physics that a world lost because a buffer was too small; the values are those of MJWarp's
+    ``OverflowType``.
     """
 
     NEFC = 1 << 0
@@ -40,8 +36,8 @@ class Overflow(IntFlag):
 
 
 class SolverLimit(IntFlag):
-    """Where a world's solver stopped short of its tolerance. The values are those of MJWarp's
-    ``OverflowType`` again.
+    """Where a world's solver stopped short of its tolerance, which loses no physics; values as in
+    `Overflow`.
     """
 
     ITERATIONS = 1 << 9

@@ -46,10 +46,6 @@ def collision(m: mjw.Model, d: mjw.Data) -> None:
     MJWarp launches a thread for each contact that the buffer has room for. The kernel's 255
     registers leave room for one block on a multiprocessor, and most blocks find nothing to do. The
     same kernel is launched here in few blocks. What models rarely have is left to MJWarp.
-
-    Args:
-        m: The uploaded model.
-        d: The worlds.
     """
     off = mjw.DisableBit
     flags = m.opt.disableflags
@@ -98,12 +94,7 @@ def why_not_rows(m: mjw.Model) -> str:
 
 
 def make_constraint(m: mjw.Model, d: mjw.Data) -> None:
-    """`mujoco_warp.make_constraint`, the rows of elliptic contacts in one launch.
-
-    Args:
-        m: The uploaded model, dense.
-        d: The worlds.
-    """
+    """`mujoco_warp.make_constraint`: rows of a dense model's elliptic contacts in one launch."""
     flags = int(m.opt.disableflags)
     contact = int(mjw.DisableBit.CONTACT)
     if flags & (contact | int(mjw.DisableBit.CONSTRAINT)) or why_not_rows(m):
@@ -118,10 +109,7 @@ def make_constraint(m: mjw.Model, d: mjw.Data) -> None:
 
 
 def solve(m: mjw.Model, d: mjw.Data) -> None:
-    """`mujoco_warp.solve` in one launch: the same cost, tolerances, limits and outputs.
-
-    Args:
-        m: The uploaded model, to which `why_not` has no objection.
-        d: The worlds.
+    """`mujoco_warp.solve` in one launch, for models to which `why_not` has no objection: the same
+    cost, tolerances, limits and outputs.
     """
     launch(("newton",), m, d, fast_math=True)

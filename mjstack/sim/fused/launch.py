@@ -98,13 +98,8 @@ def find(name: str, m: mjw.Model, d: mjw.Data) -> Any:
 
 def arguments(kernel: wp.Kernel, m: mjw.Model, d: mjw.Data, *owners: object) -> Iterable[Any]:
     """Arguments of a Warp kernel that are named as MJWarp names them: ``NAME``, ``NAME_in`` where
-    the kernel reads the data and ``NAME_out`` where it writes.
-
-    Args:
-        kernel: The kernel.
-        m: The uploaded model.
-        d: The worlds.
-        owners: Objects that are searched before those.
+    the kernel reads the data and ``NAME_out`` where it writes. ``owners`` are objects that are
+    searched before the model and the data.
     """
     for parameter in inspect.signature(kernel.func).parameters:
         name = re.sub("_(in|out)$", "", parameter)

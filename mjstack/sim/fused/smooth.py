@@ -45,11 +45,8 @@ def why_not(m: mjw.Model) -> str:
 
 
 def positions(m: mjw.Model, d: mjw.Data) -> None:
-    """`mujoco_warp.kinematics` and `com_pos` in one launch.
-
-    Args:
-        m: The uploaded model, to which `why_not` has no objection.
-        d: The worlds.
+    """`mujoco_warp.kinematics` and `com_pos` in one launch, for models to which `why_not` has no
+    objection.
     """
     launch(("tree", "positions"), m, d)
 
