@@ -13,10 +13,9 @@ def few_threads(device: torch.device, nworld: int) -> Iterator[None]:
     """Torch on few threads inside, on the CPU: the numbers of some thousand worlds are too few to
     share out, and threads that wait for more take cores from the physics.
     """
-    before = threads = torch.get_num_threads()
-    if device.type == "cpu":
-        threads = max(1, min(before, nworld // _WORLDS))
-    if threads == before:
+    before = torch.get_num_threads()
+    threads = max(1, min(before, nworld // _WORLDS))
+    if threads == before or device.type == "cuda":
         yield
         return
     torch.set_num_threads(threads)

@@ -9,7 +9,6 @@ from mjstack.errors import ConfigError, MjstackError
 from mjstack.kinematics.ik_kernels import HINGE, SLIDE, Chain, Shape
 from mjstack.scene.index import approach_body, joint_limits
 
-_KINDS = {int(mujoco.mjtJoint.mjJNT_HINGE): HINGE, int(mujoco.mjtJoint.mjJNT_SLIDE): SLIDE}
 _NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
 
 _Pose = tuple[np.ndarray, np.ndarray]  # position and quaternion (wxyz)
@@ -96,7 +95,7 @@ def _read_link(model: mujoco.MjModel, joint: int, pose: _Pose, column: int) -> _
     """
     kind = int(model.jnt_type[joint])
     axis = model.jnt_axis[joint].copy()
-    if kind not in _KINDS:
+    if kind not in (HINGE, SLIDE):
         name = model.joint(joint).name
         type_ = mujoco.mjtJoint(kind).name.removeprefix("mjJNT_").lower()
         raise MjstackError(
@@ -104,12 +103,12 @@ def _read_link(model: mujoco.MjModel, joint: int, pose: _Pose, column: int) -> _
         )
     zero = float(model.qpos0[model.jnt_qposadr[joint]])
     turn = _NO_TURN.copy()
-    if _KINDS[kind] == HINGE:
+    if kind == HINGE:
         mujoco.mju_axisAngle2Quat(turn, axis, -zero)
         back = (np.zeros(3), turn)
     else:
         back = (-zero * axis, turn)
-    return _compose(pose, back), axis, _KINDS[kind], column
+    return _compose(pose, back), axis, kind, column
 
 
 def _path(model: mujoco.MjModel, body: int) -> list[int]:

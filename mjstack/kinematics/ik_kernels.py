@@ -5,10 +5,12 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
+import mujoco
+
 from mjstack.sim.warp_setup import wp
 
-HINGE = 0
-SLIDE = 1
+HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
+SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
 
 # Share of the squared error [1/rad^2] that is added to the squared damping. A far target is
 # approached without running into a dead end at the limits (from home, over the reBot's whole reach,

@@ -194,8 +194,7 @@ class Term:
                 self.call = self.call(env)
             if hasattr(func, "label"):
                 self.call.label = label
-        self._reset = getattr(self.call, "reset", None)
-        self.has_memory = self._reset is not None
+        self.has_memory = hasattr(self.call, "reset")
         # Two groups may need the same: a function of the state gives both the same value, while
         # others may keep something.
         key = (id(env), func, repr(sorted(self.params.items())))
@@ -210,8 +209,8 @@ class Term:
 
     def reset(self, mask: torch.Tensor) -> None:
         """Let a term with a memory forget the masked worlds."""
-        if self._reset is not None:
-            self._reset(mask)
+        if self.has_memory:
+            self.call.reset(mask)
 
 
 def first_value(

@@ -130,12 +130,8 @@ def rows_of(mask: torch.Tensor) -> Rows:
 
 def zero_rows(mask: torch.Tensor, *buffers: torch.Tensor) -> None:
     """Write 0 into the masked worlds of buffers, each of shape ``(nworld, n)``."""
-    at = rows_of(mask)
     for buffer in buffers:
-        if isinstance(at, torch.Tensor):
-            buffer.index_fill_(0, at, 0.0)
-        else:
-            buffer.masked_fill_(mask[:, None], 0.0)
+        buffer.masked_fill_(mask[:, None], 0.0)
 
 
 def episode_draw(

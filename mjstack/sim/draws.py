@@ -53,17 +53,11 @@ def _philox_uniform(
         c3 = low0
         k0 = k0 + wp.uint32(0x9E3779B9)
         k1 = k1 + wp.uint32(0xBB67AE85)
+    words = wp.vec4ui(c0, c1, c2, c3)
     for i in range(4):
         column = 4 * block + i
         if column < out.shape[1]:
-            word = c0
-            if i == 1:
-                word = c1
-            if i == 2:
-                word = c2
-            if i == 3:
-                word = c3
-            draw = float(word >> wp.uint32(8)) * (2.0 / 16777216.0) - 1.0
+            draw = float(words[i] >> wp.uint32(8)) * (2.0 / 16777216.0) - 1.0  # type: ignore[index]
             out[w, column] = low + half_width * (draw + 1.0)
 
 
