@@ -258,7 +258,7 @@ class RobotCfg:
     locked: dict[str, float] = spec(factory=dict, unit="rad, m")
     """Arm joints that inverse kinematics holds, with their values."""
     ik_joints: list[str] = field(default_factory=list)
-    """Arm joints that inverse kinematics moves. Empty: all that are not locked."""
+    """Arm joints for inverse kinematics, each moves both grasp sites. Empty: all not locked."""
     approach_body: str = ""
     """Body with the approach axis: the last that carries both jaws. Empty: the body of the last arm
     joint."""
