@@ -1,6 +1,4 @@
-"""What `-m` does around the jobs of a sweep: it composes and checks them, claims their folder, and
-shows what they have left.
-"""
+"""Sweeps, around their jobs: composes and checks them, claims their folder, and shows their table."""
 
 import itertools
 import os

@@ -1,5 +1,5 @@
-"""What the drivers with feedback share: where the objects are, where each phase leads from there,
-and batched inverse kinematics.
+"""Base class of the drivers with feedback: where the objects are, where each phase leads from
+there, and batched inverse kinematics.
 """
 
 import math

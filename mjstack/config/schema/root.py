@@ -73,7 +73,7 @@ class Config:
     web: WebCfg = field(default_factory=WebCfg)
     """Worlds in a browser."""
     sweep: SweepCfg = field(default_factory=SweepCfg)
-    """What -m shows of its jobs."""
+    """Table and picture of a sweep."""
     starts: str | None = spec(None)
     """reset=starts_file: an npz file with one row per world, from which all of them start."""
     policy: str | None = spec(None)
