@@ -1,4 +1,4 @@
-"""Sweeps, around their jobs: composes and checks them, claims their folder, and shows their table."""
+"""Sweeps: composes and checks their jobs, claims their folder, and shows their table."""
 
 import itertools
 import os
