@@ -65,13 +65,14 @@ def test_the_share_of_the_expert() -> None:
             return self.value
 
     expert, policy = Constant(1.0), Constant(2.0)
-    driver = dagger.MixedDriver(expert, policy, env, 0.5, 10)
+    driver = dagger.MixedDriver(expert, policy, env, beta=0.5, alone=10, spell=25)
     seen = []
     for step in range(0, 1000, 25):
         env.episode_step.fill_(step)
         seen.append(driver.command()[:, 0].clone())
         env.episode_step.add_(24)
         assert torch.equal(driver.command()[:, 0], seen[-1])
+        assert torch.equal(driver.own == 1, seen[-1] == 1.0)
     share = (torch.stack(seen) == 1.0).float().mean(0)
     assert (share[:10] == 0.0).all()
     assert abs(float(share[10:].mean()) - 0.5) < 0.05

@@ -54,7 +54,8 @@ class Batch:
 
     def finite(self) -> Tensor:
         """Whether all that was recorded of each world is finite, shape ``(nworld,)``, bool."""
-        parts = [rows.isfinite().flatten(2).all(2).all(0) for rows in self.rows.values()]
+        finite = (rows.isfinite() for rows in self.rows.values())
+        parts = [rows.reshape(*rows.shape[:2], -1).all(2).all(0) for rows in finite]
         return torch.stack(parts).all(0)
 
     def select(self, name: str, worlds: Tensor) -> Tensor:

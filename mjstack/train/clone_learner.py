@@ -109,8 +109,14 @@ class CloneLearner(Learner):
         self._last = demonstrations.ends[episode] - 1  # steps of their episodes
         share = min(_VALIDATION_SHARE, len(demonstrations.ends))
         validates = episode % _VALIDATION_SHARE == share - 1
-        self._training = (~validates).nonzero()[:, 0]
-        self._validation = validates.nonzero()[:, 0]
+        # A chunk is the expert's own way only where it drove all steps but the last one.
+        usable = torch.ones_like(validates)
+        if (own := demonstrations.own) is not None:
+            steps = torch.arange(len(own), device=own.device)
+            for ahead in range(self._job.chunk - 1):
+                usable &= own[torch.minimum(steps + ahead, self._last)].bool()
+        self._training = (usable & ~validates).nonzero()[:, 0]
+        self._validation = (usable & validates).nonzero()[:, 0]
 
     def learn(self, first: int = 0, total: int | None = None) -> None:
         """Make the missing batches; see `Learner`.

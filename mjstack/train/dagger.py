@@ -17,6 +17,7 @@ from mjstack.drivers.driver import Driver
 from mjstack.drivers.policy import PolicyDriver
 from mjstack.envs import Env
 from mjstack.episodes.batches import BatchPlan, play_batches
+from mjstack.episodes.recorder import Channels, Read
 from mjstack.episodes.rollout import STATE_BASED
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, MjstackError
@@ -28,17 +29,26 @@ from mjstack.train.clone_learner import CloneLearner
 from mjstack.train.demonstrations import Demonstrations, LabelDriver, demonstration_channels
 from mjstack.train.trainer import LAST, Trained, Trainer, earlier_state, with_observation
 
-_TENSORS = ("seen", "labels", "ends")  # of `Demonstrations`, in the file of a round
-_SPELL = 0.5  # s, for which the expert or the policy drives before it is drawn anew
+_TENSORS = ("seen", "labels", "ends", "own")  # of `Demonstrations`, in the file of a round
 
 
 class MixedDriver(LabelDriver):
     """The expert or the policy drives, as a draw for every world and spell says. In some worlds the
     policy drives alone.
+
+    Attributes:
+        own: Where the expert drives this step, shape ``(nworld,)``, int8.
     """
 
     def __init__(
-        self, expert: Driver, policy: Driver | None, env: Env, beta: float, alone: int
+        self,
+        expert: Driver,
+        policy: Driver | None,
+        env: Env,
+        *,
+        beta: float,
+        alone: int,
+        spell: int,
     ) -> None:
         """Take the drivers.
 
@@ -48,11 +58,13 @@ class MixedDriver(LabelDriver):
             env: The environment.
             beta: Share of the time in which the expert drives.
             alone: Number of worlds, the first ones, in which the policy drives alone.
+            spell: Control steps for which one of them drives before it is drawn anew.
         """
         super().__init__(expert, env)
         self._policy = policy
         self._beta = beta
-        self._spell = max(1, round(_SPELL / env.cfg.timing.step_dt))
+        self._spell = spell
+        self.own = torch.ones(env.nworld, dtype=torch.int8, device=env.device)
         self._alone = torch.arange(env.nworld, device=env.device) < alone
 
     def command(self) -> Tensor:
@@ -64,7 +76,13 @@ class MixedDriver(LabelDriver):
         spell = torch.div(self._env.episode_step, self._spell, rounding_mode="floor")
         draw = random_uniform(self._env, "train.driver", 1, 0.0, 1.0, step=spell)
         drives = (draw < self._beta) & ~self._alone[:, None]
+        self.own.copy_(drives[:, 0])
         return torch.where(drives, self.label, action)
+
+
+def _read_own(env: Env, driver: Driver) -> Read:
+    own = cast(MixedDriver, driver).own
+    return lambda: {"own": own}
 
 
 class RoundLearner(CloneLearner):
@@ -174,8 +192,8 @@ def _round(
     if not path.exists():
         write_state(path, *_play_round(stage, policy, number))
     tensors, facts = read_state(path)
-    seen, labels, ends = (tensors[name].to(stage.backend[1]) for name in _TENSORS)
-    part = Demonstrations(seen=seen, labels=labels, ends=ends, widths=facts["widths"])
+    seen, labels, ends, own = (tensors[name].to(stage.backend[1]) for name in _TENSORS)
+    part = Demonstrations(seen=seen, labels=labels, ends=ends, own=own, widths=facts["widths"])
     return part, facts["success"]
 
 
@@ -199,14 +217,17 @@ def _play_round(
 
     def drive(plan: BatchPlan, env: Env) -> Driver:
         learner = PolicyDriver(env, policy) if policy else None
-        return MixedDriver(stage.driver(env), learner, env, beta, alone)
+        # Whole answers: the policy takes over where it is queried.
+        spell = job.execute * max(1, round(job.spell / env.cfg.timing.step_dt / job.execute))
+        expert = stage.driver(env)
+        return MixedDriver(expert, learner, env, beta=beta, alone=alone, spell=spell)
 
     parts = []
     successes = 0
     for batch in play_batches(
         stage,
         [BatchPlan(seed, range(nworld)) for seed in range(first, first + batches)],
-        demonstration_channels(job),
+        [*demonstration_channels(job), Channels(_read_own)],
         cfg=with_observation(stage.driven(cfg.reset)),
         driver=drive,
         label=f"steps of round {number} of {job.rounds}",

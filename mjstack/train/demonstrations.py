@@ -97,6 +97,8 @@ class Demonstrations:
         labels: The expert's joint targets, shape ``(steps of all episodes, nu)``.
         ends: The step after the last one of each episode, shape ``(episodes,)``, int64.
         widths: Numbers of each term of the observation, in order.
+        own: Where the expert drove the step itself, shape ``(steps of all episodes,)``, int8; None
+            if it drove all of them.
         played: Episodes that were played, successful or not.
         source: Where they come from, in words.
         qpos: Positions before each step, from which images are drawn, shape ``(steps of all
@@ -108,6 +110,7 @@ class Demonstrations:
     labels: Tensor
     ends: Tensor
     widths: dict[str, int]
+    own: Tensor | None = None
     played: int = 0
     source: str = ""
     qpos: Tensor | None = None
@@ -126,6 +129,7 @@ class Demonstrations:
             labels=labels.flatten(0, 1),
             ends=steps * torch.arange(1, len(worlds) + 1, device=worlds.device),
             widths=batch.env.observation_manager.term_dims[job.group],
+            own=before.get("own"),
             qpos=before.get("qpos"),
             fields={name: fields[name][worlds] for name in fields},
         )
@@ -137,11 +141,13 @@ class Demonstrations:
         """The episodes of all parts, in their order."""
         first = [0, *itertools.accumulate(len(part.seen) for part in parts)]
         states = [part.qpos for part in parts if part.qpos is not None]
+        own = [part.own for part in parts if part.own is not None]
         return cls(
             seen=torch.cat([part.seen for part in parts]),
             labels=torch.cat([part.labels for part in parts]),
             ends=torch.cat([part.ends + at for part, at in zip(parts, first, strict=False)]),
             widths=parts[0].widths,
+            own=torch.cat(own) if own else None,
             played=played,
             source=source,
             qpos=torch.cat(states) if states else None,

@@ -148,6 +148,8 @@ class DaggerJobCfg(CloneJobCfg):
     """Share of the time in which the expert drives in the second round."""
     beta_decay: float = spec(ge=0.0, le=1.0)
     """Factor of ``beta`` from round to round."""
+    spell: float = spec(unit="s", gt=0.0)
+    """Time for which the expert or the policy drives before it is drawn anew."""
     alone: float = spec(gt=0.0, le=1.0)
     """Share of the worlds in which the policy drives alone: their success is that of a round."""
 
