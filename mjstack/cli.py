@@ -170,7 +170,6 @@ def _run_checked(hydra: Any, cfg: DictConfig, checked: "CheckedJob", overrides: 
     chosen = any(override.lstrip("+").startswith("hydra.run.dir=") for override in overrides)
     resumed = None if chosen else checked.folder
     folder = resumed or hydra_path(cfg, "run.dir")
-    marker = "" if chosen else checked.marker
     begin_job()
     if not ranks.writes:
         global _assisting
@@ -178,7 +177,8 @@ def _run_checked(hydra: Any, cfg: DictConfig, checked: "CheckedJob", overrides: 
         checked.assist(ranks.from_first(lambda: folder))
         return 0
     with ExitStack() as stack:
-        claim = claim_folder(folder, checked.resumes, marker, numbered=not (chosen or resumed))
+        job = checked.resumes or (checked.resumable if resumed else "")
+        claim = claim_folder(folder, job, numbered=not (chosen or resumed))
         claimed = ranks.from_first(lambda: stack.enter_context(claim))
         cfg.hydra.run.dir = str(claimed)
         hydra.run(CONFIG_NAME, run_job, overrides)
@@ -251,7 +251,7 @@ def run_job(cfg: DictConfig) -> Report:
                 print(f"job {job.number}: {done.status}, done before", flush=True)
                 _save_config(cfg, folder)  # Hydra has just put one with interpolations there
                 return done
-            earlier = job.clear()
+            earlier = job.set_aside()
             if earlier is not None and earlier.resumes == cfg.job.name == "gates":
                 cfg.resume = str(folder)
                 _checked.clear()

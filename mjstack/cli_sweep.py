@@ -16,7 +16,7 @@ from mjstack.config.load import compose
 from mjstack.config.schema import SweepCfg
 from mjstack.config.session import quoted
 from mjstack.errors import ConfigError, MjstackError, is_out_of_memory
-from mjstack.files import check_unused, claim_folder
+from mjstack.files import claim_folder
 from mjstack.report.record import Report
 from mjstack.report.table import Console
 
@@ -77,8 +77,6 @@ def check_jobs(
                 raise
         placed.append(place_job(cfg, number, job))
         path = placed[-1].folder
-        if not path.is_relative_to(folder):
-            check_unused(path, key="hydra.sweep.subdir")
         first = numbers.setdefault(path, number)
         if first != number:
             raise MjstackError(
@@ -129,7 +127,13 @@ def claim_sweep(master: DictConfig, jobs: Sequence["SweepJob"]) -> Iterator[Path
         master.hydra.overrides.hydra.append(_sweep_dir(claimed))  # of its jobs
         add_jobs(
             claimed,
-            [replace(job, folder=claimed / os.path.relpath(job.folder, folder)) for job in jobs],
+            [
+                replace(
+                    job,
+                    folder=Path(os.path.normpath(claimed / os.path.relpath(job.folder, folder))),
+                )
+                for job in jobs
+            ],
         )
         yield claimed
 

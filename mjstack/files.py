@@ -87,8 +87,8 @@ def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
 def claim_folder(
     folder: Path,
     job: str = "",
-    marker: str = "",
     *,
+    marker: str = "",
     numbered: bool = False,
     shared: bool = False,
     key: str = _KEY,
@@ -126,7 +126,7 @@ def claim_folder(
             folder = folder.with_name(f"{name}-{number}")
         handle = lock_folder(folder, shared=shared)
         before = {*folder.iterdir()}
-        check_unused(folder, job, marker, key)
+        check_unused(folder, job, marker=marker, key=key)
         yield folder
     except BaseException as error:
         if handle is not None:  # else it is another process's
@@ -148,15 +148,42 @@ def claim_folder(
             os.close(handle)
 
 
-def check_unused(folder: Path, job: str = "", marker: str = "", key: str = _KEY) -> None:
-    """Check that no run has begun in a folder, or one that a job goes on with.
+def _run_files(folder: Path) -> list[Path]:
+    """Everything in a folder beside what a run that never began leaves: logs, Hydra's files and a
+    report that is half-written.
+    """
+    return sorted(
+        path
+        for path in folder.glob("*")
+        if path.name != ".hydra" and path.suffix != ".log" and not path.match(".report.json.*")
+    )
 
-    Before a run begins there are only logs and Hydra's files, perhaps half-written.
+
+def move_aside(folder: Path) -> Path:
+    """Move what a run has left in its folder to a new folder beside it, beside logs and Hydra's
+    files, which may be open.
+
+    Raises:
+        OSError: The folder cannot be made or a file cannot be moved.
+    """
+    for number in itertools.count(1):
+        aside = folder.with_name(f"{folder.name}-earlier-{number}")
+        with suppress(FileExistsError):
+            aside.mkdir()
+            break
+    for path in _run_files(folder):
+        path.rename(aside / path.name)
+    return aside
+
+
+def check_unused(folder: Path, job: str = "", *, marker: str = "", key: str = _KEY) -> None:
+    """Check that no run has begun in a folder, or one that a job goes on with. It alone decides
+    whose a folder is.
 
     Args:
         folder: The folder, which need not be there.
         job: As report.json names a job that goes on with the run; empty if none may.
-        marker: A file by which the job knows its folder even without the report.
+        marker: A file by which a sweep, which has no report, knows its folder.
         key: Configuration key that names another folder.
 
     Raises:
@@ -170,16 +197,15 @@ def check_unused(folder: Path, job: str = "", marker: str = "", key: str = _KEY)
                 f"{path} is a link, and what it leads to would be overwritten",
                 f"Remove it, or set {key} to another folder",
             )
-    names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
-    used = sorted(name for name in names if name != ".hydra" and not name.endswith(".log"))
-    if not used or marker in names:
+    used = _run_files(folder)
+    if not used or (marker and (folder / marker).is_file()):
         return
     with suppress(OSError, ValueError, KeyError, TypeError):
         if job and json.loads((folder / "report.json").read_text())["resumes"] == job:
             return
     raise FolderError(
-        f"{folder} has {used[0]}{made_by(folder)}, expected a new or an empty folder, or one with"
-        f" which this job can go on. Set {key} to another"
+        f"{folder} has {used[0].name}{made_by(folder)}, expected a new or an empty folder, or one"
+        f" with which this job can go on. Set {key} to another"
     )
 
 

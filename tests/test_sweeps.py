@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -11,11 +12,12 @@ from typing import Any
 
 import pytest
 from test_ranks import SHORT, report_of, start
+from test_run_folder import contents
 
 from mjstack import process
 from mjstack.errors import ConfigError, FolderError
 from mjstack.jobs.sweep import Queueing, run_jobs
-from mjstack.jobs.sweep_folder import LOG, SWEEP, SweepJob, lock_file
+from mjstack.jobs.sweep_folder import LOG, SWEEP, SweepJob, add_jobs, lock_file
 from mjstack.report.record import GateResult, Report, Status
 from mjstack.report.write import read_report, write_report
 
@@ -85,13 +87,15 @@ def test_failures_are_repeated_on_request(stub: Path, capsys: pytest.CaptureFixt
     """Anew, and once in a call."""
     sweep = jobs(stub, 1, 2)
     run_jobs(stub, sweep)
-    (stub / "1" / "left").touch()
+    (stub / "1" / "notes.txt").write_text("mine")
     capsys.readouterr()
     assert [report.status for report in run_jobs(stub, sweep, Queueing(retry=True))][1] == "fail"
     out = capsys.readouterr().out
     assert "job 0: pass, done before" in out
     assert out.count("job 1 on cores") == 1
-    assert not (stub / "1" / "left").exists()
+    assert not (stub / "1" / "notes.txt").exists()
+    assert (stub / "1-earlier-1" / "notes.txt").read_text() == "mine"
+    assert (stub / "1-earlier-1" / "report.json").exists()
 
 
 def test_a_job_that_takes_too_long_has_failed(stub: Path) -> None:
@@ -143,7 +147,8 @@ def test_a_number_of_jobs_that_cannot_be_is_refused(count: Any) -> None:
 
 
 def test_a_job_that_was_stopped_goes_on(stub: Path) -> None:
-    """By its own folder; one that left nothing of use begins anew."""
+    """By its own folder; one that left nothing of use begins anew, and removes nothing."""
+    add_jobs(stub, jobs(stub, 1, 3))
     for name, resumes in (("0", "gates"), ("1", "")):
         (stub / name).mkdir(parents=True)
         (stub / name / "kept").touch()
@@ -153,6 +158,38 @@ def test_a_job_that_was_stopped_goes_on(stub: Path) -> None:
     assert (stub / "0" / "kept").exists()
     assert str(stub / "0") in (stub / "0" / LOG).read_text()
     assert not (stub / "1" / "kept").exists()
+    assert (stub / "1-earlier-1" / "kept").exists()
+
+
+@pytest.mark.parametrize("listed", [False, True])
+@pytest.mark.parametrize("what", ["files", "link", "empty link", "cut report", "another run"])
+def test_a_job_removes_no_file_that_it_did_not_write(stub: Path, what: str, listed: bool) -> None:
+    """A folder with other files, or a link in its place, is refused before any job starts."""
+    sweep = jobs(stub, 1, 2)
+    run_jobs(stub, sweep[: 1 + listed])
+    place = stub / "1"
+    report = (stub / "0" / "report.json").read_text()
+    files = {"notes.txt": "mine", "data/x": "mine"}
+    if what == "another run" and listed:
+        pytest.skip("it is the job's")
+    if what in ("cut report", "another run"):
+        files["report.json"] = report if what == "another run" else report[:20]
+    if what.endswith("link"):
+        shutil.rmtree(place, ignore_errors=True)
+        files = {} if what == "empty link" else files
+        place.symlink_to("../precious")
+        place = stub.parent / "precious"
+    elif what == "files" and listed:
+        (place / "report.json").unlink()
+    for name, text in files.items():
+        (place / name).parent.mkdir(parents=True, exist_ok=True)
+        (place / name).write_text(text)
+    place.mkdir(exist_ok=True)
+    before = contents(stub.parent)
+    expected = "1 is a link" if what.endswith("link") else r"1 has data, expected a new or an empty"
+    with pytest.raises(FolderError, match=expected):
+        run_jobs(stub, jobs(stub, 1, 2, 3))
+    assert contents(stub.parent) == before
 
 
 def test_a_gpu_for_each_job(stub: Path, monkeypatch: pytest.MonkeyPatch) -> None:

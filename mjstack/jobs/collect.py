@@ -78,7 +78,6 @@ def check_collect(cfg: Config) -> CheckedJob:
         title=f"task {cfg.task.name}, {count:,} demonstrations",
         work=partial(run_collect, plan),
         folder=plan.home,
-        marker=DATASET,
         resumes=NAME,
         spreads=True,
     )

@@ -10,7 +10,7 @@ import torch
 from mjstack.config.fingerprint import config_content, differences
 from mjstack.config.schema import Backend, Config
 from mjstack.envs import build_env, driven_config
-from mjstack.episodes.earlier_run import REPORT, EarlierRun
+from mjstack.episodes.earlier_run import EarlierRun
 from mjstack.episodes.record import STEMS
 from mjstack.episodes.rollout import CLOSED_LOOP, POLICY, STATE_BASED
 from mjstack.episodes.stage import Stage
@@ -166,7 +166,6 @@ def check_gates(cfg: Config) -> CheckedJob:
         title=title,
         work=run_gates,
         folder=None if cfg.resume is None else Path(cfg.resume),
-        marker=REPORT,
         resumable="gates",
         earlier=earlier,
         spreads=True,

@@ -69,7 +69,6 @@ class CheckedJob:
         title: The work in one line.
         work: Does it in a folder, and hands each result to the run's ``record``.
         folder: The default folder of a job that resumes; None for a folder of the hour.
-        marker: A file by which it knows that folder.
         resumes: Its name in report.json, by which it knows any folder that it goes on with.
         resumable: Its name there if it goes on only where the command line says so.
         earlier: The calls that the run goes on with, in words.
@@ -80,7 +79,6 @@ class CheckedJob:
     title: str
     work: Callable[[Run, Path], None]
     folder: Path | None = None
-    marker: str = ""
     resumes: str = ""
     resumable: str = ""
     earlier: Sequence[str] = ()

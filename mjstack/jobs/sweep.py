@@ -225,7 +225,7 @@ class _Queue:
                     self._slots.append(self._slots.pop(self._slots.index(slot)))
                     return False
                 locks.enter_context(gpu)
-            earlier = job.clear(anew=anew)
+            earlier = job.set_aside(anew=anew)
             goes_on = earlier is not None and earlier.resumes == "gates"
             key = "resume" if goes_on else "hydra.run.dir"
             args = [*job.overrides, f"{key}={quoted(job.folder)}", *search_path_args()]

@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ from pathlib import Path
 from typing import IO
 
 from mjstack.errors import FolderError
-from mjstack.files import lock, write_atomic
+from mjstack.files import check_unused, lock, move_aside, write_atomic
 from mjstack.report.record import Report, Status
 from mjstack.report.write import read_report
 
@@ -36,19 +35,19 @@ class SweepJob:
         report = self.report()
         return report if report is not None and report.status in _ENDED else None
 
-    def clear(self, *, anew: bool = False) -> Report | None:
-        """Make room for a run: remove what an earlier one has left beside logs and Hydra's files,
+    def set_aside(self, *, anew: bool = False) -> Report | None:
+        """Make room for a run: move what an earlier one has left into a folder beside this one,
         unless the job goes on with it and shall not begin anew.
 
         Returns:
             The report of the run with which the job goes on.
         """
-        earlier = None if anew else self.report()
-        if earlier is not None and earlier.resumes:
+        earlier = self.report()
+        if earlier is None:  # the run refuses other files
+            return None
+        if earlier.resumes and not anew:
             return earlier
-        for path in [*self.folder.glob("*")]:
-            if path.name != ".hydra" and path.suffix != ".log":  # these may be open
-                (shutil.rmtree if path.is_dir() and not path.is_symlink() else os.remove)(path)
+        move_aside(self.folder)
         return None
 
 
@@ -56,7 +55,8 @@ def add_jobs(folder: Path, jobs: Sequence[SweepJob]) -> None:
     """Add jobs to the list of a sweep's folder. A sweeper may bring them in several batches.
 
     Raises:
-        FolderError: The list has another job of one of these numbers.
+        FolderError: The list has another job of one of these numbers, or a job's folder has other
+            files than those of its run.
     """
     listed = {job.number: _entry(folder, job) for job in list_jobs(folder)}
     before = dict(listed)
@@ -68,6 +68,13 @@ def add_jobs(folder: Path, jobs: Sequence[SweepJob]) -> None:
                 f"{folder} has another sweep, whose job {job.number} is {overrides}, expected the"
                 f" same jobs, which are in {SWEEP}. Set hydra.sweep.dir to another folder"
             )
+        if job.folder.is_symlink():
+            raise FolderError(
+                f"{job.folder} is a link, expected a folder of the sweep's own",
+                "Remove it, or set hydra.sweep.dir to another folder",
+            )
+        if job.number not in before or job.report() is None:
+            check_unused(job.folder, key="hydra.sweep.dir")
     if listed != before or not (folder / SWEEP).exists():
         folder.mkdir(parents=True, exist_ok=True)
         write_atomic(folder / SWEEP, json.dumps(listed, indent=1) + "\n")

@@ -27,7 +27,7 @@ from mjstack.jobs.showing import check_showing
 from mjstack.report.picture import save_curves
 from mjstack.report.record import GateResult, Status
 from mjstack.report.table import Table
-from mjstack.train.trainer import LAST, STATE, Trained, Trainer, whole_starts
+from mjstack.train.trainer import LAST, Trained, Trainer, whole_starts
 
 NAME = "train"
 CONFIG = "training.json"  # the configuration of the training in the folder
@@ -70,7 +70,6 @@ def check_train(cfg: Config) -> CheckedJob:
         title=f"task {cfg.task.name}, training",
         work=partial(_run, trainer),
         folder=folder,
-        marker=STATE,
         resumes=NAME,
         spreads=True,
     )
