@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import inspect
 import signal
 import socket
 import subprocess
@@ -11,18 +13,25 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
+from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
 from urllib.error import URLError
 from urllib.request import urlopen
 
+import msgspec
 import numpy as np
 import pytest
 import test_ppo
 import test_train
+import viser
+import viser.infra._infra
 from browser import EXECUTABLE, browse
 from compositions import load_config, refusal
 from environments import configure, has_gl
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
 
 import mjstack.jobs.showing as showing
 import mjstack.report.web as web
@@ -31,6 +40,7 @@ from mjstack.drivers.driver import Driver
 from mjstack.envs import Env, build_env
 from mjstack.episodes.rollout import rollout
 from mjstack.episodes.stage import Progress, Stage
+from mjstack.errors import MjstackError
 from mjstack.jobs import check_job
 from mjstack.jobs.live import LiveView, read_worlds
 from mjstack.report.geometry import Shapes
@@ -121,7 +131,7 @@ def test_worlds_pause_step_and_are_chosen(
     worker.start()
     try:
         settle(0)  # it waits in its first step
-        assert "**training**, step 1, 5 worlds" in view._status.content
+        assert "training, step 1, 5 worlds" in view._status.value
         assert view._view is not None
         view._advance()
         settle(1)
@@ -143,12 +153,12 @@ def test_worlds_pause_step_and_are_chosen(
             assert np.allclose(held[:, 2], places[:, body, 2], atol=1e-4)
         view._worlds.value = "99"
         line = "Worlds: '99' names none, expected numbers from 0 to 4"
-        wait_until(lambda: line in view._status.content)
+        wait_until(lambda: line in view._status.value)
         assert view._numbers == [4, 1]
         # Another plotted world: its own lines, from here on
         assert plot.data[0].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
         view._plotted.value = 3
-        wait_until(lambda: "world 3: step" in view._status.content)
+        wait_until(lambda: "world 3: step" in view._status.value)
         assert plot.data[0].tolist() == [4.0]
         values = env.reward_manager.values[3].tolist()
         assert np.allclose([column[0] for column in plot.data], [4.0, sum(values), *values])
@@ -186,7 +196,7 @@ def test_a_driven_episode_shows_cameras_and_rewards(server: Any, backend: str) -
             assert not np.array_equal(handle.image, images[name][1].numpy())
         names = {title: names for title, *names in view._plots}
         assert names["reward"] == ["sum", *cfg.reward]
-        assert "success no" in view._status.content
+        assert "success no" in view._status.value
     unseen = stage.with_config(replace(cfg, view="false")).start(sim, cfg.reset)
     assert unseen.reward_manager.names == []
     sim.close()
@@ -264,6 +274,148 @@ def test_a_port_in_use_is_one_line() -> None:
     assert "Set another web.port" in line
 
 
+EVIL = "<img src=x onerror=alert(1)>"
+TOKEN = "t0ken"
+COOKIE = {"Cookie": f"a=b; mjstack-{TOKEN}=1"}
+
+
+@pytest.fixture(scope="module")
+def guarded() -> Iterator[Callable[[str], int]]:
+    """The port of a server that listens at an address."""
+    servers = {host: start_server(host, 0, TOKEN) for host in ("127.0.0.1", "0.0.0.0")}
+    yield lambda host: servers[host].get_port()
+    for opened in servers.values():
+        stop_server(opened)
+
+
+def get(port: int, path: str, headers: dict[str, str]) -> tuple[int, str, dict[str, str]]:
+    """Status, beginning of the content and headers of an answer."""
+    connection = HTTPConnection("127.0.0.1", port, timeout=20)
+    connection.request("GET", path, headers=headers)
+    answer = connection.getresponse()
+    text = answer.read(2000).decode(errors="replace")
+    connection.close()
+    return answer.status, text, dict(answer.headers)
+
+
+def opens_websocket(port: int, path: str, headers: dict[str, str]) -> bool:
+    """Whether a websocket opens and brings the scene's messages; a raw one, with these headers."""
+    lines = {
+        "Host": f"127.0.0.1:{port}",
+        "Upgrade": "websocket",
+        "Connection": "Upgrade",
+        "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
+        "Sec-WebSocket-Version": "13",
+        "Sec-WebSocket-Protocol": f"viser-v{viser.__version__}",
+    } | headers
+    request = "".join(f"{name}: {value}\r\n" for name, value in lines.items())
+    with socket.create_connection(("127.0.0.1", port), timeout=20) as raw:
+        raw.sendall(f"GET {path} HTTP/1.1\r\n{request}\r\n".encode())
+        answer = raw.recv(4096)
+    assert answer.startswith((b"HTTP/1.1 101 ", b"HTTP/1.1 403 ")), answer
+    return answer.startswith(b"HTTP/1.1 101 ")
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
+def test_a_page_needs_the_token(guarded: Callable[[str], int], host: str) -> None:
+    """Its answer makes the token a cookie that no script reads and no other site sends."""
+    port = guarded(host)
+    for path in ("/", "/?token=", "/?token=wrong", "/assets/x.hdr", f"/{TOKEN}"):
+        status, text, headers = get(port, path, {"Cookie": "mjstack-=1; mjstack-wrong=1"})
+        assert (status, "Set-Cookie" in headers) == (403, False)
+        assert "Open the whole address that the run has printed" in text
+    status, text, headers = get(port, f"/?token={TOKEN}", {})
+    assert status == 200
+    assert "<html" in text
+    cookie = f"mjstack-{TOKEN}=1; HttpOnly; SameSite=Strict; Path=/"
+    assert headers["Set-Cookie"] == cookie
+    assert get(port, "/", COOKIE)[0] == 200
+    assert opens_websocket(port, "/", COOKIE)
+    assert not opens_websocket(port, "/", {})
+
+
+# Host, Origin, and whether a server on this machine alone answers
+NAMES = [
+    ("127.0.0.1:{port}", "http://127.0.0.1:{port}", True),
+    ("localhost:9000", "http://localhost:9000", True),  # ssh -L
+    ("[::1]:9000", "http://[::1]:9000", True),
+    ("localhost", "http://localhost", True),
+    ("127.0.0.1:{port}", "http://evil.example", False),
+    ("127.0.0.1:{port}", "http://127.0.0.1:8999", False),  # another server of this machine
+    ("127.0.0.1:{port}", "null", False),
+    ("evil.example:{port}", "http://evil.example:{port}", False),  # DNS rebinding
+    ("localhost.evil.example", "http://localhost.evil.example", False),
+    ("127.0.0.1@evil.example", "http://127.0.0.1@evil.example", False),
+]
+
+
+@pytest.mark.parametrize(("host", "origin", "allowed"), NAMES)
+def test_other_origins_and_hosts_are_refused(
+    guarded: Callable[[str], int], host: str, origin: str, allowed: bool
+) -> None:
+    """Also with the token, which decides alone where other machines are let in."""
+    for address in ("127.0.0.1", "0.0.0.0"):
+        port = guarded(address)
+        names = {"Host": host.format(port=port), "Origin": origin.format(port=port)}
+        lets_in = allowed or address == "0.0.0.0"
+        assert opens_websocket(port, "/", COOKIE | names) == lets_in
+        assert opens_websocket(port, f"/?token={TOKEN}", names) == lets_in
+        assert (get(port, f"/?token={TOKEN}", names)[0] == 200) == lets_in
+        assert not opens_websocket(port, "/", names)
+
+
+def test_a_message_of_a_browser_is_short(guarded: Callable[[str], int]) -> None:
+    """A text of megabytes would slow the run."""
+    port = guarded("127.0.0.1")
+    protocol = Subprotocol(f"viser-v{viser.__version__}")
+    for size, code in ((1000, None), (100_000, 1009)):
+        address = f"ws://127.0.0.1:{port}"
+        with connect(address, subprotocols=[protocol], additional_headers=COOKIE) as websocket:
+            updates = {"value": size * "x"}
+            message = {"type": "GuiUpdateMessage", "uuid": "none", "updates": updates}
+            websocket.send(msgspec.msgpack.encode(message))
+            with contextlib.suppress(TimeoutError, ConnectionClosed):
+                while True:
+                    websocket.recv(timeout=1.0)
+            assert websocket.close_code == code
+
+
+def test_viser_has_what_the_guard_uses() -> None:
+    """It has no hook: its server hands ``process_request`` and ``max_size`` to `websockets`."""
+    source = inspect.getsource(viser.infra._infra.WebsockServer._background_worker)
+    for text in ("websockets.asyncio.server.serve(", "process_request=(", "max_size="):
+        assert source.count(text) == 1
+
+
+def test_a_viser_that_cannot_be_guarded_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Server:
+        def __init__(self, **_: object) -> None: ...
+        def stop(self) -> None: ...
+
+    monkeypatch.setattr(viser, "ViserServer", Server)
+    with pytest.raises(MjstackError, match=r"viser .* cannot be guarded, expected 1\.1\.1"):
+        start_server("127.0.0.1", 0)
+
+
+def test_texts_are_plain_and_short(
+    server: Any, get_stage: Callable[..., Stage], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No markdown or HTML shows what a browser has sent or a configuration names."""
+    env = build_env(configure("task=reach"), nworld=2)
+    env.reset()
+    for kind in ("add_markdown", "add_html"):
+        monkeypatch.delattr(viser.GuiApi, kind)
+    view = LiveView(server, get_stage("so101"))
+    view.begin(EVIL)
+    view.start(env, NoActions(env))
+    view._worlds.value = EVIL + 20_000_000 * "x"
+    view._show(0)
+    env.close()
+    assert isinstance(view._status, viser.GuiTextHandle)
+    assert EVIL in view._status.value
+    assert len(view._status.value) < 1000
+
+
 @pytest.mark.parametrize(
     ("args", "says"),
     [
@@ -315,18 +467,20 @@ def test_jobs_serve_the_live_view(
     """A page on this machine shows the worlds of each part; after the end there is none."""
     command, parts = JOBS[job]
     looked: dict[str, str] = {}
+    tokens: list[str] = []
 
-    def start(host: str, number: int) -> Any:
-        opened = start_server(host, number)
+    def start(host: str, number: int, token: str) -> Any:
+        opened = start_server(host, number, token)
+        tokens[:] = [token]
         monkeypatch.setattr(opened, "get_clients", lambda: {0: None})
         return opened
 
     def look(self: LiveView, step: int) -> None:
         after_step(self, step)
         if self._part not in looked:
-            with urlopen(f"http://127.0.0.1:{port}", timeout=60) as page:
+            with urlopen(f"http://127.0.0.1:{port}/?token={tokens[0]}", timeout=60) as page:
                 assert b"<html" in page.read()
-            looked[self._part] = self._status.content
+            looked[self._part] = self._status.value
 
     after_step = LiveView.after_step
     monkeypatch.setattr(LiveView, "after_step", look)
@@ -336,7 +490,7 @@ def test_jobs_serve_the_live_view(
     assert run([*command, *where, folder]) == 0
     assert looked.keys() == parts
     worlds = "1 world" if job == "play" else "4 worlds"
-    assert all(f"**{part}**" in text and worlds in text for part, text in looked.items()), looked
+    assert all(f"{part}" in text and worlds in text for part, text in looked.items()), looked
     with pytest.raises(URLError):
         urlopen(f"http://127.0.0.1:{port}", timeout=5)
 
@@ -352,15 +506,21 @@ def test_a_browser_looks_at_a_run(tmp_path: Path, port: int) -> None:
     with log.open("w") as told:
         process = subprocess.Popen(command, stdout=told, stderr=subprocess.STDOUT)
     button = "[...document.querySelectorAll('button')].find(b => b.innerText == '{}')"
-    text = "document.body.innerText"
+    text = "[document.body, ...document.querySelectorAll('textarea')]"
+    text += ".map(part => part.innerText + (part.value ?? '')).join(' ')"
     try:
         until = time.monotonic() + 120.0
         while "live view: http://127.0.0.1" not in log.read_text():
             assert process.poll() is None, log.read_text()
             assert time.monotonic() < until
             time.sleep(0.1)
+        address = log.read_text().partition("live view: ")[2].split()[0]
         with browse(1200, 800) as tab:
             tab.open(f"http://127.0.0.1:{port}")
+            assert "with its token" in tab.run("document.body.innerText")
+            tab.problems.clear()  # that it was refused
+            tab.requests.clear()
+            tab.open(address)
             tab.wait(f"!!{button.format('Pause')}")
             tab.run(f"{button.format('Pause')}.click()")
             tab.wait(f"{text}.includes('4 worlds') && {text}.includes('Go on')")
@@ -371,7 +531,8 @@ def test_a_browser_looks_at_a_run(tmp_path: Path, port: int) -> None:
             tab.run(f"{button.format('Step')}.click()")
             tab.wait(f"{text} != {before!r}")
             assert tab.problems == []
-            assert {address.rstrip("/") for address in tab.requests} == {f"http://127.0.0.1:{port}"}
+            local = f"http://127.0.0.1:{port}"
+            assert {request.partition("?")[0].rstrip("/") for request in tab.requests} == {local}
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=60) == 130
     finally:

@@ -26,6 +26,7 @@ from mjstack.sim import StateRenderer
 _RATE = 25.0  # pictures per second, at most
 _HISTORY = 500  # points of a plot
 _FIRST = 16  # worlds that are shown at first
+_TEXT = 200  # characters of a text, at most
 _GRACE = 3.0  # s in which a page that is loaded anew comes back
 _COLORS = ("#4478b8", "#c93434", "#1a7f4b", "#9a6700", "#7b4ab8", "#1f8a99", "#b8447f", "#656d76")
 _HEIGHT = "height above the table [mm]"
@@ -65,7 +66,9 @@ class LiveView(Observer):
         # Controls; their callbacks run in other threads and set attributes alone.
         gui = server.gui
         pausable = stage.ranks.size == 1  # others would wait for this one
-        self._status = gui.add_markdown("waiting for the first step")
+        # Plain text: it repeats names of the configuration and what a browser has sent.
+        waiting = "waiting for the first step"
+        self._status = gui.add_text("State", waiting, multiline=True, disabled=True)
         self._pause = gui.add_button("Pause", visible=pausable)
         self._pause.on_click(lambda _: self._toggle())
         gui.add_button("Step", visible=pausable).on_click(lambda _: self._advance())
@@ -125,7 +128,7 @@ class LiveView(Observer):
                 line = "live view: the run was paused, and goes on without a browser"
                 self._stage.progress.print_line(line)
                 self._toggle()
-            if self._choice != (self._worlds.value, self._plotted.value):
+            if self._choice != (self._worlds.value[:_TEXT], self._plotted.value):
                 self._show(step + 1)
         self._steps = max(0, self._steps - 1)
         if real and not self.paused:
@@ -147,7 +150,7 @@ class LiveView(Observer):
         """Draw the chosen worlds, and what is known of the plotted one."""
         env = self.env
         self._last = time.perf_counter()
-        text = self._worlds.value
+        text = self._worlds.value[:_TEXT]
         plotted = self._plotted.value
         if plotted != self._choice[1]:
             self._history.clear()  # it is another world's
@@ -182,8 +185,9 @@ class LiveView(Observer):
             if name not in self._images:
                 self._images[name] = self._server.gui.add_image(pixels, label=name)
             self._images[name].image = pixels
-        title = f"**{self._part}**, step {step:,}, {env.nworld:,} worlds"
-        self._status.content = "\n\n".join([title, f"world {world}: {terms}", *problem])
+        title = f"{self._part}, step {step:,}, {env.nworld:,} worlds"
+        lines_shown = [title, f"world {world}: {terms}", *problem]
+        self._status.value = "\n".join(line[: 2 * _TEXT] for line in lines_shown)
 
     @cached_property
     def _shapes(self) -> Shapes:

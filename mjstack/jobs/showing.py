@@ -1,6 +1,7 @@
 """Shows a job's worlds: pictures, the 3-D page, the live view and MuJoCo's viewer."""
 
 import os
+import secrets
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -105,9 +106,10 @@ def serve_live_view(stage: Stage, console: Console) -> Iterator[LiveView | None]
         yield None
         return
     check_address(cfg.web.host, cfg.web.port)  # another program may have come first
-    server = start_server(cfg.web.host, cfg.web.port)
+    token = secrets.token_urlsafe()
+    server = start_server(cfg.web.host, cfg.web.port, token)
     try:
-        console.print(f"live view: http://{cfg.web.host}:{server.get_port()}")
+        console.print(f"live view: http://{cfg.web.host}:{server.get_port()}/?token={token}")
         with closing(LiveView(server, stage)) as live:
             yield live
     finally:

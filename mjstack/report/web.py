@@ -8,16 +8,20 @@ import io
 import logging
 import math
 import os
+import secrets
 import socket
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
+from urllib.parse import parse_qs, urlsplit
 
 import mujoco
 import numpy as np
 
-from mjstack.errors import ConfigError, MissingExtra
+from mjstack.errors import ConfigError, MissingExtra, MjstackError
 from mjstack.interrupt import check_interrupt
 from mjstack.report.geometry import Shapes
 from mjstack.report.page import MOST_WORLDS, World
@@ -25,6 +29,8 @@ from mjstack.report.page import MOST_WORLDS, World
 EPISODE = "episode.html"
 _LENGTH = 4.0 / 2**15  # m, to which positions are rounded
 _TURN = 1.0 / 2**12  # of quaternions
+_LOOPBACK = ("127.0.0.1", "::1", "localhost")
+_MESSAGE = 2**16  # bytes, the largest of a browser
 _MARGIN = 0.12  # m between worlds
 _FAILED = np.array([0.86, 0.35, 0.32])
 _TWIN = np.array([0.42, 0.60, 0.86])
@@ -189,15 +195,69 @@ def check_address(host: str, port: int) -> None:
         raise ConfigError("web.host", host, expected) from error
 
 
-def start_server(host: str, port: int) -> Any:
-    """A viser server; port 0 is any that is free. Ask `check_address` of others: where one is in
-    use, viser tries the next ones and then hangs.
+def start_server(host: str, port: int, token: str = "") -> Any:
+    """A viser server that answers those alone who know a token.
+
+    Args:
+        host: Address.
+        port: 0 is any that is free. Ask `check_address` of others: where one is in use, viser tries
+            the next ones and then hangs.
+        token: In the address of the page, ``/?token=...``; nobody knows one that is empty.
+
+    Raises:
+        MjstackError: This viser opens its websockets in another way than the known one.
     """
     import viser
+    from viser.infra import _infra
+
+    # viser has no hook for requests: what it hands to websockets is wrapped while it starts.
+    asyncio_server = _infra.websockets.asyncio.server
+    serve = asyncio_server.serve
+    token = token or secrets.token_urlsafe()
+    guarded = []
+
+    def serve_guarded(*args: Any, process_request: Any, **options: Any) -> Any:
+        guarded.append(port)
+        answer = partial(_answer, process_request, token, host in _LOOPBACK)
+        return serve(*args, process_request=answer, **options | {"max_size": _MESSAGE})
 
     logging.getLogger("websockets").setLevel(logging.WARNING)
-    with contextlib.redirect_stdout(io.StringIO()):  # its banner
-        return viser.ViserServer(host=host, port=port, verbose=False)
+    with (
+        patch.object(asyncio_server, "serve", serve_guarded),
+        contextlib.redirect_stdout(io.StringIO()),  # its banner
+    ):
+        server = viser.ViserServer(host=host, port=port, verbose=False)
+    if not guarded:
+        stop_server(server)
+        raise MjstackError(f"viser {viser.__version__} cannot be guarded, expected 1.1.1")
+    return server
+
+
+def _answer(
+    process: Callable[[Any, Any], Any], token: str, local: bool, connection: Any, request: Any
+) -> Any:
+    """Answer a request of a browser, HTTP or the start of a websocket.
+
+    The page's address has the token. Its answer makes it a cookie, which the page's websocket
+    brings; a page of another site cannot send it (SameSite=Strict), nor can a script read it. On
+    this machine alone (``local``) another port is the same site, so that Origin and Host count too.
+    """
+    headers = request.headers
+    host = headers.get("Host", "")
+    cookie = f"mjstack-{token}=1"
+    fresh = token in parse_qs(urlsplit(request.path).query).get("token", [])
+    known = cookie in (text.strip() for text in headers.get("Cookie", "").split(";"))
+    refused = not (fresh or known)
+    if local:
+        origin = headers.get("Origin", f"http://{host}")  # a browser sends that of a websocket
+        refused |= urlsplit(f"//{host}").hostname not in _LOOPBACK or origin != f"http://{host}"
+    if refused:
+        text = "Open the whole address that the run has printed, with its token.\n"
+        return connection.respond(403, text)
+    response = process(connection, request)
+    if fresh and response is not None:
+        response.headers["Set-Cookie"] = f"{cookie}; HttpOnly; SameSite=Strict; Path=/"
+    return response
 
 
 def stop_server(server: Any) -> None:

@@ -116,8 +116,8 @@ class WebCfg:
     episode: bool = True
     """Write episode.html, which plays worlds of the run in 3-D."""
     host: str = "127.0.0.1"
-    """view=web: address that serves the page. 0.0.0.0 lets other machines in; there is no
-    password."""
+    """view=web: address that serves the page. 0.0.0.0 lets other machines in that know the
+    token of the printed address."""
     port: int = spec(8080, ge=1, le=65_535)
     """view=web: its port."""
 
