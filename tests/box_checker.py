@@ -113,7 +113,11 @@ def check_box_world(rec: BoxRecording, cfg: Config, model: mujoco.MjModel) -> Bo
         airborne = loaded & (z.min(1) - top >= rules.lift_height) & ~supported[:, cube]
 
         still = detached & (outside <= rules.inside) & (speed < rules.rest_speed)
-        seen = Seen(loaded, airborne, over, detached, still, opening, rec.pose[:, cube, :2])
+        rest = top + box.floor + cfg.scene.objects[color].half_height
+        high = rec.pose[:, cube, 2] - rest > rules.drop_height
+        let_go = np.append(False, loaded[:-1]) & ~loaded
+        falls = high & (let_go | ~loaded & ~supported[:, cube])
+        seen = Seen(loaded, airborne, over, falls, detached, still, opening, rec.pose[:, cube, :2])
         if rec.phase is None:
             found = judge_freely(seen, rules, steps)
         else:
@@ -155,6 +159,7 @@ class Seen:
     loaded: np.ndarray
     airborne: np.ndarray
     over: np.ndarray
+    falls: np.ndarray
     detached: np.ndarray
     still: np.ndarray
     opening: np.ndarray
@@ -254,7 +259,7 @@ def judge_freely(seen: Seen, rules: Any, steps: int) -> Found:
     for f in range(steps):
         if seen.loaded[f]:
             over_box = bool(seen.over[f])
-        elif lifted_at is not None and f >= lifted_at and not over_box:
+        elif lifted_at is not None and f >= lifted_at and (seen.falls[f] or not over_box):
             unloaded += 1
 
     free = [f for f in range(steps) if carried_at is not None and f >= carried_at]

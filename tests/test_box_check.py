@@ -578,3 +578,42 @@ def test_cheats_in_the_box_break_a_rule() -> None:
     assert broken["leaned"] == {"INSIDE"}
     assert broken["moving_at_the_end"] == {"INSIDE"}
     assert broken["touched"] == set()
+
+
+def test_a_fall_over_the_box_is_a_drop_without_phases() -> None:
+    """Load lost high over the box and regained, and a cube let go of high above its place; just
+    low enough it is none.
+    """
+    worlds = {
+        f"{name}_{color}": World.of(planned())
+        for name in ("caught", "caught_late", "one_jaw", "high", "low", "let_go_high")
+        for color in ("red", "blue")
+    }
+    for name, world in worlds.items():
+        alter, color = name.rsplit("_", 1)
+        cube = RED if color == "red" else BLUE
+        hold = world.steps(f"hold_{color}")
+        box = world.stage.cfg.scene.box
+        assert box is not None
+        thing = world.stage.cfg.scene.objects[color]
+        rest = world.stage.cfg.scene.table_top + box.floor + thing.half_height
+        if alter in ("caught", "caught_late", "one_jaw"):
+            for jaw in (0, 1)[: 1 if alter == "one_jaw" else 2]:
+                world.jaw(cube, jaw)[hold[: 30 if alter == "caught_late" else 1]] = 0.0
+        elif alter == "let_go_high":  # 0.19 m up, as the carry ended; the real opening follows
+            world.pose(cube)[hold[-9:]] = world.pose(cube)[world.steps(f"carry_{color}")[-1]]
+            for jaw in (0, 1):
+                world.jaw(cube, jaw)[hold[-9:]] = 0.0
+        else:
+            at = hold[-1]
+            world.pose(cube)[at, 2] = (
+                rest + world.t.drop_height + (HAIR if alter == "high" else -HAIR)
+            )
+            for jaw in (0, 1):
+                world.jaw(cube, jaw)[at] = 0.0
+    result = feed(list(worlds.values()), phased=False)
+    for k, (name, world) in enumerate(worlds.items()):
+        alter, color = name.rsplit("_", 1)
+        expected = set() if alter == "low" else {f"DROP_{color.upper()}"}
+        assert CASES.broken(result, k) == expected, name
+        assert_same(result, k, world.outcome_without_phases)

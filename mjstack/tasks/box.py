@@ -40,9 +40,9 @@ class BoxCheck(EpisodeCheck):
     attempt.
 
     Without phases, an object is grasped, lifted and carried in that order at any time before the
-    settled window. A load that is lost after the lift while the object is not over the box is a
-    drop. It is released once no jaw touches it and the gripper is open after the carry, and has to
-    be at rest in the box for the window at some time after that.
+    settled window. A load that is lost after the lift is a drop, unless the object is over the box
+    and low in it. It is released once no jaw touches it and the gripper is open after the carry,
+    and has to be at rest in the box for the window at some time after that.
     """
 
     @dataclass(kw_only=True, slots=True)
@@ -67,6 +67,9 @@ class BoxCheck(EpisodeCheck):
         """Least number of such steps in a row of a carry."""
         carry_distance: float = spec(unit="m", gt=0.0)
         """Horizontal distance from where those steps began."""
+        drop_height: float = spec(unit="m", gt=0.0)
+        """Without phases: an object that is let go of, or falls, this much above where it rests in
+        the box was dropped, also if it is caught again."""
         open_fraction: float = spec(gt=0.0, le=1.0)
         """Share of the gripper's opening, as measured, once released."""
         inside: float = spec(unit="m", ge=0.0)
@@ -130,6 +133,7 @@ class BoxCheck(EpisodeCheck):
             grasp=grasp,
             lift=lift,
             carry=carry,
+            high=self.high,
         )
         release = _Release(
             *("RELEASE", "{object} not released", self.objects),
@@ -202,6 +206,13 @@ class BoxCheck(EpisodeCheck):
         constant = step.view.constant
         return torch.maximum(constant(*self._low) - low, high - constant(*self._high))
 
+    def high(self, step: Step) -> Tensor:
+        """Whether each object is higher than it may be let go of, shape ``(nworld, objects)``,
+        bool.
+        """
+        heights = [self._low[2] + thing.half_height for thing in step.view.things]
+        return step.pos[..., 2] - step.view.constant(*heights) > self.t.drop_height
+
     def over(self, step: Step) -> Tensor:
         """Whether each object is over the box or in it."""
         return (self.outside(step)[..., :2] <= 0.0).all(-1)
@@ -264,10 +275,15 @@ class _Drop(AtLeast):
     grasp: Streak
     lift: Streak
     carry: _CarriedOver
+    high: Condition
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.expected = ["0"] * len(self.objects)
+
+    def start(self, view: TaskView) -> None:
+        super().start(view)
+        self._loaded = view.zeros(len(self.objects))  # in the step before
 
     def update(self, step: Step) -> None:
         if step.view.phased:
@@ -276,7 +292,10 @@ class _Drop(AtLeast):
             self.best.masked_fill_(step.judged(self.grasp.key) & grasped, 0.0)
             lost = self.grasp.holds() & step.judged(self.key)
         else:
-            lost = self.lift.holds() & (self.carry.over == 0.0)
+            # High over the box, and let go of now, or in free fall
+            falls = self.high(step) & ((self._loaded > 0.0) | ~step.supported)
+            lost = self.lift.holds() & ((self.carry.over == 0.0) | falls)
+        self._loaded.copy_(self.condition(step))
         self.best.add_(lost & ~self.condition(step))
 
     def holds(self) -> Tensor:
