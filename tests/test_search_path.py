@@ -15,7 +15,7 @@ import mjstack
 from mjstack.cli import run
 from mjstack.config import load_config
 from mjstack.config.load import load_saved
-from mjstack.config.session import is_trusted, search_path, search_path_args
+from mjstack.config.session import check_term, is_own, search_path, search_path_args
 from mjstack.errors import MjstackError
 
 TASK = """# @package _global_
@@ -157,7 +157,7 @@ def test_a_sweep_and_a_replay(
     saved = first.parent / ".hydra" / "config.yaml"
     with pytest.raises(MjstackError) as caught:
         load_saved(saved)
-    assert "reset.lean.func=lean.lean: expected a name of mjstack" in str(caught.value)
+    assert "reset.lean.func=lean.lean: expected one of the reset terms" in str(caught.value)
     assert f"--config-dir {lean}" in str(caught.value)
     with search_path([lean]):
         assert load_saved(saved).reset["lean"].func == "lean.lean"
@@ -205,18 +205,22 @@ def test_an_installed_package_registers_its_configuration(lean: Path) -> None:
     points = "[mjstack.configs]\nleaning = leaning.conf\n"
     (site / "leaning-1.0.dist-info" / "entry_points.txt").write_text(points)
     shutil.copytree(lean, site / "leaning" / "conf")
-    (site / "leaning" / "__init__.py").write_text(MODULE)
+    mark = "from mjstack.managers import offers\noffers('observation term')(height)\n"
+    (site / "leaning" / "__init__.py").write_text(MODULE + mark)
     task = site / "leaning" / "conf" / "task" / "lean.yaml"
     task.write_text(TASK.replace("lean.height", "leaning.height"))
     program = (
         f"import sys; sys.path.insert(0, {str(site)!r}); from mjstack.config import load_config;"
-        "from mjstack.config.session import is_trusted; from pathlib import Path;"
-        "print(load_config(['task=lean']).reward['height'].func,"
-        " is_trusted('leaning.height', Path('config.yaml')))"
+        "from mjstack.config.session import check_term; from pathlib import Path;"
+        "print(load_config(['task=lean']).reward['height'].func);"
+        "check_term('', 'leaning.height', 'observation term', Path('config.yaml'));"
+        "check_term('', 'leaning.height', 'reset term', Path('config.yaml'))"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.stdout.split() == ["leaning.height", "True"], done.stderr
-    assert not is_trusted("leaning.height", Path("config.yaml"))
+    assert done.stdout.split() == ["leaning.height"], done.stderr
+    assert "leaning.height: expected one of the reset terms" in done.stderr.splitlines()[-1]
+    with pytest.raises(MjstackError, match="expected one of the observation terms"):
+        check_term("", "leaning.height", "observation term", Path("config.yaml"))
 
 
 def test_only_modules_beside_the_folder_are_trusted(
@@ -224,6 +228,6 @@ def test_only_modules_beside_the_folder_are_trusted(
 ) -> None:
     monkeypatch.chdir(lean.parent)  # a built-in module has no file: it is not beside the folder
     with search_path([lean]):
-        assert is_trusted("lean.height", Path("config.yaml"))
+        assert is_own("lean.height", Path("config.yaml"))
         for name in ("os.system", "sys.exit", "shutil.rmtree", "nowhere.at_all"):
-            assert not is_trusted(name, Path("config.yaml")), name
+            assert not is_own(name, Path("config.yaml")), name

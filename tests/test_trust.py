@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+import pkgutil
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +18,15 @@ import pytest
 from compositions import load_config
 from environments import one_second_episode
 from omegaconf import OmegaConf
+from policies import write_policy
 
+import mjstack
 from mjstack.cli import run
-from mjstack.config.session import is_trusted, search_path
+from mjstack.config.session import check_term, is_own, search_path
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.errors import MjstackError
 from mjstack.jobs import check_job
+from mjstack.policy import load_policy
 from mjstack.process import Child
 
 ROOT = Path(__file__).parents[1]
@@ -94,11 +100,68 @@ def test_a_replay_runs_no_command_of_its_folder(key: str, stranger: Path) -> Non
     edit(stranger, key, SHELL | ({"weight": 1.0} if key.startswith("reward") else {}))
     if key in USED:
         found = refused(lambda: replay(stranger))
-        assert f"{key}.func=pydoc.pipepager: expected a name of mjstack" in found
+        assert f"{key}.func=pydoc.pipepager: expected one of the" in found
         assert found.endswith("add --config-dir DIR.")
     else:
         replay(stranger)
     assert not Path("PWNED").exists()
+
+
+# Each takes env first: they write, play or call what their parameters say.
+DOERS = {
+    "mjstack.mdp.starts.starts_file.write_starts": {"path": "victim"},
+    "mjstack.bench.env_step.measure_env_step": {"steps": 1_000_000_000},
+    "mjstack.envs.buffers.play_random_actions": {"steps": 10**12},
+    "mjstack.mdp.starts.expert_states.ExpertStates": {"path": "victim"},
+    "mjstack.adapters.rsl_rl_runner.Runner": {"train_cfg": {}},  # of earlier versions
+    "mjstack.adapters.rsl_rl.RslRlVecEnv": {},
+}
+
+
+@pytest.mark.parametrize("name", DOERS)
+def test_a_policy_names_terms_alone(name: str, tmp_path: Path) -> None:
+    victim = tmp_path / "victim"
+    victim.write_text("precious")
+    folder = write_policy(tmp_path / "policy", load_config(["sim=native"]))
+    path = folder / "policy.json"
+    content = path.read_text()
+    params = DOERS[name] | ({"path": str(victim)} if "path" in DOERS[name] else {})
+    term = {"func": name, "params": params}
+    for part, kind in (("observation", "observation term"), ("action", "action term")):
+        facts = json.loads(content)
+        terms = facts[part]["terms"] or facts["config"]["controller"]["action"]
+        terms[next(iter(terms))].update(term)
+        path.write_text(json.dumps(facts))
+        gone = "Runner" in name
+        says = f"module '{name[:-7]}' cannot" if gone else f"expected one of the {kind}s"
+        assert f"func={name}: {says}" in refused(lambda: load_policy(folder))
+    assert run([f"policy={folder}", "controller=policy", "gates=[success]", "nworld=2"]) == 2
+    assert victim.read_text() == "precious"
+
+
+@pytest.mark.parametrize("name", [n for n in DOERS if not n.endswith(("ExpertStates", "Runner"))])
+def test_a_run_names_terms_alone(name: str, stranger: Path) -> None:
+    edit(stranger, "reset.evil", {"func": name, "params": DOERS[name]})
+    assert f"reset.evil.func={name}: expected" in refused(lambda: replay(stranger))
+
+
+def test_each_kind_of_term_is_listed(tmp_path: Path) -> None:
+    """A policy names observation and action terms, a run action and reset terms and checks: those
+    of the list, and nothing else of mjstack.
+    """
+    listed = set((ROOT / "tests" / "data" / "may_be_named.txt").read_text().splitlines())
+    named = set()
+    for module in pkgutil.walk_packages(mjstack.__path__, "mjstack."):
+        if module.name.endswith(("__main__", "rsl_rl", "rsl_rl_ppo")):
+            continue
+        for name, value in vars(importlib.import_module(module.name)).items():
+            if getattr(value, "__module__", "") != module.name:
+                continue
+            for kind in ("observation term", "action term", "reset term", "check"):
+                with suppress(MjstackError):
+                    check_term("", f"{module.name}.{name}", kind, tmp_path / "policy.json")
+                    named.add(f"{kind}: {module.name}.{name}")
+    assert named == listed
 
 
 CALLABLE = ("pydoc.pipepager", "builtins.max", "builtins.dict", "sys.exit", "torch.save")
@@ -137,7 +200,7 @@ def test_no_module_of_the_folder_is_imported(
     edit(stranger, key, {"func": "beside.rmtree" if given == "beside" else "stranger.payload.X"})
     with search_path(["conf"] if given else []):
         found = refused(lambda: replay(stranger))
-        assert not given or is_trusted("beside.X", stranger)
+        assert not given or is_own("beside.X", stranger)
     assert f"{key}.func=" in found
     assert "stranger.payload" not in sys.modules
 
@@ -166,7 +229,7 @@ def test_a_package_that_the_folder_lies_in_is_not_trusted(
         sys.path.insert(0, str(Path.cwd()))
     sys.path.insert(0, str(home.resolve()))
     with search_path([str(home / "conf")]):
-        assert not is_trusted("outputs.run.payload.f", saved)
+        assert not is_own("outputs.run.payload.f", saved)
 
 
 @pytest.mark.full

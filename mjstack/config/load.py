@@ -25,7 +25,7 @@ from mjstack.config.session import (
     CONFIG_NAME,
     add_folder,
     check_beside,
-    check_trusted,
+    check_replayed,
     compose_raw,
     hydra_session,
     list_choices,
@@ -211,7 +211,7 @@ def load_saved(path: Path) -> Config:
         merged = cast(DictConfig, OmegaConf.merge(_schema, plain))
         if missing := sorted(OmegaConf.missing_keys(merged)):
             raise MjstackError(f"{missing[0]} is missing, expected every key of this version.")
-        check_trusted(merged, path)
+        check_replayed(merged, path)
         try:
             cfg = to_config(merged)
         except ConfigError as error:

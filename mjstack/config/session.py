@@ -8,6 +8,7 @@ beside an added one is importable, so that its YAML can name functions by module
 import copy
 import functools
 import os
+import re
 import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -44,8 +45,12 @@ CONFIG_NAME = "config"
 ENTRY_POINTS = "mjstack.configs"
 PROVIDER = "mjstack.search_path"  # of added entries, in a run's .hydra/hydra.yaml
 _FILE = "file://"
-# Where a replay's functions are named.
-_REPLAYED = ("controller.action.", "gate.success.reset.", "reset.", "task.check.")
+# The functions that a replay calls: where a run's configuration names them, and of which kind.
+_REPLAYED = {
+    r"controller\.action\.\w+": "action term",
+    r"(gate\.success\.)?reset\.\w+": "reset term",
+    r"task\.check": "check",
+}
 
 _added: ContextVar[tuple[Path, ...]] = ContextVar("search path", default=())
 
@@ -134,52 +139,55 @@ def _registered() -> list[str]:
     return [point.value for point in entry_points(group=ENTRY_POINTS)]
 
 
-def check_trusted(cfg: DictConfig, saved: Path) -> None:
-    """Check that every function that a replay uses is in the current search path, and that it was
-    defined there: a module imports others' functions too.
+def check_replayed(cfg: DictConfig, saved: Path) -> None:
+    """`check_term` for every function that a replay of a run calls.
 
     Args:
         cfg: The configuration of an earlier run.
         saved: Its file.
-
-    Raises:
-        MjstackError: A function is elsewhere; names it.
-        TermError: There is no such function.
     """
     for key, name in list_items(cfg):
-        if not (key.startswith(_REPLAYED) and key.endswith(".func")):
-            continue
-        if not is_trusted_function(key.removesuffix(".func"), str(name), saved):
-            raise MjstackError(
-                f"{key}={name}: expected a name of mjstack, of a package registered under"
-                f" {ENTRY_POINTS}, or beside a folder of the search path. {add_folder(saved)}"
-            )
+        for place, kind in _REPLAYED.items():
+            if re.fullmatch(place + r"\.func", key):
+                check_term(key.removesuffix(".func"), str(name), kind, saved)
 
 
-def is_trusted_function(label: str, dotted: str, saved: Path) -> bool:
-    """Whether a saved file may name a function, and the function was defined in a trusted module
-    too; arguments as of `is_trusted`, and the key that names it.
+def check_term(label: str, dotted: str, kind: str, saved: Path) -> None:
+    """Check that the folder of a policy or of a run, which may be a stranger's, may name a function
+    or class: one that declares itself in an installed package (`mjstack.managers.offers`), or any
+    that was defined beside a folder of the search path.
+
+    Args:
+        label: Dotted configuration key, for errors.
+        dotted: Its name.
+        kind: The kind of term that it is to be.
+        saved: The file that names it.
 
     Raises:
+        MjstackError: It may not.
         TermError: There is no such function.
     """
-    # A module runs when it is imported.
-    return is_trusted(dotted, saved) and is_trusted(
-        str(getattr(find_object(label, dotted), "__module__", "")), saved
+    installed = {"mjstack", *(name.partition(".")[0] for name in _registered())}
+    # A module runs when it is imported, and imports others' functions too.
+    if dotted.partition(".")[0] in installed or is_own(dotted, saved):
+        func = find_object(label, dotted)
+        home = str(getattr(func, "__module__", ""))
+        if getattr(func, "term_kind", "") == kind or is_own(home, saved):
+            return
+    raise MjstackError(
+        f"{label}.func={dotted}: expected one of the {kind}s of mjstack, of a package registered"
+        f" under {ENTRY_POINTS}, or beside a folder of the search path. {add_folder(saved)}"
     )
 
 
-def is_trusted(dotted: str, saved: Path) -> bool:
-    """Whether a saved run may name a function or module: one of mjstack, of a registered package,
-    or of the search path.
+def is_own(dotted: str, saved: Path) -> bool:
+    """Whether a function or module lies beside a folder of the search path.
 
     Args:
         dotted: Its dotted name.
-        saved: The run's ``config.yaml``. No package that it lies in is trusted.
+        saved: The file that names it. No package that it lies in counts.
     """
     package = dotted.partition(".")[0]
-    if package in {"mjstack", *(name.partition(".")[0] for name in _registered())}:
-        return True
     try:
         module = find_spec(package)
     except ValueError:  # no name of a module, or __main__

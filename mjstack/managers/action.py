@@ -30,6 +30,7 @@ class ActionTerm(ABC):
     low: torch.Tensor
     high: torch.Tensor
     unit: str = "-1 to 1"
+    term_kind = "action term"  # as of `offers`
     actuators: tuple[int, ...] = ()
 
     @abstractmethod

@@ -51,8 +51,12 @@ class EnvView(Protocol):
     given_places: dict[str, torch.Tensor]
 
 
-def offers(**attributes: Any) -> Callable[[Any], Any]:
-    """Mark a term with what others may ask of it.
+def offers(kind: str = "", /, **attributes: Any) -> Callable[[Any], Any]:
+    """Mark a term with its kind, and with what others may ask of it.
+
+    Kinds are ``observation term``, ``action term``, ``reset term`` and ``check``; subclasses of
+    `ActionTerm` and `EpisodeCheck` have theirs already. The folder of a policy or of a run may name
+    a term of an installed package only as that kind.
 
     Known attributes: ``unit`` of an observation (one, or one per number; ``joint`` and ``joint/s``
     are those of the robot's joints); ``ends_on`` of a termination, ``overflow`` or ``non_finite``,
@@ -62,9 +66,11 @@ def offers(**attributes: Any) -> Callable[[Any], Any]:
     middle of an episode.
 
     Example:
-        >>> @offers(unit="m")
+        >>> @offers("observation term", unit="m")
         ... def tip_height(env): ...
     """
+    if kind:
+        attributes["term_kind"] = kind
 
     def mark(term: Any) -> Any:
         for name, value in attributes.items():
@@ -78,7 +84,7 @@ def uses_fields(*names: str) -> Callable[[Any], Any]:
     """Mark a reset term that writes per-world model fields, so that the simulation is built with
     them.
     """
-    return offers(model_fields=names)
+    return offers("reset term", model_fields=names)
 
 
 def random_uniform(

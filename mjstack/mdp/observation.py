@@ -8,25 +8,25 @@ from mjstack.managers.view import EnvView, offers
 from mjstack.mdp.geometry import jaw_forces, place_xy, pose_w, robot
 
 
-@offers(unit="joint")
+@offers("observation term", unit="joint")
 def joint_pos(env: EnvView) -> Tensor:
     """Joint positions [rad, m], arm then gripper, shape ``(nworld, n)``."""
     return env.sim.part("qpos", robot(env).qpos)
 
 
-@offers(unit="joint")
+@offers("observation term", unit="joint")
 def joint_pos_relative(env: EnvView) -> Tensor:
     """Joint positions less home [rad, m], shape ``(nworld, n)``."""
     return joint_pos(env) - robot(env).home
 
 
-@offers(unit="joint/s")
+@offers("observation term", unit="joint/s")
 def joint_vel(env: EnvView) -> Tensor:
     """Joint velocities [rad/s, m/s], shape ``(nworld, n)``."""
     return env.sim.part("qvel", robot(env).qvel)
 
 
-@offers(unit="m")
+@offers("observation term", unit="m")
 def grasp_point_pos(env: EnvView) -> Tensor:
     """Midpoint between the jaws [m], world frame, shape ``(nworld, 3)``. Not to be written into."""
 
@@ -37,7 +37,7 @@ def grasp_point_pos(env: EnvView) -> Tensor:
     return shared((id(env), grasp_point_pos), compute)
 
 
-@offers(unit="m")
+@offers("observation term", unit="m")
 def grasp_point_to_object(env: EnvView, *, object: str, height: float = 0.0) -> Tensor:
     """From the grasp point to a point above an object's centre [m], shape ``(nworld, 3)``.
 
@@ -52,13 +52,13 @@ def grasp_point_to_object(env: EnvView, *, object: str, height: float = 0.0) -> 
     return offset
 
 
-@offers(unit="m")
+@offers("observation term", unit="m")
 def object_to_object(env: EnvView, *, a: str, b: str) -> Tensor:
     """From one object's centre to another's [m], shape ``(nworld, 3)``."""
     return pose_w(env, b)[:, :3] - pose_w(env, a)[:, :3]
 
 
-@offers(unit="m")
+@offers("observation term", unit="m")
 def object_to_place(env: EnvView, *, object: str, place: str) -> Tensor:
     """From an object's centre to where it is when it stands at a place on the table [m], shape
     ``(nworld, 3)``.
@@ -68,13 +68,13 @@ def object_to_place(env: EnvView, *, object: str, place: str) -> Tensor:
     return torch.cat((place_xy(env, place) - at[:, :2], height - at[:, 2:]), dim=1)
 
 
-@offers(unit=("m",) * 3 + ("1",) * 4)
+@offers("observation term", unit=("m",) * 3 + ("1",) * 4)
 def object_pose(env: EnvView, *, object: str) -> Tensor:
     """Position [m] and quaternion (wxyz), world frame, shape ``(nworld, 7)``."""
     return pose_w(env, object)
 
 
-@offers(unit="m")
+@offers("observation term", unit="m")
 def positions(env: EnvView, *, objects: list[str] | None = None) -> Tensor:
     """Where objects are [m], world frame, shape ``(nworld, 3 * objects)``.
 
@@ -87,7 +87,7 @@ def positions(env: EnvView, *, objects: list[str] | None = None) -> Tensor:
     return torch.cat([env.sim.qpos[:, :0], *parts], dim=1)
 
 
-@offers(unit="m")
+@offers("observation term", unit="m")
 def offsets(env: EnvView, *, objects: list[str] | None = None) -> Tensor:
     """From the grasp point to objects [m], shape ``(nworld, 3 * objects)``; arguments as of
     `positions`.
@@ -96,14 +96,14 @@ def offsets(env: EnvView, *, objects: list[str] | None = None) -> Tensor:
     return at - grasp_point_pos(env).repeat(1, at.shape[1] // 3)
 
 
-@offers(unit="m")
+@offers("observation term", unit="m")
 def goals(env: EnvView) -> Tensor:
     """Where the scene's places are [m], shape ``(nworld, 2 * places)``."""
     places = [place_xy(env, name) for name in env.cfg.scene.places]
     return torch.cat([env.sim.qpos[:, :0], *places], dim=1)
 
 
-@offers(unit="1")
+@offers("observation term", unit="1")
 def headings(env: EnvView, *, objects: list[str] | None = None) -> Tensor:
     """How boxes are turned about z: cosine and sine of four times the yaw of each, which are the
     same after a quarter turn, shape ``(nworld, 2 * objects)``.
@@ -128,7 +128,7 @@ def headings(env: EnvView, *, objects: list[str] | None = None) -> Tensor:
     return torch.stack((cos, sin), dim=2).flatten(1)
 
 
-@offers(unit=("m/s",) * 3 + ("rad/s",) * 3)
+@offers("observation term", unit=("m/s",) * 3 + ("rad/s",) * 3)
 def object_velocity(env: EnvView, *, object: str) -> Tensor:
     """Linear [m/s, world frame] and angular [rad/s, body frame] velocity, shape ``(nworld, 6)``."""
     if object in env.index.fixed:
@@ -136,7 +136,7 @@ def object_velocity(env: EnvView, *, object: str) -> Tensor:
     return env.sim.part("qvel", env.index.object_columns(object)[1])
 
 
-@offers(unit="N")
+@offers("observation term", unit="N")
 def jaw_force(env: EnvView, *, object: str) -> Tensor:
     """Size of each jaw's contact force on an object [N], at the last physics step, shape ``(nworld,
     2)``.
@@ -144,7 +144,7 @@ def jaw_force(env: EnvView, *, object: str) -> Tensor:
     return jaw_forces(env.index, env.sim, object)
 
 
-@offers(unit="joint")
+@offers("observation term", unit="joint")
 def last_action(env: EnvView) -> Tensor:
     """The policy's last action, shape ``(nworld, action_dim)``."""
     return env.action

@@ -21,6 +21,7 @@ from mjstack.mdp.starts.reach import require_reach
 from mjstack.scene.index import ALL, Columns, Rows, joint_limits
 
 
+@offers("reset term")
 def home(env: EnvView, mask: Tensor, *, pose: Pose = "home") -> None:
     """Put the robot at its home, or at ``start``, at rest. Writes qpos, qvel and ctrl."""
     at = rows_of(mask)
@@ -28,7 +29,7 @@ def home(env: EnvView, mask: Tensor, *, pose: Pose = "home") -> None:
     zero_rows(mask, env.sim.qvel)
 
 
-@offers(joint_noise=True)
+@offers("reset term", joint_noise=True)
 class JointNoise:
     """Adds uniform noise to the robot's joint positions and targets, within the joints' ranges."""
 
@@ -56,6 +57,7 @@ class JointNoise:
         write_robot(env, mask, torch.clamp(command, self._low, self._high), at)
 
 
+@offers("reset term")
 class JitterObjects:
     """Moves each object a little off its nominal position."""
 
@@ -84,7 +86,7 @@ class JitterObjects:
         _write_objects(env, mask, self._poses, self._xy * xy, self._yaw * yaw[..., 0], at)
 
 
-@offers(places_objects=True)
+@offers("reset term", places_objects=True)
 class RandomizeObjects:
     """Puts each object anywhere in a region around its nominal position where nothing is in its
     way.

@@ -24,7 +24,7 @@ import mjstack
 from mjstack.config.complete import typed
 from mjstack.config.fingerprint import MOST_TEXT, POLICY_FILE, config_content
 from mjstack.config.schema import Config, ObservationGroupCfg, ObservationTermCfg, TermCfg
-from mjstack.config.session import is_trusted_function
+from mjstack.config.session import check_term
 from mjstack.errors import FolderError
 from mjstack.files import read_inside, reading, write_atomic
 from mjstack.policy.network import PolicyNetwork, Vision
@@ -298,24 +298,20 @@ def _weights_name(digest: str) -> str:
 
 
 def _read_group(seen: Mapping[str, Any], path: Path) -> ObservationGroupCfg:
-    """The observation group of a policy's file, its functions trusted."""
+    """The observation group of a policy's file, its functions checked."""
     key = f"observation.{seen['group']}"
     group = typed(key, {"noise": seen["noise"]}, ObservationGroupCfg)
     group.terms = _read_terms(f"{key}.terms", seen["terms"], ObservationTermCfg, path)
     return group
 
 
-def _read_terms(key: str, nodes: Mapping[str, Any], kind: type, path: Path) -> dict[str, Any]:
-    """Terms of a policy's file at a dotted key, their functions trusted."""
+def _read_terms(key: str, nodes: Mapping[str, Any], model: type, path: Path) -> dict[str, Any]:
+    """Terms of a policy's file at a dotted key, which it may name."""
+    kind = "action term" if model is TermCfg else "observation term"
     terms = {}
     for name, node in nodes.items():
-        term = typed(f"{key}.{name}", node, kind)
-        if not is_trusted_function(f"{key}.{name}", term.func, path):
-            raise FolderError(
-                f"{path}: {key}.{name}.func={term.func}: expected a name of mjstack, of a"
-                " registered package, or beside a folder of the search path",
-                "Add the policy's --config-dir",
-            )
+        term = typed(f"{key}.{name}", node, model)
+        check_term(f"{path}: {key}.{name}", term.func, kind, path)
         terms[name] = term
     return terms
 

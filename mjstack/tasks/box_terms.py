@@ -8,7 +8,7 @@ from mjstack.mdp.geometry import pose_w
 from mjstack.tasks.box import BoxCheck
 
 
-@offers(unit="m")
+@offers("observation term", unit="m")
 class ToSlot:
     """From an object's centre to where it rests at its place in the box [m], shape ``(nworld,
     3)``.

@@ -191,6 +191,7 @@ class EpisodeCheck(ABC):
 
     Thresholds: ClassVar[type]
     summaries: Mapping[str, tuple[str, str]] = {}
+    term_kind = "check"  # as of `offers`
 
     def __init__(self, cfg: Config) -> None:
         """Read the thresholds and build the rules.

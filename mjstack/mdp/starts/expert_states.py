@@ -17,7 +17,7 @@ FIELD = "field."  # in front of a model field's name
 EPISODE = "episode"
 
 
-@offers(starts_midway=True)
+@offers("reset term", starts_midway=True)
 class ExpertStates:
     """Some worlds start in a state of an accepted episode of the expert, in any of its phases; the
     others as the terms before say.
