@@ -4,6 +4,7 @@ over Gloo, tensors on CUDA over NCCL.
 
 import logging
 import os
+import signal
 import socket
 import sys
 import time
@@ -284,11 +285,19 @@ def launch(args: Sequence[str], count: int) -> int:
     except SignalException:
         return EXIT_CODE
     except ChildFailedError as error:
-        first = error.failures.get(0)
-        if first is not None and first.exitcode < 0:  # the others may have ended before they know
-            print(f"mjstack: rank 0 of {count} was killed ({first.signal_name()})", file=sys.stderr)
         codes = {failure.exitcode for failure in error.failures.values()}
-        return next((code for code in (2, EXIT_CODE) if code in codes), 1)
+        # torch ends the others by SIGTERM, which is status 130 where they have not begun.
+        killed = False
+        for rank, failure in sorted(error.failures.items()):
+            if failure.exitcode < 0 and failure.exitcode != -signal.SIGTERM:
+                killed = True
+                if rank == 0 or 1 not in codes:  # else another rank has said so
+                    name = failure.signal_name()
+                    process = f"{name}, process {failure.pid}"
+                    print(
+                        f"mjstack: rank {rank} of {count} was killed ({process})", file=sys.stderr
+                    )
+        return 1 if killed else next((code for code in (2, EXIT_CODE) if code in codes), 1)
     finally:
         logging.disable(logging.NOTSET)
     return 0

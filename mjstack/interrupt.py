@@ -71,7 +71,9 @@ def _handle(number: int, frame: FrameType | None) -> None:
     if _running and not _asked:
         _asked = True
         return
-    if not _running:
+    # torch stops the other ranks so where one has failed, which is no interruption.
+    by_torch = number == signal.SIGTERM and "TORCHELASTIC_RUN_ID" in os.environ
+    if not _running and not by_torch:
         os.write(2, b"mjstack: interrupted before anything ran\n")
     with suppress(Exception):  # it may be in the middle of a print
         sys.stdout.flush()

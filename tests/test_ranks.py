@@ -4,6 +4,7 @@ on with in another number of ranks.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import os
@@ -240,10 +241,42 @@ def test_a_killed_first_rank_is_named(script: bool, trap: list[str], tmp_path: P
     killed = r"mjstack: rank 1: rank 0 of [23] \(.*, process \d+\) was killed"
     assert len(re.findall(killed, text)) == 1
     assert "mjstack: rank 2" not in text
-    assert ("mjstack: rank 0 of 2 was killed (SIGKILL)" in text) == (not script)
+    assert ("mjstack: rank 0 of 2 was killed (SIGKILL, process " in text) == (not script)
     assert report_of(folder)["status"] == "interrupted"
     play(0, [*trap, f"resume={folder}"], tmp_path, 1)
     assert report_of(folder)["gates"][0]["metrics"]["episodes"] == 20
+
+
+def rank_process(parent: int, rank: int) -> int:
+    """The process of a rank that a command has started, as soon as there is one."""
+    until = time.monotonic() + 60.0
+    while time.monotonic() < until:
+        for path in Path("/proc").glob("[0-9]*"):
+            with contextlib.suppress(OSError, IndexError):
+                above = int((path / "stat").read_text().rpartition(")")[2].split()[1])
+                environment = (path / "environ").read_bytes().split(b"\0")
+                if above == parent and f"RANK={rank}".encode() in environment:
+                    return int(path.name)
+        time.sleep(0.05)
+    raise AssertionError(f"rank {rank} has not started")
+
+
+@pytest.mark.full
+@pytest.mark.skipif(not Path("/proc").exists(), reason="a system without /proc")
+@pytest.mark.parametrize("rank", [0, 1])
+@pytest.mark.parametrize("delay", [0.5, 2.0])
+def test_a_rank_killed_while_ranks_start_is_a_failure(
+    rank: int, delay: float, tmp_path: Path
+) -> None:
+    """It is no interruption; the command that has started the ranks names it."""
+    process = start(0, [*SHORT, "devices=2", "nworld=4", f"hydra.run.dir={tmp_path}/run"], tmp_path)
+    killed = rank_process(process.pid, rank)
+    time.sleep(delay)
+    os.kill(killed, signal.SIGKILL)
+    text, _ = process.communicate(timeout=120)
+    assert process.returncode == 1, text
+    assert f"mjstack: rank {rank} of 2 was killed (SIGKILL, process {killed})" in text
+    assert "interrupted" not in text
 
 
 @pytest.mark.full

@@ -105,6 +105,70 @@ def test_somebody_elses_dataset_is_read(dataset: Path, tmp_path: Path) -> None:
     assert torch.equal(theirs.labels, ours.labels)
 
 
+def reshape_rows(lengths: dict[int, int | None]) -> Callable[[pa.Table], pa.Table]:
+    """Other lengths of some rows of the action; None: a null."""
+
+    def change(table: pa.Table) -> pa.Table:
+        rows = table["action"].to_pylist()
+        for row, length in lengths.items():
+            rows[row] = None if length is None else (2 * rows[row])[:length]
+        number = table.schema.get_field_index("action")
+        return table.set_column(number, "action", pa.array(rows, pa.list_(pa.float32())))
+
+    return change
+
+
+def swap(first: int, second: int) -> Callable[[pa.Table], pa.Table]:
+    def change(table: pa.Table) -> pa.Table:
+        order = np.arange(len(table))
+        order[[first, second]] = order[[second, first]]
+        return table.take(order)
+
+    return change
+
+
+def shuffle(table: pa.Table) -> pa.Table:
+    return table.take(np.random.default_rng(0).permutation(len(table)))
+
+
+SHAPES = "rows of action without 6 numbers"
+ORDER = "out of order, expected 3 episodes and 450 frames"
+DAMAGES: dict[str, tuple[Callable[[pa.Table], pa.Table], str]] = {
+    "a null row and a double one": (reshape_rows({7: None, 8: 12}), SHAPES),
+    "rows of 5 and 7": (reshape_rows({100: 5, 200: 7}), SHAPES),
+    "the end is missing": (lambda table: table.slice(0, 413), "has 3 episodes and 413 frames, ex"),
+    "an episode is missing": (lambda table: table.slice(150), "has 2 episodes and 300 frames, ex"),
+    "shuffled": (shuffle, ORDER),
+    "two steps swapped": (swap(20, 21), ORDER),
+    "episodes mixed": (swap(149, 150), ORDER),
+}
+
+
+@pytest.mark.parametrize("change", [None, as_lerobot], ids=["ours", "LeRobot's"])
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_dataset_that_still_reads_is_refused(
+    damage: str, change: Callable[[dict], None] | None, dataset: Path, tmp_path: Path
+) -> None:
+    folder = copied(dataset, tmp_path, change)
+    change_table(folder, DAMAGES[damage][0])
+    line = refused([f"job.dataset={folder}"])
+    assert DAMAGES[damage][1] in line
+    assert str(folder) in line
+
+
+def test_a_file_that_is_there_twice_is_refused(dataset: Path, tmp_path: Path) -> None:
+    """A dataset of ours says which files count."""
+    for change in (None, as_lerobot):
+        folder = copied(dataset, tmp_path / str(change is None), change)
+        first = folder / "data/chunk-000/file-000.parquet"
+        shutil.copy(first, first.with_name("file-001.parquet"))
+        if change is None:
+            assert len(read(folder).ends) == 3
+        else:
+            line = refused([f"job.dataset={folder}"])
+            assert "has 3 episodes and 900 frames out of order, expected 3 episodes and 450" in line
+
+
 def test_without_a_success_all_episodes_count(dataset: Path, tmp_path: Path) -> None:
     def fail_the_second(table: pa.Table) -> pa.Table:
         success = np.array(table["next.success"].to_pylist())

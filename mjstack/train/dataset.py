@@ -3,6 +3,7 @@ that a policy sees.
 """
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -21,6 +22,7 @@ from mjstack.train.demonstrations import Demonstrations
 _ACTION = "action"
 _SUCCESS = "next.success"
 _EPISODE = "episode_index"
+_FRAME = "frame_index"
 _TASK = "task_index"
 _BEYOND = 1e-3  # rad, m: how far a joint target may be out of its actuator's range
 
@@ -35,7 +37,8 @@ def check_dataset(stage: Stage, widths: Mapping[str, int]) -> range:
         The seeds of the dataset's starts, as far as it names them.
 
     Raises:
-        MjstackError: It is no dataset, lacks columns, or is of another robot, task or rate.
+        MjstackError: It is no dataset, lacks columns or frames, or is of another robot, task or
+            rate.
     """
     cfg = stage.cfg
     folder = _folder(cfg)
@@ -43,7 +46,8 @@ def check_dataset(stage: Stage, widths: Mapping[str, int]) -> range:
     places = _find_columns(info, cfg, widths)
     _task_number(cfg)
     # The ranges of the first file: degrees, say, are far out of them
-    action = _read(_files(folder, info)[0], {_ACTION: places[_ACTION]})[_ACTION]
+    _check_frames(folder, info)
+    action = _read(_files(folder, info)[0], {_ACTION: places[_ACTION]}, info)[_ACTION]
     low, high = stage.index.ctrl_range.T
     worst = np.maximum(low - action, action - high).max(0)
     joint = int(worst.argmax())
@@ -72,7 +76,7 @@ def read_demonstrations(stage: Stage, widths: dict[str, int]) -> Demonstrations:
     places = _find_columns(info, cfg, widths)
     facts = [_EPISODE, _TASK, *({_SUCCESS} & info["features"].keys())]
     places |= {name: [(name, 0)] for name in facts}
-    parts = [_read(path, places) for path in _files(folder, info)]
+    parts = [_read(path, places, info) for path in _files(folder, info)]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in places}
 
     # Episodes of the task that succeeded
@@ -124,7 +128,7 @@ def _read_info(folder: Path) -> dict[str, Any]:
     with readable(path):
         info = json.loads(path.read_text(encoding="utf-8"))
         version = str(info["codebase_version"])
-        for name in ("robot_type", "fps", "features"):
+        for name in ("robot_type", "fps", "features", "total_episodes", "total_frames"):
             info[name]
     if not version.startswith("v3"):
         raise FolderError(
@@ -200,6 +204,29 @@ def _files(folder: Path, info: Mapping[str, Any]) -> list[Path]:
     return sorted(folder.glob("data/chunk-*/file-*.parquet"))
 
 
+def _check_frames(folder: Path, info: Mapping[str, Any]) -> None:
+    """Raise a `FolderError` where episodes or frames are missing, are there twice, or are out of
+    order.
+    """
+    places = {name: [(name, 0)] for name in (_EPISODE, _FRAME)}
+    parts = [_read(path, places, info) for path in _files(folder, info)]
+    if not parts:
+        parts = [{name: np.empty((0, 1)) for name in places}]
+    episode, frame = (np.concatenate([part[name][:, 0] for part in parts]) for name in places)
+    begins = np.flatnonzero(np.diff(episode, prepend=-1))
+    count = len(np.unique(episode))
+    there = f"{count} episodes and {len(episode)} frames"
+    recorded = f"{info['total_episodes']} episodes and {info['total_frames']} frames"
+    steps = np.arange(len(frame)) - np.repeat(begins, np.diff(begins, append=len(frame)))
+    wrong = len(begins) != count or (frame != steps).any()
+    if there != recorded or wrong:
+        raise FolderError(
+            f"job.dataset={folder}: has {there}{' out of order' * bool(wrong)}, expected"
+            f" {recorded}, as {lerobot.INFO} says, each episode in one piece and"
+            f" {_FRAME} rising by one in it. Restore its files, or give another dataset"
+        )
+
+
 def _seeds(folder: Path) -> list[int]:
     """Seeds of the episodes, as far as the dataset has them."""
     seeds: list[int] = []
@@ -232,17 +259,26 @@ def _task_number(cfg: Config) -> int:
     return int(tasks[cfg.task.instruction])
 
 
-def _read(path: Path, columns: Mapping[str, Sequence[Place]]) -> dict[str, np.ndarray]:
-    """Numbers of a data file by name, each shape ``(frames, numbers)``."""
+def _read(
+    path: Path, columns: Mapping[str, Sequence[Place]], info: Mapping[str, Any]
+) -> dict[str, np.ndarray]:
+    """Numbers of a data file by name, each shape ``(frames, numbers)``; every row of a feature has
+    its shape in info.json.
+    """
     features = sorted({feature for places in columns.values() for feature, _ in places})
     with readable(path):
         table = lerobot.require_pyarrow()[1].ParquetFile(path).read(columns=features)
         values = {}
         for feature in features:
             column = table[feature].combine_chunks()
-            flat = column.flatten() if hasattr(column, "flatten") else column
+            width = math.prod(info["features"][feature]["shape"])
+            flat = column
+            if hasattr(column, "flatten"):
+                flat = column.flatten()
+                if set(column.value_lengths().to_pylist()) - {width}:  # a null has none
+                    raise ValueError(f"rows of {feature} without {width} numbers")
             array = np.asarray(flat.to_numpy(zero_copy_only=False), dtype=float)
-            values[feature] = array.reshape(len(table), -1)
+            values[feature] = array.reshape(len(table), width)
         arrays = {
             name: np.stack([values[feature][:, number] for feature, number in places], axis=1)
             for name, places in columns.items()
