@@ -15,7 +15,7 @@ from mjstack.policy import load_policy
 from mjstack.train.clone_learner import CloneLearner
 
 TINY = (
-    *("job=train", "trainer=dagger", "task=reach", "sim=native", "nworld=4", "job.rounds=2"),
+    *("job=train", "task=reach", "sim=native", "nworld=4", "job.rounds=2"),
     *("job.episodes=4", "job.hidden=[32]", "job.batches=20", "job.batch_size=64"),
     "gate.success.rate=0.0",
 )
@@ -32,7 +32,7 @@ def test_rounds_leave_a_policy_and_go_on_bit_for_bit(tmp_path: Path) -> None:
     rows = curve(whole)
     assert rows["round"].tolist() == [1.0, 2.0]
     policy = load_policy(whole / "last")
-    assert (policy.network.chunk, policy.execute, policy.training["trainer"]) == (1, 1, "dagger")
+    assert (policy.network.chunk, policy.execute, policy.training["trainer"]) == (16, 8, "dagger")
     assert load_policy(whole / "best").training["success"] == rows["success"].max()
     assert not list(whole.glob("round-*"))
 
@@ -72,7 +72,7 @@ def test_the_share_of_the_expert() -> None:
         seen.append(driver.command()[:, 0].clone())
         env.episode_step.add_(24)
         assert torch.equal(driver.command()[:, 0], seen[-1])
-        assert torch.equal(driver.own == 1, seen[-1] == 1.0)
+        assert torch.equal(driver.driven == 1, seen[-1] == 1.0)
     share = (torch.stack(seen) == 1.0).float().mean(0)
     assert (share[:10] == 0.0).all()
     assert abs(float(share[10:].mean()) - 0.5) < 0.05

@@ -20,6 +20,7 @@ from policies import (
     same,
     weights,
 )
+from safetensors.torch import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import mjstack.policy.checkpoint as checkpoint
@@ -38,7 +39,8 @@ from mjstack.train.demonstrations import Demonstrations, lead_gripper, play_expe
 from mjstack.train.trainer import STATE
 
 TINY = (
-    *("job=train", "sim=native", "nworld=4", "job.episodes=4", "job.noisy_episodes=2"),
+    *("job=train", "trainer=clone", "sim=native", "nworld=4"),
+    *("job.episodes=4", "job.noisy_episodes=2"),
     *("job.hidden=[32]", "job.batches=30", "job.batch_size=64", "job.save_every=10"),
     "gate.success.rate=0.0",
 )
@@ -98,6 +100,28 @@ def test_a_training_goes_on_where_it_was_interrupted(after: int, tmp_path: Path)
     assert run([*REACH, f"job.folder={parts}"]) == 0
     assert same(whole / "last", parts / "last")
     np.testing.assert_allclose(curve(whole)["loss"], curve(parts)["loss"], rtol=1e-5)
+
+
+def test_numbers_that_are_not_finite(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """An episode with one is left out; a network with one is not saved, and ends the training."""
+    (tmp_path / "conf").mkdir()
+    (tmp_path / "faulty.py").write_text(
+        "import torch\n\n\ndef missing(env):\n"
+        "    value = torch.zeros((env.nworld, 2))\n"
+        "    value[env.world == 1] = torch.nan\n"
+        "    return value\n"
+    )
+    faulty = [*REACH, "job.noisy_episodes=0", "+job.observation.policy.terms.x.func=faulty.missing"]
+    out = tmp_path / "left_out"
+    assert run(["--config-dir", str(tmp_path / "conf"), *faulty, f"job.folder={out}"]) == 0
+    assert report(out)["train"]["metrics"]["expert_episodes"] == 3
+    (path,) = (out / "last").glob("*.safetensors")
+    assert all(bool(value.isfinite().all()) for value in load_file(path).values())
+
+    out = tmp_path / "diverged"
+    assert run([*REACH, "job.learning_rate=1e30", f"job.folder={out}"]) == 1
+    assert "weights are not finite after batch 10" in report(out)["train"]["reason"]
+    assert not (out / "last").exists()
 
 
 @pytest.mark.full
@@ -182,7 +206,7 @@ def test_two_cores_train(
     """
     began = time.process_time()
     out = tmp_path / "training"
-    assert run(["job=train", "sim=native", *overrides, f"job.folder={out}"]) == 0
+    assert run(["job=train", "trainer=clone", "sim=native", *overrides, f"job.folder={out}"]) == 0
     assert report(out)["train"]["metrics"]["expert_episodes_played"] == episodes
     assert report(out)["success"]["metrics"]["success_rate"] >= rate
     assert time.process_time() - began < 60.0 * minutes
@@ -262,7 +286,7 @@ def test_a_folder_belongs_to_one_training(tmp_path: Path) -> None:
 
 
 def test_a_task_without_an_expert_has_no_clone() -> None:
-    cfg = load_config(["job=train", "task=reach", "sim=native"])
+    cfg = load_config(["job=train", "trainer=clone", "task=reach", "sim=native"])
     cfg.controller.phases = {}
     with pytest.raises(MjstackError, match=r"task=reach: expected a task with phases.*has no phas"):
         check_train(cfg)

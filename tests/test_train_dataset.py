@@ -27,7 +27,14 @@ from mjstack.train.trainer import observed_widths
 
 REACH = ("task=reach", "sim=native", "nworld=3")
 TRAIN = (
-    *("job=train", *REACH, "job.hidden=[16]", "job.batches=4", "job.batch_size=32"),
+    *(
+        "job=train",
+        "trainer=clone",
+        *REACH,
+        "job.hidden=[16]",
+        "job.batches=4",
+        "job.batch_size=32",
+    ),
     *("job.save_every=2", "gate.success.rate=0.0"),
 )
 

@@ -12,7 +12,7 @@ from test_ppo import REACH as PPO
 
 from mjstack.cli import run
 
-CLONE = ("job=train", "sim=native")
+CLONE = ("job=train", "trainer=clone", "sim=native")
 PIXELS = ("job=train", "trainer=pixels", *SMALL)
 DAGGER = ("job=train", "trainer=dagger", "task=reach", "sim=native")
 BAD: dict[tuple[str, ...], list[tuple[list[str], str]]] = {

@@ -109,12 +109,12 @@ class CloneLearner(Learner):
         self._last = demonstrations.ends[episode] - 1  # steps of their episodes
         share = min(_VALIDATION_SHARE, len(demonstrations.ends))
         validates = episode % _VALIDATION_SHARE == share - 1
-        # A chunk is the expert's own way only where it drove all steps but the last one.
+        # A chunk is the expert's way only where it drove all steps but the last one.
         usable = torch.ones_like(validates)
-        if (own := demonstrations.own) is not None:
-            steps = torch.arange(len(own), device=own.device)
+        if (driven := demonstrations.driven) is not None:
+            steps = torch.arange(len(driven), device=driven.device)
             for ahead in range(self._job.chunk - 1):
-                usable &= own[torch.minimum(steps + ahead, self._last)].bool()
+                usable &= driven[torch.minimum(steps + ahead, self._last)].bool()
         self._training = (usable & ~validates).nonzero()[:, 0]
         self._validation = (usable & validates).nonzero()[:, 0]
 

@@ -29,7 +29,7 @@ from mjstack.train.clone_learner import CloneLearner
 from mjstack.train.demonstrations import Demonstrations, LabelDriver, demonstration_channels
 from mjstack.train.trainer import LAST, Trained, Trainer, earlier_state, with_observation
 
-_TENSORS = ("seen", "labels", "ends", "own")  # of `Demonstrations`, in the file of a round
+_TENSORS = ("seen", "labels", "ends", "driven")  # of `Demonstrations`, in the file of a round
 
 
 class MixedDriver(LabelDriver):
@@ -37,7 +37,7 @@ class MixedDriver(LabelDriver):
     policy drives alone.
 
     Attributes:
-        own: Where the expert drives this step, shape ``(nworld,)``, int8.
+        driven: Where the expert drives this step, shape ``(nworld,)``, int8.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class MixedDriver(LabelDriver):
         self._policy = policy
         self._beta = beta
         self._spell = spell
-        self.own = torch.ones(env.nworld, dtype=torch.int8, device=env.device)
+        self.driven = torch.ones(env.nworld, dtype=torch.int8, device=env.device)
         self._alone = torch.arange(env.nworld, device=env.device) < alone
 
     def command(self) -> Tensor:
@@ -76,13 +76,13 @@ class MixedDriver(LabelDriver):
         spell = torch.div(self._env.episode_step, self._spell, rounding_mode="floor")
         draw = random_uniform(self._env, "train.driver", 1, 0.0, 1.0, step=spell)
         drives = (draw < self._beta) & ~self._alone[:, None]
-        self.own.copy_(drives[:, 0])
+        self.driven.copy_(drives[:, 0])
         return torch.where(drives, self.label, action)
 
 
-def _read_own(env: Env, driver: Driver) -> Read:
-    own = cast(MixedDriver, driver).own
-    return lambda: {"own": own}
+def _read_driven(env: Env, driver: Driver) -> Read:
+    driven = cast(MixedDriver, driver).driven
+    return lambda: {"driven": driven}
 
 
 class RoundLearner(CloneLearner):
@@ -192,8 +192,14 @@ def _round(
     if not path.exists():
         write_state(path, *_play_round(stage, policy, number))
     tensors, facts = read_state(path)
-    seen, labels, ends, own = (tensors[name].to(stage.backend[1]) for name in _TENSORS)
-    part = Demonstrations(seen=seen, labels=labels, ends=ends, own=own, widths=facts["widths"])
+    parts = {name: tensors[name].to(stage.backend[1]) for name in _TENSORS}
+    part = Demonstrations(
+        seen=parts["seen"],
+        labels=parts["labels"],
+        ends=parts["ends"],
+        driven=parts["driven"],
+        widths=facts["widths"],
+    )
     return part, facts["success"]
 
 
@@ -227,7 +233,7 @@ def _play_round(
     for batch in play_batches(
         stage,
         [BatchPlan(seed, range(nworld)) for seed in range(first, first + batches)],
-        [*demonstration_channels(job), Channels(_read_own)],
+        [*demonstration_channels(job), Channels(_read_driven)],
         cfg=with_observation(stage.driven(cfg.reset)),
         driver=drive,
         label=f"steps of round {number} of {job.rounds}",

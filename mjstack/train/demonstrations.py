@@ -97,8 +97,8 @@ class Demonstrations:
         labels: The expert's joint targets, shape ``(steps of all episodes, nu)``.
         ends: The step after the last one of each episode, shape ``(episodes,)``, int64.
         widths: Numbers of each term of the observation, in order.
-        own: Where the expert drove the step itself, shape ``(steps of all episodes,)``, int8; None
-            if it drove all of them.
+        driven: Where the expert drove the step, shape ``(steps of all episodes,)``, int8; None if
+            it drove all of them.
         played: Episodes that were played, successful or not.
         source: Where they come from, in words.
         qpos: Positions before each step, from which images are drawn, shape ``(steps of all
@@ -110,7 +110,7 @@ class Demonstrations:
     labels: Tensor
     ends: Tensor
     widths: dict[str, int]
-    own: Tensor | None = None
+    driven: Tensor | None = None
     played: int = 0
     source: str = ""
     qpos: Tensor | None = None
@@ -129,7 +129,7 @@ class Demonstrations:
             labels=labels.flatten(0, 1),
             ends=steps * torch.arange(1, len(worlds) + 1, device=worlds.device),
             widths=batch.env.observation_manager.term_dims[job.group],
-            own=before.get("own"),
+            driven=before.get("driven"),
             qpos=before.get("qpos"),
             fields={name: fields[name][worlds] for name in fields},
         )
@@ -141,13 +141,13 @@ class Demonstrations:
         """The episodes of all parts, in their order."""
         first = [0, *itertools.accumulate(len(part.seen) for part in parts)]
         states = [part.qpos for part in parts if part.qpos is not None]
-        own = [part.own for part in parts if part.own is not None]
+        driven = [part.driven for part in parts if part.driven is not None]
         return cls(
             seen=torch.cat([part.seen for part in parts]),
             labels=torch.cat([part.labels for part in parts]),
             ends=torch.cat([part.ends + at for part, at in zip(parts, first, strict=False)]),
             widths=parts[0].widths,
-            own=torch.cat(own) if own else None,
+            driven=torch.cat(driven) if driven else None,
             played=played,
             source=source,
             qpos=torch.cat(states) if states else None,
@@ -197,7 +197,7 @@ def batches_of(job: CloneJobCfg, nworld: int) -> list[tuple[int, float]]:
 
 def play_expert(stage: Stage) -> Demonstrations:
     """Play the configured expert, each rank in its worlds, and keep the episodes that the task's
-    check accepts.
+    check accepts and whose observations are finite.
     """
     cfg = stage.cfg
     job = cast(CloneJobCfg, cfg.job)
@@ -216,7 +216,7 @@ def play_expert(stage: Stage) -> Demonstrations:
     ):
         count, noise = batches[batch.plan.seed]
         counted = range(worlds.start, min(worlds.stop, count))
-        accepted = batch.succeeded[: len(counted)].nonzero()[:, 0]
+        accepted = (batch.succeeded & batch.finite())[: len(counted)].nonzero()[:, 0]
         parts.append(Demonstrations.of(batch, accepted, job))
         played += len(counted)
         condition = f"noise of {noise:g} rad" if noise else "no noise"

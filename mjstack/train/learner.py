@@ -15,6 +15,7 @@ from torch.optim import Optimizer
 
 from mjstack.config.schema import Config
 from mjstack.episodes.stage import Stage
+from mjstack.errors import MjstackError
 from mjstack.interrupt import check_interrupt
 from mjstack.policy import Policy, save_policy
 from mjstack.policy.checkpoint import write_state
@@ -126,6 +127,12 @@ class Learner(ABC):
     def _save(self, **figures: Any) -> None:
         """Add a row to the curve, with figures in front of it, and write policies and state."""
         row = figures | self._new_row()
+        if not all(bool(value.isfinite().all()) for value in self._networks.parameters()):
+            raise MjstackError(
+                f"train: the network's weights are not finite after {self.step} {self.done};"
+                f" {self._folder} keeps what was saved before",
+                "Lower job.learning_rate, or look at observations and rewards",
+            )
         best = all(self.score(row) >= self.score(earlier) for earlier in self.curve)
         self.curve.append(row)
         # JSON has no NaN
