@@ -7,6 +7,7 @@ import itertools
 import json
 import os
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -18,13 +19,15 @@ import numpy as np
 import mjstack
 from mjstack.errors import FolderError, MjstackError, first_line
 
+_MOST_TEXT = 2**26  # bytes of JSON or YAML
+_MOST_BYTES = 2**34  # of any other file
 _KEY = "hydra.run.dir (job=collect, job=train: job.folder)"
 
 
 @contextmanager
 def reading(path: Path, fix: str) -> Iterator[None]:
-    """Raise one line for a file that is missing or damaged: one of a run's folder, which may be a
-    stranger's, can hold anything.
+    """Raise one line for a file that is missing, damaged or none at all, as of `check_regular`: one
+    of a run's folder, which may be a stranger's, can hold anything.
 
     Args:
         path: The file that is read inside.
@@ -34,6 +37,7 @@ def reading(path: Path, fix: str) -> Iterator[None]:
         MjstackError: Something went wrong inside.
     """
     try:
+        check_regular(path)
         yield
     except MjstackError:
         raise
@@ -43,6 +47,21 @@ def reading(path: Path, fix: str) -> Iterator[None]:
         raise FolderError(
             f"{path}: cannot be read ({reason}), expected it as written", fix
         ) from error
+
+
+def check_regular(path: Path) -> None:
+    """Check, before anything reads it, that a file ends: a stranger's may be a pipe or a device.
+
+    Raises:
+        OSError: There is no such file.
+        ValueError: It is no regular file, or far larger than any that is written.
+    """
+    status = path.stat()
+    if not stat.S_ISREG(status.st_mode):
+        raise ValueError("it is no regular file")
+    most = _MOST_TEXT if path.suffix in (".json", ".yaml") else _MOST_BYTES
+    if status.st_size > most:
+        raise ValueError(f"it has {status.st_size} bytes, more than {most}")
 
 
 def write_atomic(path: Path, content: str | bytes) -> None:
@@ -201,6 +220,7 @@ def check_unused(folder: Path, job: str = "", *, marker: str = "", key: str = _K
     if not used or (marker and (folder / marker).is_file()):
         return
     with suppress(OSError, ValueError, KeyError, TypeError):
+        check_regular(folder / "report.json")
         if job and json.loads((folder / "report.json").read_text())["resumes"] == job:
             return
     raise FolderError(
@@ -215,6 +235,7 @@ def made_by(folder: Path) -> str:
     """
     for report in (folder / "report.json", *sorted(folder.glob("*/report.json"))):
         with suppress(OSError, ValueError, LookupError, TypeError, RecursionError):
+            check_regular(report)
             version = json.loads(report.read_text())["provenance"]["versions"]["mjstack"]
             return "" if version == mjstack.__version__ else f" of mjstack {str(version)[:40]}"
     return ""
@@ -270,6 +291,7 @@ def read_inside(path: Path, most: int) -> bytes:
     """The content of a file inside its folder, if it is not larger than ``most`` bytes."""
     if path.resolve().parent != path.parent.resolve():
         raise ValueError("it is a link that leads out of the folder")
+    check_regular(path)
     size = path.stat().st_size
     if size > most:
         raise ValueError(f"it has {size} bytes, more than {most}")

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import pkgutil
 import shutil
+import signal
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -21,12 +23,15 @@ from omegaconf import OmegaConf
 from policies import write_policy
 
 import mjstack
+from mjstack import make_env
 from mjstack.cli import run
+from mjstack.config.fingerprint import config_content
 from mjstack.config.session import check_term, is_own, search_path
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.errors import MjstackError
 from mjstack.jobs import check_job
 from mjstack.policy import load_policy
+from mjstack.policy.checkpoint import read_state
 from mjstack.process import Child
 
 ROOT = Path(__file__).parents[1]
@@ -283,6 +288,68 @@ def test_aliases_are_refused_at_once(stranger: Path) -> None:
     assert "(YAMLError: an alias)" in refused(lambda: replay(stranger))
 
 
+@pytest.fixture
+def soon() -> Iterator[None]:
+    """Waiting for a pipe or a device without end is an error."""
+
+    def stop(*_: object) -> None:
+        raise TimeoutError
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(20)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.usefixtures("soon")
+@pytest.mark.parametrize("kind", ["pipe", "device"])
+def test_only_regular_files_are_read(kind: str, stranger: Path) -> None:
+    def swap(path: Path) -> Path:
+        path.unlink(missing_ok=True)
+        os.mkfifo(path) if kind == "pipe" else path.symlink_to("/dev/zero")
+        return path
+
+    folder = write_policy(stranger.parent / "policy", load_config(["sim=native"]))
+    swap(next(folder.glob("weights-*")))
+    assert "it is no regular file" in refused(lambda: load_policy(folder))
+    for name in ("worlds_seed0.npz", ".hydra/hydra.yaml"):
+        swap(stranger / name)
+        if name == "worlds_seed0.npz":
+            assert "it is no regular file" in refused(lambda: replay(stranger))
+        else:
+            edit(stranger, "task.check.func", "os.system")
+            assert "add --config-dir DIR." in refused(lambda: replay(stranger))
+    state = swap(stranger / "training.safetensors")
+    assert "it is no regular file" in refused(lambda: read_state(state))
+    starts = swap(stranger / "starts.npz")
+    overrides = ["reset=starts_file", f"starts={starts}", "sim=native", "nworld=1"]
+    assert f"starts={starts}" in refused(lambda: make_env(overrides))
+    assert "it is no regular file" in refused(lambda: content(starts))
+
+
+def content(starts: Path) -> object:
+    """What a starts file counts as."""
+    return config_content(load_config(["reset=starts_file", f"starts={starts}"]))
+
+
+@pytest.mark.usefixtures("soon")
+def test_a_policy_cannot_claim_more_than_it_is(tmp_path: Path) -> None:
+    """Neither thousands of terms, nor weights that are a hole of gigabytes."""
+    folder = write_policy(tmp_path / "policy", load_config(["sim=native"]))
+    path = folder / "policy.json"
+    facts = path.read_text()
+    many = json.loads(facts)
+    terms = many["observation"]["terms"]
+    terms.update({f"x{n}": next(iter(terms.values())) for n in range(20_000)})
+    many["observation"]["widths"] = dict.fromkeys(terms, 1)
+    path.write_text(json.dumps(many))
+    assert "terms, expected at most 100" in refused(lambda: load_policy(folder))
+    path.write_text(facts)
+    os.truncate(next(folder.glob("weights-*")), 2**32)
+    assert "it has 4294967296 bytes" in refused(lambda: load_policy(folder))
+
+
 def damage_record(**changes: Any) -> Callable[[Path], object]:
     def apply(folder: Path) -> None:
         path = folder / "worlds_seed0.npz"
@@ -344,13 +411,13 @@ def test_no_control_character_reaches_the_terminal(
     stranger: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     report = json.loads((stranger / "report.json").read_text())
-    report["provenance"]["git_commit"] = "\x1b]0;PWNED\x07\x9b2J"
+    report["provenance"]["git_commit"] = "\x1b]0;PWNED\x07\x9b2J\u202e\u2066"
     (stranger / "report.json").write_text(json.dumps(report))
     edit(stranger, "robot.title", "\x1b[8m[/]")
     assert run(["job=replay", f"run={stranger}", "world=1", "hydra.run.dir=out"]) in (0, 1)
     told = "".join(capsys.readouterr())
     assert "commit was ]0;PWNED2J in that run" in " ".join(told.split())
-    assert not {"\x1b", "\x07", "\x9b"} & set(told)
+    assert not {"\x1b", "\x07", "\x9b", "\u202e", "\u2066"} & set(told)
     edit(stranger, "robot.title", 3)
     edit(stranger, "controller.action.arm.func", "os.\x1b[8m")
     assert run(["job=replay", f"run={stranger}", "world=1"]) == 2

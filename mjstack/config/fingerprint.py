@@ -13,6 +13,7 @@ from mjstack.config.check import reads_starts_file
 from mjstack.config.schema import Config
 from mjstack.config.session import list_items
 from mjstack.errors import ConfigError
+from mjstack.files import check_regular
 
 CONTENT = "sha256:"  # in front of what stands for a file
 _OF_THE_CALL = ("resume", "devices", "sweep", "web")  # they change no result
@@ -74,6 +75,8 @@ def differences(earlier: Mapping[str, Any], current: Mapping[str, Any]) -> str:
 
 def _content(key: str, path: str) -> str:
     try:
+        check_regular(Path(path))
         return CONTENT + hashlib.sha256(Path(path).read_bytes()).hexdigest()
-    except OSError as error:
-        raise ConfigError(key, path, f"a file that can be read ({error.strerror})") from error
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", error)
+        raise ConfigError(key, path, f"a file that can be read ({reason})") from error

@@ -33,6 +33,7 @@ from typing_extensions import override
 
 from mjstack.config.functions import find_object
 from mjstack.errors import MjstackError
+from mjstack.files import check_regular
 
 _PACKAGE_FOLDER = Path(__file__).parents[1]
 # In a checkout the configuration lies beside the package, in a wheel inside of it.
@@ -118,6 +119,7 @@ def read_yaml(path: Path) -> Any:
     Raises:
         Exception: It cannot be read, or has aliases: a few stand for any number of values.
     """
+    check_regular(path)
     text = path.read_text()
     # libyaml, where PyYAML has it: the other parser takes minutes for brackets nested very deep.
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)

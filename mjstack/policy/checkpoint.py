@@ -36,6 +36,7 @@ _NAME_ANOTHER = "Name a policy that job=train has written, such as outputs/mine/
 _MOST_WEIGHTS = 2**32  # bytes
 _MOST_COUNT = 1_000_000
 _MOST_LAYERS = 100
+_MOST_TERMS = 100
 _MOST_PIXELS = 4096  # along a side
 _MOST_STEPS = 1000  # control steps between two queries
 
@@ -218,7 +219,8 @@ def load_policy(folder: Path) -> Policy:
             raise ValueError("weights_sha256 is no SHA-256")
     weights = folder / _weights_name(digest)
     with reading(weights, "Copy the whole folder again, or train the policy again"):
-        content = read_inside(weights, _MOST_WEIGHTS)
+        numbers = sum(value.numel() for value in policy.network.state_dict().values())
+        content = read_inside(weights, min(4 * numbers + 2**20, _MOST_WEIGHTS))  # and names
         if sha256(content).hexdigest() != digest:
             raise ValueError(f"its content is not that of {POLICY_FILE}")
         tensors = load(content)
@@ -307,6 +309,8 @@ def _read_group(seen: Mapping[str, Any], path: Path) -> ObservationGroupCfg:
 
 def _read_terms(key: str, nodes: Mapping[str, Any], model: type, path: Path) -> dict[str, Any]:
     """Terms of a policy's file at a dotted key, which it may name."""
+    if len(nodes) > _MOST_TERMS:
+        raise ValueError(f"{key} has {len(nodes)} terms, expected at most {_MOST_TERMS}")
     kind = "action term" if model is TermCfg else "observation term"
     terms = {}
     for name, node in nodes.items():

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mjstack.config.fields import Count, Fraction
 from mjstack.errors import ParameterError, first_line
-from mjstack.files import write_npz
+from mjstack.files import check_regular, write_npz
 from mjstack.managers.view import EnvView, offers, random_uniform, rows_of
 
 STATE = ("qpos", "qvel", "act", "ctrl")
@@ -54,6 +54,7 @@ class ExpertStates:
             expected = "a file of states, which job=train trainer=ppo records in its folder"
             raise ParameterError("path", None, expected)
         try:
+            check_regular(Path(path))
             with np.load(path, allow_pickle=False) as file:
                 tensors = {name: torch.from_numpy(file[name]) for name in file.files}
             self._source = tensors[EPISODE].to(env.device)
