@@ -30,14 +30,17 @@ def reading(path: Path, fix: str) -> Iterator[None]:
     of a run's folder, which may be a stranger's, can hold anything.
 
     Args:
-        path: The file that is read inside.
+        path: The file that is read inside, or a folder of files.
         fix: What to do about it, a sentence without its full stop.
 
     Raises:
         MjstackError: Something went wrong inside.
     """
     try:
-        check_regular(path)
+        files = path.rglob("*") if path.is_dir() else [path]
+        for file in files:
+            if not file.is_dir():
+                check_regular(file)
         yield
     except MjstackError:
         raise

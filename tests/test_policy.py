@@ -376,7 +376,7 @@ STRANGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "a list": (lambda f: (f / "policy.json").write_text("[]"), "cannot be read (TypeError"),
     "deep": (lambda f: (f / "policy.json").write_text("[" * 100_000), "(RecursionError"),
     "bytes": (lambda f: (f / "policy.json").write_bytes(b"\xff\x00" * 99), "(JSONDecodeError"),
-    "large": (lambda f: os.truncate(f / "policy.json", 2**40), "more than 16777216"),
+    "large": (lambda f: os.truncate(f / "policy.json", 2**40), "more than 67108864"),
     "text": (change("action", "chunk", value="6"), "action.chunk is '6', not a"),
     "a fraction": (change("action", "execute", value=4.0), "execute is 4.0, not"),
     "long": (change("action", "execute", value=1001), "from 1 to 1000"),
