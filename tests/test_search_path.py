@@ -15,7 +15,7 @@ import mjstack
 from mjstack.cli import run
 from mjstack.config import load_config
 from mjstack.config.load import load_saved
-from mjstack.config.session import check_term, is_own, search_path, search_path_args
+from mjstack.config.session import check_term, in_search_path, search_path, search_path_args
 from mjstack.errors import MjstackError
 
 TASK = """# @package _global_
@@ -228,6 +228,6 @@ def test_only_modules_beside_the_folder_are_trusted(
 ) -> None:
     monkeypatch.chdir(lean.parent)  # a built-in module has no file: it is not beside the folder
     with search_path([lean]):
-        assert is_own("lean.height", Path("config.yaml"))
+        assert in_search_path("lean.height", Path("config.yaml"))
         for name in ("os.system", "sys.exit", "shutil.rmtree", "nowhere.at_all"):
-            assert not is_own(name, Path("config.yaml")), name
+            assert not in_search_path(name, Path("config.yaml")), name

@@ -26,7 +26,7 @@ import mjstack
 from mjstack import make_env
 from mjstack.cli import run
 from mjstack.config.fingerprint import config_content
-from mjstack.config.session import check_term, is_own, search_path
+from mjstack.config.session import check_term, in_search_path, search_path
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.errors import MjstackError
 from mjstack.jobs import check_job
@@ -205,7 +205,7 @@ def test_no_module_of_the_folder_is_imported(
     edit(stranger, key, {"func": "beside.rmtree" if given == "beside" else "stranger.payload.X"})
     with search_path(["conf"] if given else []):
         found = refused(lambda: replay(stranger))
-        assert not given or is_own("beside.X", stranger)
+        assert not given or in_search_path("beside.X", stranger)
     assert f"{key}.func=" in found
     assert "stranger.payload" not in sys.modules
 
@@ -234,7 +234,7 @@ def test_a_package_that_the_folder_lies_in_is_not_trusted(
         sys.path.insert(0, str(Path.cwd()))
     sys.path.insert(0, str(home.resolve()))
     with search_path([str(home / "conf")]):
-        assert not is_own("outputs.run.payload.f", saved)
+        assert not in_search_path("outputs.run.payload.f", saved)
 
 
 @pytest.mark.full

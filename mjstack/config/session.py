@@ -171,10 +171,10 @@ def check_term(label: str, dotted: str, kind: str, saved: Path) -> None:
     """
     installed = {"mjstack", *(name.partition(".")[0] for name in _registered())}
     # A module runs when it is imported, and imports others' functions too.
-    if dotted.partition(".")[0] in installed or is_own(dotted, saved):
+    if dotted.partition(".")[0] in installed or in_search_path(dotted, saved):
         func = find_object(label, dotted)
         home = str(getattr(func, "__module__", ""))
-        if getattr(func, "term_kind", "") == kind or is_own(home, saved):
+        if getattr(func, "term_kind", "") == kind or in_search_path(home, saved):
             return
     raise MjstackError(
         f"{label}.func={dotted}: expected one of the {kind}s of mjstack, of a package registered"
@@ -182,7 +182,7 @@ def check_term(label: str, dotted: str, kind: str, saved: Path) -> None:
     )
 
 
-def is_own(dotted: str, saved: Path) -> bool:
+def in_search_path(dotted: str, saved: Path) -> bool:
     """Whether a function or module lies beside a folder of the search path.
 
     Args:

@@ -202,7 +202,7 @@ def start_server(host: str, port: int, token: str = "") -> Any:
         host: Address.
         port: 0 is any that is free. Ask `check_address` of others: where one is in use, viser tries
             the next ones and then hangs.
-        token: In the address of the page, ``/?token=...``; nobody knows one that is empty.
+        token: In the address of the page, ``/?token=...``. Empty: a random one.
 
     Raises:
         MjstackError: This viser opens its websockets in another way than the known one.

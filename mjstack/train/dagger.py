@@ -192,14 +192,9 @@ def _round(
     if not path.exists():
         write_state(path, *_play_round(stage, policy, number))
     tensors, facts = read_state(path)
-    parts = {name: tensors[name].to(stage.backend[1]) for name in _TENSORS}
-    part = Demonstrations(
-        seen=parts["seen"],
-        labels=parts["labels"],
-        ends=parts["ends"],
-        driven=parts["driven"],
-        widths=facts["widths"],
-    )
+    seen, labels, ends, driven = (tensors[name].to(stage.backend[1]) for name in _TENSORS)
+    widths = facts["widths"]
+    part = Demonstrations(seen=seen, labels=labels, ends=ends, driven=driven, widths=widths)
     return part, facts["success"]
 
 
