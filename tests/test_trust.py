@@ -145,9 +145,10 @@ def test_a_policy_names_terms_alone(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", [n for n in DOERS if not n.endswith(("ExpertStates", "Runner"))])
-def test_a_run_names_terms_alone(name: str, stranger: Path) -> None:
-    edit(stranger, "reset.evil", {"func": name, "params": DOERS[name]})
-    assert f"reset.evil.func={name}: expected" in refused(lambda: replay(stranger))
+@pytest.mark.parametrize("term", ["evil", "evil-2"])
+def test_a_run_names_terms_alone(name: str, term: str, stranger: Path) -> None:
+    edit(stranger, f"reset.{term}", {"func": name, "params": DOERS[name]})
+    assert f"reset.{term}.func={name}: expected" in refused(lambda: replay(stranger))
 
 
 def test_each_kind_of_term_is_listed(tmp_path: Path) -> None:
