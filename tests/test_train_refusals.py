@@ -66,7 +66,7 @@ BAD: dict[tuple[str, ...], list[tuple[list[str], str]]] = {
         (["job.dataset=outputs/demos"], "expected null, because images are drawn"),
     ],
     DAGGER: [
-        (["controller=closed_loop"], "controller=closed_loop: expected state_based, because"),
+        (["controller=closed_loop"], "Set trainer=clone, which learns from any expert"),
         (["job.dataset=outputs"], "job.dataset=outputs: expected null"),
         (["job.rounds=0"], "job.rounds=0"),
         (["job.episodes=1"], "job.episodes=1: expected at least 2"),

@@ -117,7 +117,8 @@ def check_dagger(stage: Stage) -> range:
     job = cast(DaggerJobCfg, cfg.job)
     if cfg.controller.name != STATE_BASED:
         expected = "state_based, because trainer=dagger asks the expert in the policy's states"
-        raise ConfigError("controller", cfg.controller.name, expected)
+        fix = "Set trainer=clone, which learns from any expert, or controller=state_based"
+        raise ConfigError("controller", cfg.controller.name, expected, fix)
     if job.vision.cameras:
         expected = "[], because trainer=dagger learns from numbers"
         raise ConfigError("job.vision.cameras", job.vision.cameras, expected, "Set trainer=pixels")
