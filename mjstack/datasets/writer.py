@@ -170,10 +170,10 @@ class DatasetWriter:
             check_same(self.folder, info, self.spec)
             self._tasks = {task: index for index, task in enumerate(read_tasks(self.folder, info))}
             self._provenance = info["mjstack"]["provenance"]
-            rows = read_rows(self.folder, info)
-            with readable(self.folder / "meta/episodes"):
-                for row in rows:
-                    self._count(row)
+            if rows := read_rows(self.folder, info):  # else there are no files of them
+                with readable(self.folder / "meta/episodes"):
+                    for row in rows:
+                        self._count(row)
             self._shards = info["mjstack"]["shards"]
         for path in uncommitted(self.folder, self._shards):
             path.unlink()

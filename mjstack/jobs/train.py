@@ -53,10 +53,10 @@ def check_train(cfg: Config) -> CheckedJob:
     if not isinstance(trainer, Trainer):
         raise ConfigError("job.trainer", job.trainer, "a mjstack.train.trainer.Trainer")
     stage = Stage(cfg)
+    used = trainer.check(stage)  # first: it starts neither Warp nor an expert
     reset = whole_starts(cfg.reset) if trainer.midway else cfg.reset
     check_task(stage.with_config(replace(cfg, reset=reset)))
     check_showing(cfg)
-    used = trainer.check(stage)
     tested = range(job.test_seed, job.test_seed + cfg.gate.success.seeds)
     if used.start < tested.stop and tested.start < used.stop:
         expected = f"seeds that training does not use, which are {used.start} to {used.stop - 1}"
