@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+import sys
+from types import FrameType
 from typing import Any
 
 import pytest
@@ -18,7 +21,7 @@ from mjstack.managers import (
     RewardManager,
     TerminationManager,
 )
-from mjstack.managers.term import Term, shared, step_cache
+from mjstack.managers.term import Term, in_one_pass, shared
 from mjstack.scene import SceneIndex
 from mjstack.scene.index import Columns
 
@@ -193,14 +196,51 @@ def test_a_branch_knows_what_came_before_it_and_keeps_the_rest() -> None:
     def value(name: str) -> torch.Tensor:
         return shared(name, lambda: torch.zeros(1))
 
-    with step_cache():
+    def work() -> torch.Tensor:
         before = value("before")
-        with step_cache():
-            assert value("before") is before
-            first = value("within")
-        with step_cache():
-            assert value("within") is not first
-    assert value("before") is not before
+        assert in_one_pass(lambda: value("before")) is before
+        first, second = (in_one_pass(lambda: value("within")) for _ in range(2))
+        assert first is not second
+        return before
+
+    assert value("before") is not in_one_pass(work)
+
+
+def test_an_interrupt_at_any_moment_leaves_no_values_behind() -> None:
+    """KeyboardInterrupt at every call, line and return of a pass in a pass: what is computed after
+    it is new.
+    """
+
+    def value() -> torch.Tensor:
+        return shared("a", lambda: torch.zeros(1))
+
+    def work() -> torch.Tensor:
+        value()
+        return in_one_pass(value)
+
+    def interrupt(frame: FrameType, event: str, argument: object) -> object:
+        nonlocal left
+        left -= 1
+        if left == 0:
+            raise KeyboardInterrupt
+        return interrupt
+
+    for moment in itertools.count(1):
+        left = moment
+        before = sys.gettrace()
+        sys.settrace(interrupt)
+        try:
+            in_one_pass(work)
+        except KeyboardInterrupt as error:
+            kept = error  # its traceback keeps what was cut short, as a notebook does
+        else:
+            break
+        finally:
+            sys.settrace(before)
+        assert value() is not value()
+        del kept
+        assert value() is not value()
+    assert moment > 20
 
 
 def test_terms_with_parameters_are_built_once() -> None:

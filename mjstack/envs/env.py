@@ -1,6 +1,7 @@
 """The environment: one step order over any simulation."""
 
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -16,7 +17,7 @@ from mjstack.errors import ArgumentError
 from mjstack.managers.action import ActionManager
 from mjstack.managers.episode import ResetManager, RewardManager, TerminationManager
 from mjstack.managers.observation import ObservationManager
-from mjstack.managers.term import Term, current_term, first_value, step_cache
+from mjstack.managers.term import Term, current_term, first_value, in_one_pass
 from mjstack.mdp.geometry import lost_state
 from mjstack.rng import check_seed
 from mjstack.scene import SceneIndex
@@ -287,16 +288,7 @@ class Env:
         """
         self.episode_step += 1 if ended is None else ~ended
 
-        def reward() -> None:
-            with step_cache():
-                self.termination_manager.compute(ended)
-                self.reward_manager.compute(void=broken, ended=ended)
-
-        def observe() -> None:
-            with step_cache():
-                self.observation_manager.compute()
-
-        with step_cache():  # both branches go on with what success has computed
+        def look() -> tuple[Tensor, Tensor | None]:
             lost = lost_state(self)
             # None where the host can see that there are none
             broken = lost if lost.is_cuda or bool(lost.any()) else None
@@ -305,9 +297,19 @@ class Env:
                 if ended is not None:  # their success stays
                     achieved = torch.where(ended, self.success, achieved)
                 self.success.copy_(achieved if broken is None else achieved & ~broken)
+
+            def reward() -> None:
+                self.termination_manager.compute(ended)
+                self.reward_manager.compute(void=broken, ended=ended)
+
             # A held step is seen by what remembers it alone.
             observes = last or self.observation_manager.remembers
-            side_by_side(self.device, reward, *([observe] if observes else []))
+            works = (reward, self.observation_manager.compute) if observes else (reward,)
+            # Both branches go on with what success has computed.
+            side_by_side(self.device, *(partial(in_one_pass, work) for work in works))
+            return lost, broken
+
+        lost, broken = in_one_pass(look)
         current_term.label = ""
         self.faults.look(lost, broken)
         ends = self.termination_manager
@@ -343,8 +345,7 @@ class Env:
         if ending:
             self._start_worlds(done)
             self._reset_managers(done)
-            with step_cache():
-                self.observation_manager.refresh(done)
+            in_one_pass(partial(self.observation_manager.refresh, done))
         elif broken is not None:
             self._outputs.restore_observations()
 

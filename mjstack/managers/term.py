@@ -4,9 +4,10 @@ import inspect
 import io
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar, copy_context
 from functools import partial
 from types import UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import torch
 from rich.console import Console
@@ -18,6 +19,8 @@ from mjstack.config.schema import TermCfg
 from mjstack.errors import ConfigError, MjstackError, ParameterError, TermError, first_line, suggest
 from mjstack.managers.view import EnvView
 from mjstack.math import describe_tensor
+
+Result = TypeVar("Result")
 
 _WORDS = {float: "a number", int: "an integer", bool: "true or false", str: "a name"}
 _WORDS |= {type(None): "null"}
@@ -108,29 +111,44 @@ class CurrentTerm:
     Attributes:
         label: Dotted configuration key of the term that was called last: the one to name if a
             capture fails.
-        values: Values computed from the state that a pass looks at, by function and environment;
-            None outside a pass.
     """
 
     label = ""
-    values: dict[Any, torch.Tensor] | None = None
 
 
 current_term = CurrentTerm()
 
+# Values computed from the state that a pass looks at, by function and environment; None outside.
+_pass_values: ContextVar[dict[Any, Any] | None] = ContextVar("_pass_values", default=None)
 
-@contextmanager
-def step_cache() -> Iterator[None]:
-    """While nothing changes the state: what two terms have in common is computed once. An inner one
-    knows what the outer one has computed so far, and keeps the rest to itself, because it may be
-    a branch of a captured graph.
+
+def in_one_pass(work: Callable[[], Result]) -> Result:
+    """Do work that does not change the state: a value that several terms need is computed once.
+
+    An inner pass knows what the outer one has computed so far, and keeps the rest to itself,
+    because it may be a branch of a captured graph. The values belong to a context, which Python
+    leaves however the work ends: a ``finally`` clause that Ctrl-C cuts short would leave old values
+    to every later step of the process.
+
+    Args:
+        work: What to do.
+
+    Returns:
+        The result of the work.
     """
-    outer = current_term.values
-    current_term.values = dict(outer or {})
-    try:
-        yield
-    finally:
-        current_term.values = outer
+    values = dict(_pass_values.get() or {})
+
+    def do() -> Result:
+        _pass_values.set(values)
+        return work()
+
+    return copy_context().run(do)
+
+
+def known_values() -> dict[Any, Any]:
+    """What the current pass has computed, to read and to add to; outside a pass a new dict."""
+    values = _pass_values.get()
+    return {} if values is None else values
 
 
 def shared(key: Any, compute: Callable[[], torch.Tensor]) -> torch.Tensor:
@@ -140,11 +158,10 @@ def shared(key: Any, compute: Callable[[], torch.Tensor]) -> torch.Tensor:
         key: What it is, the environment included.
         compute: Computes it.
     """
-    if current_term.values is None:
-        return compute()
-    if key not in current_term.values:
-        current_term.values[key] = compute()
-    return current_term.values[key]
+    values = known_values()
+    if key not in values:
+        values[key] = compute()
+    return values[key]
 
 
 class Term:

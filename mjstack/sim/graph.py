@@ -252,7 +252,7 @@ class Scratch:
         self._free[self._owner[ptr], size].append(ptr)
 
 
-def side_by_side(device: torch.device, *works: Callable[[], None]) -> None:
+def side_by_side(device: torch.device, *works: Callable[[], object]) -> None:
     """Do independent works: in a CUDA graph that is being captured as parallel branches, else one
     after the other.
 

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mjstack.managers.term import current_term
+from mjstack.managers.term import known_values
 from mjstack.managers.view import EnvView
 from mjstack.math import lowest_point, quat_to_matrix
 from mjstack.mdp.geometry import LOADED, gripper_opening, pose_w
@@ -161,7 +161,7 @@ class Step:
         self.view = view
         # What is known of this state, see `once_per_step`; within a pass of an environment's terms
         # all of them share it.
-        self.known: dict[Any, Any] = {} if current_term.values is None else current_term.values
+        self.known = known_values()
         self._phase = phase
 
     @step_value
