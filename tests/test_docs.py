@@ -120,6 +120,7 @@ def compose_together(commands: list[dict[str, str]]) -> None:
         compose_together(commands[half:])
 
 
+@pytest.mark.full
 def test_the_task_of_the_guide_passes_its_gates(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -197,6 +197,7 @@ def test_the_recorder_takes_frames_from_the_start_on(
     assert np.array_equal(recorded[:, 1:], ends)
 
 
+@pytest.mark.full
 def test_without_viser_a_run_says_how_to_have_the_page(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -214,6 +215,7 @@ def labels_of(path: Path) -> list[str]:
     return [m["props"]["text"] for _, m in messages(path) if m["type"] == "LabelMessage"]
 
 
+@pytest.mark.full
 def test_a_resumed_run_shows_the_worlds_that_it_reads_back(tmp_path: Path) -> None:
     """Baseline plays anew, and the page still has the batch, poses and all."""
     args = ["sim=native", "gates=[baseline,batch]", "nworld=3", *one_second_episode()]

@@ -57,7 +57,7 @@ def play_gates(example: str, robot: str, folder: Path, *overrides: str) -> dict[
         ("tower", "so101", "batch"),
         pytest.param("tower", "rebot", "baseline,parity,batch", marks=pytest.mark.full),
         ("push", "so101", "baseline,batch"),
-        ("push", "rebot", "baseline,parity,batch"),
+        pytest.param("push", "rebot", "baseline,parity,batch", marks=pytest.mark.full),
         ("scara", "scara", "baseline,batch,success"),
     ],
 )
@@ -72,6 +72,7 @@ def test_the_gates_pass(example: str, robot: str, gates: str, tmp_path: Path) ->
         assert compared == {"before_contact", "in_contact", "at_end"}
 
 
+@pytest.mark.full
 def test_a_dataset_and_a_replay(tmp_path: Path) -> None:
     flags = arguments("push", "so101")
     out = tmp_path / "out"

@@ -150,8 +150,12 @@ def solved_alike(worlds: Worlds) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize(
     ("cone", "condim", "boxes"),
     [
-        *(("elliptic", 1, 2), ("elliptic", 3, 2), ("elliptic", 4, 5), ("elliptic", 6, 8)),
-        *(("pyramidal", 3, 3), ("pyramidal", 6, 5)),
+        ("elliptic", 1, 2),
+        pytest.param("elliptic", 3, 2, marks=pytest.mark.full),
+        pytest.param("elliptic", 4, 5, marks=pytest.mark.full),
+        pytest.param("elliptic", 6, 8, marks=pytest.mark.full),
+        ("pyramidal", 3, 3),
+        pytest.param("pyramidal", 6, 5, marks=pytest.mark.full),
     ],
 )
 def test_every_kind_of_row(cone: str, condim: int, boxes: int, device: str) -> None:

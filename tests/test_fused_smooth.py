@@ -177,8 +177,10 @@ def test_robots(args: tuple[str, ...], device: str) -> None:
         (0, ""),
         (4, ""),  # more than 32 degrees of freedom
         (1, "GRAVITY CLAMPCTRL"),
-        *((0, "ACTUATION"), (0, "SPRING"), (0, "DAMPER")),
-        *((0, "SPRING DAMPER"), (0, "SPRING DAMPER ACTUATION")),
+        *(
+            pytest.param(0, off, marks=pytest.mark.full)
+            for off in ("ACTUATION", "SPRING", "DAMPER", "SPRING DAMPER", "SPRING DAMPER ACTUATION")
+        ),
     ],
 )
 def test_parts(boxes: int, off: str, device: str) -> None:

@@ -229,6 +229,7 @@ def test_without_a_browser_nothing_is_drawn(
     assert view.aside > 0.9 * waited
 
 
+@pytest.mark.full
 def test_a_paused_run_goes_on_when_the_last_browser_leaves(
     server: Any, get_stage: Callable[..., Stage], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -110,7 +110,7 @@ def fall(value: torch.Tensor) -> torch.Tensor:
 
 @pytest.mark.parametrize(
     ("task", "objects"),
-    [("stack", 1), ("box", 2), pytest.param("tower", 2, marks=pytest.mark.full)],
+    [("stack", 1), *(pytest.param(task, 2, marks=pytest.mark.full) for task in ("box", "tower"))],
 )
 def test_the_stage_never_falls_along_an_accepted_episode(
     task: str, objects: int, robot: str

@@ -118,6 +118,7 @@ def put(folder: Path, files: dict[str, str]) -> None:
         path.write_text(text)
 
 
+@pytest.mark.full
 def test_runs_that_begin_at_once_have_a_folder_each(begin: Callable[..., int]) -> None:
     assert in_children(3, lambda number: begin(f"seed={number}")) == [0, 0, 0]
     seeds = set()
@@ -193,6 +194,7 @@ def test_an_interrupted_sweep_leaves_a_summary(begin: Callable[..., int]) -> Non
     assert Path(f"{SWEEP}-2", "2", "report.json").exists()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("what", ["a closed output", "a signal after the last step"])
 def test_a_run_that_is_done_ends_with_its_status(
     what: str, begin: Callable[..., int], monkeypatch: pytest.MonkeyPatch
@@ -276,6 +278,7 @@ def test_a_given_folder_of_another_run_is_refused(
     assert contents(Path()) == before
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("report", ["given/report.json", "given/0/report.json"])
 def test_a_folder_of_another_version_is_named(
     report: str, begin: Callable[..., int], error_line: Callable[[], str]

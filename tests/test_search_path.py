@@ -166,6 +166,7 @@ def test_a_sweep_and_a_replay(
         load_saved(saved)
 
 
+@pytest.mark.full
 def test_a_gate_of_one_s_own(
     lean: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -19,7 +19,11 @@ def test_an_environment_steps(robot: str) -> None:
     env.close()
 
 
-@pytest.mark.parametrize("overrides", [["task=stack"], ["task=box", "robot=rebot"]], ids=str)
+@pytest.mark.parametrize(
+    "overrides",
+    [["task=stack"], pytest.param(["task=box", "robot=rebot"], marks=pytest.mark.full)],
+    ids=str,
+)
 def test_the_baseline_passes(overrides: list[str], tmp_path: Path) -> None:
     assert cli.run([*overrides, "gates=[baseline]", f"hydra.run.dir={tmp_path}"]) == 0
     assert (tmp_path / "report.json").is_file()

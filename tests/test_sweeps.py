@@ -22,7 +22,7 @@ from mjstack.report.record import GateResult, Report, Status
 from mjstack.report.write import read_report, write_report
 
 STUB = """\
-import json, os, sys, time
+import json, os, signal, sys, time
 from pathlib import Path
 
 args = dict(arg.split("=", 1) for arg in sys.argv[1:])
@@ -31,6 +31,7 @@ if os.environ.get("SILENT"):
     sys.exit(3)
 print("mjstack: what it says", args.get("resume"), os.environ.get("CUDA_VISIBLE_DEVICES"))
 if args["seed"] == "7":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored behind nohup
     time.sleep(90)
 if args["seed"] == "9":
     os.kill(os.getpid(), 9)

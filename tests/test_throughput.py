@@ -90,6 +90,7 @@ def test_steps_fit_into_the_time(budget: float, step: float, fit: int) -> None:
 ONE = ("sim=native", "nworld=1", *SHORT)
 
 
+@pytest.mark.full
 def test_native_measurements(new_run: Callable[..., Run]) -> None:
     result, cuda = run_throughput(new_run("sim=native", "nworld=2", *SHORT))
     assert result.status is Status.passed, result.reason

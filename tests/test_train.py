@@ -88,7 +88,7 @@ def test_a_training_leaves_policies_a_curve_and_a_judgement(
     assert_drives(out / "last", tmp_path / "gates", "task=reach", nworld=3)
 
 
-@pytest.mark.parametrize("after", [7, 10])
+@pytest.mark.parametrize("after", [7, pytest.param(10, marks=pytest.mark.full)])
 def test_a_training_goes_on_where_it_was_interrupted(after: int, tmp_path: Path) -> None:
     """Bit for bit as one that was not."""
     whole = tmp_path / "whole"
@@ -212,6 +212,7 @@ def test_two_cores_train(
     assert time.process_time() - began < 60.0 * minutes
 
 
+@pytest.mark.full
 def test_a_clone_of_stack_drives_the_batch(tmp_path: Path) -> None:
     """From few episodes at double speed, which take seconds: no success is asked for. It sees what
     a real arm has, with its past, decides ten times a second, and its commands are late.
