@@ -21,7 +21,6 @@ STEMS = {"batch": "worlds", "success": "success"}
 FAILING = "failing_worlds.csv"
 SUCCESS_FAILING = "success_failing_worlds.csv"  # where the batch gate has the other one
 REGIONS = "success_regions.csv"
-PICTURE = "success.png"
 _FACTS = ("seed", "backend", "device", "seconds", "steps")
 _NAMES = ("object_names", "phase_names")
 CIRCUMSTANCES = ("start_places", "retries", "unreachable", "sign", "sign_phase", "sign_step")

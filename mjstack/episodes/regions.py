@@ -1,5 +1,5 @@
 """Where an episode started against how it ended: success rates over cells of the objects' starts,
-as a table, a file and a picture.
+as a table and a file.
 """
 
 import math
@@ -10,12 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from mjstack.config.schema import Config
-from mjstack.episodes.record import PICTURE, REGIONS
-from mjstack.episodes.tally import EpisodeTally, rate_cells
+from mjstack.episodes.record import REGIONS
+from mjstack.episodes.tally import rate_cells
 from mjstack.files import to_csv, write_atomic
 from mjstack.math import wilson_interval
-from mjstack.report.page import Page
-from mjstack.report.picture import save_places
 from mjstack.report.table import Table
 from mjstack.report.write import safely_write
 
@@ -151,26 +149,7 @@ def regions_table(cfg: Config, regions: list[Region]) -> list[Table]:
     return [Table(title=title, header=header, rows=rows)]
 
 
-def save_regions(
-    cfg: Config,
-    folder: Path,
-    page: Page,
-    regions: list[Region],
-    starts: np.ndarray,
-    tally: EpisodeTally,
-) -> list[str]:
-    """Write the table of regions and the picture of all starts. A failure takes no result back.
-
-    Returns:
-        The files that could not be written, a line each.
-    """
+def save_regions(folder: Path, regions: list[Region]) -> str:
+    """Write the table of regions; return why it was not written, empty if it was."""
     rows = to_csv([asdict(region) for region in regions], [f.name for f in fields(Region)])
-    unwritten = safely_write(folder / REGIONS, write_atomic, rows)
-    scene = cfg.scene
-    table = (scene.table_center[:2], scene.table_half[:2])
-    title = f"{cfg.robot.title}: {tally.summary}"
-    colors = {name: thing.color for name, thing in scene.free.items()}
-    places = (starts, np.concatenate(tally.succeeded), table, title, colors)
-    if not (problem := safely_write(folder / PICTURE, save_places, *places)):
-        page.pictures.append(PICTURE)
-    return list(filter(None, [unwritten, problem]))
+    return safely_write(folder / REGIONS, write_atomic, rows)

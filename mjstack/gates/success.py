@@ -85,8 +85,8 @@ def run_success(run: Run) -> list[GateResult]:
     if all(region.succeeded == region.episodes for region in regions):
         there = "had a failure" if regions else "(gate.success.cell_episodes): more seeds have more"
         tally.details.append(f"no region of at least {t.cell_episodes} episodes {there}")
-    if run.folder is not None:
-        tally.details += save_regions(cfg, run.folder, run.page, regions, starts, tally)
+    if run.folder is not None and (problem := save_regions(run.folder, regions)):
+        tally.details.append(problem)
     result = tally.result(
         parts,
         passed=tally.successes / tally.episodes >= t.rate,

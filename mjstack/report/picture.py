@@ -1,6 +1,4 @@
-"""Pictures of a run: the final scene, the objects' way there, where episodes started, and a
-video.
-"""
+"""Pictures of a run: the final scene, the objects' way there, and a video."""
 
 import itertools
 import math
@@ -285,43 +283,3 @@ def save_curves(
         axes.set(xlabel=label, yscale=scale)
         axes.grid(alpha=0.3, which="both")
         axes.legend(frameon=False)
-
-
-def save_places(
-    path: Path,
-    places: np.ndarray,
-    succeeded: np.ndarray,
-    table: tuple[Sequence[float], Sequence[float]],
-    title: str,
-    colors: Mapping[str, Sequence[float]],
-) -> None:
-    """Draw every start as a dot per object; a failed one as crosses on its objects, joined by a
-    line.
-
-    Args:
-        path: The picture.
-        places: x and y [m] of each object first, shape ``(n, objects, 2 or more)``.
-        succeeded: Whether each episode was, shape ``(n,)``, bool.
-        table: Centre and half size of the table in x and y [m].
-        title: Above the panels.
-        colors: Red, green, blue and alpha of each object, by name.
-    """
-    centre, half = table
-    with figure(path, title, figsize=(7.5, 6.5)) as (_, axes):
-        # As seen by someone who stands behind the arm: y to the left, x away from the base.
-        axes.add_patch(outline(centre[1::-1], half[1::-1], ec="k", lw=1.5))
-        axes.plot(0.0, 0.0, "k^", markersize=9, label="base")
-        for pair in places[~succeeded]:
-            axes.plot(pair[:, 1], pair[:, 0], color="0.3", lw=0.5, alpha=0.6)
-        marks = (("succeeded", succeeded, ".", 0.25), ("failed", ~succeeded, "x", 1.0))
-        for number, (name, color) in enumerate(colors.items()):
-            for word, rows, marker, alpha in marks:
-                x, y = places[rows, number, :2].T
-                label = f"{name}, {word}: {len(x):,}"
-                axes.scatter(y, x, 30.0, color=color, marker=marker, alpha=alpha, label=label)
-        axes.set(xlabel="y [m]", ylabel="x [m]", aspect="equal")
-        axes.invert_xaxis()
-        axes.grid(alpha=0.3)
-        axes.legend(
-            frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=5
-        )
