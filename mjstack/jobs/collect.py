@@ -40,27 +40,11 @@ from mjstack.jobs.collect_plan import (
 )
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import CheckedJob, Job
-from mjstack.report.markdown import to_markdown
 from mjstack.report.record import GateResult, Status
-from mjstack.report.sections import Section
 from mjstack.report.table import Table
-from mjstack.report.text import format_value
 
 _SPARE = 1.05  # worlds played over episodes that are missing: some fail
 _MOST_EMPTY = 3  # batches in a row without an episode
-LOADING = """\
-import json
-from pathlib import Path
-
-import pyarrow.parquet as pq
-
-folder = Path("{folder}")
-info = json.loads((folder / "meta/info.json").read_text())
-episode = pq.read_table(folder / "data", filters=[("episode_index", "==", 0)])
-for name in ("observation.state", "action"):
-    values = episode[name].combine_chunks().flatten().to_numpy().reshape(len(episode), -1)
-    print(name, values.shape, info["features"][name]["names"], info["mjstack"]["units"][name])
-"""
 
 
 def check_collect(cfg: Config) -> CheckedJob:
@@ -84,7 +68,7 @@ def check_collect(cfg: Config) -> CheckedJob:
 
 
 def run_collect(plan: CollectPlan, run: Run, folder: Path) -> None:
-    """Add the missing episodes to the dataset, and leave dataset.md in the folder."""
+    """Add the missing episodes to the dataset."""
     run.begin(NAME)
     ranks = run.stage.ranks
     collection = Collection(plan, run.stage)
@@ -95,8 +79,7 @@ def run_collect(plan: CollectPlan, run: Run, folder: Path) -> None:
             return
         result = collection.result(status, problem)
         if collection.committed:
-            _write_table(run.cfg, plan, folder, result)
-            run.print_line(f"dataset: {collection.path}, described in {folder}/dataset.md")
+            run.print_line(f"dataset: {collection.path}")
         run.record(result)
 
     try:
@@ -321,29 +304,20 @@ class Collection:
             metrics=metrics,
             notes=notes,
             details=details,
+            tables=[self._ranges()] if self.committed else [],
         )
 
-
-def _write_table(cfg: Config, plan: CollectPlan, folder: Path, result: GateResult) -> None:
-    """Write dataset.md: facts, the range of every joint and its target, and the lines that load the
-    first episode.
-    """
-    dataset = plan.home / DATASET
-    statistics = json.loads((dataset / lerobot.STATS).read_text())
-    ranges = []
-    for name in (STATE, ACTION):
-        feature = plan.spec.features[name]
-        columns = [statistics[name][key] for key in ("min", "mean", "max")]
-        for joint, unit, *values in zip(feature.names, feature.units, *columns, strict=True):
-            ranges.append([f"{name} {joint}", unit, *(f"{value:.4f}" for value in values)])
-    facts = [[key, format_value(value)] for key, value in (result.notes | result.metrics).items()]
-    header = ["number", "unit", "smallest", "mean", "largest"]
-    tables = [Table(header=["fact", "value"], rows=facts), Table(header=header, rows=ranges)]
-    title = f"{cfg.robot.title}, task {cfg.task.name}: demonstrations"
-    loading = LOADING.format(folder=dataset)
-    facts_of = to_markdown([Section(title=title, parts=tables, level=1)])
-    text = f"{facts_of}\nWith pyarrow alone:\n\n```python\n{loading}```\n"
-    write_atomic(folder / "dataset.md", text)
+    def _ranges(self) -> Table:
+        """The range of every joint and its target."""
+        statistics = json.loads((self.path / lerobot.STATS).read_text())
+        rows = []
+        for name in (STATE, ACTION):
+            feature = self._plan.spec.features[name]
+            columns = [statistics[name][key] for key in ("min", "mean", "max")]
+            for joint, unit, *values in zip(feature.names, feature.units, *columns, strict=True):
+                rows.append([f"{name} {joint}", unit, *(f"{value:.4f}" for value in values)])
+        header = ["number", "unit", "smallest", "mean", "largest"]
+        return Table(title="Ranges", header=header, rows=rows)
 
 
 JOB = Job(check_collect)
