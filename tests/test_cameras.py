@@ -47,6 +47,10 @@ ALL = ("rgb", "depth", "segmentation")
 Make = Callable[..., Env]
 
 
+def no_picture(*_: object) -> None:
+    """Draws nothing."""
+
+
 def small(*names: str, outputs: tuple[str, ...] = ("rgb",), size: int = 32) -> list[str]:
     """Overrides that turn on cameras with small images."""
     return [
@@ -477,7 +481,7 @@ def test_images_that_compare_too_little_fail(monkeypatch: pytest.MonkeyPatch) ->
         monkeypatch.setattr(gate_images, "load_images", lambda cfg, m=mjwarp: (np.zeros(1), m))
         monkeypatch.setattr(gate_images, "_draw_states", lambda *args, n=native: (n, labels))
         result = GateResult(name="parity", status=Status.passed)
-        problems = compare_images(stage, rest, None, [], result)
+        problems = compare_images(stage, rest, None, no_picture, result)
         assert len(problems) == len(says)
         assert all(says[k] in problem for k, problem in enumerate(problems))
         assert "image_pixels=1000 pixels: " in result.details[0]
@@ -501,7 +505,7 @@ def test_parity_compares_images_here_and_elsewhere(robot: str, tmp_path: Path) -
     stage = Stage(cfg)
     rest = np.zeros((1, stage.model.nq))
     apart = GateResult(name="parity", status=Status.passed)
-    assert compare_images(stage, rest, None, [], apart) == []
+    assert compare_images(stage, rest, None, no_picture, apart) == []
     for name in ("images.front.iou.red", "images.wrist.color_of_255"):
         assert apart.metrics[name] == result.metrics[name]
     with np.load(file) as saved:
@@ -510,7 +514,7 @@ def test_parity_compares_images_here_and_elsewhere(robot: str, tmp_path: Path) -
     arrays["segmentation.front"] = np.roll(arrays["segmentation.front"], 3, axis=2)
     np.savez(file, **arrays)
     other = GateResult(name="parity", status=Status.passed)
-    problems = compare_images(stage, rest, None, [], other)
+    problems = compare_images(stage, rest, None, no_picture, other)
     assert any(problem.startswith("camera front: IoU of red is 0.") for problem in problems)
     assert any(problem.startswith("camera top: colours differ by") for problem in problems)
     # Files that cannot be compared are one line, before anything is written.

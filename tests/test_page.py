@@ -116,7 +116,6 @@ def page(tmp_path: Path, count: int = 64) -> str:
         pictures=["scene.png", "missing.png"],
     )
     shown = Page(worlds={"batch": worlds}, episode="episode.html")
-    shown.tables.append(Table(title="Rates", header=["worlds", "rate"], rows=[["1", "2"]]))
     return to_html(make_sections(report, shown))
 
 
@@ -217,7 +216,7 @@ def test_text_is_not_markup(tmp_path: Path) -> None:
         names=[bad] * 2, broken=[[bad], []], rules={bad: bad}, values={bad: two}, maps=maps
     )
     report = Report(folder=tmp_path, overrides=[bad], provenance={bad: bad}, gates=[gate])
-    shown = Page(title=bad, worlds={bad: worlds}, tables=gate.tables, note=bad)
+    shown = Page(title=bad, worlds={bad: worlds}, note=bad)
     reader = Reader(to_html(make_sections(report, shown)))
     assert "script" not in reader.tags
     assert reader.open == []

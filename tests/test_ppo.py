@@ -54,7 +54,7 @@ def test_a_training_leaves_policies_a_curve_and_a_judgement(tmp_path: Path) -> N
     assert (rows["reach"] > 0.0).all()
     best = int(rows["return_"].argmax())  # there is no success yet
     assert load_policy(out / "best").training["iteration"] == rows["iteration"][best]
-    for name in ("train.png", "train.md", "best/policy.json", "last/policy.json"):
+    for name in ("train.png", "train.csv", "best/policy.json", "last/policy.json"):
         assert (out / name).stat().st_size > 0, name
 
     policy = load_policy(out / "last")

@@ -444,7 +444,7 @@ def test_the_job_leaves_a_map(
         assert (row["grasp_tilt_deg"] != "nan") is (row["grasp_reached"] == "1")
     share = np.mean([row["grasp_reached"] == "1" for row in rows])
     assert gates["grasp"]["metrics"]["reached_fraction"] == pytest.approx(share)
-    text = (tmp_path / "reachability.md").read_text()
+    text = (tmp_path / "report.md").read_text()
     assert "| red | " in text
     assert "the largest square is " in text
     assert "![reachability.png](reachability.png)" in text

@@ -308,7 +308,7 @@ def test_a_job_that_failed_is_a_gap_even_with_figures(
         return plot(self, x, y, *args, **kwargs)
 
     monkeypatch.setattr(Axes, "plot", spy)
-    save_sweep(tmp_path / "p.png", plot=PLOT, rows=rows)
+    save_sweep(tmp_path / "p.png", PLOT, rows)
     curves = [y for label, y in drawn if label == "mjwarp, physics"]
     assert [[math.isnan(value) for value in y] for y in curves] == [[False, True, False]] * 2
     assert curves[1][2] == pytest.approx(curves[0][2] / 10)

@@ -64,7 +64,7 @@ def test_a_training_leaves_policies_a_curve_and_a_judgement(
     rows = curve(out)
     assert rows["batch"].tolist() == [10.0, 20.0, 30.0]
     assert rows["validation_loss"][-1] < rows["validation_loss"][0]
-    for name in ("train.png", "train.md", "best/policy.json", "last/policy.json"):
+    for name in ("train.png", "train.csv", "best/policy.json", "last/policy.json"):
         assert (out / name).stat().st_size > 0, name
 
     # What the policy sees and says

@@ -14,6 +14,7 @@ from mjstack.episodes.stage import Stage, TextHook
 from mjstack.managers.view import offers
 from mjstack.report.page import Page, World, frame_stride
 from mjstack.report.record import GateResult, Status
+from mjstack.report.write import safely_write
 from mjstack.sim import Simulation, make_simulation
 
 needs_episode = offers(needs_episode=True)
@@ -122,6 +123,17 @@ class Run:
             states = self.cfg.gate.parity.states
             return {name: stage.phase(phase).stop - 1 for name, phase in states.items()}
         return {f"third_{k}": k * stage.episode_steps // 3 - 1 for k in (1, 2, 3)}
+
+    def draw(self, name: str, save: Callable[..., object], *args: object) -> None:
+        """Draw a picture beside the report by a call with its path and ``args``, if there is a
+        folder. One that fails is a printed line.
+        """
+        if self.folder is None:
+            return
+        if problem := safely_write(self.folder / name, save, *args):
+            self.print_line(problem)
+        else:
+            self.page.pictures.append(name)
 
     def judge_one(self, episode: Episode) -> tuple[Status, str, dict[str, float]]:
         """Status, reason and metrics of a one-world episode."""

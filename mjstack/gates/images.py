@@ -17,7 +17,6 @@ from mjstack.report.gl import require_offscreen
 from mjstack.report.picture import save_images
 from mjstack.report.record import GateResult
 from mjstack.report.table import Table
-from mjstack.report.write import safely_write
 from mjstack.sim import StateRenderer
 from mjstack.sim.cameras import PREFIXES, thing_of, with_outputs
 
@@ -51,7 +50,11 @@ class Agreement:
 
 
 def compare_images(
-    stage: Stage, path: np.ndarray, folder: Path | None, pictures: list[str], result: GateResult
+    stage: Stage,
+    path: np.ndarray,
+    folder: Path | None,
+    draw: Callable[..., None],
+    result: GateResult,
 ) -> list[str]:
     """Render states of the reference episode with MJWarp and with native MuJoCo, and compare them.
 
@@ -62,7 +65,7 @@ def compare_images(
         stage: Scene and cameras.
         path: Positions of the reference episode, shape ``(steps, nq)``.
         folder: The run's, if it has one.
-        pictures: Names of the run's pictures; gets the name of that of the comparison.
+        draw: Draws a picture of the run, as `Run.draw` does.
         result: The gate's, which gets figures, thresholds and notes.
 
     Returns:
@@ -92,11 +95,14 @@ def compare_images(
     agreements = {
         name: agree(name, native, mjwarp, labels, limits.image_pixels) for name in scene.cameras
     }
-    if folder is not None:
-        if problem := _draw(folder / PICTURE, agreements, native, mjwarp):
-            stage.progress.print_line(problem)
-        else:
-            pictures.append(PICTURE)
+    # The state of each camera that differs most, side by side
+    rows = {}
+    for name, camera in agreements.items():
+        a, b = (images[f"images.{name}"][camera.worst].astype(int) for images in (native, mjwarp))
+        difference = np.minimum(np.abs(a - b) * _AMPLIFIED, 255)
+        rows[f"{name}, state {camera.worst}"] = [a, b, difference]
+    columns = ["native MuJoCo", "MJWarp", f"difference x {_AMPLIFIED}"]
+    draw(PICTURE, save_images, rows, columns)
     result.thresholds |= {
         "images.same_thing": limits.image_same,
         "images.iou": limits.image_iou,
@@ -248,14 +254,3 @@ def _about(cfg: Config) -> dict[str, object]:
             for key in ("size", "fovy", "pose")
         },
     }
-
-
-def _draw(path: Path, agreements: dict[str, Agreement], native: Images, mjwarp: Images) -> str:
-    """Save the state of each camera that differs most, side by side; return why not."""
-    rows = {}
-    for name, camera in agreements.items():
-        a, b = (images[f"images.{name}"][camera.worst].astype(int) for images in (native, mjwarp))
-        difference = np.minimum(np.abs(a - b) * _AMPLIFIED, 255)
-        rows[f"{name}, state {camera.worst}"] = [a, b, difference]
-    columns = ["native MuJoCo", "MJWarp", f"difference x {_AMPLIFIED}"]
-    return safely_write(path, save_images, rows, columns)

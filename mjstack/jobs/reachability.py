@@ -7,7 +7,6 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -17,11 +16,11 @@ from mjstack.config.schema import Config, ReachabilityJobCfg
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError
-from mjstack.jobs.runner import CheckedJob, Job, write_tables
+from mjstack.files import write_atomic
+from mjstack.jobs.runner import CheckedJob, Job
 from mjstack.kinematics.reach import PointReach
 from mjstack.report.picture import figure, outline
 from mjstack.report.record import GateResult, Status
-from mjstack.report.sections import summarize
 from mjstack.scene.phases import object_targets
 from mjstack.sim import resolve_backend
 
@@ -71,23 +70,21 @@ def check_reachability(cfg: Config) -> CheckedJob:
 
 
 def run_reachability(run: Run, folder: Path) -> None:
-    """Draw the map and leave reachability.csv, .md and .png in the folder.
+    """Draw the map and leave reachability.csv and .png in the folder.
 
     An object passes if the region of ``reset=randomized`` is reached with the margin around its
     position.
     """
     cfg = run.cfg
     levels: list[ReachLevel] = []
-    results: list[GateResult] = []
     for name, (height, gripper) in find_levels(cfg).items():
         run.begin(name)
         began = time.perf_counter()
         levels.append(map_level(run, name, height, gripper))
-        results.append(_level_result(levels[-1], time.perf_counter() - began))
-        _write(run, levels, results, [])
-        run.record(results[-1])
+        write_atomic(folder / "reachability.csv", _points_csv(cfg, levels))
+        run.record(_level_result(cfg, levels[-1], time.perf_counter() - began))
     regions = [find_region(cfg, levels, name) for name in cfg.scene.free]
-    _write(run, levels, results, regions)
+    run.draw("reachability.png", _save_map, cfg, levels, regions)
     for region in regions:
         run.record(region)
 
@@ -203,8 +200,9 @@ def find_region(cfg: Config, levels: list[ReachLevel], name: str) -> GateResult:
     )
 
 
-def _level_result(level: ReachLevel, seconds: float) -> GateResult:
+def _level_result(cfg: Config, level: ReachLevel, seconds: float) -> GateResult:
     share = float(level.reached.mean())
+    joints = ", ".join(cfg.robot.ik_joints)
     metrics: dict[str, float] = {
         "height_above_table_m": level.height,
         "points": level.reached.size,
@@ -218,32 +216,13 @@ def _level_result(level: ReachLevel, seconds: float) -> GateResult:
         metrics |= {"smallest_tilt_deg": low, "largest_tilt_deg": high}
         reason += f", tilted by {low:.0f} to {high:.0f} degrees at least"
     return GateResult(
-        name=level.name, status=Status.passed, reason=reason, seconds=seconds, metrics=metrics
+        name=level.name,
+        status=Status.passed,
+        reason=reason,
+        seconds=seconds,
+        metrics=metrics,
+        notes={"reached": f"to {1e3 * cfg.controller.ik_tolerance:g} mm, by {joints}"},
     )
-
-
-def _write(
-    run: Run, levels: list[ReachLevel], results: list[GateResult], regions: list[GateResult]
-) -> None:
-    """Write the table of levels and regions, and a picture as soon as there are regions."""
-    cfg = run.cfg
-    job = _job(cfg)
-    title = f"{cfg.robot.title}, task {cfg.task.name}: what the arm reaches"
-    notes = [
-        "Half-widths in m, around the position. A region counts as reached if it still is with"
-        f" {1e3 * job.margin:g} mm more all round, at every level; points are {1e3 * job.step:g} mm"
-        " apart. Regions keep objects of any yaw on the table.",
-        f"Reached: inverse kinematics of {', '.join(cfg.robot.ik_joints)} brings the grasp point"
-        f" within {1e3 * cfg.controller.ik_tolerance:g} mm. Collisions are not looked at.",
-        "Tilt: the smallest angle between the gripper's approach axis and straight down that a"
-        " solution has. A controller that goes on from where it is need not find that solution,"
-        " and may stop at a joint limit short of a point that is reached.",
-        "Reached does not mean grasped: how many worlds succeed, the gate success tells.",
-    ]
-    draw = partial(_save_map, title=title, cfg=cfg, levels=levels, regions=regions)
-    table = summarize([*results, *regions])
-    text = _points_csv(cfg, levels)
-    write_tables(run, "reachability", title, table, notes, text, draw if regions else None)
 
 
 def _points_csv(cfg: Config, levels: Sequence[ReachLevel]) -> str:
@@ -261,11 +240,7 @@ def _points_csv(cfg: Config, levels: Sequence[ReachLevel]) -> str:
 
 
 def _save_map(
-    path: Path,
-    title: str,
-    cfg: Config,
-    levels: Sequence[ReachLevel],
-    regions: Sequence[GateResult],
+    path: Path, cfg: Config, levels: Sequence[ReachLevel], regions: Sequence[GateResult]
 ) -> None:
     """Draw a panel per level: the tilt as colour, hatched where the arm does not get to, table,
     objects and regions.
@@ -274,9 +249,9 @@ def _save_map(
     x, y = axes(cfg)
     wide = x[-1] - x[0]
     deep = y[-1] - y[0]
-    title += (
-        "\nhatched: not reached; squares: objects; solid: configured region; dotted: largest with"
-        " margin"
+    title = (
+        f"{cfg.robot.title}, task {cfg.task.name}: what the arm reaches\nhatched: not reached;"
+        " squares: objects; solid: configured region; dotted: largest with margin"
     )
     size = ((3.6 * max(0.6, wide / deep) + 1.0) * len(levels) + 1.2, 5.6)
     with figure(path, title, len(levels), figsize=size) as (drawing, panels):

@@ -6,7 +6,7 @@ import logging
 import re
 import socket
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -29,12 +29,11 @@ from mjstack.jobs.showing import draw_episode, find_viewers, save_page, serve_li
 from mjstack.mdp.starts.placement import SCHEMA
 from mjstack.process import available_cores
 from mjstack.report.formats import FORMATS, write_formats
-from mjstack.report.markdown import save_tables
 from mjstack.report.page import Page
 from mjstack.report.provenance import collect_provenance
 from mjstack.report.record import GateResult, Provenance, Report, Status
 from mjstack.report.sections import summarize
-from mjstack.report.table import Console, Table
+from mjstack.report.table import Console
 from mjstack.report.web import EPISODE, lacks_viser
 from mjstack.sim import resolve_backend
 from mjstack.sim.build import cuda_driver, cuda_uuid
@@ -279,29 +278,6 @@ def check_job(cfg: Config, overrides: Sequence[str] = ()) -> CheckedJob:
     if cfg.video and not job.shows:
         raise ConfigError("video", "true", f"{by}, which shows no world", "Leave it out")
     return job.check(cfg)
-
-
-def write_tables(
-    run: Run,
-    name: str,
-    title: str,
-    table: Table,
-    notes: Sequence[str],
-    csv: str,
-    draw: Callable[[Path], object] | None = None,
-) -> None:
-    """Replace ``name.csv``, ``name.md`` and, where ``draw`` is given, ``name.png`` of a run, and
-    show the table on its page. A picture that fails is a printed line.
-
-    Raises:
-        OSError: A file cannot be written.
-    """
-    path = cast(Path, run.folder) / name
-    if problem := save_tables(path, title, table, notes, csv, draw):
-        run.print_line(problem)
-    elif draw is not None:
-        run.page.pictures.append(f"{name}.png")
-    run.page.tables.append(replace(table, title=table.title or title))
 
 
 def run_provenance(stage: Stage) -> Provenance:

@@ -3,7 +3,6 @@
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -12,12 +11,14 @@ from omegaconf import DictConfig, OmegaConf
 from mjstack.config.explain import parse
 from mjstack.config.schema import SweepCfg
 from mjstack.errors import is_out_of_memory
-from mjstack.files import to_csv
+from mjstack.files import to_csv, write_atomic
 from mjstack.jobs.sweep_folder import LOG, list_jobs
-from mjstack.report.markdown import save_tables
+from mjstack.report.markdown import to_markdown
 from mjstack.report.record import Report, Status
+from mjstack.report.sections import Part, Section
 from mjstack.report.sweep_picture import Plot, Row, describe_crossover, save_sweep
 from mjstack.report.table import Table
+from mjstack.report.write import safely_write
 
 _HEADLINES = ("succeeded", "success_rate", "world_steps_per_s")
 _RATE = "_per_s.median"
@@ -69,14 +70,18 @@ def write_summary(
         lines=[key for key in swept if key != over] if over in swept else [],
         panels=sweep.panels or {name: {"": name} for name in _headlines(rows)[:_PANELS]},
     )
-    drawable = draw and any(row["status"] != _NOT_RUN for row in rows) and plot.shows(rows)
-    save = partial(save_sweep, plot=plot, rows=rows) if drawable else None
+    picture = folder / "summary.png"
+    problem = ""
+    if draw and any(row["status"] != _NOT_RUN for row in rows) and plot.shows(rows):
+        problem = safely_write(picture, save_sweep, plot, rows, stops=False)
     notes = [*filter(None, [describe_crossover(plot, rows)]), *sweep.notes]
     for key, name in (("backend", "hardware"), ("git_commit", "commit")):
         values = sorted({str(row[key]) for row in rows if row.get(key)})
         notes += [f"{name}: {value}" for value in values]
-    csv = to_csv(rows)
-    problem = save_tables(folder / "summary", title, table, notes, csv, save, stops=False)
+    write_atomic(folder / "summary.csv", to_csv(rows))
+    parts: list[Part] = [table, *([picture] if picture.exists() else []), notes]
+    text = to_markdown([Section(title=title, parts=parts, level=1)])
+    write_atomic(folder / "summary.md", text)
     return replace(table, title=title), problem
 
 

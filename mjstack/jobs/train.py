@@ -22,12 +22,12 @@ from mjstack.files import made_by, reading, to_csv, write_atomic
 from mjstack.gates.runner import run_guarded
 from mjstack.gates.success import run_success
 from mjstack.jobs.gates import check_task
-from mjstack.jobs.runner import CheckedJob, Job, write_tables
+from mjstack.jobs.runner import CheckedJob, Job
 from mjstack.jobs.showing import check_showing
 from mjstack.report.picture import save_curves
 from mjstack.report.record import GateResult, Status
 from mjstack.report.table import Table
-from mjstack.train.trainer import LAST, Trained, Trainer, whole_starts
+from mjstack.train.trainer import LAST, Trainer, whole_starts
 
 NAME = "train"
 CONFIG = "training.json"  # the configuration of the training in the folder
@@ -123,11 +123,18 @@ def _train(trainer: Trainer, folder: Path, run: Run) -> list[GateResult]:
     """The training as a result of the report."""
     began = time.perf_counter()
     trained = trainer.train(run.stage, folder)
+    rows = trained.curve
     if run.stage.ranks.writes:
-        _write_curve(run, trained)
+        write_atomic(folder / f"{NAME}.csv", to_csv(rows))
+        title = f"{run.cfg.robot.title}, task {run.cfg.task.name}: training"
+        lines = {name.replace("_", " "): [row[name] for row in rows] for name in trained.lines}
+        at = [row[trained.abscissa] for row in rows]
+        picture = (at, lines, title, trained.abscissa, trained.scale)
+        run.draw(f"{NAME}.png", save_curves, *picture)
     seconds = time.perf_counter() - began
-    last = trained.curve[-1]
+    last = rows[-1]
     figures = ", ".join(f"{name.replace('_', ' ')} {last[name]:.4g}" for name in trained.lines)
+    columns = {name.replace("_", " "): name for name in last}
     return [
         GateResult(
             name=NAME,
@@ -137,26 +144,9 @@ def _train(trainer: Trainer, folder: Path, run: Run) -> list[GateResult]:
             seconds=seconds,
             metrics=trained.metrics,
             notes=trained.notes,
+            tables=[Table.of(columns, rows, "Curve")],
         )
     ]
-
-
-def _write_curve(run: Run, trained: Trained) -> None:
-    """Write train.csv, train.md and train.png."""
-    rows = trained.curve
-    columns = {name.replace("_", " "): name for name in rows[0]}
-    title = f"{run.cfg.robot.title}, task {run.cfg.task.name}: training"
-    lines = {name.replace("_", " "): [row[name] for row in rows] for name in trained.lines}
-    at = [row[trained.abscissa] for row in rows]
-    write_tables(
-        run,
-        NAME,
-        title,
-        Table.of(columns, rows),
-        [f"{name}: {value}" for name, value in trained.notes.items()],
-        to_csv(rows),
-        lambda path: save_curves(path, at, lines, title, trained.abscissa, trained.scale),
-    )
 
 
 JOB = Job(check_train, live=True)

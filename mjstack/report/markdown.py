@@ -1,12 +1,10 @@
-"""Sections as Markdown, and tables as files."""
+"""Sections as Markdown."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
-from mjstack.files import write_atomic
 from mjstack.report.sections import Part, Plots, Section
 from mjstack.report.table import Table
-from mjstack.report.write import safely_write
 
 
 def to_markdown(sections: Sequence[Section]) -> str:
@@ -17,34 +15,6 @@ def to_markdown(sections: Sequence[Section]) -> str:
         for part in section.content:
             blocks += _blocks(part, section.level + 1)
     return "\n\n".join(blocks) + "\n"
-
-
-def save_tables(
-    path: Path,
-    title: str,
-    table: Table,
-    notes: Sequence[str],
-    csv: str,
-    draw: Callable[[Path], object] | None = None,
-    *,
-    stops: bool = True,
-) -> str:
-    """Replace a table's files, ``path`` with the endings csv, md and, where ``draw`` is given, png.
-    Markdown shows a picture that is there.
-
-    Returns:
-        Why there is no picture, as of `safely_write`.
-
-    Raises:
-        OSError: A file cannot be written.
-    """
-    picture = path.with_suffix(".png")
-    problem = safely_write(picture, draw, stops=stops) if draw is not None else ""
-    write_atomic(path.with_suffix(".csv"), csv)
-    parts: list[Part] = [table, *([picture] if picture.exists() else []), list(notes)]
-    text = to_markdown([Section(title=title, parts=parts, level=1)])
-    write_atomic(path.with_suffix(".md"), text)
-    return problem
 
 
 def _blocks(part: Part, level: int) -> list[str]:

@@ -5,8 +5,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mjstack.report.table import Table
-
 MOST_WORLDS = 64  # in motion, of a page
 
 
@@ -73,7 +71,6 @@ class Page:
         motion: Whether it shows worlds in motion.
         worlds: Episodes by gate.
         worlds3d: Worlds in motion, by the part of the run that played them.
-        tables: Tables of the run, such as of job=train.
         pictures: Files that parts of the run have drawn.
         episode: Name of the file with the episode in 3-D; empty without one.
         note: Why there is none.
@@ -83,7 +80,6 @@ class Page:
     motion: bool = False
     worlds: dict[str, Worlds] = field(default_factory=dict)
     worlds3d: dict[str, list[World]] = field(default_factory=dict)
-    tables: list[Table] = field(default_factory=list)
     pictures: list[str] = field(default_factory=list)
     episode: str = ""
     note: str = ""

@@ -76,7 +76,6 @@ def make_sections(report: Report, page: Page) -> list[Section]:
         " ".join(report.overrides),
         summarize(report.gates),
         episode,
-        *page.tables,
         *(report.folder / name for name in report.pictures),
     ]
     sections = [Section(title=page.title, status=report.status, parts=head, level=1)]

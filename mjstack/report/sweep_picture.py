@@ -59,7 +59,7 @@ class Plot:
         return len(numbers) == len(values) and len(set(numbers)) > 1
 
 
-def save_sweep(path: Path, *, plot: Plot, rows: Sequence[Row]) -> None:
+def save_sweep(path: Path, plot: Plot, rows: Sequence[Row]) -> None:
     """Draw a panel for each metric: curves over a number, else a bar for each job.
 
     A job that did not pass interrupts its curves, and a cross marks it.
