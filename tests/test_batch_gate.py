@@ -21,7 +21,7 @@ from environments import at_double_speed, one_second_episode
 from mjstack.drivers.open_loop import JointTrajectory
 from mjstack.episodes import batches
 from mjstack.episodes import tally as tally_module
-from mjstack.episodes.record import FAILING, REGIONS, EpisodeRecord, starts_name
+from mjstack.episodes.record import FAILING, REGIONS, STEMS, EpisodeRecord, starts_name
 from mjstack.episodes.rollout import Episode, play_episode
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Progress, Stage
@@ -247,7 +247,7 @@ def test_full_disk_takes_no_verdict_back(
     assert result.status is Status.passed
     problems = [line for line in result.details if "No space left on device" in line]
     files = (starts_name(0), REGIONS) if gate == "success" else ()
-    for name in ("no record of its", FAILING, *files):
+    for name in (f"{STEMS[gate]}_seed0.npz", FAILING, *files):
         assert any(name in line for line in problems)
     assert list(tmp_path.iterdir()) == []
 

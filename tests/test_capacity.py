@@ -465,7 +465,7 @@ def test_each_workload_is_played_again_and_a_flip_fails_where_runs_repeat(
         "random_actions": 256,
         "task": 128,
     }
-    assert {sizes for name, sizes in played if name != "task"} == {run.stage.measured.env}
+    assert {sizes for name, sizes in played if name != "task"} == {run.stage.measured["env"]}
     flip = "randomized at batch.nconmax=32 batch.njmax=256: another result in 1 of 2 worlds (1)"
     assert result.metrics["rerun.randomized.flipped_worlds"] == 1
     if device == "cpu":
@@ -495,8 +495,8 @@ def test_the_gate_recommends_nothing_from_motion_that_lost_physics(
     assert result.reason.startswith(
         "environments: NEFC overflow in 1 of 2 worlds (1) even with batch.nconmax=128"
     )
-    assert run.stage.measured.task is not None
-    assert run.stage.measured.env is None
+    assert "task" in run.stage.measured
+    assert "env" not in run.stage.measured
     assert said[1].endswith("not known, physics was lost")
     assert "recommended.njmax" in result.metrics
     assert "recommended_env.njmax" not in result.metrics
@@ -573,7 +573,7 @@ def test_gates_get_no_sizes_from_a_task_that_lost_physics(
     message = "what the driven task needs cannot be measured: NEFC overflow in 1 of 2 worlds"
     with pytest.raises(FaultError, match=message):
         run.stage.sizes  # noqa: B018
-    assert run.stage.measured.task is None
+    assert "task" not in run.stage.measured
 
 
 @pytest.mark.full
@@ -585,16 +585,16 @@ def test_native_environment_measures_nothing(monkeypatch: pytest.MonkeyPatch) ->
 @pytest.mark.full
 def test_batch_uses_what_capacity_measured(new_run: NewRun) -> None:
     run = new_run("sim=mjwarp", "sim.device=cpu", "nworld=2", "batch=auto", "batch.nconmax=48")
-    run.stage.measured.task = BatchSizes(nconmax=40, njmax=184, source="batch=auto: somewhere")
+    run.stage.measured["task"] = BatchSizes(nconmax=40, njmax=184, source="batch=auto: somewhere")
     sim = run.stage.batch_simulation(2)
     assert sim.sizes == BatchSizes(nconmax=48, njmax=184)  # type: ignore[attr-defined]
     other = make_simulation(run.stage.model, run.cfg, 1, backend=Backend.mjwarp)
     assert other.sizes == BatchSizes(nconmax=48, njmax=300)
     assert run.stage.env_sizes is None
-    run.stage.measured.env = BatchSizes(nconmax=64, njmax=400)
+    run.stage.measured["env"] = BatchSizes(nconmax=64, njmax=400)
     assert run.stage.env_sizes == BatchSizes(nconmax=48, njmax=400)
     plain = new_run("sim=mjwarp", "sim.device=cpu", "nworld=2")
-    plain.stage.measured.task = plain.stage.measured.env = BatchSizes(nconmax=8, njmax=8)
+    plain.stage.measured |= dict.fromkeys(("task", "env"), BatchSizes(nconmax=8, njmax=8))
     assert (plain.stage.sizes, plain.stage.env_sizes) == (BatchSizes(nconmax=128, njmax=300), None)
 
 

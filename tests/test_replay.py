@@ -25,10 +25,11 @@ from mjstack.config.check import validate
 from mjstack.config.load import load_saved
 from mjstack.config.schema import Backend, TermCfg
 from mjstack.episodes.earlier_run import STEM, archive_starts, copy_names
-from mjstack.episodes.record import EpisodeRecord
+from mjstack.episodes.record import EpisodeRecord, record_name
 from mjstack.episodes.replay import simulate_alone
 from mjstack.episodes.rollout import snapshot
 from mjstack.episodes.run import Run
+from mjstack.files import write_npz
 from mjstack.jobs import check_job
 from mjstack.jobs.replay import _compare
 from mjstack.sim import BatchSizes
@@ -176,7 +177,7 @@ def test_another_verdict_is_said(
     record = record_of(folder, 0)
     record.failed[0] = RULES["CARRY"]
     record.qpos[0, 14] += 0.002  # somewhere in blue's position
-    record.write(folder)
+    write_npz(folder / record_name("batch", record.seed), record.arrays())
     status, report = replay(folder, "world=0")
     (gate,) = report["gates"]
     differs = "NOT as recorded (red not carried): its objects end 2 mm from where they did, "
@@ -262,7 +263,7 @@ def test_a_start_that_is_not_the_recorded_one_is_refused(
     record = record_of(folder, 1)
     assert record.start is not None
     record.start[3, 14] += 0.002
-    record.write(folder)
+    write_npz(folder / record_name("batch", record.seed), record.arrays())
     monkeypatch.chdir(tmp_path)
     assert run(["job=replay", f"run={folder}", f"world={SUCCEEDED}"]) == 2
     says = "world 3 of seed 1 would start up to 0.002 (m, rad) from where it did, expected its own"

@@ -13,7 +13,7 @@ import torch
 
 from mjstack.episodes.failures import FailureMonitor, Sign
 from mjstack.episodes.rollout import Episode
-from mjstack.files import reading, write_npz
+from mjstack.files import reading
 from mjstack.tasks.check import Rules
 
 STEMS = {"batch": "worlds", "success": "success"}
@@ -137,7 +137,7 @@ class EpisodeRecord:
         Raises:
             FolderError: The file cannot be read.
         """
-        path = folder / _file_name(gate, seed)
+        path = folder / record_name(gate, seed)
         if not path.exists():
             return None
         with reading(path, "Run the gate again"), np.load(path) as file:
@@ -167,15 +167,14 @@ class EpisodeRecord:
         if not re.fullmatch(r"(native|mjwarp) on (cpu|cuda:\d+)", where):
             raise ValueError(f"played by {where}")
 
-    def write(self, folder: Path, gate: str = "batch") -> None:
-        """Write the gate's file of this seed in one step."""
+    def arrays(self) -> dict[str, Any]:
+        """The content of its file, `record_name`."""
         arrays: dict[str, Any] = self.worlds | {name: getattr(self, name) for name in _FACTS}
         if "sign" in arrays:
             arrays |= {name: getattr(self, name) for name in _NAMES}
             arrays["sign_names"] = [sign.name for sign in Sign]
-        arrays["rank_first_world"] = list(self.ranks)
-        arrays["rank_place"] = list(self.ranks.values())
-        write_npz(folder / _file_name(gate, self.seed), arrays)
+        ranks = {"rank_first_world": list(self.ranks), "rank_place": list(self.ranks.values())}
+        return arrays | ranks
 
     def failing_rows(self, rules: Rules) -> list[dict[str, object]]:
         """Cells of every failing episode by column: rules, circumstances, and all measurements."""
@@ -212,5 +211,6 @@ def starts_name(seed: int | str) -> str:
     return f"starts_seed{seed}.npz"
 
 
-def _file_name(gate: str, seed: int | str) -> str:
+def record_name(gate: str, seed: int | str) -> str:
+    """Name of the file of a seed's record."""
     return f"{STEMS[gate]}_seed{seed}.npz"

@@ -13,14 +13,22 @@ import numpy as np
 from mjstack.episodes.batches import Batch, BatchPlan, play_batches
 from mjstack.episodes.failures import FailureMonitor
 from mjstack.episodes.motion import motion_path, motion_recorder, restore_batch, show_batch
-from mjstack.episodes.record import FAILING, SUCCESS_FAILING, EpisodeRecord, circumstances
+from mjstack.episodes.record import (
+    FAILING,
+    SUCCESS_FAILING,
+    EpisodeRecord,
+    circumstances,
+    record_name,
+)
 from mjstack.episodes.rollout import Observer
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
 from mjstack.episodes.tally import EpisodeTally
 from mjstack.errors import FolderError, first_line, name_worlds
+from mjstack.files import write_npz
 from mjstack.interrupt import check_interrupt
 from mjstack.report.page import Map, Worlds
+from mjstack.report.write import safely_write
 from mjstack.sim import Simulation
 
 log = logging.getLogger(__name__)
@@ -170,16 +178,10 @@ class _Player:
         no result back.
         """
         tally = self.tally
-        if tally.path is None:
-            return
-        try:
-            record.write(tally.path.parent, tally.gate)
-        except OSError as error:
-            log.exception("the record of seed %d was not written", record.seed)
-            tally.details.append(
-                f"seed {record.seed}: no record of its {tally.noun} could be written"
-                f" ({error.strerror})"
-            )
+        if tally.path is not None:
+            path = tally.path.with_name(record_name(tally.gate, record.seed))
+            if problem := safely_write(path, write_npz, record.arrays(), stops=False):
+                tally.details.append(problem)
 
 
 def _worlds(tally: EpisodeTally, run: Run) -> Worlds:

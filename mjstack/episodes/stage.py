@@ -62,19 +62,6 @@ class Progress:
     advance: Advance = lambda what, done, total: None
 
 
-@dataclass(eq=False, slots=True)
-class MeasuredSizes:
-    """Buffer sizes that were measured, with a margin.
-
-    Attributes:
-        task: Those that the driven task needs, from *capacity* or from ``batch=auto``.
-        env: Those that environments need, from *capacity*.
-    """
-
-    task: BatchSizes | None = None
-    env: BatchSizes | None = None
-
-
 @dataclass(eq=False)
 class Stage:
     """Makes the simulations, environments and drivers of a configuration.
@@ -84,7 +71,9 @@ class Stage:
         assets: Scene, plan and policy, which several configurations may share; by default those of
             this one.
         ranks: The processes of the run.
-        measured: Buffer sizes that were measured.
+        measured: Buffer sizes that were measured, with a margin: those that the driven ``task``
+            needs, from *capacity* or from ``batch=auto``, and those that environments (``env``)
+            need, from *capacity*.
         progress: Where the run prints.
         observers: Look on at every rollout of many worlds, such as the live view.
     """
@@ -92,7 +81,7 @@ class Stage:
     cfg: Config
     assets: Assets = None  # type: ignore[assignment]
     ranks: Ranks = field(default_factory=current_ranks)
-    measured: MeasuredSizes = field(default_factory=MeasuredSizes)
+    measured: dict[str, BatchSizes] = field(default_factory=dict)
     progress: Progress = field(default_factory=Progress)
     observers: Sequence[Observer] = ()
 
@@ -104,7 +93,7 @@ class Stage:
         """A stage for another configuration, which shares all attributes that do not change. It
         measures sizes itself unless it is given some: other starts, say, have other peaks.
         """
-        return replace(self, cfg=cfg, **({"measured": MeasuredSizes()} | changes))
+        return replace(self, cfg=cfg, **({"measured": {}} | changes))
 
     # What is built once
 
@@ -274,12 +263,12 @@ class Stage:
         # Native MuJoCo has no fixed buffers.
         if not self.cfg.batch.auto or self.backend[0] is Backend.native:
             return resolve_sizes(self.cfg)
-        sizes = self.measured.task
+        sizes = self.measured.get("task")
         if sizes is None:
             what = "the driven task"
             source = f"{what} in {self.measuring_nworld} worlds"
             task = self.play_task(self.cfg.reset)
-            sizes = self.measured.task = measured_sizes(self.cfg, what, task, source)
+            sizes = self.measured["task"] = measured_sizes(self.cfg, what, task, source)
             self.progress.print_line(str(sizes))
         return apply_configured(self.cfg, sizes)
 
@@ -288,7 +277,7 @@ class Stage:
         """Buffer sizes of environments with ``batch=auto``, if *capacity* has measured them; None
         leaves it to `build_env`.
         """
-        sizes = self.measured.env
+        sizes = self.measured.get("env")
         return apply_configured(self.cfg, sizes) if self.cfg.batch.auto and sizes else None
 
     @property

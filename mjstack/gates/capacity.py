@@ -75,8 +75,8 @@ def run_capacity(run: Run) -> list[GateResult]:
         )
 
     # Problems. Motion that lost physics sizes nothing that follows.
-    run.stage.measured.task = None if task.lost else task.advice
-    run.stage.measured.env = None if env.lost else env.advice
+    groups = {"task": task, "env": env}
+    run.stage.measured |= {name: part.advice for name, part in groups.items() if not part.lost}
     problems = [text for _, text in _shortages(task)]
     for key, text in _shortages(env):
         # A size that was set may be meant for the batch alone; those of the robot's profile should
@@ -101,8 +101,8 @@ def run_capacity(run: Run) -> list[GateResult]:
         "margin": t.margin,
     }
     result.notes |= {"backend": task.runs["task"].description, "sizes_from": sizes.source}
-    _report(run, "task", task, result)
-    _report(run, "env", env, result)
+    for name, group in groups.items():
+        _report(run, name, group, result)
     if cameras := cfg.scene.cameras:
         mjwarp = run.stage.backend[0] is Backend.mjwarp
         size = image_bytes(run.stage.model, cameras, cfg.nworld, mjwarp=mjwarp)

@@ -74,25 +74,23 @@ def run_collect(plan: CollectPlan, run: Run, folder: Path) -> None:
     collection = Collection(plan, run.stage)
     ranks.from_first(lambda: None)  # the dataset is open
 
-    def conclude(status: Status, problem: str) -> None:
-        if not ranks.writes:
-            return
-        result = collection.result(status, problem)
-        if collection.committed:
-            run.print_line(f"dataset: {collection.path}")
-        run.record(result)
-
+    raised: BaseException | None = None
     try:
         problem = collection.play()
+        status = Status.failed if problem else Status.passed
     except (Exception, KeyboardInterrupt) as error:
-        cause = ranks.cause(error)
-        if isinstance(cause, KeyboardInterrupt):
-            conclude(Status.interrupted, "interrupted")
-        elif isinstance(cause, RankError):
-            conclude(Status.failed, str(cause))
-            raise cause from error
-        raise
-    conclude(Status.failed if problem else Status.passed, problem)
+        raised = ranks.cause(error)
+        if not isinstance(raised, KeyboardInterrupt | RankError):
+            raise
+        stopped = isinstance(raised, KeyboardInterrupt)
+        status = Status.interrupted if stopped else Status.failed
+        problem = "interrupted" if stopped else str(raised)
+    if ranks.writes:
+        if collection.committed:
+            run.print_line(f"dataset: {collection.path}")
+        run.record(collection.result(status, problem))
+    if raised is not None:
+        raise raised
 
 
 class Collection:
@@ -111,7 +109,10 @@ class Collection:
     Attributes:
         path: The dataset.
         batches: All that were played, in earlier calls too; of rank 0.
+        writer: Of the dataset, of rank 0.
     """
+
+    writer: DatasetWriter
 
     def __init__(self, plan: CollectPlan, stage: Stage) -> None:
         """Open the dataset of a plan; raises as `DatasetWriter` does."""
@@ -123,12 +124,12 @@ class Collection:
         self.path = plan.home / DATASET
         self._source = EpisodeSource(stage, plan.spec, self.path)
         self.batches: list[BatchRecord] = []
-        self._writer: DatasetWriter | None = None
+        self._batches_before = 0
         if not stage.ranks.writes:
             return
         if not (self.path / lerobot.INFO).exists():
             self._record_path.unlink(missing_ok=True)  # of a dataset that was removed
-        self._writer = DatasetWriter(self.path, plan.spec)
+        self.writer = DatasetWriter(self.path, plan.spec)
         self._episodes_before = self.committed
         # Those that are in the dataset, or brought no episode
         episodes = Counter(seed for seed, _ in self.writer.committed)
@@ -137,12 +138,6 @@ class Collection:
                 batch.episodes = episodes[batch.seed]
                 self.batches.append(batch)
         self._batches_before = len(self.batches)
-
-    @property
-    def writer(self) -> DatasetWriter:
-        """The dataset's writer, of rank 0."""
-        assert self._writer is not None
-        return self._writer
 
     @property
     def committed(self) -> int:
@@ -162,12 +157,12 @@ class Collection:
         stage = self._stage
         cfg = demonstration_config(stage.cfg, stage.action)
         channels = demonstration_channels(stage)
-        with closing(self._source), self._writer or nullcontext():
-            batches = play_batches(stage, self._batch_plans(), channels, cfg=cfg)
-            with closing(batches):
-                for batch in batches:
-                    self._add(batch)
-        return self._problem() if stage.ranks.writes else ""
+        batches = play_batches(stage, self._batch_plans(), channels, cfg=cfg)
+        writer = self.writer if stage.ranks.writes else nullcontext()
+        with closing(self._source), writer, closing(batches):
+            for batch in batches:
+                self._add(batch)
+        return self._problem()
 
     def _problem(self) -> str:
         """Why the last seeds of this call brought no episode; empty if they did."""
@@ -205,7 +200,7 @@ class Collection:
         finite = batch.finite().cpu().numpy()
         parts = ranks.gather((batch.episode.failed, finite, int(batch.episode.retries.sum())))
         chosen, *place = ranks.from_first(partial(self._choose, batch.plan.seed, parts))
-        with self._writer.guarded() if self._writer is not None else nullcontext():
+        with self.writer.guarded() if ranks.writes else nullcontext():
             files = ranks.gather(self._source.write(batch, chosen, *place))
         ranks.from_first(partial(self._commit, [file for group in files for file in group]))
 

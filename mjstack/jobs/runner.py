@@ -107,13 +107,16 @@ class CheckedJob:
             report.
         """
         console = Console(highlight=False, soft_wrap=True)
-        report = Report(
-            folder=folder, overrides=list(overrides), resumes=self.resumes or self.resumable
-        )
         cfg = self.stage.cfg
         page = Page(
             title=f"{cfg.robot.title}, {self.title}",
             motion=cfg.web.episode and not lacks_viser(),
+        )
+        report = Report(
+            folder=folder,
+            overrides=list(overrides),
+            resumes=self.resumes or self.resumable,
+            pictures=page.pictures,
         )
         # The collector need not look at all that was loaded each time it frees a gate's worlds.
         gc.collect()
@@ -171,10 +174,7 @@ class CheckedJob:
             self.work(run, folder)
         report.conclude()
         write_formats(report, page)
-        report.pictures = [
-            *draw_episode(self.stage, folder, run.artifacts.pictured, console),
-            *page.pictures,
-        ]
+        draw_episode(self.stage, folder, run.artifacts.pictured, run.draw)
         page.note = save_page(self.stage, folder, page)
 
     def _end(self, error: BaseException, report: Report, console: Console) -> None:

@@ -3,13 +3,11 @@
 import os
 import secrets
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from rich.markup import escape
 
 from mjstack.config.schema import Config
 from mjstack.episodes.rollout import Hook, Observer
@@ -53,31 +51,26 @@ def check_showing(cfg: Config, ending: str = ".mp4") -> None:
 
 
 def draw_episode(
-    stage: Stage, folder: Path, pictured: tuple[str, np.ndarray] | None, console: Console
-) -> list[str]:
-    """Draw the one-world episode, if there was one; return the pictures' file names."""
+    stage: Stage,
+    folder: Path,
+    pictured: tuple[str, np.ndarray] | None,
+    draw: Callable[..., None],
+) -> None:
+    """Draw the one-world episode, if there was one, with `Run.draw`."""
     if pictured is None:
-        return []
+        return
     world, qpos = pictured
     cfg = stage.cfg
+    model = stage.assets.visual_model
     objects = {name: (thing.half, thing.color) for name, thing in cfg.scene.free.items()}
     positions = np.stack([qpos[:, a : a + 3] for a in stage.index.object_qpos], axis=1)
     title = f"{cfg.robot.title}, {cfg.task.name}: {world}"
-    model = stage.assets.visual_model
-    files: dict[str, tuple[Any, ...]] = {  # each a function and its arguments
-        "scene.png": (save_scene, model, qpos[-1]),
-        "trajectories.png": (save_trajectories, positions, objects, title),
-    }
+    draw("scene.png", save_scene, model, qpos[-1])
+    draw("trajectories.png", save_trajectories, positions, objects, title)
     if cfg.video:
-        files["episode.mp4"] = (save_video, model, qpos[None], cfg.timing.step_dt)
-    pictures = []
-    for name, call in files.items():
-        problem = safely_write(folder / name, *call)
-        if name.endswith(".png") and not problem:
-            pictures.append(name)
-        else:
-            console.print(escape(problem or f"video: {folder}/{name}"))
-    return pictures
+        path = folder / "episode.mp4"
+        problem = safely_write(path, save_video, model, qpos[None], cfg.timing.step_dt)
+        stage.progress.print_line(problem or f"video: {path}")
 
 
 def save_page(stage: Stage, folder: Path, page: Page) -> str:
@@ -85,13 +78,13 @@ def save_page(stage: Stage, folder: Path, page: Page) -> str:
     cfg = stage.cfg
     if not cfg.web.episode:
         return "web.episode=false: no 3-D page"
+    path = folder / EPISODE
     worlds = choose_worlds(page.worlds3d)
     problem = lacks_viser()
     if worlds and not problem:
         frame_dt = frame_stride(cfg.timing.step_dt) * cfg.timing.step_dt
-        model = stage.assets.visual_model
-        problem = safely_write(folder / EPISODE, save_episode, model, worlds, frame_dt)
-    if (folder / EPISODE).exists():  # perhaps an earlier call's, of seeds that were read back
+        problem = safely_write(path, save_episode, stage.assets.visual_model, worlds, frame_dt)
+    if path.exists():  # perhaps an earlier call's, of seeds that were read back
         page.episode = EPISODE
     if problem:
         stage.progress.print_line(problem)
