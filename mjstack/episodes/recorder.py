@@ -45,14 +45,17 @@ class Recorder(Observer):
     copied between steps.
 
     Attributes:
+        channels: What is recorded.
         rows: By name of the channel, each ``(recorded ends, worlds, ...)``. Steps that were not
             made have NaN, or -1 where the values are integers.
     """
 
+    channels: tuple[Channels, ...] = ()
+
     def __init__(self, *channels: Channels) -> None:
-        """Take the channels, whose names differ."""
+        """Take the channels, whose names differ; by default those of the class."""
         self.rows: dict[str, Tensor] = {}
-        self._channels = channels
+        self.channels = channels or self.channels
 
     def start(self, env: Env, driver: Driver) -> None:
         """Allocate the rows, and write those of the start."""
@@ -60,7 +63,7 @@ class Recorder(Observer):
         self.rows = {}
         self._captured: list[tuple[Read, Tensor]] = []  # with the row of the next step
         self._copied: list[tuple[Read, dict[int, int]]] = []  # with the row of each recorded end
-        for channels in self._channels:
+        for channels in self.channels:
             ends = channels.ends(driver.steps)
             read = channels.bind(env, driver)
             for name, value in read().items():
@@ -97,9 +100,7 @@ def _read_world(env: Env, driver: Driver) -> Read:
 class WorldRecorder(Recorder):
     """Records positions and phases of world 0 at every step end."""
 
-    def __init__(self) -> None:
-        """Record nothing else."""
-        super().__init__(Channels(_read_world))
+    channels = (Channels(_read_world),)
 
     @property
     def qpos(self) -> np.ndarray:
@@ -124,9 +125,7 @@ def _read_commands(env: Env, driver: Driver) -> Read:
 class CommandRecorder(Recorder):
     """Records the joint targets of all worlds."""
 
-    def __init__(self) -> None:
-        """Record nothing else."""
-        super().__init__(Channels(_read_commands))
+    channels = (Channels(_read_commands),)
 
     @property
     def recorded(self) -> Recorded:

@@ -30,6 +30,35 @@ def simulate_alone(stage: Stage, backend: Backend, device: str, nworld: int = 1)
     )
 
 
+def _read_start(env: Env, driver: Driver) -> Read:
+    sim = env.sim
+    fields = {f"field.{name}": field for name, field in sim.fields.items()}
+    return lambda: {"start_qpos": sim.qpos.double(), "start_qvel": sim.qvel.double(), **fields}
+
+
+def _read_trace(env: Env, driver: Driver) -> Read:
+    """State, objects and the check's values, by name in the file."""
+    sim = env.sim
+    check = make_check(env.cfg)
+    task = check.view(env)
+    free = TaskView(env, list(env.cfg.scene.free))
+
+    def read() -> dict[str, Tensor]:
+        objects = free.step()
+        return {
+            "qpos": sim.qpos.double(),
+            "qvel": sim.qvel.double(),
+            "ctrl": sim.ctrl.double(),
+            "object_pos_m": objects.pos,
+            "object_speed_m_per_s": objects.speed,
+            "object_height_m": objects.height,
+            **check.trace(task.step()),
+            "phase": driver.phase,
+        }
+
+    return read
+
+
 class WorldTrace(Recorder):
     """Records a world that is alone.
 
@@ -40,9 +69,7 @@ class WorldTrace(Recorder):
 
     arrays: dict[str, np.ndarray]
 
-    def __init__(self) -> None:
-        """Record nothing else."""
-        super().__init__(Channels(_read_start, lambda steps: [0]), Channels(_read_trace))
+    channels = (Channels(_read_start, lambda steps: [0]), Channels(_read_trace))
 
     @override
     def finish(self) -> None:
@@ -74,32 +101,3 @@ class WorldTrace(Recorder):
             f" {reports[name][0]} (wanted: {reports[name][1]})"
             for name, bit in check.rules.items()
         ]
-
-
-def _read_start(env: Env, driver: Driver) -> Read:
-    sim = env.sim
-    fields = {f"field.{name}": field for name, field in sim.fields.items()}
-    return lambda: {"start_qpos": sim.qpos.double(), "start_qvel": sim.qvel.double(), **fields}
-
-
-def _read_trace(env: Env, driver: Driver) -> Read:
-    """State, objects and the check's values, by name in the file."""
-    sim = env.sim
-    check = make_check(env.cfg)
-    task = check.view(env)
-    free = TaskView(env, list(env.cfg.scene.free))
-
-    def read() -> dict[str, Tensor]:
-        objects = free.step()
-        return {
-            "qpos": sim.qpos.double(),
-            "qvel": sim.qvel.double(),
-            "ctrl": sim.ctrl.double(),
-            "object_pos_m": objects.pos,
-            "object_speed_m_per_s": objects.speed,
-            "object_height_m": objects.height,
-            **check.trace(task.step()),
-            "phase": driver.phase,
-        }
-
-    return read

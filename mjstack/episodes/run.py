@@ -143,7 +143,7 @@ class Run:
         return Status.failed if bits else Status.passed, reason, metrics
 
     def show_world(
-        self, part: str, label: str, qpos: np.ndarray, *, failed: bool, title: str = ""
+        self, part: str, label: str, qpos: np.ndarray, status: Status, title: str = ""
     ) -> None:
         """Show a world that was played alone, on the run's page if that has worlds in motion.
 
@@ -151,11 +151,13 @@ class Run:
             part: The part of the run that has played it.
             label: Its text on the page.
             qpos: Positions at every step end, shape ``(steps, nq)``.
-            failed: Whether it failed.
+            status: How it ended.
             title: Title of the run's pictures, if they show it too.
         """
         if self.page.motion:
             frames = qpos[:: frame_stride(self.cfg.timing.step_dt)]
-            self.page.worlds3d[part] = [World(label=label, qpos=frames, failed=failed)]
+            self.page.worlds3d[part] = [
+                World(label=label, qpos=frames, failed=status is Status.failed)
+            ]
         if title:
             self.artifacts.pictured = (title, qpos)

@@ -1,7 +1,7 @@
 """Gate *baseline*: one native world does the task."""
 
 from mjstack.episodes.run import Run, needs_episode
-from mjstack.report.record import GateResult, Status
+from mjstack.report.record import GateResult
 
 
 @needs_episode
@@ -25,9 +25,8 @@ def run_baseline(run: Run) -> list[GateResult]:
         metrics["waypoint_error_m"] = float(episode.waypoint_error.max())
         metrics["path_error_m"] = run.stage.planner.path_error()
         thresholds["waypoint_error_m"] = cfg.controller.ik_tolerance
-    failed = status is Status.failed
     qpos = run.nominal.world.qpos
-    run.show_world("baseline", "baseline, native", qpos, failed=failed, title="baseline world")
+    run.show_world("baseline", "baseline, native", qpos, status, "baseline world")
     result = GateResult(name="baseline", status=status, reason=reason or headline)
     result.thresholds = thresholds
     result.metrics = metrics

@@ -80,18 +80,17 @@ def play_worlds(run: Run) -> list[GateResult]:
             observers = [*run.viewers, recorder]
             label = f"steps of world {world}"
             outcome = "not judged: the task has no check"
-            failed = False
+            status = Status.passed
             if cfg.task.check is None:
                 rollout(env, driver, observers, advance=advance, label=label)
             else:
                 episode = play_episode(env, driver, observers, advance=advance, label=label)
                 status, outcome, metrics = run.judge_one(episode)
-                failed = status is Status.failed
-                succeeded += not failed
+                succeeded += status is Status.passed
                 outcome = outcome or f"succeeded, {stage.check.headline(metrics)}"
             positions.append(recorder.qpos)
             fields.append({name: value.clone() for name, value in sim.fields.items()})
-            run.show_world(f"{NAME}_{world}", str(world), recorder.qpos, failed=failed)
+            run.show_world(f"{NAME}_{world}", str(world), recorder.qpos, status)
             details.append(f"world {world}: {outcome}")
             run.print_line(details[-1])
     result = GateResult(

@@ -102,11 +102,10 @@ def _replay(
         lines = trace.explain(episode)
     qpos = trace.arrays["qpos"]
     status, reason, metrics = run.judge_one(episode)
-    failed = status is Status.failed
     agrees, comparison = _compare(plan, number, episode, qpos[-1], changes, run)
     label = f"{plan.world}, {backend}"
     title = f"world {plan.world} of seed {plan.seed}, replayed ({backend})" if first else ""
-    run.show_world(f"replay_{backend}", label, qpos, failed=failed, title=title)
+    run.show_world(f"replay_{backend}", label, qpos, status, title)
     lines += [_first_sign(monitor, episode) for monitor in monitors]
     for line in lines:
         run.print_line(f"  {line}")
