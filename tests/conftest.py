@@ -7,6 +7,7 @@ from __future__ import annotations
 import gc
 import os
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -144,6 +145,24 @@ def error_line(capsys: pytest.CaptureFixture[str]) -> Callable[[], str]:
         return line
 
     return read
+
+
+@pytest.fixture
+def refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error_line: Callable[[], str]
+) -> Callable[..., str]:
+    """The line in which a command is refused, before it writes anything."""
+
+    def refuse(*args: str) -> str:
+        from mjstack.cli import run
+
+        monkeypatch.chdir(tmp_path)
+        before = sorted(tmp_path.rglob("*"))
+        assert run(list(args)) == 2
+        assert sorted(tmp_path.rglob("*")) == before
+        return error_line()
+
+    return refuse
 
 
 @pytest.fixture(scope="session")

@@ -35,20 +35,6 @@ def result(folder: Path) -> dict:
 
 
 @pytest.fixture
-def refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
-    """The line in which a command is refused, before it writes anything."""
-
-    def refuse(*args: str) -> str:
-        out = tmp_path / "out"
-        assert run([*args, f"hydra.run.dir={out}"]) == 2
-        (line,) = capsys.readouterr().err.splitlines()
-        assert not out.exists()
-        return line
-
-    return refuse
-
-
-@pytest.fixture
 def saved(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
     """States of videos, none of which is drawn."""
     videos: list[np.ndarray] = []

@@ -5,6 +5,7 @@ file.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -317,19 +318,10 @@ def test_values_within_the_configured_ranges_alone(tmp_path: Path) -> None:
     ],
 )
 def test_the_command_line_refuses_before_anything_is_written(
-    args: str,
-    message: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    args: str, message: str, tmp_path: Path, refused: Callable[..., str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     np.savez(tmp_path / "worlds.npz", **plain_starts(configure()))
-    assert run([*args.split(), "gates=[batch]", "sim=native"]) == 2
-    err = capsys.readouterr().err
-    assert message in err
-    assert len(err.strip().splitlines()) == 1
-    assert [path.name for path in tmp_path.iterdir()] == ["worlds.npz"]
+    assert message in refused(*args.split(), "gates=[batch]", "sim=native")
 
 
 @pytest.mark.full

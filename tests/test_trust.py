@@ -174,14 +174,9 @@ CALLABLE = ("pydoc.pipepager", "builtins.max", "builtins.dict", "sys.exit", "tor
 
 
 @pytest.mark.parametrize("name", others_full(CALLABLE, CALLABLE[0]))
-def test_only_what_declares_itself_is_called(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert run([f"+reward.evil={{func: {name}, params: {{cmd: 'id > PWNED'}}, weight: 1}}"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
+def test_only_what_declares_itself_is_called(name: str, refused: Callable[..., str]) -> None:
+    line = refused(f"+reward.evil={{func: {name}, params: {{cmd: 'id > PWNED'}}, weight: 1}}")
     assert f"func={name}: expected a function or class whose first parameter is named env" in line
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.full
