@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from environments import configure
-from policies import write_policy
 from test_pixels import CAMERAS, SMALL
 from test_ppo import REACH as PPO
 
@@ -40,22 +38,18 @@ BAD: dict[tuple[str, ...], list[tuple[list[str], str]]] = {
             "job.iterations=null: expected a number, or a limit in job.minutes",
         ),
         (["job.minibatches=64"], "job.minibatches=64: expected at most 8"),
-        (["job.critic=[nope]"], "job.critic: observation group 'nope' does not exist"),
         (["job.leave_out=[nope]"], "term of policy 'nope' does not exist"),
         (
             ["+job.observation.policy.terms.joint_pos.params.foo=1"],
             ": job.observation.policy.terms.joint_pos: parameter 'foo' does not exist",
         ),
-        (["job.start_from=/nowhere"], "policy=/nowhere: has no policy.json"),
-        (["job.start_from={rebot}"], "was trained with robot.name=rebot, and here it is so101"),
         (["job.batch_size=3"], "'job.batch_size' does not exist"),
         (
             ["reset=expert_states", "reset.expert.params.path=/nowhere"],
             "a file of states; it cannot",
         ),
         (["reset=expert_states", "reset.expert.params.share=2"], "reset.expert.params.share=2"),
-        (["job.std=[1,2]"], "job.std"),
-        (["job.std=[0.5,2.0,1.0]"], "job.std=[0.5, 2.0, 1.0]: expected its value at the start"),
+        (["job.std=0"], "job.std=0"),
     ],
     PIXELS: [
         (["job.vision.cameras=[front,side]"], "job.vision.cameras: camera 'side' does not exist"),
@@ -89,10 +83,7 @@ def test_bad_input_is_one_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     out = tmp_path / "out"
-    if "{rebot}" in overrides[0]:
-        other = write_policy(tmp_path / "other", configure("task=reach", robot="rebot"))
-        overrides = [f"job.start_from={other}"]
     assert run([*base, *overrides, f"job.folder={out}"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert says in line
-    assert {path.name for path in tmp_path.iterdir()} <= {"other"}
+    assert not list(tmp_path.iterdir())

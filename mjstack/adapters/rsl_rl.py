@@ -1,15 +1,21 @@
-"""RSL-RL's `VecEnv` over an environment, without leaving the device."""
+"""RSL-RL's `VecEnv` over an environment, without leaving the device, and its runner."""
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout
+from io import StringIO
 from typing import Any
 
 import torch
 
 from mjstack.config.schema import Config
+from mjstack.distributed import Ranks
 from mjstack.envs import Env
 from mjstack.errors import MissingExtra
 
 try:
     from rsl_rl.env import VecEnv
+    from rsl_rl.runners import OnPolicyRunner
     from tensordict import TensorDict
 except ImportError as error:
     raise MissingExtra("mjstack.adapters.rsl_rl", str(error.name), "train") from error
@@ -116,3 +122,28 @@ class RslRlVecEnv(VecEnv):
         # Storage keeps what it gets until after the next step, which draws anew.
         obs = obs | {name: image.clone() for name, image in self.env.images.items()}
         return TensorDict(obs, batch_size=[self.num_envs], device=self.device)
+
+
+def make_runner(env: RslRlVecEnv, cfg: dict[str, Any], ranks: Ranks) -> OnPolicyRunner:
+    """RSL-RL's runner of a configuration, which neither prints nor writes. In ranks its algorithm
+    averages gradients over their group: a runner of its own would not take one that is there.
+    """
+    with redirect_stdout(StringIO()), _one_process():
+        runner = OnPolicyRunner(env, cfg, device=str(env.device))
+    if ranks.size > 1:
+        runner.alg.is_multi_gpu = True
+        runner.alg.gpu_global_rank = ranks.rank
+        runner.alg.gpu_world_size = ranks.size
+        runner.alg.broadcast_parameters()
+    return runner
+
+
+@contextmanager
+def _one_process() -> Iterator[None]:
+    """Hide from RSL-RL that torchrun has started several."""
+    size = os.environ.pop("WORLD_SIZE", None)
+    try:
+        yield
+    finally:
+        if size is not None:
+            os.environ["WORLD_SIZE"] = size

@@ -70,8 +70,6 @@ _RESOLVERS: dict[str, Callable] = {
     "steps": _control_steps,
     "by_device": _by_device,
     "if_native": lambda native, mjwarp, *, _root_: native if _is_native(_root_) else mjwarp,
-    # A random network, or a policy to go on from
-    "by_start": lambda new, policy, *, _root_: new if _root_.job.start_from is None else policy,
     "at_most": lambda value, limit, small, large: small if value <= limit else large,
 }
 for _name, _function in _RESOLVERS.items():

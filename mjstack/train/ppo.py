@@ -3,7 +3,7 @@
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import torch
 
@@ -15,11 +15,10 @@ from mjstack.envs import Env
 from mjstack.episodes.batches import BatchPlan, play_batches
 from mjstack.episodes.recorder import Channels, Read
 from mjstack.episodes.stage import Stage
-from mjstack.errors import ConfigError, FolderError, MjstackError, UnknownName, renamed_keys
+from mjstack.errors import ConfigError, MjstackError, renamed_keys
 from mjstack.managers.term import check_params
 from mjstack.mdp.starts.expert_states import STATE as STATE_VIEWS
 from mjstack.mdp.starts.expert_states import write_states
-from mjstack.policy import Policy, load_policy
 from mjstack.policy.checkpoint import read_state
 from mjstack.train.ppo_learner import PpoLearner
 from mjstack.train.trainer import (
@@ -34,58 +33,14 @@ from mjstack.train.trainer import (
 
 _STATES = "expert_states.npz"  # in the training's folder
 _STRIDE = 5  # control steps between two states
-_TARGETS = "mjstack.mdp.action.JointTargets"
 
 
-def _environment(cfg: Config) -> tuple[Config, Policy | None, str]:
-    """The configuration of the environment, the policy that training starts from, if one is named,
-    and the name of the observation group that the policy sees.
-
-    Raises:
-        MjstackError: There is no such group or term, or the policy to start from cannot be used.
+def _environment(cfg: Config) -> Config:
+    """The configuration of the environment: the policy's observation group beside or in place of
+    the task's, all of which the critic sees.
     """
     job = cast(PpoJobCfg, cfg.job)
-    start = None
-    name = job.group
-    if job.start_from is None:
-        seen = observed_group(job)
-    else:
-        start = load_policy(Path(job.start_from))
-        start.check_fit(cfg)
-        if start.network.vision.sizes:
-            expected = "a policy that sees no images"
-            raise ConfigError("job.start_from", job.start_from, expected)
-        name = start.group
-        seen = start.observation
-        cfg = _acting_as(cfg, start)
-    for group in job.critic:
-        if group not in cfg.observation:
-            raise UnknownName("job.critic: observation group", group, cfg.observation)
-    critic = {group: cfg.observation[group] for group in job.critic if group != name}
-    return replace(cfg, observation={name: seen, **critic}), start, name
-
-
-def _acting_as(cfg: Config, policy: Policy) -> Config:
-    """The configuration with a policy's actions and rate. Of joint targets, an action is the part
-    of a chunk that the policy plays.
-    """
-    action = policy.action
-    network = policy.network
-    if action == cfg.controller.action:
-        params: dict[str, Any] = {
-            name: network.get_buffer(f"action_{name}").double().tolist()
-            for name in ("mean", "std", "low", "high")
-        }
-        params["steps"] = min(network.chunk, policy.execute)
-        action = {"targets": TermCfg(func=_TARGETS, params=params)}
-    elif network.chunk > 1:
-        raise FolderError(
-            f"policy={policy.folder}: has chunks of {network.chunk} actions: expected 1, as its"
-            " actions are no joint targets",
-            "Name another policy",
-        )
-    timing = replace(cfg.timing, policy_decimation=policy.execute)
-    return replace(cfg, action=action, timing=timing)
+    return replace(cfg, observation=cfg.observation | {job.group: observed_group(job)})
 
 
 def _unrecorded(reset: dict[str, TermCfg]) -> dict[str, TermCfg]:
@@ -132,7 +87,7 @@ def _record_states(stage: Stage, path: Path) -> None:
 
 
 def check_ppo(stage: Stage) -> range:
-    """Check the terms, the policy to start from and the sizes; see `Trainer`."""
+    """Check the terms and the sizes; see `Trainer`."""
     cfg = stage.cfg
     job = cast(PpoJobCfg, cfg.job)
     if job.iterations is None and job.minutes is None:
@@ -142,23 +97,14 @@ def check_ppo(stage: Stage) -> range:
         expected = f"at most {worlds * job.horizon // 2}, so that each has two decisions"
         expected += f" (nworld={worlds} times job.horizon={job.horizon} are divided)"
         raise ConfigError("job.minibatches", job.minibatches, expected)
-    env_cfg, start, group = _environment(cfg)
-    first, least, most = job.std
-    if not least <= first <= most:
-        expected = (
-            "its value at the start, the smallest and the largest, the first within the others"
-        )
-        raise ConfigError("job.std", job.std, expected)
     unrecorded = _unrecorded(cfg.reset)  # there is no file to build them with yet
     for name, term in unrecorded.items():
         label = f"reset.{name}"
         check_params(label, resolve_func(label, term.func), term.params, 1)
     reset = {name: term for name, term in cfg.reset.items() if name not in unrecorded}
-    seen = f"observation.{group}"
-    keys = {seen: f"job.{seen}"} if start is None else {}
-    with renamed_keys(keys), one_world(stage, replace(env_cfg, reset=reset)) as env:
-        if start is not None:
-            start.check_widths(env.observation_manager.term_dims[group])
+    keys = {f"observation.{job.group}": f"job.observation.{job.group}"}
+    with renamed_keys(keys), one_world(stage, replace(_environment(cfg), reset=reset)):
+        pass
     return range(cfg.seed, cfg.seed + 1)
 
 
@@ -172,11 +118,10 @@ def train_ppo(stage: Stage, folder: Path) -> Trained:
     for name, term in _unrecorded(reset).items():
         ranks.from_first(lambda: None if states.exists() else _record_states(stage, states))
         reset[name] = replace(term, params=term.params | {"path": str(states)})
-    environment = _environment(replace(cfg, reset=reset))
     cards = [device] if device.type == "cuda" else []
     with torch.random.fork_rng(devices=cards):
-        torch.manual_seed(cfg.seed + ranks.rank)
-        with closing(PpoLearner(stage, *environment, folder)) as learner:
+        environment = _environment(replace(cfg, reset=reset))
+        with closing(PpoLearner(stage, environment, folder)) as learner:
             if (folder / STATE).exists():
                 learner.restore(*read_state(folder / STATE))
             learner.learn()

@@ -1,4 +1,4 @@
-"""Trainer *ppo* at work: rsl-rl-lib's PPO on an environment, and a policy of its actor."""
+"""Trainer *ppo* at work: rsl-rl-lib's runner on an environment, and a policy of its actor."""
 
 import math
 import sys
@@ -6,22 +6,22 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from typing_extensions import override
 
-from mjstack.adapters.rsl_rl import RslRlVecEnv
-from mjstack.adapters.rsl_rl_ppo import RATE, RewardScale, make_ppo
+from mjstack.adapters.rsl_rl import RslRlVecEnv, make_runner
 from mjstack.config.fingerprint import config_content
 from mjstack.config.schema import Config, PpoJobCfg
 from mjstack.drivers.driver import Driver
-from mjstack.envs import build_env
+from mjstack.envs import Env, build_env
 from mjstack.envs.statistics import join_statistics
+from mjstack.episodes.rollout import Observer
 from mjstack.episodes.stage import Stage
+from mjstack.errors import MjstackError
 from mjstack.policy import Policy, PolicyNetwork
 from mjstack.train.learner import Learner
-
-_MEASURED = 8192  # decisions by which the change of a policy is measured
 
 
 class _Actor(Driver):
@@ -32,22 +32,34 @@ class _Actor(Driver):
         raise NotImplementedError
 
 
+class _Worlds(RslRlVecEnv):
+    """Shows every step to observers."""
+
+    def __init__(self, env: Env, observers: Sequence[Observer]) -> None:
+        super().__init__(env, log_interval=sys.maxsize)
+        self._observers = observers
+        for observer in observers:
+            observer.start(env, _Actor(env.nworld, sys.maxsize, env.device))
+
+    @override
+    def step(self, actions: Tensor) -> Any:
+        result = super().step(actions)
+        for observer in self._observers:
+            observer.after_step(self._steps)
+        return result
+
+
 class PpoLearner(Learner):
     """PPO on an environment. A step is an iteration. The best policy is the one with the largest
     share of successes of the episodes between two saves, then with the largest return.
-
-    Attributes:
-        change: KL divergence of the policy after the last iteration from the one before.
     """
 
     trainer = "ppo"
     step = "iteration"
 
-    def __init__(
-        self, stage: Stage, cfg: Config, start: Policy | None, group: str, folder: Path
-    ) -> None:
-        """Build the environment of a configuration, and the networks of a policy that sees the
-        group: with random weights, or those of ``start``.
+    def __init__(self, stage: Stage, cfg: Config, folder: Path) -> None:
+        """Build the environment of a configuration, and networks with random weights: the actor
+        sees the observation group ``job.group``, the critic all groups.
         """
         self._job = job = cast(PpoJobCfg, cfg.job)
         super().__init__(stage, cfg, folder, job.save_every)
@@ -61,24 +73,54 @@ class PpoLearner(Learner):
             backend=backend,
             device=device,
         )
-        self._worlds = RslRlVecEnv(self._env, log_interval=sys.maxsize)
-        self._steps = 0
-        self._observers = stage.observers
-        for observer in self._observers:
-            observer.start(self._env, _Actor(len(worlds), sys.maxsize, self._env.device))
-        self._scale = RewardScale(job, stage.ranks, len(worlds), self._env.device)
-        hidden = job.hidden if start is None else start.network.hidden
-        self._alg = alg = make_ppo(self._worlds, job, stage.ranks, group, hidden)
-        self._value_loss = math.nan  # of the last iteration
-        self.policy = self._make_policy(start, group, hidden)
-        if start is not None:
-            self._begin_with(start)
+        self._seed()
+        self._runner = make_runner(
+            _Worlds(self._env, stage.observers), self._runner_config(), stage.ranks
+        )
+        self._alg = alg = self._runner.alg
         self._networks = nn.ModuleDict({"actor": alg.actor, "critic": alg.critic})
-        self._networks.register_buffer("rewards", self._scale.sums)  # so it is part of the state
-        groups = [{"params": list(net.parameters())} for net in self._networks.values()]
-        self._optimizer = alg.optimizer = torch.optim.Adam(groups)
-        alg.optimizer.register_step_pre_hook(lambda *_: self._set_rates())
-        self.change = math.nan
+        self._optimizer = alg.optimizer
+        self._spread = True  # the first episodes, so that they do not all end at once
+        widths = self._env.observation_manager.term_dims[job.group]
+        actions = self._env.action_manager.action_dim
+        self.policy = Policy(
+            network=PolicyNetwork(sum(widths.values()), actions, 1, job.hidden),
+            group=job.group,
+            observation=cfg.observation[job.group],
+            widths=widths,
+            execute=cfg.timing.policy_decimation,
+            config=config_content(cfg),
+            action=cfg.action,
+        )
+
+    def _runner_config(self) -> dict[str, Any]:
+        """The configuration of rsl_rl's runner."""
+        job = self._job
+        network = {
+            "class_name": "MLPModel",
+            "hidden_dims": job.hidden,
+            "activation": "elu",
+            "obs_normalization": True,
+        }
+        gaussian = {"class_name": "GaussianDistribution", "init_std": job.std}
+        return {
+            "num_steps_per_env": job.horizon,
+            "obs_groups": {"actor": [job.group], "critic": list(self._cfg.observation)},
+            "actor": network | {"distribution_cfg": gaussian},
+            "critic": dict(network),
+            "algorithm": {
+                "class_name": "PPO",
+                "num_learning_epochs": job.epochs,
+                "num_mini_batches": job.minibatches,
+                "learning_rate": job.learning_rate,
+                "desired_kl": job.desired_kl,
+                "gamma": job.gamma,
+                "lam": job.gae_lambda,
+                "clip_param": job.clip,
+                "use_clipped_value_loss": False,  # whose limit suits returns around 1
+                "entropy_coef": job.entropy,
+            },
+        }
 
     def close(self) -> None:
         """Give the worlds back too."""
@@ -87,12 +129,6 @@ class PpoLearner(Learner):
 
     def learn(self) -> None:
         """See `Learner`. A training without an iteration leaves policies too."""
-        if self._ranks.size > 1:
-            self._alg.broadcast_parameters()
-        # Episodes do not all end at once
-        worlds = self._worlds
-        steps = worlds.episode_length_buf
-        worlds.episode_length_buf = torch.randint_like(steps, high=worlds.max_episode_length)
         super().learn()
         if not self.curve:
             self._save()
@@ -109,57 +145,20 @@ class PpoLearner(Learner):
         return self._ranks.any(over)
 
     def _step(self) -> None:
-        """One iteration."""
-        job = self._job
-        start, end = job.entropy
-        share = min(1.0, self.done / job.entropy_iterations)
-        self._alg.entropy_coef = start + (end - start) * share
-        self._alg.actor.requires_grad_(self.done >= job.critic_iterations)
-        scale = self._alg.actor.obs_normalizer
-        before = scale._mean.clone(), scale._std.clone()
-        self._roll_out()
-        self._value_loss = self._alg.update()["value"]
-        self._deviation().data.clamp_(*job.std[1:])
-        if self.done >= job.critic_iterations:
-            # By what learning has changed, not the scale of the observation
-            after = scale._mean, scale._std
-            scale._mean, scale._std = before
-            self._measure_change()
-            scale._mean, scale._std = after
+        """One iteration.
 
-    @torch.inference_mode()
-    def _roll_out(self) -> None:
-        """Let the worlds act for an iteration, and compute returns."""
-        worlds = self._worlds
-        obs = worlds.get_observations()
-        for _ in range(self._job.horizon):
-            obs, rewards, dones, extras = worlds.step(self._alg.act(obs))
-            self._steps += 1
-            for observer in self._observers:
-                observer.after_step(self._steps)
-            self._alg.process_env_step(obs, self._scale(rewards, dones), dones, extras)
-        self._alg.compute_returns(obs)
-
-    def _set_rates(self) -> None:
-        """Set the learning rates of a step of the optimizer. rsl_rl, which has one for both
-        networks, adapts it to the change of the policy before every step: the actor's follows.
+        Raises:
+            MjstackError: A number of the networks is not finite.
         """
-        actor, critic = self._alg.optimizer.param_groups
-        actor["lr"] = self._alg.learning_rate / RATE * self._job.learning_rate
-        critic["lr"] = self._job.critic_learning_rate
-
-    def _measure_change(self) -> None:
-        """Measure how the last iteration changed the policy."""
-        actor = self._alg.actor
-        storage = self._alg.storage
-        decisions = storage.num_envs * storage.num_transitions_per_env
-        sample = slice(None, None, -(-decisions // _MEASURED))
-        with torch.inference_mode():
-            before = [p.flatten(0, 1)[sample] for p in storage.distribution_params]
-            actor(storage.observations.flatten(0, 1)[sample], stochastic_output=True)
-            change = actor.get_kl_divergence(before, actor.output_distribution_params).mean()
-        self._ranks.sum_(change)
-        self.change = float(change) / self._ranks.size
+        spread = self._spread
+        self._spread = False
+        self._runner.learn(1, init_at_random_ep_len=spread)
+        if not all(bool(value.isfinite().all()) for value in self._networks.state_dict().values()):
+            raise MjstackError(
+                f"train: the networks' numbers are not finite after iteration {self.done + 1};"
+                f" {self._folder} keeps what was saved before",
+                "Lower job.learning_rate, or look at observations and rewards",
+            )
 
     def _show(self) -> None:
         job = self._job
@@ -184,7 +183,10 @@ class PpoLearner(Learner):
 
     def _new_row(self) -> dict[str, Any]:
         """Figures since the last row. Values of reward terms are means over the episodes' steps."""
-        self._take_weights()
+        actor = self._alg.actor
+        self.policy.network.layers.load_state_dict(actor.mlp.state_dict())
+        scale = actor.obs_normalizer
+        self.policy.network.set_scale("observation", scale.mean.cpu(), scale.std.cpu() + scale.eps)
         env = self._env
         means = join_statistics(self._ranks.gather(env.read_statistics()))
         steps = means.get("steps", math.nan)
@@ -207,77 +209,27 @@ class PpoLearner(Learner):
             "return": means.get("return", math.nan),
             "steps": steps,
             **terms,
-            "value_loss": self._value_loss,
-            "kl": self.change,
-            "std": float(self._deviation().data.mean()),
-            "entropy_weight": self._alg.entropy_coef,
-            "learning_rate": self._alg.optimizer.param_groups[0]["lr"],
+            "std": float(actor.distribution.std_param.detach().mean()),
+            "learning_rate": self._alg.learning_rate,
         }
 
-    # Networks
-
-    def _make_policy(self, start: Policy | None, group: str, hidden: Sequence[int]) -> Policy:
-        """The policy that is saved, its weights still to come."""
-        cfg = self._cfg
-        widths = self._env.observation_manager.term_dims[group]
-        actions = self._worlds.num_actions
-        width = actions if start is None else start.network.width
-        network = PolicyNetwork(sum(widths.values()), width, actions // width, hidden)
-        if start is not None:
-            network.set_scale("action", start.network.action_mean, start.network.action_std)
-            network.set_range(start.network.action_low, start.network.action_high)
-        action = cfg.action if start is None else start.action
-        facts = (widths, cfg.timing.policy_decimation, config_content(cfg), action)
-        return Policy(network, group, cfg.observation[group], *facts)
-
-    def _begin_with(self, start: Policy) -> None:
-        """Give the actor a policy's weights and the scale of its observation, which stays."""
-        actor = self._alg.actor
-        with torch.no_grad():
-            sources = list(start.network.layers.parameters())
-            for weight, source in zip(actor.mlp.parameters(), sources, strict=True):
-                weight.copy_(source[: len(weight)])  # of a chunk, the part that is played
-            scale = actor.obs_normalizer
-            scale._mean.copy_(start.network.observation_mean)
-            scale._std.copy_(start.network.observation_std - scale.eps)
-        scale.until = 0
-
-    def _take_weights(self) -> None:
-        """Copy the actor's weights and the scale of its observation into the policy."""
-        actor = self._alg.actor
-        network = self.policy.network
-        network.layers.load_state_dict(actor.mlp.state_dict())
-        scale = actor.obs_normalizer
-        network.set_scale("observation", scale.mean.cpu(), scale.std.cpu() + scale.eps)
-
-    def _deviation(self) -> Tensor:
-        """Standard deviation of each number of an action."""
-        return self._alg.actor.distribution.std_param
-
-    # State
-
-    @override
-    def _tensors(self) -> dict[str, Tensor]:
-        env = self._env
-        state = {"random": torch.get_rng_state(), "episode": env.episode}
-        if env.device.type == "cuda":
-            state["random_cuda"] = torch.cuda.get_rng_state(env.device)
-        return super()._tensors() | state
+    def _seed(self) -> None:
+        """Seed the noise of actions and the order of minibatches, by seed, rank and iteration."""
+        numbers = np.random.SeedSequence([self._cfg.seed, self._ranks.rank, self.done])
+        torch.manual_seed(int(numbers.generate_state(1)[0]))
 
     @override
     def facts(self) -> dict[str, Any]:
-        return super().facts() | {"learning_rate": self._alg.learning_rate}
+        numbers = {
+            "learning_rate": self._alg.learning_rate,
+            "episode": int(self._env.episode.max()),
+        }
+        return super().facts() | numbers
 
     def restore(self, state: dict[str, Tensor], facts: dict[str, Any]) -> None:
-        """See `Learner`. Worlds begin their next episodes."""
+        """See `Learner`. All worlds begin the episode after the latest one."""
         super().restore(state, facts)
-        env = self._env
         self._alg.learning_rate = facts["learning_rate"]
-        if self._ranks.writes:  # the others have their own
-            torch.set_rng_state(state["random"])
-            if "random_cuda" in state and env.device.type == "cuda":
-                torch.cuda.set_rng_state(state["random_cuda"], env.device)
-        episode = state["episode"]
-        # With another number of ranks, or another share, all worlds begin the latest episode.
-        env.episode.copy_(episode if len(episode) == env.nworld else episode.max())
-        env.reset()
+        self._env.episode.fill_(facts["episode"])
+        self._env.reset()
+        self._seed()

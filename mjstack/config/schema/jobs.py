@@ -158,11 +158,6 @@ class DaggerJobCfg(CloneJobCfg):
 class PpoJobCfg(TrainJobCfg):
     """A policy learns from the task's rewards, by rsl_rl's PPO."""
 
-    critic: list[str] = spec(factory=list)
-    """Observation groups that the critic sees besides the policy's."""
-    start_from: str | None = spec(None)
-    """Folder of a policy that training starts from, with its observation and its actions; null: a
-    random network."""
     iterations: int | None = spec(None, ge=1)
     """Iterations of the training, over all calls; null: as ``minutes`` says."""
     minutes: float | None = spec(None, unit="min", gt=0.0)
@@ -181,28 +176,20 @@ class PpoJobCfg(TrainJobCfg):
     """How often an iteration goes through them."""
     minibatches: int = spec(ge=1)
     """Parts into which they are divided."""
-    critic_learning_rate: float = spec(gt=0.0)
-    """Of the critic."""
     gamma: float = spec(ge=0.0, le=1.0)
     """Discount per decision."""
     gae_lambda: float = spec(ge=0.0, le=1.0)
     """Of the generalised advantage estimation."""
     clip: float = spec(gt=0.0)
     """Largest change of an action's probability that counts."""
-    reward_limit: float = spec(gt=0.0)
-    """Limit of the rewards, over the standard deviation of their discounted sum."""
-    entropy_iterations: int = spec(ge=1)
-    """Iterations over which the weight of the entropy changes."""
-    std: list[float] = spec(length=3, gt=0.0)
-    """Standard deviation of the actions: at the start, smallest and largest."""
-    entropy: list[float] = spec(length=2, ge=0.0)
-    """Weight of the entropy at the start, and after ``entropy_iterations``."""
+    std: float = spec(gt=0.0)
+    """Standard deviation of the actions at the start."""
+    entropy: float = spec(ge=0.0)
+    """Weight of the entropy."""
     desired_kl: float = spec(gt=0.0)
     """Change of the policy per iteration to which rsl_rl adapts the learning rate."""
     learning_rate: float = spec(gt=0.0)
-    """Of the actor at the start; it stays within a hundredth and ten times of it."""
-    critic_iterations: int = spec(ge=0)
-    """First iterations, in which only the critic learns."""
+    """At the start; it stays within 0.00001 and 0.01."""
 
 
 # Trainers with keys of their own; the others have those of clone.
