@@ -45,7 +45,7 @@ PATHS: dict[str, dict[str, str] | None] = {
         "ObjectOffTable JointLimit": "__call__",
     },
     "mdp/action.py": {
-        "JointPosition Gripper JointTargets": "write_commands",
+        "JointPosition Gripper": "write_commands",
         "EndEffectorDelta": "write_commands _tilted",
         "_Commands": "_write_bounded",
     },

@@ -119,59 +119,6 @@ class Gripper(_Commands):
         self._columns.write(self._ctrl, self._closed + opened)
 
 
-class JointTargets(_Commands):
-    """Absolute joint targets of the control steps of one decision: the answer of a cloned policy.
-
-    The action has the targets of the first step, then of the second, and so on, each less ``mean``
-    and over ``std``. If there are fewer of them than control steps, the last ones hold. Targets are
-    kept within ``low`` and ``high``.
-    """
-
-    unit = "standard deviations"
-
-    def __init__(
-        self,
-        env: EnvView,
-        *,
-        mean: Sequence[float],
-        std: Sequence[Positive],
-        low: Sequence[float],
-        high: Sequence[float],
-        steps: Count = 1,
-    ) -> None:
-        """Take scale and range.
-
-        Args:
-            env: The environment.
-            mean: Of every joint's targets [rad, m].
-            std: Of every joint's targets [rad, m].
-            low: Of every joint's targets [rad, m]: the smallest.
-            high: Of every joint's targets [rad, m]: the largest.
-            steps: Control steps for which there are targets.
-        """
-        joints = len(env.index.ctrl)
-        self._set_up(env, range(joints), dim=steps * joints)
-        self._steps = steps
-        self._mean, self._std, least, most = (
-            torch.tensor(values, dtype=self._ctrl.dtype, device=env.device)
-            for values in (mean, std, low, high)
-        )
-        self._low = torch.maximum(self._low, least)
-        self._high = torch.minimum(self._high, most)
-        self.low, self.high = (
-            ((limit - self._mean) / self._std).repeat(steps) for limit in (self._low, self._high)
-        )
-        self._decimation = env.cfg.timing.policy_decimation
-        self._step = env.episode_step
-
-    def write_commands(self, action: Tensor) -> None:
-        """Write the commands of the control step."""
-        number = self._step.remainder(self._decimation).clamp(max=self._steps - 1)
-        targets = action.unflatten(1, (self._steps, -1))
-        now = targets.gather(1, number[:, None, None].expand(-1, 1, targets.shape[2]))[:, 0]
-        self._write_bounded(self._mean + self._std * now)
-
-
 class EndEffectorDelta(_Commands):
     """Moves the commanded grasp point by ``scale`` times the action in x, y and z, by batched
     inverse kinematics. With ``roll`` one more number turns the gripper about its approach axis.
