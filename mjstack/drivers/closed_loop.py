@@ -7,6 +7,7 @@ from collections.abc import Iterable
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from mjstack.drivers.feedback import STAY, FeedbackDriver
 from mjstack.drivers.open_loop import OpenLoopPlanner, smoothstep
@@ -44,7 +45,7 @@ class ClosedLoopDriver(FeedbackDriver):
         self._home_grip = robot(env).home[self._n_arm :].float()
 
         # Buffers
-        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
             return torch.zeros((env.nworld, *shape), dtype=dtype, device=env.device)
 
         self._time = zeros()
@@ -57,7 +58,7 @@ class ClosedLoopDriver(FeedbackDriver):
         self._to = torch.zeros_like(self._from)
         self._roll = zeros()
 
-    def command(self) -> torch.Tensor:
+    def command(self) -> Tensor:
         """Commands of the next step, shape ``(nworld, nu)``, float32. The controller's own memory:
         do not write into it.
         """
@@ -89,7 +90,7 @@ class ClosedLoopDriver(FeedbackDriver):
         _put(self.error, last, torch.maximum(self.error, distance))
         return self._command
 
-    def _advance(self, fresh: torch.Tensor) -> None:
+    def _advance(self, fresh: Tensor) -> None:
         """Time goes on by a step; worlds whose phase is over enter the next one, or try their grasp
         again.
         """
@@ -118,7 +119,7 @@ class ClosedLoopDriver(FeedbackDriver):
         _put(self._from, entering, torch.where(fresh[:, None], home, self._to))
         _put(self._to, entering, torch.cat((target, self._grip[phase]), dim=1))
 
-    def _judge_grasp(self, over: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def _judge_grasp(self, over: Tensor) -> tuple[Tensor, Tensor]:
         """Worlds that try their grasp again, ``(nworld,)`` bool, and how fast they go on,
         ``(nworld,)``.
         """
@@ -134,7 +135,7 @@ class ClosedLoopDriver(FeedbackDriver):
         self._tried |= retry[:, None] & (grasps[:, None] == self._numbers)
         return retry, rate
 
-    def _turn(self, command: torch.Tensor, fresh: torch.Tensor) -> None:
+    def _turn(self, command: Tensor, fresh: Tensor) -> None:
         """Roll the open jaws towards a face of the object that a phase observes, by a little per
         step.
 
@@ -168,7 +169,7 @@ class ClosedLoopDriver(FeedbackDriver):
         names = [phase.name for phase in phases]
         objects = list(cfg.scene.objects)
 
-        def column(values: Iterable[object]) -> torch.Tensor:
+        def column(values: Iterable[object]) -> Tensor:
             return torch.tensor(list(values), device=self.phase.device)
 
         self._length = column(float(phase.stop - phase.start) for phase in phases)
@@ -188,7 +189,7 @@ class ClosedLoopDriver(FeedbackDriver):
         self._rest = window + math.ceil(cfg.controller.rest_seconds / cfg.timing.step_dt)
 
 
-def _put(buffer: torch.Tensor, mask: torch.Tensor, values: torch.Tensor) -> None:
+def _put(buffer: Tensor, mask: Tensor, values: Tensor) -> None:
     """Write the rows of a ``(nworld,)`` bool mask; the buffer keeps its address."""
     rows = mask if buffer.dim() == 1 else mask[:, None]
     buffer.copy_(torch.where(rows, values, buffer))

@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 
 import torch
+from torch import Tensor
 
 from mjstack.config.schema import Config, TermCfg
 from mjstack.drivers.open_loop import JointTrajectory
@@ -37,7 +38,7 @@ class Driver(ABC):
         self.retries = torch.zeros(nworld, dtype=torch.int32, device=device)
 
     @abstractmethod
-    def command(self) -> torch.Tensor:
+    def command(self) -> Tensor:
         """Actions of the next step, shape ``(nworld, action_dim)``."""
 
 
@@ -70,7 +71,7 @@ class Recorded(Driver):
     worlds with six joint targets. ``job=replay`` needs none of it: it plays a world from its seed.
     """
 
-    def __init__(self, source: Driver, commands: torch.Tensor, phases: torch.Tensor) -> None:
+    def __init__(self, source: Driver, commands: Tensor, phases: Tensor) -> None:
         """Take the driver, its commands ``(steps, nworld, nu)`` and phases ``(steps, nworld)``."""
         super().__init__(len(source.phase), source.steps, source.phase.device, source.phases)
         self.error = source.error
@@ -79,7 +80,7 @@ class Recorded(Driver):
         self._phases = phases
         self._next = torch.zeros(1, dtype=torch.int64, device=source.phase.device)
 
-    def command(self) -> torch.Tensor:
+    def command(self) -> Tensor:
         """Commands of the next step, shape ``(nworld, nu)``."""
         out = self._commands.index_select(0, self._next)[0]
         self.phase.copy_(self._phases.index_select(0, self._next)[0])
@@ -102,7 +103,7 @@ class OpenLoopDriver(Driver):
         self._phase_at = torch.arange(len(phases), device=device).repeat_interleave(lengths)
         self._next = torch.zeros(1, dtype=torch.int64, device=device)
 
-    def command(self) -> torch.Tensor:
+    def command(self) -> Tensor:
         """Commands of the next step, shape ``(nworld, nu)``."""
         out = self._trajectory.command(self._next)
         self.phase.copy_(self._phase_at.index_select(0, self._next).expand_as(self.phase))

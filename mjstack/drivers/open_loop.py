@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from mjstack.config.schema import Config
 from mjstack.errors import MjstackError, Unreachable
@@ -53,9 +54,9 @@ class JointTrajectory:
         waypoint_error: Largest distance [m] from a target at any knot, shape ``(nworld,)``.
     """
 
-    knots: torch.Tensor
-    weights: torch.Tensor
-    numbers: torch.Tensor
+    knots: Tensor
+    weights: Tensor
+    numbers: Tensor
     waypoint_error: np.ndarray
 
     @property
@@ -72,7 +73,7 @@ class JointTrajectory:
             numbers=self.numbers.to(device),
         )
 
-    def command(self, step: int | torch.Tensor) -> torch.Tensor:
+    def command(self, step: int | Tensor) -> Tensor:
         """Commands of one step.
 
         Args:
@@ -259,7 +260,7 @@ class OpenLoopPlanner:
             for step in range(steps):
                 yield number, smoothstep((step + 1) / steps)
 
-    def _step_weights(self) -> tuple[torch.Tensor, torch.Tensor]:
+    def _step_weights(self) -> tuple[Tensor, Tensor]:
         """Barycentric Lagrange weights of the Chebyshev points, and their numbers, for every
         step.
         """

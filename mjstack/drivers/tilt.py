@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import mujoco
 import torch
+from torch import Tensor
 
 from mjstack.config.schema import Config
 from mjstack.kinematics.batched_ik import BatchedIk
@@ -31,7 +32,7 @@ class CarryTilt:
         cfg: Config,
         phases: Sequence[Phase],
         ik: BatchedIk,
-        nominal: torch.Tensor,
+        nominal: Tensor,
     ) -> None:
         """Allocate for the worlds of the solver.
 
@@ -67,8 +68,8 @@ class CarryTilt:
         self._last_turn = nominal.new_zeros(ik.nworld)
 
     def desired_approach(
-        self, command: torch.Tensor, phase: torch.Tensor, there: torch.Tensor, fresh: torch.Tensor
-    ) -> torch.Tensor:
+        self, command: Tensor, phase: Tensor, there: Tensor, fresh: Tensor
+    ) -> Tensor:
         """Desired approach axis of the next step. Fixed shapes, no host read.
 
         Args:
@@ -95,9 +96,7 @@ class CarryTilt:
         since = torch.where(keeps, self._last_turn, self._there[:, 0])
         return self._turned(axis, command[:, 0] - since)
 
-    def release_approach(
-        self, command: torch.Tensor, phase: torch.Tensor, there: torch.Tensor
-    ) -> torch.Tensor:
+    def release_approach(self, command: Tensor, phase: Tensor, there: Tensor) -> Tensor:
         """Approach axis of the release pose, turned about the vertical to where the arm looks; from
         these arguments alone, which are those of `desired_approach`. Fixed shapes, no host read.
         """
@@ -105,12 +104,12 @@ class CarryTilt:
         arm = self._there_ik.solve(start, there)[0]
         return self._turned(self._there_ik.forward(arm)[2], command[:, 0] - arm[:, 0])
 
-    def _turned(self, axis: torch.Tensor, turn: torch.Tensor) -> torch.Tensor:
+    def _turned(self, axis: Tensor, turn: Tensor) -> Tensor:
         """Axes, shape ``(nworld, 3)``, turned with the first joint [rad], shape ``(nworld,)``."""
         return turn_about_z(axis, self._sign * turn)
 
 
-def turn_about_z(vectors: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
+def turn_about_z(vectors: Tensor, angle: Tensor) -> Tensor:
     """Vectors, shape ``(n, 2)`` or ``(n, 3)``, turned about the vertical [rad], shape ``(n,)``."""
     x, y, *z = vectors.unbind(1)
     cos = torch.cos(angle)

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import torch
 import warp as wp
+from torch import Tensor
 
 from mjstack.config.schema import RobotCfg
 from mjstack.errors import ArgumentError
@@ -113,7 +114,7 @@ class BatchedIk:
         self.solve(self._view["q"], self._view["target"])
         wp.synchronize_device(self._device)
 
-    def forward(self, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def forward(self, q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Forward kinematics, in one launch.
 
         Args:
@@ -130,11 +131,11 @@ class BatchedIk:
 
     def solve(
         self,
-        q: torch.Tensor,
-        target: torch.Tensor,
-        posture: torch.Tensor | None = None,
-        approach: torch.Tensor | None = None,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+        q: Tensor,
+        target: Tensor,
+        posture: Tensor | None = None,
+        approach: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
         """Move the robot's ik joints towards a target; the other joints stay as given.
 
         The ik joints end within the range of the joint and of its actuator, wherever they start.
@@ -178,7 +179,7 @@ class BatchedIk:
         with torch_stream_scope(self._device):
             wp.launch(kernel, dim=self.nworld, inputs=inputs, block_dim=self._block_dim)
 
-    def _copy_in(self, name: str, values: torch.Tensor) -> None:
+    def _copy_in(self, name: str, values: Tensor) -> None:
         """Copy an argument into float32 memory that keeps its address."""
         buffer = self._view[name]
         if values.shape != buffer.shape:  # else copy_ would broadcast it

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 
 import torch
+from torch import Tensor
 
 from mjstack.config.schema import TermCfg
 from mjstack.errors import ArgumentError, TermError
@@ -27,14 +28,14 @@ class ActionTerm(ABC):
     """
 
     dim: int
-    low: torch.Tensor
-    high: torch.Tensor
+    low: Tensor
+    high: Tensor
     unit: str = "-1 to 1"
     term_kind = "action term"  # as of `offers`
     actuators: tuple[int, ...] = ()
 
     @abstractmethod
-    def write_commands(self, action: torch.Tensor) -> None:
+    def write_commands(self, action: Tensor) -> None:
         """Write ``sim.ctrl`` for an action of shape ``(nworld, dim)``."""
 
 
@@ -82,7 +83,7 @@ class ActionManager:
         self.high = torch.cat([term.high for term in terms]) if terms else self.action[0]
         self.not_finite = torch.zeros(env.nworld, dtype=torch.bool, device=env.device)
 
-    def process(self, action: torch.Tensor) -> None:
+    def process(self, action: Tensor) -> None:
         """Check an action and keep it for `apply`.
 
         A value that is not finite is an error at once on the CPU. On CUDA, where looking would stop
@@ -119,10 +120,10 @@ class ActionManager:
             current_term.label = f"action.{name}"
             term.write_commands(part)
 
-    def check(self, action: torch.Tensor) -> None:
+    def check(self, action: Tensor) -> None:
         """Raise an `ArgumentError` for an action of wrong type, shape, dtype or device."""
         if (
-            not isinstance(action, torch.Tensor)
+            not isinstance(action, Tensor)
             or action.shape != self.action.shape
             or action.dtype not in (torch.float32, torch.float64)
             or action.device != self.action.device
@@ -131,7 +132,7 @@ class ActionManager:
             expected = f"a float32 tensor of shape {shape} on {self.action.device}"
             raise ArgumentError("action", describe_tensor(action), expected)
 
-    def reset(self, mask: torch.Tensor) -> None:
+    def reset(self, mask: Tensor) -> None:
         """Zero the actions of the masked worlds."""
         zero_rows(mask, self.action, self.previous_action)
 

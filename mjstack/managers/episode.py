@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from itertools import chain
 
 import torch
+from torch import Tensor
 
 from mjstack.config.functions import offered
 from mjstack.config.schema import RewardTermCfg, TermCfg, TerminationTermCfg
@@ -27,7 +28,7 @@ class ResetManager:
             name: Term(f"reset.{name}", term, env, masked=True) for name, term in cfg.items()
         }
 
-    def reset(self, mask: torch.Tensor) -> None:
+    def reset(self, mask: Tensor) -> None:
         """Reset the worlds of a ``(nworld,)`` bool mask: qpos0 first, then every term."""
         self._env.sim.reset(mask)
         for term in self._terms.values():
@@ -58,7 +59,7 @@ class _ValueManager:
         self.names = list(self._terms)
         self.values = torch.zeros((env.nworld, len(cfg)), dtype=dtype, device=env.device)
 
-    def reset(self, mask: torch.Tensor) -> None:
+    def reset(self, mask: Tensor) -> None:
         """Clear what the terms keep of the masked worlds."""
         for term in self._terms.values():
             term.reset(mask)
@@ -91,9 +92,7 @@ class RewardManager(_ValueManager):
         self.reward = self.values.sum(1)
         self.episode_sums = torch.zeros_like(self.values)
 
-    def compute(
-        self, void: torch.Tensor | None = None, ended: torch.Tensor | None = None
-    ) -> torch.Tensor:
+    def compute(self, void: Tensor | None = None, ended: Tensor | None = None) -> Tensor:
         """Write `values` and `reward`, and return `reward`.
 
         Args:
@@ -115,7 +114,7 @@ class RewardManager(_ValueManager):
             self.values += before
         return torch.sum(self.values, dim=1, out=self.reward)
 
-    def reset(self, mask: torch.Tensor) -> None:
+    def reset(self, mask: Tensor) -> None:
         """Start the sums of the masked worlds anew."""
         super().reset(mask)
         zero_rows(mask, self.episode_sums)
@@ -148,7 +147,7 @@ class TerminationManager(_ValueManager):
         ends = [not term.time_out for term in cfg.values()]
         self._ends = torch.tensor(ends, dtype=torch.bool, device=env.device)
 
-    def compute(self, ended: torch.Tensor | None = None) -> None:
+    def compute(self, ended: Tensor | None = None) -> None:
         """Write `terminated`, `truncated` and `values`.
 
         Args:

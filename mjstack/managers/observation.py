@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import mujoco
 import torch
+from torch import Tensor
 
 from mjstack.config.functions import offered
 from mjstack.config.schema import ObservationGroupCfg, ObservationTermCfg
@@ -39,7 +40,7 @@ class _Part:
         self.width = 1 if self._single else value.shape[1]
         self.dim = self.width * cfg.history
 
-    def value(self, env: EnvView) -> torch.Tensor:
+    def value(self, env: EnvView) -> Tensor:
         """The term's value, shape ``(nworld, width)``."""
         value = self.term(env)
         return value[:, None] if self._single else value
@@ -89,7 +90,7 @@ class _Group:
         )
         self._past = torch.zeros((env.nworld, self.dim), dtype=torch.float32, device=env.device)
 
-    def add_noise(self, step: torch.Tensor, at: Rows) -> None:
+    def add_noise(self, step: Tensor, at: Rows) -> None:
         """Add the group's noise to a step of some worlds."""
         if not len(self._noise):
             return
@@ -102,7 +103,7 @@ class _Group:
         else:
             step.index_add_(1, columns, self._noise * draw)
 
-    def append(self, out: torch.Tensor, step: torch.Tensor) -> None:
+    def append(self, out: Tensor, step: Tensor) -> None:
         """Take in a new step of every world, and forget the oldest."""
         step = step[:, self._columns]
         if not self.remembers:
@@ -112,7 +113,7 @@ class _Group:
         torch.index_select(longer, 1, self._shift, out=self._past)
         out.copy_(self._past)
 
-    def restart(self, out: torch.Tensor, step: torch.Tensor, mask: torch.Tensor, at: Rows) -> None:
+    def restart(self, out: Tensor, step: Tensor, mask: Tensor, at: Rows) -> None:
         """The whole history of the masked worlds becomes the current step, which is that of ``at``
         alone where it has their numbers.
         """
@@ -120,7 +121,7 @@ class _Group:
         into = self._past if self.remembers else out
         if self.remembers:
             step = step.index_select(1, self._repeat)
-        if isinstance(at, torch.Tensor):
+        if isinstance(at, Tensor):
             into.index_copy_(0, at, step)
         else:
             torch.where(mask[:, None], step, into, out=into)
@@ -187,7 +188,7 @@ class ObservationManager:
         table = torch.tensor(columns, dtype=torch.float32, device=env.device).view(-1, 3)
         self._low, self._high, self._scale = table.T.contiguous()
 
-    def compute(self) -> dict[str, torch.Tensor]:
+    def compute(self) -> dict[str, Tensor]:
         """Take in a new step of every world, and return `groups`."""
         if self._parts:
             step = self._step(ALL)
@@ -195,7 +196,7 @@ class ObservationManager:
                 group.append(self.groups[name], step)
         return self.groups
 
-    def refresh(self, mask: torch.Tensor) -> dict[str, torch.Tensor]:
+    def refresh(self, mask: Tensor) -> dict[str, Tensor]:
         """Compute the masked worlds anew after their reset; their whole history becomes the first
         step.
         """
@@ -206,11 +207,11 @@ class ObservationManager:
                 group.restart(self.groups[name], step, mask, at)
         return self.groups
 
-    def _step(self, at: Rows) -> torch.Tensor:
+    def _step(self, at: Rows) -> Tensor:
         """One step of all groups in some worlds, shape ``(n, sum of widths)``, float32."""
         values = [part.value(self._env) for part in self._parts]
         step = torch.cat(values, dim=1)
-        if isinstance(at, torch.Tensor):
+        if isinstance(at, Tensor):
             step = step.index_select(0, at)
         step = step.float()
         for group in self._groups.values():

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 import torch
 from rich.console import Console
 from rich.table import Table
+from torch import Tensor
 
 from mjstack.config.fields import Range, check_fields
 from mjstack.config.functions import resolve_func
@@ -151,7 +152,7 @@ def known_values() -> dict[Any, Any]:
     return {} if values is None else values
 
 
-def shared(key: Any, compute: Callable[[], torch.Tensor]) -> torch.Tensor:
+def shared(key: Any, compute: Callable[[], Tensor]) -> Tensor:
     """A value that others may want in the same pass too. No term may write into it.
 
     Args:
@@ -224,7 +225,7 @@ class Term:
             return self.call(*args)
         return shared(self._key, partial(self.call, *args))
 
-    def reset(self, mask: torch.Tensor) -> None:
+    def reset(self, mask: Tensor) -> None:
         """Let a term with a memory forget the masked worlds."""
         if self.has_memory:
             self.call.reset(mask)
@@ -232,7 +233,7 @@ class Term:
 
 def first_value(
     term: Term, env: EnvView, *, dims: tuple[int, ...] = (1,), boolean: bool = False
-) -> torch.Tensor:
+) -> Tensor:
     """Call a value term for the first time and check what it returns.
 
     Args:
@@ -250,7 +251,7 @@ def first_value(
     shape = f"({env.nworld},)" if dims == (1,) else f"({env.nworld},) or ({env.nworld}, d)"
     kind = "bool" if boolean else "floating point"
     if (
-        not isinstance(value, torch.Tensor)
+        not isinstance(value, Tensor)
         or value.dim() not in dims
         or len(value) != env.nworld
         or not (value.dtype is torch.bool if boolean else value.is_floating_point())

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 import torch
+from torch import Tensor
 
 from mjstack.config.schema import Config
 from mjstack.rng import uniform
@@ -41,14 +42,14 @@ class EnvView(Protocol):
     nworld: int
     device: torch.device
     seed: int
-    key: torch.Tensor
-    world: torch.Tensor
-    episode: torch.Tensor
-    episode_step: torch.Tensor
-    action: torch.Tensor
-    previous_action: torch.Tensor
-    success: torch.Tensor
-    given_places: dict[str, torch.Tensor]
+    key: Tensor
+    world: Tensor
+    episode: Tensor
+    episode_step: Tensor
+    action: Tensor
+    previous_action: Tensor
+    success: Tensor
+    given_places: dict[str, Tensor]
 
 
 def offers(kind: str = "", /, **attributes: Any) -> Callable[[Any], Any]:
@@ -93,9 +94,9 @@ def random_uniform(
     size: int,
     low: float = -1.0,
     high: float = 1.0,
-    step: torch.Tensor | None = None,
+    step: Tensor | None = None,
     at: Rows = ALL,
-) -> torch.Tensor:
+) -> Tensor:
     """Random numbers of every world's current episode, which depend neither on nworld nor on which
     worlds reset.
 
@@ -127,14 +128,14 @@ def random_uniform(
     return low + 0.5 * (high - low) * (draw + 1.0)
 
 
-def rows_of(mask: torch.Tensor) -> Rows:
+def rows_of(mask: Tensor) -> Rows:
     """The worlds of a mask where the host can look at it, and all of them on CUDA: an index for
     what costs by the world.
     """
     return ALL if mask.is_cuda else mask.nonzero().squeeze(1)
 
 
-def zero_rows(mask: torch.Tensor, *buffers: torch.Tensor) -> None:
+def zero_rows(mask: Tensor, *buffers: Tensor) -> None:
     """Write 0 into the masked worlds of buffers, each of shape ``(nworld, n)``."""
     for buffer in buffers:
         buffer.masked_fill_(mask[:, None], 0.0)
@@ -142,7 +143,7 @@ def zero_rows(mask: torch.Tensor, *buffers: torch.Tensor) -> None:
 
 def episode_draw(
     env: EnvView, name: str, size: int, low: float = -1.0, high: float = 1.0
-) -> torch.Tensor:
+) -> Tensor:
     """Random numbers of every world that stay the same all episode: every term that names them sees
     the same, and the next episode has others. Arguments and result as of `random_uniform`.
     """

@@ -8,13 +8,14 @@ from itertools import combinations
 import mujoco
 import numpy as np
 import torch
+from torch import Tensor
 
 from mjstack.config.schema import RobotCfg, SceneCfg
 from mjstack.errors import ConfigError, UnknownName
 from mjstack.math import quat_z_row
 from mjstack.scene.build import WORLD, force_sensor
 
-Rows = torch.Tensor | slice
+Rows = Tensor | slice
 """Worlds: their numbers, shape ``(n,)``, or all of them."""
 ALL = slice(None)
 
@@ -37,7 +38,7 @@ class Columns:
         if self.indices != tuple(range(first, stop)):
             self.at = torch.tensor(self.indices, dtype=torch.int64, device=device)
 
-    def read(self, view: torch.Tensor) -> torch.Tensor:
+    def read(self, view: Tensor) -> Tensor:
         """The columns, shape ``(nworld, n, ...)``. It may be the view's own memory: do not write
         into it.
         """
@@ -45,18 +46,16 @@ class Columns:
             return view[:, self.at]
         return view.index_select(1, self.at)
 
-    def write(self, view: torch.Tensor, value: torch.Tensor) -> None:
+    def write(self, view: Tensor, value: Tensor) -> None:
         """Write all worlds."""
         view[:, self.at] = value
 
-    def write_masked(
-        self, view: torch.Tensor, mask: torch.Tensor, value: torch.Tensor, at: Rows = ALL
-    ) -> None:
+    def write_masked(self, view: Tensor, mask: Tensor, value: Tensor, at: Rows = ALL) -> None:
         """Write the worlds of a ``(nworld,)`` bool mask. Where ``at`` has their numbers, the value
         has their rows alone.
         """
         value = value.to(view.dtype)
-        if isinstance(at, torch.Tensor):
+        if isinstance(at, Tensor):
             view[at if isinstance(self.at, slice) else at[:, None], self.at] = value
             return
         rows = mask.view(-1, *[1] * (view.dim() - 1))
@@ -89,13 +88,13 @@ class RobotTensors:
     qvel: Columns
     ctrl: Columns
     gripper_qpos: Columns
-    range: torch.Tensor
-    ctrl_range: torch.Tensor
-    home: torch.Tensor
-    start: torch.Tensor
-    gripper_open: torch.Tensor
-    gripper_closed: torch.Tensor
-    gripper_travel: torch.Tensor
+    range: Tensor
+    ctrl_range: Tensor
+    home: Tensor
+    start: Tensor
+    gripper_open: Tensor
+    gripper_closed: Tensor
+    gripper_travel: Tensor
 
 
 class SceneIndex:
@@ -149,7 +148,7 @@ class SceneIndex:
             name: np.flatnonzero(model.geom_bodyid == body).tolist()
             for name, body in self.bodies.items()
         }
-        self._constants: dict[tuple, torch.Tensor] = {}
+        self._constants: dict[tuple, Tensor] = {}
         host = torch.device("cpu")  # side by side, so that no device has anything of them
         self._columns = {
             name: (Columns(range(qpos, qpos + 7), host), Columns(range(qvel, qvel + 6), host))
@@ -186,7 +185,7 @@ class SceneIndex:
             self._tensors[key] = RobotTensors(*columns, *numbers)  # type: ignore[arg-type]
         return self._tensors[key]
 
-    def constant(self, values: Sequence[float], like: torch.Tensor) -> torch.Tensor:
+    def constant(self, values: Sequence[float], like: Tensor) -> Tensor:
         """Numbers in the type and on the device of a tensor, shape ``(n,)``. Copied there once: a
         captured step may not copy from the host.
         """
@@ -251,8 +250,8 @@ def turn_sign(model: mujoco.MjModel, robot: RobotCfg) -> float:
 
 
 def lowest_height(
-    model: mujoco.MjModel, bodies: Sequence[str], xpos: torch.Tensor, xquat: torch.Tensor
-) -> torch.Tensor:
+    model: mujoco.MjModel, bodies: Sequence[str], xpos: Tensor, xquat: Tensor
+) -> Tensor:
     """Height of the lowest point of the colliding geoms of some bodies [m], shape ``(nworld,)``.
 
     Each geom is a box, a ball around it, and a disc across its z axis, some of them of size 0:
@@ -283,7 +282,7 @@ def lowest_height(
         mujoco.mju_quat2Mat(matrix.reshape(9), quat)
     center = model.geom_pos[geoms] + (axes @ middle[..., None])[..., 0]
 
-    def constant(values: np.ndarray) -> torch.Tensor:
+    def constant(values: np.ndarray) -> Tensor:
         return torch.tensor(values, dtype=torch.float32, device=xpos.device)
 
     # How far down they reach in each world

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import mujoco
 import torch
+from torch import Tensor
 
 from mjstack.config.schema import Backend, Config
 from mjstack.errors import ArgumentError, ConfigError, DeviceError
@@ -121,9 +122,7 @@ class StateRenderer:
         self._world = torch.arange(count, device=self._sim.device)
         self.labels = self._cameras.labels
 
-    def draw(
-        self, qpos: torch.Tensor, fields: Mapping[str, torch.Tensor] | None = None
-    ) -> dict[str, torch.Tensor]:
+    def draw(self, qpos: Tensor, fields: Mapping[str, Tensor] | None = None) -> dict[str, Tensor]:
         """Draw states.
 
         Args:

@@ -5,6 +5,7 @@ cost more than the numbers.
 # No `from __future__ import annotations` here: Warp reads the annotations as objects.
 import torch
 import warp as wp
+from torch import Tensor
 
 from mjstack.sim.warp_setup import torch_stream_scope
 
@@ -62,15 +63,15 @@ def _philox_uniform(
 
 
 def draw_uniform(
-    key: torch.Tensor,
+    key: Tensor,
     stream: int,
-    world: torch.Tensor,
-    episode: torch.Tensor,
-    step: torch.Tensor | None,
+    world: Tensor,
+    episode: Tensor,
+    step: Tensor | None,
     size: int,
     low: float = -1.0,
     high: float = 1.0,
-) -> torch.Tensor:
+) -> Tensor:
     """The numbers of `mjstack.rng.uniform`, from low to high: one launch, nothing read by the host.
 
     ``key`` is the seed, shape ``(1,)``, int64, on the device of everything else; ``step`` is 0 if

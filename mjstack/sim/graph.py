@@ -13,6 +13,7 @@ from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
 import torch
+from torch import Tensor
 
 from mjstack.errors import MjstackError, first_line
 from mjstack.interrupt import check_interrupt
@@ -230,7 +231,7 @@ class Scratch:
         self._device = device
         self._free: dict[tuple[int, int], list[int]] = defaultdict(list)
         self._owner: dict[int, int] = {}
-        self._blocks: list[torch.Tensor] = []
+        self._blocks: list[Tensor] = []
 
     def allocate(self, size_in_bytes: int) -> int:
         """Address of a block on the current stream."""

@@ -8,6 +8,7 @@ from functools import cache, partial
 
 import mujoco
 import torch
+from torch import Tensor
 from typing_extensions import override
 
 from mjstack.config.schema import CameraCfg
@@ -138,14 +139,14 @@ class MjwarpSimulation(Simulation):
             mjw.forward(self._m, self._d)
         self.latch()
 
-    def kinematics(self, mask: torch.Tensor | None = None) -> None:
+    def kinematics(self, mask: Tensor | None = None) -> None:
         """Bring the poses of all worlds up to the current qpos: a mask would save nothing."""
         self.check_mask(mask)
         with torch_stream_scope(self._device):
             self._pose()
 
     @override
-    def reset(self, mask: torch.Tensor | None = None) -> None:
+    def reset(self, mask: Tensor | None = None) -> None:
         self.check_mask(mask)
         self._keep_peaks(mask)
         if mask is None:

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 
 import mujoco
 import numpy as np
-import torch
+from torch import Tensor
 
 from mjstack.errors import MjstackError, UnknownName
 
@@ -64,16 +64,16 @@ def check_fields(names: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-class Fields(dict[str, torch.Tensor]):
+class Fields(dict[str, Tensor]):
     """Per-world model fields by MuJoCo's name. Write into a tensor; an item cannot be replaced."""
 
-    def __missing__(self, name: str) -> torch.Tensor:
+    def __missing__(self, name: str) -> Tensor:
         raise MjstackError(
             f"sim.fields['{name}'] is not a per-world field of this simulation: make it with"
             f" fields=['{name}'], or mark the reset term with uses_fields('{name}')"
         )
 
-    def __setitem__(self, name: str, value: torch.Tensor) -> None:
+    def __setitem__(self, name: str, value: Tensor) -> None:
         # Python ends `fields[name] *= 2` by setting the item to the tensor that it has just changed
         # in place.
         if self[name] is not value:

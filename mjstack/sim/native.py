@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import torch
 from mujoco.batch import Batch
+from torch import Tensor
 from typing_extensions import override
 
 from mjstack.config.schema import CameraCfg
@@ -136,12 +137,12 @@ class NativeSimulation(Simulation):
         self._compute(0, kinematics=False)
 
     @override
-    def kinematics(self, mask: torch.Tensor | None = None) -> None:
+    def kinematics(self, mask: Tensor | None = None) -> None:
         for worlds in self._visit(self._finite_worlds(self._poses, mask), 1):
             self._pose(worlds)
 
     @override
-    def reset(self, mask: torch.Tensor | None = None) -> None:
+    def reset(self, mask: Tensor | None = None) -> None:
         rows = self._rows(mask)
         self.batch.state[rows] = self._initial
         if "qpos0" in self._fields:
@@ -172,13 +173,13 @@ class NativeSimulation(Simulation):
     def make_cameras(self, cameras: Mapping[str, CameraCfg]) -> Cameras:
         return NativeCameras(self.model, self.qpos.numpy(), self._fields, cameras)
 
-    def _rows(self, mask: torch.Tensor | None) -> np.ndarray:
+    def _rows(self, mask: Tensor | None) -> np.ndarray:
         """The mask as numpy sees it; every world for None."""
         self.check_mask(mask)
         return np.ones(self.nworld, dtype=bool) if mask is None else mask.numpy()
 
     def _finite_worlds(
-        self, derived: Sequence[np.ndarray], mask: torch.Tensor | None = None
+        self, derived: Sequence[np.ndarray], mask: Tensor | None = None
     ) -> np.ndarray:
         """The masked worlds that can be computed; the others' derived arrays become NaN.
 

@@ -7,6 +7,7 @@ from functools import cached_property
 
 import mujoco
 import torch
+from torch import Tensor
 
 from mjstack.config.schema import CameraCfg
 from mjstack.errors import ArgumentError, MjstackError
@@ -114,41 +115,41 @@ class Simulation(ABC):
     backend: str
     device: torch.device
     description: str
-    qpos: torch.Tensor
-    qvel: torch.Tensor
-    act: torch.Tensor
-    ctrl: torch.Tensor
-    xpos: torch.Tensor
-    xquat: torch.Tensor
-    site_xpos: torch.Tensor
-    geom_xpos: torch.Tensor
-    qfrc_actuator: torch.Tensor
-    sensordata: torch.Tensor
+    qpos: Tensor
+    qvel: Tensor
+    act: Tensor
+    ctrl: Tensor
+    xpos: Tensor
+    xquat: Tensor
+    site_xpos: Tensor
+    geom_xpos: Tensor
+    qfrc_actuator: Tensor
+    sensordata: Tensor
     fields: Fields
-    contact_count: torch.Tensor
-    constraint_count: torch.Tensor
-    step_count: torch.Tensor
-    overflow: torch.Tensor
-    peak_contacts: torch.Tensor
-    peak_constraints: torch.Tensor
+    contact_count: Tensor
+    constraint_count: Tensor
+    step_count: Tensor
+    overflow: Tensor
+    peak_contacts: Tensor
+    peak_constraints: Tensor
     sizes: BatchSizes | None = None
-    peak_pool: torch.Tensor | None = None
-    solver_limits: torch.Tensor | None = None
+    peak_pool: Tensor | None = None
+    solver_limits: Tensor | None = None
     # Peak contacts, peak rows and overflow bits that masked resets have erased since the last full
     # one. They are taken in just before such a reset, and not in every substep: nothing else lowers
     # a counter, so the two together never miss one, and it costs a step three small operations.
-    _erased: tuple[torch.Tensor, ...]
+    _erased: tuple[Tensor, ...]
 
     def __setattr__(self, name: str, value: object) -> None:
         # Captured graphs and the stepping code know the memory, not the attribute: a rebound view
         # would be ignored without a word. Python ends `sim.qpos += 1` by setting the attribute to
         # the tensor that it has just changed in place.
         bound = self.__dict__.get(name)
-        if isinstance(bound, (torch.Tensor, Fields)) and bound is not value:
+        if isinstance(bound, (Tensor, Fields)) and bound is not value:
             raise MjstackError(REBOUND.format(f"sim.{name}" + "[name]" * isinstance(bound, Fields)))
         super().__setattr__(name, value)
 
-    def part(self, name: str, columns: Columns | int, *shape: int) -> torch.Tensor:
+    def part(self, name: str, columns: Columns | int, *shape: int) -> Tensor:
         """Columns of a view, for reading. Those that lie side by side are sliced once, because a
         view keeps its address for life.
 
@@ -163,7 +164,7 @@ class Simulation(ABC):
         if key in self._parts:
             return self._parts[key]
         view = getattr(self, name)
-        if isinstance(at, torch.Tensor):
+        if isinstance(at, Tensor):
             part = view.index_select(1, at)
             return part.unflatten(1, shape) if shape else part
         with torch.inference_mode(False):
@@ -172,10 +173,10 @@ class Simulation(ABC):
         return self._parts[key]
 
     @cached_property
-    def _parts(self) -> dict[tuple, torch.Tensor]:
+    def _parts(self) -> dict[tuple, Tensor]:
         return {}
 
-    def lasting_peaks(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def lasting_peaks(self) -> tuple[Tensor, Tensor, Tensor]:
         """Largest contact_count and constraint_count, and bits of `Overflow`, since the last full
         reset (one without a mask), each of shape ``(nworld,)``, int32: those of a run in which
         worlds end and start anew.
@@ -201,7 +202,7 @@ class Simulation(ABC):
         """
 
     @abstractmethod
-    def kinematics(self, mask: torch.Tensor | None = None) -> None:
+    def kinematics(self, mask: Tensor | None = None) -> None:
         """Bring the poses up to the current qpos, without advancing time.
 
         Args:
@@ -212,7 +213,7 @@ class Simulation(ABC):
         """
 
     @abstractmethod
-    def reset(self, mask: torch.Tensor | None = None) -> None:
+    def reset(self, mask: Tensor | None = None) -> None:
         """Put worlds back to the model's qpos0, at rest: act, ctrl, sensordata, counters and
         overflow bits become zero.
 
@@ -248,16 +249,16 @@ class Simulation(ABC):
         """Give buffers back. Native MuJoCo's threads end with the last view of their memory."""
         return
 
-    def check_mask(self, mask: torch.Tensor | None) -> None:
+    def check_mask(self, mask: Tensor | None) -> None:
         """Check what can be known of a mask without reading it; `reset` has the error."""
         expected = (torch.bool, (self.nworld,), self.device)
         if mask is not None and (
-            not isinstance(mask, torch.Tensor) or (mask.dtype, mask.shape, mask.device) != expected
+            not isinstance(mask, Tensor) or (mask.dtype, mask.shape, mask.device) != expected
         ):
             text = f"a torch.bool tensor of shape ({self.nworld},) on {self.device}"
             raise ArgumentError("mask", describe_tensor(mask), text)
 
-    def _keep_peaks(self, mask: torch.Tensor | None) -> None:
+    def _keep_peaks(self, mask: Tensor | None) -> None:
         """Keep the peaks that a reset of some worlds would erase; drop all in a full one."""
         contacts, rows, bits = self._erased
         if mask is None:

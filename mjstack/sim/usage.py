@@ -7,6 +7,7 @@ from itertools import combinations_with_replacement
 import mujoco
 import numpy as np
 import torch
+from torch import Tensor
 
 from mjstack.sim.mujoco_warp import mjw
 from mjstack.sim.simulation import LOST_PHYSICS
@@ -57,7 +58,7 @@ class Usage:
                 outputs=[self._kind_counts, peak_pool],
             )
 
-    def clear(self, mask: torch.Tensor) -> None:
+    def clear(self, mask: Tensor) -> None:
         """Clear the counters of the worlds of a mask, shape ``(nworld,)``, bool."""
         self._counts.masked_fill_(mask, 0)
         self._steps.masked_fill_(mask, 0)
