@@ -5,6 +5,7 @@ import logging
 import warnings
 from collections.abc import Mapping, Sequence
 from functools import cache, partial
+from types import SimpleNamespace
 
 import mujoco
 import torch
@@ -88,6 +89,13 @@ class MjwarpSimulation(Simulation):
             self._d = mjw.make_data(model, nworld=nworld, **sizes.as_kwargs())
             self.plan = StepPlan() if step == "stock" else plan_step(model, self._m, self._d)
             self._usage = Usage(model, nworld, self.device)
+            # MJWarp's kernel skips geoms that are welded to the world, but not to a mocap body:
+            # with these it skips all others
+            moves = (model.body_weldid > 0) | (model.body_mocapid[model.body_rootid] >= 0)
+            self._swapped = SimpleNamespace(
+                body_weldid=wp.array(1 - moves, dtype=int),
+                body_mocapid=wp.full(model.nbody, -1, dtype=int),
+            )
 
         if self.plan.reason:
             _log_once(f"sim.step: {self.plan}")
@@ -240,37 +248,6 @@ class MjwarpSimulation(Simulation):
         d = self._d
         if not posed:
             mjw.kinematics(m, d)
-        wp.launch(
-            place_static_geoms,
-            dim=(self.nworld, m.ngeom),
-            inputs=[*arguments(place_static_geoms, m, d)],
-        )
-
-
-@wp.kernel(enable_backward=False)
-def place_static_geoms(
-    body_rootid: wp.array[int],
-    body_weldid: wp.array[int],
-    body_mocapid: wp.array[int],
-    geom_bodyid: wp.array[int],
-    geom_pos: wp.array2d[wp.vec3],
-    geom_quat: wp.array2d[wp.quat],
-    xpos: wp.array2d[wp.vec3],
-    xquat: wp.array2d[wp.quat],
-    geom_xpos: wp.array2d[wp.vec3],
-    geom_xmat: wp.array2d[wp.mat33],
-) -> None:
-    """Write the poses of exactly those geoms that MJWarp's kinematics leaves out. Warp's own
-    quaternions are xyzw.
-    """
-    world, geom = wp.tid()  # type: ignore[misc]
-    body = geom_bodyid[geom]
-    if body_weldid[body] != 0 or body_mocapid[body_rootid[body]] != -1:
-        return
-    # Fields that the worlds share have one row.
-    p = geom_pos[world % geom_pos.shape[0], geom]
-    g = geom_quat[world % geom_quat.shape[0], geom]
-    b = xquat[world, body]
-    q = wp.quat(b[1], b[2], b[3], b[0])
-    geom_xpos[world, geom] = xpos[world, body] + wp.quat_rotate(q, p)
-    geom_xmat[world, geom] = wp.quat_to_matrix(wp.normalize(q * wp.quat(g[1], g[2], g[3], g[0])))
+        kernel = mjw._src.smooth._geom_local_to_global
+        inputs = [*arguments(kernel, m, d, self._swapped)]
+        wp.launch(kernel, dim=(self.nworld, m.ngeom), inputs=inputs)
