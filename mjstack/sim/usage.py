@@ -40,23 +40,15 @@ class Usage:
         # A thread per world, and at least one for every eighth place of the pool, which is mostly
         # empty.
         stride = max(d.nworld, d.contact.worldid.shape[0] // 8)
-        contacts, *counters, peak_pool, steps_made = self._arrays
-        contacts.zero_()
-        used = [d.nacon, d.contact.worldid, d.nefc, d.ncollision, d.overflow]
+        self._arrays[0].zero_()
+        self._kind_counts.zero_()
+        used = [d.nacon, d.contact.worldid, d.contact.geom, d.nefc, d.ncollision, d.overflow]
         wp.launch(
             record_usage,
             dim=stride,
-            inputs=[*used, LOST_PHYSICS, steps, stride],
-            outputs=[contacts, *counters, peak_pool, steps_made],
+            inputs=[*used, m.geom_type, self._kinds, LOST_PHYSICS, steps, stride],
+            outputs=[self._kind_counts, *self._arrays],
         )
-        if self._kind_counts.size:
-            self._kind_counts.zero_()
-            wp.launch(
-                record_convex_contacts,
-                dim=stride,
-                inputs=[d.nacon, d.contact.geom, m.geom_type, self._kinds, stride],
-                outputs=[self._kind_counts, peak_pool],
-            )
 
     def clear(self, mask: Tensor) -> None:
         """Clear the counters of the worlds of a mask, shape ``(nworld,)``, bool."""
@@ -114,12 +106,16 @@ def data_bytes(model: mujoco.MjModel, nworld: int, sizes: BatchSizes) -> int:
 def record_usage(
     nacon: wp.array[int],
     worldid: wp.array[int],
+    geom: wp.array[wp.vec2i],
     nefc: wp.array[int],
     ncollision: wp.array[int],
     overflow: wp.array[int],
+    geom_type: wp.array[int],
+    kinds: wp.array2d[int],
     lost_bits: int,
     advance: int,
     stride: int,
+    kind_counts: wp.array[int],
     contacts: wp.array[int],
     peak_contacts: wp.array[int],
     peak_nefc: wp.array[int],
@@ -129,16 +125,24 @@ def record_usage(
     steps: wp.array[wp.int64],
 ) -> None:
     """Count each world's contacts, and keep the largest counters and every overflow bit seen so
-    far.
+    far; also the most contacts that convex collision found for one combination of geom types.
 
-    ``contacts`` is zero before. The packed list may claim more contacts than it holds after an
-    overflow. A world's last increment of its counter is its number of contacts, so the largest one
-    seen is the peak.
+    ``contacts`` and ``kind_counts`` are zero before. The packed list may claim more contacts than
+    it holds after an overflow. A world's last increment of its counter is its number of contacts,
+    so the largest one seen is the peak.
+
+    MJWarp has room for naccdmax penetrating pairs of each combination, and each such pair gives at
+    least one contact. ``kinds`` numbers the combinations, and is negative for those that are no
+    convex collision.
     """
     i = wp.tid()
     for c in range(i, wp.min(nacon[0], worldid.shape[0]), stride):  # type: ignore[arg-type]
         world = worldid[c]
         wp.atomic_max(peak_contacts, world, wp.atomic_add(contacts, world, 1) + 1)
+        if kind_counts.shape[0] > 0:
+            kind = kinds[geom_type[geom[c][0]], geom_type[geom[c][1]]]
+            if kind >= 0:
+                wp.atomic_max(peak_pool, 2, wp.atomic_add(kind_counts, kind, 1) + 1)
     if i < steps.shape[0]:
         peak_nefc[i] = wp.max(peak_nefc[i], nefc[i])
         lost[i] = lost[i] | (overflow[i] & lost_bits)
@@ -147,27 +151,3 @@ def record_usage(
     if i == 0:
         peak_pool[0] = wp.max(peak_pool[0], nacon[0])
         peak_pool[1] = wp.max(peak_pool[1], ncollision[0])
-
-
-@wp.kernel(enable_backward=False)
-def record_convex_contacts(
-    nacon: wp.array[int],
-    geom: wp.array[wp.vec2i],
-    geom_type: wp.array[int],
-    kinds: wp.array2d[int],
-    stride: int,
-    counts: wp.array[int],
-    peak_pool: wp.array[int],
-) -> None:
-    """Keep the most contacts that convex collision found for one combination of geom types;
-    ``counts`` is zero before.
-
-    MJWarp has room for naccdmax penetrating pairs of each combination, and each such pair gives at
-    least one contact. ``kinds`` numbers the combinations, and is negative for those that are no
-    convex collision.
-    """
-    i = wp.tid()
-    for c in range(i, wp.min(nacon[0], geom.shape[0]), stride):  # type: ignore[arg-type]
-        kind = kinds[geom_type[geom[c][0]], geom_type[geom[c][1]]]
-        if kind >= 0:
-            wp.atomic_max(peak_pool, 2, wp.atomic_add(counts, kind, 1) + 1)
