@@ -26,7 +26,7 @@ const bool derivative = dampers && !(io.opt_disableflags & NO_ACTUATION);
 for (int u = lane; u < NA; u += T) {
   const float *gainprm = field(io.actuator_gainprm) + 10 * u;
   const int joint = io.actuator_trnid.data[u][0], dof = io.jnt_dofadr.data[joint];
-  const float gain = io.actuator_gaintype.data[u] == AFFINE ? gainprm[2] : 0.0f;
+  const float gain = io.actuator_gaintype.data[u] == GAIN_AFFINE ? gainprm[2] : 0.0f;
   float value = 0.0f;
   if (io.actuator_biastype.data[u] == BIAS_AFFINE) value = field(io.actuator_biasprm)[10 * u + 2];
   if (gain != 0.0f) {
@@ -193,7 +193,7 @@ for (int i = lane; i < NV; i += T) of_world(io.qacc_warmstart)[i] = of_world(io.
 if (lane == 0) {
   io.time.data[world] += timestep;
   int bits = 0;
-  if (io.nefc.data[world] > io.njmax) bits |= LIMIT_ROWS;
+  if (io.nefc.data[world] > io.njmax) bits |= LIMIT_NEFC;
   if (io.ncollision.data[0] > io.naconmax) bits |= LIMIT_BROADPHASE;
   if (io.nacon.data[0] > io.naconmax) bits |= LIMIT_NARROWPHASE;
   if (bits) io.overflow.data[world] |= bits;

@@ -109,7 +109,7 @@ for (int u = lane; u < NA; u += T) {
   if (io.actuator_ctrlnum.data[u] > 0) {
     control = of_world(io.ctrl)[from];
     const float *range = field(io.actuator_ctrlrange) + 2 * from;
-    if (io.actuator_ctrllimited.data[from] && !(io.opt_disableflags & NO_CLAMP))
+    if (io.actuator_ctrllimited.data[from] && !(io.opt_disableflags & NO_CLAMPCTRL))
       control = wp::clamp(control, range[0], range[1]);
   }
   const int last = io.actuator_actadr.data[u] + io.actuator_actnum.data[u] - 1;
@@ -125,7 +125,7 @@ for (int u = lane; u < NA; u += T) {
   }
   const float *k = field(io.actuator_gainprm) + 10 * u, *c = field(io.actuator_biasprm) + 10 * u;
   float gain = k[0], value = 0.0f;
-  if (io.actuator_gaintype.data[u] == AFFINE) gain = k[0] + k[1] * length + k[2] * speed;
+  if (io.actuator_gaintype.data[u] == GAIN_AFFINE) gain = k[0] + k[1] * length + k[2] * speed;
   if (io.actuator_biastype.data[u] == BIAS_AFFINE) value = c[0] + c[1] * length + c[2] * speed;
   value = gain * control + value;
   if (io.actuator_forcelimited.data[u]) {

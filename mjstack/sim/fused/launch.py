@@ -21,8 +21,9 @@ SHARED_BYTES = 48 * 1024 - 256
 """Shared memory that every block may have, less Warp's own [bytes]."""
 
 
-def _numbers(owner: Any, names: str, prefix: str = "") -> dict[str, int]:
-    return {name: int(getattr(owner, prefix + name)) for name in names.split()}
+def _numbers(owner: Any, names: str, prefix: str = "", here: str = "") -> dict[str, int]:
+    """Numbers of MuJoCo's names less a prefix, with the prefix that they have ``here``."""
+    return {here + name: int(getattr(owner, prefix + name)) for name in names.split()}
 
 
 _CONSTANTS = {
@@ -34,19 +35,12 @@ _CONSTANTS = {
         "mjCNSTRSTATE_",
     ),
     **_numbers(mjw.DynType, "NONE INTEGRATOR FILTER FILTEREXACT"),
-    **_numbers(mjw.DisableBit, "REFSAFE"),
-    "AFFINE": int(mjw.GainType.AFFINE),
-    "BIAS_AFFINE": int(mjw.BiasType.AFFINE),
-    "NO_GRAVITY": int(mjw.DisableBit.GRAVITY),
-    "NO_ACTUATION": int(mjw.DisableBit.ACTUATION),
-    "NO_CLAMP": int(mjw.DisableBit.CLAMPCTRL),
-    "NO_SPRING": int(mjw.DisableBit.SPRING),
-    "NO_DAMPER": int(mjw.DisableBit.DAMPER),
-    "LIMIT_ROWS": int(mjw.OverflowType.NEFC),
-    "LIMIT_BROADPHASE": int(mjw.OverflowType.BROADPHASE),
-    "LIMIT_NARROWPHASE": int(mjw.OverflowType.NARROWPHASE),
-    "LIMIT_ITERATIONS": int(mjw.OverflowType.ITERATIONS),
-    "LIMIT_LS_ITERATIONS": int(mjw.OverflowType.LS_ITERATIONS),
+    **_numbers(mjw.GainType, "AFFINE", here="GAIN_"),
+    **_numbers(mjw.BiasType, "AFFINE", here="BIAS_"),
+    **_numbers(mjw.DisableBit, "REFSAFE GRAVITY ACTUATION CLAMPCTRL SPRING DAMPER", here="NO_"),
+    **_numbers(
+        mjw.OverflowType, "NEFC BROADPHASE NARROWPHASE ITERATIONS LS_ITERATIONS", here="LIMIT_"
+    ),
 }
 
 

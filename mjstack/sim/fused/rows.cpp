@@ -143,7 +143,7 @@ for (int group = warp * GROUP; group < count; group += WARPS * GROUP) {
     const int r = first + k;
     const bool separate = k > 0 && (friction_ref[0] != 0.0f || friction_ref[1] != 0.0f);
     const auto ref = separate ? friction_ref : normal_ref;
-    const float least_time = io.opt_disableflags & REFSAFE ? ref[0] : wp::max(ref[0], 2.0f * timestep);
+    const float least_time = io.opt_disableflags & NO_REFSAFE ? ref[0] : wp::max(ref[0], 2.0f * timestep);
     const float damping = ref[1] <= 0.0f ? -ref[1] / wp::max(TINY, high)
                                          : 2.0f / wp::max(TINY, high * least_time);
     float aref = -damping * speeds[n], scale = 1.0f;
