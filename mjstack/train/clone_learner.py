@@ -24,6 +24,7 @@ from mjstack.train.images import Augmentation, ImagePool
 from mjstack.train.learner import Learner
 from mjstack.train.trainer import made_with, with_observation
 
+_LOSSES = {"absolute": nn.functional.l1_loss, "squared": nn.functional.mse_loss}
 _VALIDATION_SHARE = 20  # of so many episodes one is for validation
 _VALIDATED = 65536  # steps at once
 _VALIDATED_IMAGES = 4096  # steps, at most
@@ -196,8 +197,8 @@ class CloneLearner(Learner):
         images: Sequence[Tensor],
         noise: Tensor | float = 0.0,
     ) -> Tensor:
-        """Mean squared error of the normalised actions at some steps, shape ``(n,)``. At an
-        episode's end its last joint targets hold.
+        """Mean error, by ``job.loss``, of the normalised actions at some steps, shape ``(n,)``. At
+        an episode's end its last joint targets hold.
 
         Noise on the observation says that the actions are the same a little off the expert's way.
         It also stops the policy from reading elapsed time out of micrometre drift: while the expert
@@ -215,7 +216,7 @@ class CloneLearner(Learner):
         )
         with fast:
             action = network.normalized(self._seen[steps] + noise, images)
-        return torch.nn.functional.mse_loss(action.float(), target)
+        return _LOSSES[self._job.loss](action.float(), target)
 
     @property
     def _steps(self) -> Tensor:

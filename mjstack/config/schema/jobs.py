@@ -112,6 +112,9 @@ class CloneJobCfg(TrainJobCfg):
     """Joint targets of one answer."""
     execute: int = spec(unit="steps", ge=1, le=1000)
     """Control steps between two answers."""
+    loss: str = spec(choices=("squared", "absolute"))
+    """Error of a joint target. Where the expert's answer jumps, the least absolute error is one of
+    the answers, and the least squared one lies between them."""
     learning_rate: float = spec(gt=0.0)
     """Of AdamW at the start; a cosine brings it to 0."""
     averaging: float = spec(ge=0.0, le=1.0)
