@@ -8,7 +8,7 @@ import pytest
 import torch
 from policies import curve, interrupted, report, same
 
-import mjstack.train.dagger as dagger
+import mjstack.train.rounds as rounds
 from mjstack.cli import run
 from mjstack.drivers.driver import Driver
 from mjstack.policy import load_policy
@@ -65,7 +65,7 @@ def test_the_share_of_the_expert() -> None:
             return self.value
 
     expert, policy = Constant(1.0), Constant(2.0)
-    driver = dagger.MixedDriver(expert, policy, env, beta=0.5, alone=10, spell=25)
+    driver = rounds.MixedDriver(expert, policy, env, beta=0.5, alone=10, spell=25)
     seen = []
     for step in range(0, 1000, 25):
         env.episode_step.fill_(step)

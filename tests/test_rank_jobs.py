@@ -109,6 +109,6 @@ def test_ranks_learn_from_pixels(tmp_path: Path) -> None:
     text = play(2, args, tmp_path)
     assert text.count("status: pass") == 1
     train, success = report_of(tmp_path / "out")["gates"]
-    assert train["metrics"]["expert_episodes_played"] == 4
+    assert train["metrics"]["episodes_played"] == 4
     assert success["metrics"]["episodes"] == 4
     assert load_policy(tmp_path / "out/last").network.vision.sizes == {"front": (32, 32)}

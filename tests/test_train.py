@@ -55,8 +55,8 @@ def test_a_training_leaves_policies_a_curve_and_a_judgement(
     gates = report(out)
     train = gates["train"]["metrics"]
     assert train["batches"] == 30
-    assert train["expert_episodes_played"] == 6
-    assert 2 <= train["expert_episodes"] <= 6
+    assert train["episodes_played"] == 6
+    assert 2 <= train["episodes"] <= 6
     success = gates["success"]["metrics"]
     assert success["episodes"] == 4
     assert 0.0 <= success["success_rate_low95"] <= success["success_rate_high95"] <= 1.0
@@ -114,7 +114,7 @@ def test_numbers_that_are_not_finite(tmp_path: Path, capsys: pytest.CaptureFixtu
     faulty = [*REACH, "job.noisy_episodes=0", "+job.observation.policy.terms.x.func=faulty.missing"]
     out = tmp_path / "left_out"
     assert run(["--config-dir", str(tmp_path / "conf"), *faulty, f"job.folder={out}"]) == 0
-    assert report(out)["train"]["metrics"]["expert_episodes"] == 3
+    assert report(out)["train"]["metrics"]["episodes"] == 3
     (path,) = (out / "last").glob("*.safetensors")
     assert all(bool(value.isfinite().all()) for value in load_file(path).values())
 
@@ -167,7 +167,7 @@ def test_two_processes_learn_one_policy(tmp_path: Path) -> None:
     assert "seed 0, no noise" in texts[0]
     assert not texts[1]
     assert not list((tmp_path / "1").iterdir())
-    assert report(out)["train"]["metrics"]["expert_episodes_played"] == 6
+    assert report(out)["train"]["metrics"]["episodes_played"] == 6
     facts = read_state(out / STATE)[1]
     assert facts["done"] == 30
     assert facts["made_with"]["processes"] == 2
@@ -207,7 +207,7 @@ def test_two_cores_train(
     began = time.process_time()
     out = tmp_path / "training"
     assert run(["job=train", "trainer=clone", "sim=native", *overrides, f"job.folder={out}"]) == 0
-    assert report(out)["train"]["metrics"]["expert_episodes_played"] == episodes
+    assert report(out)["train"]["metrics"]["episodes_played"] == episodes
     assert report(out)["success"]["metrics"]["success_rate"] >= rate
     assert time.process_time() - began < 60.0 * minutes
 
@@ -221,7 +221,7 @@ def test_a_clone_of_stack_drives_the_batch(tmp_path: Path) -> None:
     seen = ["observation@job.observation=real", "+job.observation.policy.terms.joint_pos.history=2"]
     out = tmp_path / "training"
     assert run([*TINY, *fast, *seen, "job.execute=5", f"job.folder={out}"]) == 0
-    assert report(out)["train"]["metrics"]["expert_episodes"] >= 4
+    assert report(out)["train"]["metrics"]["episodes"] >= 4
     policy = load_policy(out / "last")
     assert policy.widths["joint_pos"] == 12
     assert policy.execute == 5

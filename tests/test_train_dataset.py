@@ -80,7 +80,7 @@ def test_a_policy_learns_from_a_dataset(
     out = tmp_path / "out"
     assert run([*TRAIN, f"job.dataset={folder}", f"job.folder={out}"]) == 0
     train = report(out)["train"]
-    assert train["metrics"]["expert_episodes"] == 3
+    assert train["metrics"]["episodes"] == 3
     assert train["notes"]["demonstrations"] == str(folder)
 
 

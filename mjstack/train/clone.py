@@ -1,4 +1,6 @@
-"""Trainer *clone*: a policy learns by regression to answer as the expert does."""
+"""Trainers *clone*, *dagger* and *pixels*: a policy learns by regression to answer as the expert
+does, in the expert's episodes and, with rounds, in states to which the policy itself has led.
+"""
 
 import math
 import time
@@ -9,24 +11,54 @@ from typing import Any, cast
 import torch
 
 from mjstack.config.schema import CloneJobCfg
+from mjstack.episodes.rollout import STATE_BASED
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, MjstackError, UnknownName
 from mjstack.sim.memory import free_memory
 from mjstack.train.clone_learner import CloneLearner
 from mjstack.train.dataset import check_dataset, read_demonstrations
-from mjstack.train.demonstrations import batches_of, lead_gripper, play_expert
+from mjstack.train.demonstrations import Demonstrations, batches_of, lead_gripper, play_expert
+from mjstack.train.rounds import make_round
 from mjstack.train.trainer import LAST, Trained, Trainer, earlier_state, observed_widths
 
 
 def check_clone(stage: Stage) -> range:
-    """Check the observation, the sizes and the dataset; see `Trainer`."""
+    """Check the expert, the observation, the sizes and the dataset; see `Trainer`."""
     cfg = stage.cfg
     job = cast(CloneJobCfg, cfg.job)
+    if job.rounds:
+        _check_rounds(stage, job)
     _check_vision(stage, job)
     widths = observed_widths(stage)
     if job.dataset is not None:
         return check_dataset(stage, widths)
+    if job.rounds:
+        batches = (job.rounds + 1) * math.ceil(job.episodes / cfg.nworld)
+        return range(cfg.seed, cfg.seed + batches)
     return range(cfg.seed, cfg.seed + len(batches_of(job, cfg.nworld)))
+
+
+def _check_rounds(stage: Stage, job: CloneJobCfg) -> None:
+    """Refuse what cannot be learned in rounds."""
+    name = stage.cfg.controller.name
+    if name != STATE_BASED:
+        expected = "state_based, because trainer=dagger asks the expert in the policy's states"
+        fix = "Set trainer=clone, which learns from any expert, or controller=state_based"
+        raise ConfigError("controller", name, expected, fix)
+    if job.vision.cameras:
+        expected = "[], because trainer=dagger learns from numbers"
+        raise ConfigError("job.vision.cameras", job.vision.cameras, expected, "Set trainer=pixels")
+    if job.dataset is not None:
+        expected = "null, because trainer=dagger asks the expert itself"
+        raise ConfigError("job.dataset", job.dataset, expected, "Set trainer=clone")
+    if (processes := stage.ranks.size) > 1:
+        raise MjstackError(
+            f"torchrun has started {processes} processes, and trainer=dagger runs in one",
+            "Start it without torchrun, or set trainer=clone",
+        )
+    if job.episodes < 2:
+        expected = "at least 2, because one of them is for validation"
+        raise ConfigError("job.episodes", job.episodes, expected)
 
 
 def _check_vision(stage: Stage, job: CloneJobCfg) -> None:
@@ -57,58 +89,80 @@ def _check_vision(stage: Stage, job: CloneJobCfg) -> None:
 
 
 def train_clone(stage: Stage, folder: Path) -> Trained:
-    """Play the expert or read a dataset, and fit a network to its answers; see `Trainer`."""
+    """Fit a network to the expert's answers; see `Trainer`."""
     # An earlier call's training, which may be complete
     job = cast(CloneJobCfg, stage.cfg.job)
     earlier = earlier_state(stage, folder)
-    if earlier and earlier[1]["done"] == job.batches:
+    if earlier and _is_complete(job, earlier[1]):
         stage.progress.print_line(f"train: {folder} is trained already, and is judged anew")
-        return _trained(folder, earlier[1])
+        return _trained(job, folder, earlier[1])
 
-    # Demonstrations
+    # The expert's episodes, which give the scale
     began = time.perf_counter()
+    first = _demonstrate(stage, folder)
+    if len(first.ends) < 2:
+        raise MjstackError(
+            f"{first.source}: {len(first.ends)} of {first.played}"
+            " episodes succeeded, expected two at least",
+            "Ask for more (job.episodes), or look at why with gates=[success]",
+        )
+    seconds = time.perf_counter() - began
+
+    # Rounds: in the worlds of the next one the policy of a round shows its success.
+    parts = [first]
+    with closing(CloneLearner(stage, first, folder, seconds)) as learner:
+        if earlier:
+            learner.restore(*earlier)
+        if not job.rounds:
+            learner.learn()
+        for number in range(1, job.rounds + 1):
+            learner.process(Demonstrations.join(parts))
+            learner.learn((number - 1) * job.batches, number * job.batches)
+            part, success = make_round(stage, folder, learner.policy, number)
+            parts.append(part)
+            if len(learner.curve) < number:
+                learner.conclude(number, success)
+    for path in folder.glob("round-*.safetensors"):
+        path.unlink()
+    return _trained(job, folder, learner.facts())
+
+
+def _is_complete(job: CloneJobCfg, facts: dict[str, Any]) -> bool:
+    if job.rounds:
+        return len(facts["curve"]) == job.rounds
+    return bool(facts["done"] == job.batches)
+
+
+def _demonstrate(stage: Stage, folder: Path) -> Demonstrations:
+    """Episodes of a dataset or of the expert."""
+    job = cast(CloneJobCfg, stage.cfg.job)
+    if job.rounds:
+        return make_round(stage, folder, None, 0)[0]
     if job.dataset is None:
         demonstrations = play_expert(stage)
     else:
         demonstrations = read_demonstrations(stage, observed_widths(stage))
-    if len(demonstrations.ends) < 2:
-        raise MjstackError(
-            f"{demonstrations.source}: {len(demonstrations.ends)} of {demonstrations.played}"
-            " episodes succeeded, expected two at least",
-            "Ask for more (job.episodes), or look at why with gates=[success]",
-        )
-    demonstrations = lead_gripper(demonstrations, len(stage.cfg.robot.gripper_joints))
-    counts = demonstrations.ends.new_tensor([len(demonstrations.ends), demonstrations.played])
-    stage.ranks.sum_(counts)
-    facts = {
-        "expert_episodes": int(counts[0]),
-        "expert_episodes_played": int(counts[1]),
-        "expert_s": time.perf_counter() - began,
-        "source": demonstrations.source,
-    }
-
-    # Batches
-    with closing(CloneLearner(stage, demonstrations, folder, facts)) as learner:
-        if earlier:
-            learner.restore(*earlier)
-        learner.learn()
-    return _trained(folder, learner.facts())
+    return lead_gripper(demonstrations, len(stage.cfg.robot.gripper_joints))
 
 
-def _trained(folder: Path, facts: dict[str, Any]) -> Trained:
+def _trained(job: CloneJobCfg, folder: Path, facts: dict[str, Any]) -> Trained:
     """The result of a complete training, from the facts of its state."""
-    last = facts["curve"][-1]
+    curve = facts["curve"]
     expert = dict(facts["expert"])
     notes = {"policy": str(folder / LAST), "demonstrations": expert.pop("source")}
     metrics = expert | {
         "batches": facts["done"],
         "training_s": facts["seconds"],
-        "loss": last["loss"],
-        "validation_loss": last["validation_loss"],
-        "best_validation_loss": min(row["validation_loss"] for row in facts["curve"]),
+        "loss": curve[-1]["loss"],
+        "validation_loss": curve[-1]["validation_loss"],
+        "best_validation_loss": min(row["validation_loss"] for row in curve),
     }
+    if job.rounds:
+        best = max(row["success"] for row in curve)
+        metrics |= {"rounds": job.rounds, "best_training_success": best}
+        return Trained(metrics=metrics, notes=notes, curve=curve, abscissa="round")
     lines = ["loss", "validation_loss"]
-    return Trained(metrics=metrics, notes=notes, curve=facts["curve"], lines=lines, scale="log")
+    return Trained(metrics=metrics, notes=notes, curve=curve, lines=lines, scale="log")
 
 
 TRAINER = Trainer(check_clone, train_clone)

@@ -1,5 +1,5 @@
-"""The learner of trainer *clone*: fits a network to demonstrations, and goes on where it was
-stopped.
+"""The learner of trainers *clone*, *dagger* and *pixels*: fits a network to demonstrations, and
+goes on where it was stopped.
 """
 
 import copy
@@ -35,10 +35,11 @@ class CloneLearner(Learner):
 
     The policy is a moving average of the network's weights over the batches.
 
-    A step is a batch. The best policy is the one with the smallest validation loss.
+    A step is a batch. Without rounds a row of the curve is written every ``job.save_every``
+    batches, and the best policy is the one with the smallest validation loss. With rounds a row is
+    a round, with the success of its policy, and the best one is the first with the largest success.
     """
 
-    trainer = "clone"
     _look_every = 10
     _validation: Tensor
 
@@ -47,13 +48,21 @@ class CloneLearner(Learner):
         stage: Stage,
         demonstrations: Demonstrations,
         folder: Path,
-        expert: dict[str, Any],
+        expert_s: float,
     ) -> None:
-        """Make the network; ``expert`` has figures of the demonstrations, by name."""
+        """Make the network with the scale of the first demonstrations.
+
+        Args:
+            stage: The stage.
+            demonstrations: The first episodes.
+            folder: Where policies and state are written.
+            expert_s: Time in which the episodes were played or read [s].
+        """
         cfg = with_observation(stage.cfg)
         self._job = job = cast(CloneJobCfg, cfg.job)
         super().__init__(stage, cfg, folder, job.save_every)
-        self._expert = expert
+        self.trainer = "dagger" if job.rounds else "clone"
+        self._expert_s = expert_s
         ranks = stage.ranks
         device = demonstrations.seen.device
         size = max(1, job.batch_size // ranks.size)
@@ -103,6 +112,14 @@ class CloneLearner(Learner):
         """Learn from these demonstrations from now on, whose range of joint targets is the
         policy's. The scale stays that of the first ones.
         """
+        counts = demonstrations.ends.new_tensor([len(demonstrations.ends), demonstrations.played])
+        self._ranks.sum_(counts)
+        self._expert = {
+            "episodes": int(counts[0]),
+            "episodes_played": int(counts[1]),
+            "expert_s": self._expert_s,
+            "source": demonstrations.source,
+        }
         self._average.set_range(*demonstrations.labels.aminmax(dim=0))
         self._seen = demonstrations.seen
         self._labels = demonstrations.labels
@@ -256,10 +273,24 @@ class CloneLearner(Learner):
 
     @override
     def score(self, row: Mapping[str, Any]) -> tuple[float, ...]:
+        if self._job.rounds:
+            return row["success"], -row["round"]
         return (-row["validation_loss"],)
 
+    @override
+    def _save(self, **figures: Any) -> None:
+        """Save; in a round write the state alone, as the policy's success is not known yet."""
+        if self._job.rounds and not figures:
+            self._write_state()
+        else:
+            super()._save(**figures)
+
+    def conclude(self, number: int, success: float) -> None:
+        """End a round, with the success of its policy."""
+        self._save(round=number, success=success)
+
     def _notes(self) -> dict[str, Any]:
-        return {"episodes": self._expert["expert_episodes"]}
+        return {"episodes": self._expert["episodes"]}
 
     @override
     def facts(self) -> dict[str, Any]:

@@ -135,9 +135,7 @@ class Demonstrations:
         )
 
     @classmethod
-    def join(
-        cls, parts: Sequence["Demonstrations"], played: int = 0, source: str = ""
-    ) -> "Demonstrations":
+    def join(cls, parts: Sequence["Demonstrations"]) -> "Demonstrations":
         """The episodes of all parts, in their order."""
         first = [0, *itertools.accumulate(len(part.seen) for part in parts)]
         states = [part.qpos for part in parts if part.qpos is not None]
@@ -148,8 +146,8 @@ class Demonstrations:
             ends=torch.cat([part.ends + at for part, at in zip(parts, first, strict=False)]),
             widths=parts[0].widths,
             driven=torch.cat(driven) if driven else None,
-            played=played,
-            source=source,
+            played=sum(part.played for part in parts),
+            source=parts[0].source,
             qpos=torch.cat(states) if states else None,
             fields={
                 name: torch.cat([part.fields[name] for part in parts]) for name in parts[0].fields
@@ -204,8 +202,8 @@ def play_expert(stage: Stage) -> Demonstrations:
     nworld = min(cfg.nworld, max(job.episodes, job.noisy_episodes))
     worlds = stage.ranks.share(nworld)
     batches = dict(enumerate(batches_of(job, nworld), start=cfg.seed))
+    source = f"the expert, seeds {min(batches)} to {max(batches)}"
     parts = []
-    played = 0
     for batch in play_batches(
         stage,
         [BatchPlan(seed, worlds) for seed in batches],
@@ -217,13 +215,12 @@ def play_expert(stage: Stage) -> Demonstrations:
         count, noise = batches[batch.plan.seed]
         counted = range(worlds.start, min(worlds.stop, count))
         accepted = (batch.succeeded & batch.finite())[: len(counted)].nonzero()[:, 0]
-        parts.append(Demonstrations.of(batch, accepted, job))
-        played += len(counted)
+        part = Demonstrations.of(batch, accepted, job)
+        parts.append(replace(part, played=len(counted), source=source))
         condition = f"noise of {noise:g} rad" if noise else "no noise"
         succeeded = sum(stage.ranks.gather(len(accepted)))
         stage.progress.print_line(
             f"train: seed {batch.plan.seed}, {condition}: {succeeded} of {count} episodes of the"
             " expert succeeded"
         )
-    source = f"the expert, seeds {min(batches)} to {max(batches)}"
-    return Demonstrations.join(parts, played, source)
+    return Demonstrations.join(parts)

@@ -100,7 +100,21 @@ class VisionCfg:
 
 @dataclass(slots=True)
 class CloneJobCfg(TrainJobCfg):
-    """A network learns to act as the expert does."""
+    """A network learns to act as the expert does, from the expert's episodes and, in rounds, from
+    its answers in states to which the policy has led. Sizes are those of a round.
+    """
+
+    rounds: int = spec(ge=0, le=1000)
+    """Rounds after the expert's own: expert and policy drive, and the policy learns from all rounds
+    so far. 0: it learns from the expert's episodes alone."""
+    beta: float = spec(ge=0.0, le=1.0)
+    """Share of the time in which the expert drives after the first round."""
+    beta_decay: float = spec(ge=0.0, le=1.0)
+    """Factor of ``beta`` from round to round."""
+    spell: float = spec(unit="s", gt=0.0)
+    """Time for which the expert or the policy drives before it is drawn anew."""
+    alone: float = spec(gt=0.0, le=1.0)
+    """Share of the worlds in which the policy drives alone: their success is that of a round."""
 
     dataset: str | None = spec(None)
     """Folder of a dataset from which it learns; null: from the expert, who plays now."""
@@ -137,24 +151,6 @@ class CloneJobCfg(TrainJobCfg):
     """Of AdamW."""
     vision: VisionCfg = field(default_factory=VisionCfg)
     """Images that it sees."""
-
-
-@dataclass(slots=True)
-class DaggerJobCfg(CloneJobCfg):
-    """In every round the expert and the policy drive, and the policy learns the expert's answers to
-    all states of all rounds. Sizes are those of a round, and ``noisy_episodes`` are not played.
-    """
-
-    rounds: int = spec(ge=1, le=1000)
-    """Rounds: the expert alone drives in the first one."""
-    beta: float = spec(ge=0.0, le=1.0)
-    """Share of the time in which the expert drives in the second round."""
-    beta_decay: float = spec(ge=0.0, le=1.0)
-    """Factor of ``beta`` from round to round."""
-    spell: float = spec(unit="s", gt=0.0)
-    """Time for which the expert or the policy drives before it is drawn anew."""
-    alone: float = spec(gt=0.0, le=1.0)
-    """Share of the worlds in which the policy drives alone: their success is that of a round."""
 
 
 @dataclass(slots=True)
@@ -196,7 +192,7 @@ class PpoJobCfg(TrainJobCfg):
 
 
 # Trainers with keys of their own; the others have those of clone.
-TRAINER_SCHEMAS = {"dagger": DaggerJobCfg, "ppo": PpoJobCfg}
+TRAINER_SCHEMAS = {"ppo": PpoJobCfg}
 # Jobs with keys of their own; the others have `JobCfg`.
 JOB_SCHEMAS = {
     "reachability": ReachabilityJobCfg,

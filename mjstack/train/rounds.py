@@ -1,33 +1,26 @@
-"""Trainer *dagger*: the policy drives more and more of the time, and learns what the expert would
-have done in the states to which that leads.
+"""Rounds of a training: the policy drives a part of the time, and the expert's answers in the
+states to which that leads are recorded.
 """
 
 import math
-from collections.abc import Mapping
-from contextlib import closing
 from pathlib import Path
 from typing import Any, cast
 
 import torch
 from torch import Tensor
-from typing_extensions import override
 
-from mjstack.config.schema import DaggerJobCfg
+from mjstack.config.schema import CloneJobCfg
 from mjstack.drivers.driver import Driver
 from mjstack.drivers.policy import PolicyDriver
 from mjstack.envs import Env
 from mjstack.episodes.batches import BatchPlan, play_batches
 from mjstack.episodes.recorder import Channels, Read
-from mjstack.episodes.rollout import STATE_BASED
 from mjstack.episodes.stage import Stage
-from mjstack.errors import ConfigError, MjstackError
 from mjstack.managers.view import random_uniform
 from mjstack.policy import Policy
 from mjstack.policy.checkpoint import read_state, write_state
-from mjstack.train.clone import check_clone
-from mjstack.train.clone_learner import CloneLearner
 from mjstack.train.demonstrations import Demonstrations, LabelDriver, demonstration_channels
-from mjstack.train.trainer import LAST, Trained, Trainer, earlier_state, with_observation
+from mjstack.train.trainer import with_observation
 
 _TENSORS = ("seen", "labels", "ends", "driven")  # of `Demonstrations`, in the file of a round
 
@@ -85,103 +78,7 @@ def _read_driven(env: Env, driver: Driver) -> Read:
     return lambda: {"driven": driven}
 
 
-class RoundLearner(CloneLearner):
-    """Fits a network round by round. A row of the curve is a round, with the success of its policy
-    in the worlds of the next one. The best policy is the first one with the largest success.
-    """
-
-    trainer = "dagger"
-
-    def begin(self, demonstrations: Demonstrations) -> None:
-        """Begin a round with the demonstrations of all rounds so far."""
-        self.process(demonstrations)
-        self._expert["expert_episodes"] = len(demonstrations.ends)
-
-    @override
-    def score(self, row: Mapping[str, Any]) -> tuple[float, ...]:
-        return row["success"], -row["round"]
-
-    @override
-    def _save(self, **figures: Any) -> None:
-        """Write the state alone: `conclude` is called when the success is known."""
-        self._write_state()
-
-    def conclude(self, number: int, success: float) -> None:
-        """End a round, with the success of its policy."""
-        super()._save(round=number, success=success)
-
-
-def check_dagger(stage: Stage) -> range:
-    """Check the expert, the observation and the sizes; see `Trainer`."""
-    cfg = stage.cfg
-    job = cast(DaggerJobCfg, cfg.job)
-    if cfg.controller.name != STATE_BASED:
-        expected = "state_based, because trainer=dagger asks the expert in the policy's states"
-        fix = "Set trainer=clone, which learns from any expert, or controller=state_based"
-        raise ConfigError("controller", cfg.controller.name, expected, fix)
-    if job.vision.cameras:
-        expected = "[], because trainer=dagger learns from numbers"
-        raise ConfigError("job.vision.cameras", job.vision.cameras, expected, "Set trainer=pixels")
-    if job.dataset is not None:
-        expected = "null, because trainer=dagger asks the expert itself"
-        raise ConfigError("job.dataset", job.dataset, expected, "Set trainer=clone")
-    if (processes := stage.ranks.size) > 1:
-        raise MjstackError(
-            f"torchrun has started {processes} processes, and trainer=dagger runs in one",
-            "Start it without torchrun, or set trainer=clone",
-        )
-    check_clone(stage)
-    if job.episodes < 2:
-        expected = "at least 2, because one of them is for validation"
-        raise ConfigError("job.episodes", job.episodes, expected)
-    return range(cfg.seed, cfg.seed + (job.rounds + 1) * math.ceil(job.episodes / cfg.nworld))
-
-
-def train_dagger(stage: Stage, folder: Path) -> Trained:
-    """Play and learn, round by round; see `Trainer`."""
-    # An earlier call's training
-    job = cast(DaggerJobCfg, stage.cfg.job)
-    earlier = earlier_state(stage, folder)
-    if earlier and len(earlier[1]["curve"]) == job.rounds:
-        stage.progress.print_line(f"train: {folder} is trained already, and is judged anew")
-        return _trained(folder, earlier[1])
-
-    # Rounds: the expert plays the first one, which gives the scale; in the worlds of the next one
-    # the policy of a round shows its success.
-    first, _ = _round(stage, folder, None, 0)
-    parts = [first]
-    with closing(RoundLearner(stage, first, folder, {})) as learner:
-        if earlier:
-            learner.restore(*earlier)
-        for number in range(1, job.rounds + 1):
-            learner.begin(Demonstrations.join(parts))
-            learner.learn((number - 1) * job.batches, number * job.batches)
-            part, success = _round(stage, folder, learner.policy, number)
-            parts.append(part)
-            if len(learner.curve) < number:
-                learner.conclude(number, success)
-    for path in folder.glob("round-*.safetensors"):
-        path.unlink()
-    return _trained(folder, learner.facts())
-
-
-def _trained(folder: Path, facts: dict[str, Any]) -> Trained:
-    """The result of a complete training, from the facts of its state."""
-    curve = facts["curve"]
-    metrics = {
-        "rounds": len(curve),
-        "episodes": facts["expert"]["expert_episodes"],
-        "batches": facts["done"],
-        "training_s": facts["seconds"],
-        "loss": curve[-1]["loss"],
-        "validation_loss": curve[-1]["validation_loss"],
-        "best_training_success": max(row["success"] for row in curve),
-    }
-    notes = {"policy": str(folder / LAST)}
-    return Trained(metrics=metrics, notes=notes, curve=curve, abscissa="round")
-
-
-def _round(
+def make_round(
     stage: Stage, folder: Path, policy: Policy | None, number: int
 ) -> tuple[Demonstrations, float]:
     """Play a round, or read it where an earlier call has played it.
@@ -194,8 +91,15 @@ def _round(
         write_state(path, *_play_round(stage, policy, number))
     tensors, facts = read_state(path)
     seen, labels, ends, driven = (tensors[name].to(stage.backend[1]) for name in _TENSORS)
-    widths = facts["widths"]
-    part = Demonstrations(seen=seen, labels=labels, ends=ends, driven=driven, widths=widths)
+    part = Demonstrations(
+        seen=seen,
+        labels=labels,
+        ends=ends,
+        driven=driven,
+        widths=facts["widths"],
+        played=facts["played"],
+        source="rounds of the expert and the policy",
+    )
     return part, facts["success"]
 
 
@@ -209,7 +113,7 @@ def _play_round(
         observation's terms and the share of ``success`` of the policy alone, or of the expert.
     """
     cfg = stage.cfg
-    job = cast(DaggerJobCfg, cfg.job)
+    job = cast(CloneJobCfg, cfg.job)
     nworld = min(cfg.nworld, job.episodes)
     beta = job.beta * job.beta_decay ** (number - 1) if policy else 1.0
     share = 1.0 if number in (0, job.rounds) else job.alone
@@ -245,7 +149,5 @@ def _play_round(
     )
     played = Demonstrations.join(parts)
     tensors = {name: getattr(played, name) for name in _TENSORS}
-    return tensors, {"widths": played.widths, "success": successes / episodes}
-
-
-TRAINER = Trainer(check_dagger, train_dagger)
+    facts = {"widths": played.widths, "played": batches * nworld, "success": successes / episodes}
+    return tensors, facts
