@@ -9,6 +9,7 @@ import os
 import shutil
 import stat
 import tempfile
+import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -20,7 +21,7 @@ import mjstack
 from mjstack.errors import FolderError, MjstackError, first_line
 
 _MOST_TEXT = 2**26  # bytes of JSON or YAML
-_MOST_BYTES = 2**34  # of any other file
+_MOST_BYTES = 2**32  # of any other file, and of the arrays in one
 _KEY = "hydra.run.dir (job=collect, job=train: job.folder)"
 
 
@@ -52,19 +53,38 @@ def reading(path: Path, fix: str) -> Iterator[None]:
         ) from error
 
 
-def check_regular(path: Path) -> None:
+def check_regular(path: Path, most: int = _MOST_BYTES) -> None:
     """Check, before anything reads it, that a file ends: a stranger's may be a pipe or a device.
+
+    Args:
+        path: The file.
+        most: Bytes that it may have.
 
     Raises:
         OSError: There is no such file.
-        ValueError: It is no regular file, or far larger than any that is written.
+        ValueError: It is no regular file, or has more bytes; far fewer are enough for text.
     """
     status = path.stat()
     if not stat.S_ISREG(status.st_mode):
         raise ValueError("it is no regular file")
-    most = _MOST_TEXT if path.suffix in (".json", ".yaml") else _MOST_BYTES
+    most = min(most, _MOST_TEXT if path.suffix in (".json", ".yaml") else _MOST_BYTES)
     if status.st_size > most:
         raise ValueError(f"it has {status.st_size} bytes, more than {most}")
+
+
+def read_npz(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of an npz file by name. No object in it is built.
+
+    Raises:
+        Exception: It cannot be read; `ValueError` if it would be too large once unpacked.
+    """
+    check_regular(path)
+    with zipfile.ZipFile(path) as file:
+        size = sum(item.file_size for item in file.infolist())
+    if size > _MOST_BYTES:
+        raise ValueError(f"its arrays have {size} bytes, more than {_MOST_BYTES}")
+    with np.load(path) as arrays:
+        return dict(arrays)
 
 
 def write_atomic(path: Path, content: str | bytes) -> None:
@@ -290,12 +310,9 @@ def to_csv(rows: Sequence[Mapping[str, object]], columns: Sequence[str] = ()) ->
     return out.getvalue()
 
 
-def read_inside(path: Path, most: int) -> bytes:
-    """The content of a file inside its folder, if it is not larger than ``most`` bytes."""
+def read_inside(path: Path, most: int = _MOST_BYTES) -> bytes:
+    """The content of a file inside its folder, checked as by `check_regular`."""
     if path.resolve().parent != path.parent.resolve():
         raise ValueError("it is a link that leads out of the folder")
-    check_regular(path)
-    size = path.stat().st_size
-    if size > most:
-        raise ValueError(f"it has {size} bytes, more than {most}")
+    check_regular(path, most)
     return path.read_bytes()

@@ -654,11 +654,27 @@ ROWS = "meta/episodes/chunk-000/file-000.parquet"
 INFO = lerobot.INFO
 STATS = lerobot.STATS
 OTHER = "cannot be read"
+ORDER = "69 frames of 3 episodes, out of order, expected 3 episodes and 69 frames"
 # By name: the file, what is done to it (None: it gets 100,000 brackets), and the message
 DAMAGE: dict[str, tuple[str, Any, str]] = {
-    "frames": (DATA, lambda table: table.slice(0, 66), "and 66 frames, expected 3 and 69"),
-    "rows": (ROWS, lambda table: table.slice(0, 2), "2 episodes and 69 frames, expected 3 and"),
-    "total": (INFO, lambda info: info.update(total_episodes=4), "and 69 frames, expected 4 and 69"),
+    "frames": (
+        DATA,
+        lambda table: table.slice(0, 66),
+        "66 frames of 3 episodes, expected 3 episodes and 69 frames",
+    ),
+    "rows": (
+        ROWS,
+        lambda table: table.slice(0, 2),
+        "2 rows of episodes and 69 frames of 3 episodes, expected 3 e",
+    ),
+    "total": (
+        INFO,
+        lambda info: info.update(total_episodes=4),
+        "69 frames of 3 episodes, expected 4 episodes and 69 frames",
+    ),
+    "shuffled": (DATA, lambda table: table.take([1, 0, *range(2, 69)]), ORDER),
+    "mixed": (DATA, lambda table: table.take([*range(20, 69), *range(20)]), ORDER),
+    "null index": (DATA, set_column("frame_index", None), OTHER),
     "robot": (INFO, lambda info: info.pop("robot_type"), "cannot be read .*'robot_type'"),
     "features": (INFO, lambda info: info.update(features=[3]), OTHER),
     "shape": (INFO, lambda info: info["features"]["action"].update(shape="x"), OTHER),
@@ -671,6 +687,11 @@ DAMAGE: dict[str, tuple[str, Any, str]] = {
         OTHER,
     ),
     "shards": (INFO, lambda info: info["mjstack"].update(shards=1.5), OTHER),
+    "many shards": (
+        INFO,
+        lambda info: info["mjstack"].update(shards=10**30),
+        "file-001.parquet: cannot be read .No such file",
+    ),
     "total_tasks": (INFO, lambda info: info.update(total_tasks=2), OTHER),
     "length": (ROWS, set_column("length", None), OTHER),
     "seed": (ROWS, set_column("seed", None), OTHER),
@@ -723,6 +744,20 @@ def test_strange_statistics_and_frames_are_one_line(value: Any, tmp_path: Path) 
         DatasetWriter(tmp_path, SPEC)
     edit_table(tmp_path / DATA, set_column("action", value))
     with pytest.raises(FolderError, match="cannot be read"):
+        read_dataset(tmp_path).frames("action")
+
+
+@pytest.mark.parametrize(("first", "second"), [(None, [1.0, 2.0, 3.0, 4.0]), ([1.0], [1.0] * 3)])
+def test_every_row_has_its_features_shape(first: Any, second: Any, tmp_path: Path) -> None:
+    """Numbers of one row are not taken for another's where they are as many in all."""
+    write(tmp_path, range(3))
+    path = tmp_path / DATA
+    table = pq.read_table(path)
+    rows = [first, second, *table["action"].to_pylist()[2:]]
+    column = table.schema.get_field_index("action")
+    values = pa.array(rows, pa.list_(pa.float32()))
+    pq.write_table(table.set_column(column, "action", values), path)
+    with pytest.raises(FolderError, match="rows of action without 2 numbers"):
         read_dataset(tmp_path).frames("action")
 
 

@@ -101,7 +101,7 @@ PATHS: dict[str, dict[str, str] | None] = {
             "command _decide _find_delivered _lead_point _tilted _turn_left _point _grasp_offset"
         ),
     },
-    "train/dagger.py": {"MixedDriver": "command"},
+    "train/rounds.py": {"MixedDriver": "command"},
     "policy/network.py": {"PolicyNetwork": "normalized forward"},
     "drivers/tilt.py": {"CarryTilt": "desired_approach release_approach"},
     "episodes/failures.py": {"FailureMonitor": "update", "": "_of"},

@@ -139,12 +139,12 @@ def shuffle(table: pa.Table) -> pa.Table:
 
 
 SHAPES = "rows of action without 6 numbers"
-ORDER = "out of order, expected 3 episodes and 450 frames"
+ORDER = "3 episodes, out of order, expected 3 episodes and 450 frames"
 DAMAGES: dict[str, tuple[Callable[[pa.Table], pa.Table], str]] = {
     "a null row and a double one": (reshape_rows({7: None, 8: 12}), SHAPES),
     "rows of 5 and 7": (reshape_rows({100: 5, 200: 7}), SHAPES),
-    "the end is missing": (lambda table: table.slice(0, 413), "has 3 episodes and 413 frames, ex"),
-    "an episode is missing": (lambda table: table.slice(150), "has 2 episodes and 300 frames, ex"),
+    "the end is missing": (lambda table: table.slice(0, 413), "413 frames of 3 episodes, ex"),
+    "an episode is missing": (lambda table: table.slice(150), "300 frames of 2 episodes, ex"),
     "shuffled": (shuffle, ORDER),
     "two steps swapped": (swap(20, 21), ORDER),
     "episodes mixed": (swap(149, 150), ORDER),
@@ -173,7 +173,7 @@ def test_a_file_that_is_there_twice_is_refused(dataset: Path, tmp_path: Path) ->
             assert len(read(folder).ends) == 3
         else:
             line = refused([f"job.dataset={folder}"])
-            assert "has 3 episodes and 900 frames out of order, expected 3 episodes and 450" in line
+            assert "has 3 rows of episodes and 900 frames of 3 episodes, expected 3 epis" in line
 
 
 def test_without_a_success_all_episodes_count(dataset: Path, tmp_path: Path) -> None:
@@ -234,6 +234,17 @@ CHANGES: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "column": (rename, "has no column headings.1 in observation.policy"),
     "action": (lambda i: i["features"].pop("action"), "has no column shoulder_pan.pos in action"),
     "damaged": (lambda i: i.pop("features"), "info.json: cannot be read (KeyError"),
+    "rate in words": (lambda i: i.update(fps="50"), "info.json: cannot be read (ValueError: fps"),
+    "no features": (lambda i: i.update(features=[]), "info.json: cannot be read (ValueError: feat"),
+    "no shards": (lambda i: i["mjstack"].update(shards="1"), "cannot be read (ValueError: shards"),
+    "many shards": (lambda i: i["mjstack"].update(shards=10**30), "file-001.parquet: cannot be"),
+    "block": (lambda i: i.update(mjstack=[]), "info.json: cannot be read (ValueError: mjstack"),
+    "names": (
+        lambda i: i["features"]["action"].update(names={"a": 1, "b": "x"}),
+        "info.json: cannot be read (TypeError",
+    ),
+    "shape": (lambda i: i["features"]["action"].update(shape=[-6]), "the shape of action is [-6]"),
+    "empty": (lambda i: i.update(total_episodes=0), "it has no episodes"),
 }
 
 
@@ -249,6 +260,27 @@ def refused(overrides: list[str]) -> str:
 def test_a_dataset_that_does_not_fit_is_one_line(name: str, dataset: Path, tmp_path: Path) -> None:
     change, says = CHANGES[name]
     folder = copied(dataset, tmp_path, change)
+    assert says in refused([f"job.dataset={folder}"])
+
+
+ROWS = "meta/episodes/chunk-000/file-000.parquet"
+COLUMNS: dict[str, tuple[str, str, list[Any], str]] = {
+    "seeds null": (ROWS, "seed", [None, 0, 0], f"{ROWS}: cannot be read (TypeError"),
+    "seeds in words": (ROWS, "seed", ["0", "0", "0"], f"{ROWS}: cannot be read (TypeError"),
+    "lengths": (ROWS, "length", [149, 151, 150], "as long as its row says"),
+    "a negative length": (ROWS, "length", [-1, 301, 150], "as long as its row says"),
+    "no length": (ROWS, "length", [None, 150, 150], f"{ROWS}: cannot be read (TypeError"),
+    "task": ("meta/tasks.parquet", "task_index", [None], "tasks.parquet: cannot be read (TypeEr"),
+}
+
+
+@pytest.mark.parametrize("name", COLUMNS)
+def test_a_damaged_column_is_one_line(name: str, dataset: Path, tmp_path: Path) -> None:
+    folder = copied(dataset, tmp_path)
+    file, column, values, says = COLUMNS[name]
+    table = pq.read_table(folder / file)
+    number = table.schema.get_field_index(column)
+    pq.write_table(table.set_column(number, column, pa.array(values)), folder / file)
     assert says in refused([f"job.dataset={folder}"])
 
 

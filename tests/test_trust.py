@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from compositions import load_config
 from environments import one_second_episode
 from omegaconf import OmegaConf
@@ -29,8 +30,9 @@ from mjstack.config.fingerprint import config_content
 from mjstack.config.session import check_term, in_search_path, search_path
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.errors import MjstackError
+from mjstack.files import read_inside
 from mjstack.jobs import check_job
-from mjstack.policy import load_policy
+from mjstack.policy import load_policy, save_policy
 from mjstack.policy.checkpoint import read_state
 from mjstack.process import Child
 
@@ -344,6 +346,39 @@ def test_a_policy_cannot_claim_more_than_it_is(tmp_path: Path) -> None:
     path.write_text(facts)
     os.truncate(next(folder.glob("weights-*")), 2**32)
     assert "it has 4294967296 bytes" in refused(lambda: load_policy(folder))
+
+
+def test_arrays_are_not_unpacked_without_end(
+    stranger: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A few bytes of an npz file may stand for gigabytes."""
+    monkeypatch.setattr("mjstack.files._MOST_BYTES", 2**22)
+    for name in ("worlds_seed0.npz", "starts.npz"):
+        np.savez_compressed(stranger / name, zeros=np.zeros(2**20))
+        assert (stranger / name).stat().st_size < 2**14
+    assert "its arrays have 8388736 bytes, more than 4194304" in refused(lambda: replay(stranger))
+    starts = stranger / "starts.npz"
+    overrides = ["reset=starts_file", f"starts={starts}", "sim=native", "nworld=1"]
+    assert f"starts={starts}" in refused(lambda: make_env(overrides))
+
+
+def test_a_policy_that_a_training_saves_meanwhile_is_read_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The weights that policy.json has just named may be gone before they are read."""
+    folder = write_policy(tmp_path / "policy", load_config(["sim=native"]))
+    newer = load_policy(folder)
+    with torch.no_grad():
+        newer.network.layers[0].bias.add_(1.0)
+
+    def save_before(path: Path, *most: int) -> bytes:
+        if path.suffix == ".safetensors":
+            monkeypatch.undo()
+            save_policy(folder, newer)
+        return read_inside(path, *most)
+
+    monkeypatch.setattr("mjstack.policy.checkpoint.read_inside", save_before)
+    assert torch.equal(load_policy(folder).network.layers[0].bias, newer.network.layers[0].bias)
 
 
 def damage_record(**changes: Any) -> Callable[[Path], object]:

@@ -20,7 +20,6 @@ _OF_THE_CALL = ("resume", "devices", "sweep", "web")  # they change no result
 # Changing one of these changes no dataset and no training.
 WITHOUT_EFFECT = ("batch", "gates", "gate", "graph", "view", "video", "run", "world")
 POLICY_FILE = "policy.json"  # of a policy's folder; it names the weights by their SHA-256
-MOST_TEXT = 2**24  # bytes of it; a stranger's may ask for more
 
 
 def config_content(cfg: Config) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from yaml import YAMLError  # type: ignore[import-untyped]
 from mjstack.config.check import validate
 from mjstack.config.complete import complete
 from mjstack.config.explain import check_added, check_overrides, explain, own_overrides, parse
-from mjstack.config.fingerprint import MOST_TEXT, POLICY_FILE
+from mjstack.config.fingerprint import POLICY_FILE
 from mjstack.config.schema import JOB_SCHEMAS, TRAINER_SCHEMAS, Backend, Config
 from mjstack.config.session import (
     CONFIG_NAME,
@@ -129,7 +129,7 @@ def _policy_choices(overrides: Sequence[str]) -> list[str]:
     if not isinstance(folder, str):
         return []
     try:
-        facts = json.loads(read_inside(Path(folder) / POLICY_FILE, MOST_TEXT))
+        facts = json.loads(read_inside(Path(folder) / POLICY_FILE))
         trained = {group: [facts["config"][group]["name"]] for group in ("robot", "task")}
         trained["cameras"] = list(facts["observation"].get("images", {}))
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):

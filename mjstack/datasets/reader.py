@@ -1,6 +1,8 @@
 """Opening a dataset: to read it, or to go on with it."""
 
 import json
+import math
+import re
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -15,6 +17,9 @@ from mjstack.datasets.spec import DatasetSpec, Video
 from mjstack.datasets.video import decode
 from mjstack.errors import FolderError, UnknownName
 from mjstack.files import reading
+
+_USED = ("codebase_version", "fps", "features", "total_episodes", "total_frames")
+_ORDER = ("episode_index", "frame_index")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -77,18 +82,13 @@ class StoredDataset:
         if name not in features or name in videos:
             raise UnknownName("feature", name, features.keys() - videos.keys())
         dtype = features[name]["dtype"]
-        shape = features[name]["shape"]
-        parts = [np.empty((0, *shape), dtype)]
-        for shard in range(self.info["mjstack"]["shards"]):
-            path = lerobot.shard_path(self.folder, lerobot.DATA, shard)
+        parts = [np.empty((0, *features[name]["shape"]), dtype)]
+        for path in data_files(self.folder, self.info):
             with readable(path):
-                column = _read_table(path, [name])[name]
-                values = column.combine_chunks()
-                values = values if shape == [1] else values.flatten()
-                part = values.to_numpy(zero_copy_only=False).reshape(len(column), *shape)
+                part = read_columns(path, self.info, [name])[name]
                 if part.dtype != dtype:
                     raise ValueError(f"{name} is {part.dtype}")
-                parts.append(part)
+                parts.append(part.reshape(-1, *parts[0].shape[1:]))
         return np.concatenate(parts)
 
 
@@ -129,25 +129,33 @@ def read_info(folder: Path) -> dict[str, Any] | None:
         return None
     with readable(path):
         info = json.loads(path.read_text(encoding="utf-8"))
-        _check_types(info)
+        check_types(info)
     return info
 
 
-def _check_types(info: Any) -> None:
-    """Raise an error of any kind where info.json is not what `make_info` makes."""
+def check_types(info: Any, *, written_here: bool = True) -> None:
+    """Raise an error of any kind where info.json is not what `make_info` makes; of a dataset that
+    mjstack has not written, where its features and counts are not.
+    """
     empty = lerobot.make_info(DatasetSpec(robot_type="", fps=1, features={}, config_sha256=""))
-    for block, model in ((info, empty), (info["mjstack"], empty["mjstack"])):
+    used = empty if written_here else {name: empty[name] for name in _USED}
+    for block, model in (
+        (info, used),
+        *([(info["mjstack"], empty["mjstack"])] if written_here else []),
+    ):
         for name, value in model.items():
-            kinds = type(value) if name != "video_path" else str | None
+            kinds = {"video_path": str | None, "fps": int | float}.get(name, type(value))
             if not isinstance(block[name], kinds) or isinstance(block[name], bool):
                 raise ValueError(f"{name} is {block[name]!r:.60}")
-    _videos(info)
-    for feature in info["features"].values():
-        dtype = "uint8" if feature["dtype"] == "video" else feature["dtype"]
-        np.empty(feature["shape"], dtype)
-    for entry in info["mjstack"]["provenance"]:
+    for name, feature in info["features"].items():
+        if not all(type(number) is int and number > 0 for number in feature["shape"]):
+            raise ValueError(f"the shape of {name} is {feature['shape']!r:.60}")
+        if written_here and feature["dtype"] != "video":
+            np.dtype(feature["dtype"])
+    for entry in info["mjstack"]["provenance"] if written_here else ():
         if not 0 <= entry["from_episode"] <= info["total_episodes"]:
             raise ValueError(f"from_episode is {entry['from_episode']}")
+    _videos(info)
 
 
 def _videos(info: dict[str, Any]) -> dict[str, Video]:
@@ -202,7 +210,6 @@ def read_rows(folder: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
         FolderError: A file is missing or damaged, or has other episodes or frames than it should.
     """
     rows: list[dict[str, Any]] = []
-    frames = 0
     for shard in range(info["mjstack"]["shards"]):
         path = lerobot.shard_path(folder, lerobot.EPISODES, shard)
         with readable(path):
@@ -215,21 +222,76 @@ def read_rows(folder: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
                 if min(row["seed"], row["world"]) < 0:
                     raise ValueError(f"row {len(rows)} has a negative seed or world")
                 rows.append(row)
-        path = lerobot.shard_path(folder, lerobot.DATA, shard)
         for video in _videos(info):
-            images = lerobot.shard_path(folder, lerobot.VIDEO, shard, video)
-            with readable(images):
-                images.stat()
-        with readable(path):
-            frames += lerobot.require_pyarrow()[1].read_metadata(path).num_rows
-    episodes = info["total_episodes"]
-    if (len(rows), frames) != (episodes, info["total_frames"]):
-        raise FolderError(
-            f"{folder} has {len(rows)} episodes and {frames} frames, expected {episodes} and"
-            f" {info['total_frames']} as {lerobot.INFO} says. Restore its files, or give another"
-            " folder"
-        )
+            with readable(lerobot.shard_path(folder, lerobot.VIDEO, shard, video)):
+                pass
+    check_frames(folder, info, [row["length"] for row in rows])
     return rows
+
+
+def data_files(folder: Path, info: dict[str, Any], files: str = lerobot.DATA) -> list[Path]:
+    """The data files that count, or those of episodes (`lerobot.EPISODES`), in order. If some are
+    missing, the first of them is among these.
+    """
+    there = sorted(folder.glob(re.sub(r"{.*?}", "*", files)))
+    if "mjstack" not in info:
+        return there
+    shards = min(info["mjstack"]["shards"], len(there) + 1)
+    return [lerobot.shard_path(folder, files, shard) for shard in range(shards)]
+
+
+def check_frames(folder: Path, info: dict[str, Any], lengths: Sequence[int]) -> None:
+    """Check that the frames are as many as info.json says, and those of each episode in one piece.
+
+    Args:
+        folder: The dataset.
+        info: The content of info.json, as of `check_types`.
+        lengths: Frames of each episode, as its row says.
+
+    Raises:
+        FolderError: Frames or episodes are missing, there twice or out of order.
+    """
+    parts = [np.empty((0, 2))]
+    for path in data_files(folder, info):
+        with readable(path):
+            parts.append(np.hstack([*read_columns(path, info, _ORDER).values()]))
+    episode, frame = np.concatenate(parts).T
+    counts = (len(lengths), len(frame))
+    total = (info["total_episodes"], info["total_frames"])
+    if counts == total and min(lengths, default=1) > 0 and sum(lengths) == len(frame):
+        steps = np.concatenate([np.arange(length) for length in (0, *lengths)])
+        number = np.repeat(np.arange(len(lengths)), lengths)
+        if np.array_equal(episode, number) and np.array_equal(frame, steps):
+            return
+    raise FolderError(
+        f"{folder} has {counts[0]} rows of episodes and {counts[1]} frames of"
+        f" {len(np.unique(episode))} episodes{', out of order' * (counts == total)}, expected"
+        f" {total[0]} episodes and {total[1]} frames as {lerobot.INFO} says, each episode in one"
+        " piece, as long as its row says and frame_index rising by one in it. Restore its files,"
+        " or give another folder"
+    )
+
+
+def read_columns(path: Path, info: dict[str, Any], names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Columns of a data file, each shape ``(frames, numbers)``, in the file's types.
+
+    Raises:
+        Exception: It cannot be read, or a row has not as many numbers as info.json says.
+    """
+    table = _read_table(path, names)
+    columns = {}
+    for name in names:
+        column = table[name].combine_chunks()
+        width = math.prod(info["features"][name]["shape"])
+        if hasattr(column, "flatten"):
+            if set(column.value_lengths().unique().to_pylist()) - {width}:  # a null has none
+                raise ValueError(f"rows of {name} without {width} numbers")
+            column = column.flatten()
+        values = column.to_numpy(zero_copy_only=False)
+        if values.dtype.kind not in "biuf":
+            raise ValueError(f"{name} has other values than numbers")
+        columns[name] = values.reshape(len(table), width)
+    return columns
 
 
 def uncommitted(folder: Path, shards: int) -> list[Path]:

@@ -16,7 +16,7 @@ from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.recorder import Channels, Read, Recorder
 from mjstack.episodes.stage import Stage
-from mjstack.files import reading, write_npz
+from mjstack.files import read_npz, reading, write_npz
 from mjstack.interrupt import check_interrupt
 from mjstack.report.page import MOST_WORLDS, Page, World, frame_stride
 from mjstack.report.write import safely_write
@@ -88,7 +88,8 @@ def restore_batch(page: Page, path: Path, gate: str) -> None:
         FolderError: Their file cannot be read.
     """
     if path.exists():
-        with reading(path, "Remove it"), np.load(path) as arrays:
+        with reading(path, "Remove it"):
+            arrays = read_npz(path)
             marks = [arrays[name].tolist() for name in _MARKS]
             page.worlds3d[gate] = [
                 World(label=label, qpos=qpos, failed=failed, twin=twin)

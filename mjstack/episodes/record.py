@@ -13,7 +13,7 @@ import torch
 
 from mjstack.episodes.failures import FailureMonitor, Sign
 from mjstack.episodes.rollout import Episode
-from mjstack.files import reading
+from mjstack.files import read_npz, reading
 from mjstack.tasks.check import Rules
 
 STEMS = {"batch": "worlds", "success": "success"}
@@ -140,8 +140,8 @@ class EpisodeRecord:
         path = folder / record_name(gate, seed)
         if not path.exists():
             return None
-        with reading(path, "Run the gate again"), np.load(path) as file:
-            arrays = dict(file)
+        with reading(path, "Run the gate again"):
+            arrays = read_npz(path)
             ranks = [arrays.pop(name, np.empty(0)) for name in ("rank_first_world", "rank_place")]
             arrays.pop("sign_names", None)
             record = cls(

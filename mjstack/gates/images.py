@@ -12,7 +12,7 @@ import torch
 from mjstack.config.schema import OUTPUTS, Backend, Config
 from mjstack.episodes.stage import Stage
 from mjstack.errors import FolderError, MjstackError
-from mjstack.files import reading, write_npz
+from mjstack.files import read_npz, reading, write_npz
 from mjstack.report.gl import require_offscreen
 from mjstack.report.picture import save_images
 from mjstack.report.record import GateResult
@@ -223,8 +223,7 @@ def load_images(cfg: Config) -> tuple[np.ndarray, Images]:
     """
     path = Path(str(cfg.gate.parity.images))
     with reading(path, f"Name the {FILE} of a run of gate parity"):
-        with np.load(path, allow_pickle=False) as saved:
-            images = {name: saved[name] for name in saved.files}
+        images: Images = read_npz(path)
         about = json.loads(str(images.pop("about")))
         qpos = images.pop("qpos")
         for key, value in _about(cfg).items():

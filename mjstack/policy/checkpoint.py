@@ -22,7 +22,7 @@ from torch import Tensor
 
 import mjstack
 from mjstack.config.complete import typed
-from mjstack.config.fingerprint import MOST_TEXT, POLICY_FILE, config_content
+from mjstack.config.fingerprint import POLICY_FILE, config_content
 from mjstack.config.schema import Config, ObservationGroupCfg, ObservationTermCfg, TermCfg
 from mjstack.config.session import check_term
 from mjstack.errors import FolderError
@@ -33,7 +33,6 @@ FORMAT = 5  # grows when an older mjstack could not read what is written
 _OLDER = (3, 4)  # of version 0.1: they have no terms where actions are joint targets
 _NAME_ANOTHER = "Name a policy that job=train has written, such as outputs/mine/last"
 # A stranger's files may ask for more than this.
-_MOST_WEIGHTS = 2**32  # bytes
 _MOST_COUNT = 1_000_000
 _MOST_LAYERS = 100
 _MOST_TERMS = 100
@@ -206,7 +205,7 @@ def load_policy(folder: Path) -> Policy:
         reason = f"has no {POLICY_FILE}, expected the folder of a policy"
         raise FolderError(f"policy={folder}: {reason}", _NAME_ANOTHER)
     with reading(path, _NAME_ANOTHER):
-        facts = json.loads(read_inside(path, MOST_TEXT))
+        facts = json.loads(read_inside(path))
         if facts["format"] not in (*_OLDER, FORMAT):
             raise FolderError(
                 f"policy={folder}: has format {facts['format']}, expected {_OLDER[0]} to {FORMAT},"
@@ -218,16 +217,21 @@ def load_policy(folder: Path) -> Policy:
         if not re.fullmatch("[0-9a-f]{64}", digest):
             raise ValueError("weights_sha256 is no SHA-256")
     weights = folder / _weights_name(digest)
-    with reading(weights, "Copy the whole folder again, or train the policy again"):
-        numbers = sum(value.numel() for value in policy.network.state_dict().values())
-        content = read_inside(weights, min(4 * numbers + 2**20, _MOST_WEIGHTS))  # and names
-        if sha256(content).hexdigest() != digest:
-            raise ValueError(f"its content is not that of {POLICY_FILE}")
-        tensors = load(content)
-        for name, value in tensors.items():
-            if value.dtype != torch.float32 or not bool(value.isfinite().all()):
-                raise ValueError(f"{name} has other values than finite ones in float32")
-        policy.network.load_state_dict(tensors, assign=True)
+    try:
+        with reading(weights, "Copy the whole folder again, or train the policy again"):
+            numbers = sum(value.numel() for value in policy.network.state_dict().values())
+            content = read_inside(weights, 4 * numbers + 2**20)  # and names
+            if sha256(content).hexdigest() != digest:
+                raise ValueError(f"its content is not that of {POLICY_FILE}")
+            tensors = load(content)
+            for name, value in tensors.items():
+                if value.dtype != torch.float32 or not bool(value.isfinite().all()):
+                    raise ValueError(f"{name} has other values than finite ones in float32")
+            policy.network.load_state_dict(tensors, assign=True)
+    except FolderError:
+        if digest in path.read_text():
+            raise
+        return load_policy(folder)  # a training has saved the next one since
     policy.network.requires_grad_(False)
     return policy
 

@@ -3,8 +3,8 @@ that a policy sees.
 """
 
 import json
-import math
 from collections.abc import Mapping, Sequence
+from operator import index
 from pathlib import Path
 from typing import Any, cast
 
@@ -13,7 +13,13 @@ import torch
 
 from mjstack.config.schema import CloneJobCfg, Config
 from mjstack.datasets import lerobot
-from mjstack.datasets.reader import readable
+from mjstack.datasets.reader import (
+    check_frames,
+    check_types,
+    data_files,
+    read_columns,
+    readable,
+)
 from mjstack.datasets.spec import term_columns
 from mjstack.episodes.stage import Stage
 from mjstack.errors import FolderError
@@ -22,7 +28,6 @@ from mjstack.train.demonstrations import Demonstrations
 _ACTION = "action"
 _SUCCESS = "next.success"
 _EPISODE = "episode_index"
-_FRAME = "frame_index"
 _TASK = "task_index"
 _BEYOND = 1e-3  # rad, m: how far a joint target may be out of its actuator's range
 
@@ -45,9 +50,11 @@ def check_dataset(stage: Stage, widths: Mapping[str, int]) -> range:
     info = _read_info(folder)
     places = _find_columns(info, cfg, widths)
     _task_number(cfg)
+    lengths, seeds = _rows(folder, info)
+    check_frames(folder, info, lengths)
     # The ranges of the first file: degrees, say, are far out of them
-    _check_frames(folder, info)
-    action = _read(_files(folder, info)[0], {_ACTION: places[_ACTION]}, info)[_ACTION]
+    path = data_files(folder, info)[0]
+    action = _read(path, {_ACTION: places[_ACTION]}, info)[_ACTION]
     low, high = stage.index.ctrl_range.T
     worst = np.maximum(low - action, action - high).max(0)
     joint = int(worst.argmax())
@@ -58,7 +65,6 @@ def check_dataset(stage: Stage, widths: Mapping[str, int]) -> range:
             f" {values.max():g}, expected absolute joint targets within {low[joint]:g} to"
             f" {high[joint]:g} rad or m. Give a dataset with these units"
         )
-    seeds = _seeds(folder)
     return range(min(seeds), max(seeds) + 1) if seeds else range(0)
 
 
@@ -76,7 +82,7 @@ def read_demonstrations(stage: Stage, widths: dict[str, int]) -> Demonstrations:
     places = _find_columns(info, cfg, widths)
     facts = [_EPISODE, _TASK, *({_SUCCESS} & info["features"].keys())]
     places |= {name: [(name, 0)] for name in facts}
-    parts = [_read(path, places, info) for path in _files(folder, info)]
+    parts = [_read(path, places, info) for path in data_files(folder, info)]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in places}
 
     # Episodes of the task that succeeded
@@ -128,13 +134,16 @@ def _read_info(folder: Path) -> dict[str, Any]:
     with readable(path):
         info = json.loads(path.read_text(encoding="utf-8"))
         version = str(info["codebase_version"])
-        for name in ("robot_type", "fps", "features", "total_episodes", "total_frames"):
-            info[name]
-    if not version.startswith("v3"):
-        raise FolderError(
-            f"job.dataset={folder}: is a LeRobotDataset {version}, expected v3.0. Convert it with"
-            " LeRobot"
-        )
+        if not version.startswith("v3"):
+            raise FolderError(
+                f"job.dataset={folder}: is a LeRobotDataset {version}, expected v3.0. Convert it"
+                " with LeRobot"
+            )
+        check_types(info, written_here="mjstack" in info)
+        if info["total_episodes"] < 1:
+            raise ValueError("it has no episodes")
+        for feature in info["features"].values():
+            feature["names"] = _names(feature.get("names"))
     return info
 
 
@@ -149,9 +158,9 @@ def _find_columns(
     folder = _folder(cfg)
     expected = {"robot_type": cfg.robot.name, "fps": round(cfg.task.control_hz)}
     for key, value in expected.items():
-        if info[key] != value:
+        if info.get(key) != value:
             raise FolderError(
-                f"job.dataset={folder}: has {key}={info[key]}, expected {value}. Give another"
+                f"job.dataset={folder}: has {key}={info.get(key)}, expected {value}. Give another"
                 " dataset, or set robot and task to its own"
             )
 
@@ -161,7 +170,7 @@ def _find_columns(
         for feature in features:
             content = info["features"].get(feature, {})
             if str(content.get("dtype")).startswith("float"):
-                for number, column in enumerate(_names(content.get("names"))):
+                for number, column in enumerate(content["names"]):
                     places.setdefault(str(column), (feature, number))
         for column in columns:
             if column not in places:
@@ -196,46 +205,18 @@ def _names(value: object) -> list[object]:
     return value if isinstance(value, list) else []
 
 
-def _files(folder: Path, info: Mapping[str, Any]) -> list[Path]:
-    """The data files, in order."""
-    if "mjstack" in info:  # others may lie beside those that count
-        shards = range(info["mjstack"]["shards"])
-        return [lerobot.shard_path(folder, lerobot.DATA, shard) for shard in shards]
-    return sorted(folder.glob("data/chunk-*/file-*.parquet"))
-
-
-def _check_frames(folder: Path, info: Mapping[str, Any]) -> None:
-    """Raise a `FolderError` where episodes or frames are missing, are there twice, or are out of
-    order.
-    """
-    places = {name: [(name, 0)] for name in (_EPISODE, _FRAME)}
-    parts = [_read(path, places, info) for path in _files(folder, info)]
-    if not parts:
-        parts = [{name: np.empty((0, 1)) for name in places}]
-    episode, frame = (np.concatenate([part[name][:, 0] for part in parts]) for name in places)
-    begins = np.flatnonzero(np.diff(episode, prepend=-1))
-    count = len(np.unique(episode))
-    there = f"{count} episodes and {len(episode)} frames"
-    recorded = f"{info['total_episodes']} episodes and {info['total_frames']} frames"
-    steps = np.arange(len(frame)) - np.repeat(begins, np.diff(begins, append=len(frame)))
-    wrong = len(begins) != count or (frame != steps).any()
-    if there != recorded or wrong:
-        raise FolderError(
-            f"job.dataset={folder}: has {there}{' out of order' * bool(wrong)}, expected"
-            f" {recorded}, as {lerobot.INFO} says, each episode in one piece and"
-            f" {_FRAME} rising by one in it. Restore its files, or give another dataset"
-        )
-
-
-def _seeds(folder: Path) -> list[int]:
-    """Seeds of the episodes, as far as the dataset has them."""
+def _rows(folder: Path, info: dict[str, Any]) -> tuple[list[int], list[int]]:
+    """Length of every episode, and its seed as far as the dataset has any."""
+    lengths: list[int] = []
     seeds: list[int] = []
-    for path in sorted(folder.glob("meta/episodes/chunk-*/file-*.parquet")):
+    for path in data_files(folder, info, lerobot.EPISODES):
         with readable(path):
             file = lerobot.require_pyarrow()[1].ParquetFile(path)
-            if "seed" in file.schema_arrow.names:
-                seeds += file.read(columns=["seed"])["seed"].to_pylist()
-    return seeds
+            names = [name for name in ("length", "seed") if name in file.schema_arrow.names]
+            columns = file.read(columns=names).to_pydict()
+            lengths += map(index, columns["length"])
+            seeds += map(index, columns.get("seed", ()))
+    return lengths, seeds
 
 
 def _task_number(cfg: Config) -> int:
@@ -250,35 +231,26 @@ def _task_number(cfg: Config) -> int:
         table = lerobot.require_pyarrow()[1].ParquetFile(path).read()
         names = table.column_names
         text = "task" if "task" in names else next(n for n in names if n != "task_index")
-        tasks = dict(zip(table[text].to_pylist(), table["task_index"].to_pylist(), strict=True))
+        numbers = map(index, table["task_index"].to_pylist())
+        tasks = dict(zip(table[text].to_pylist(), numbers, strict=True))
     if cfg.task.instruction not in tasks:
         raise FolderError(
             f"job.dataset={folder}: has the task {', '.join(map(repr, tasks)) or 'none'}, expected"
             f" {cfg.task.instruction!r}. Give another dataset, or set task"
         )
-    return int(tasks[cfg.task.instruction])
+    return tasks[cfg.task.instruction]
 
 
 def _read(
-    path: Path, columns: Mapping[str, Sequence[Place]], info: Mapping[str, Any]
+    path: Path, columns: Mapping[str, Sequence[Place]], info: dict[str, Any]
 ) -> dict[str, np.ndarray]:
     """Numbers of a data file by name, each shape ``(frames, numbers)``; every row of a feature has
     its shape in info.json.
     """
     features = sorted({feature for places in columns.values() for feature, _ in places})
     with readable(path):
-        table = lerobot.require_pyarrow()[1].ParquetFile(path).read(columns=features)
-        values = {}
-        for feature in features:
-            column = table[feature].combine_chunks()
-            width = math.prod(info["features"][feature]["shape"])
-            flat = column
-            if hasattr(column, "flatten"):
-                flat = column.flatten()
-                if set(column.value_lengths().to_pylist()) - {width}:  # a null has none
-                    raise ValueError(f"rows of {feature} without {width} numbers")
-            array = np.asarray(flat.to_numpy(zero_copy_only=False), dtype=float)
-            values[feature] = array.reshape(len(table), width)
+        read = read_columns(path, info, features)
+        values = {name: column.astype(float) for name, column in read.items()}
         arrays = {
             name: np.stack([values[feature][:, number] for feature, number in places], axis=1)
             for name, places in columns.items()

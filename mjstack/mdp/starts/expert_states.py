@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mjstack.config.fields import Count, Fraction
 from mjstack.errors import ParameterError, first_line
-from mjstack.files import check_regular, write_npz
+from mjstack.files import read_npz, write_npz
 from mjstack.managers.view import EnvView, offers, random_uniform, rows_of
 
 STATE = ("qpos", "qvel", "act", "ctrl")
@@ -54,9 +54,7 @@ class ExpertStates:
             expected = "a file of states, which job=train trainer=ppo records in its folder"
             raise ParameterError("path", None, expected)
         try:
-            check_regular(Path(path))
-            with np.load(path, allow_pickle=False) as file:
-                tensors = {name: torch.from_numpy(file[name]) for name in file.files}
+            tensors = {name: torch.from_numpy(a) for name, a in read_npz(Path(path)).items()}
             self._source = tensors[EPISODE].to(env.device)
         except Exception as error:  # it may be anything
             expected = f"a file of states; it cannot be read ({first_line(error)})"

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from mjstack.errors import ArgumentError, ConfigError, ParameterError, suggest
-from mjstack.files import check_regular, write_npz
+from mjstack.files import read_npz, write_npz
 from mjstack.managers.view import EnvView, offers, uses_fields
 from mjstack.mdp.geometry import Pose, place_xy, pose_w, robot, write_robot
 from mjstack.mdp.observation import joint_pos
@@ -64,9 +64,7 @@ class StartsTable:
             expected = "an npz file; CSV is of version 0.1 and is not read any more"
             raise self.wrong(expected, "Make a new one with write_starts or numpy.savez")
         try:
-            check_regular(Path(path))
-            with np.load(path) as file:  # no pickles
-                arrays = {name: np.atleast_1d(file[name]) for name in file.files}
+            arrays = {name: np.atleast_1d(array) for name, array in read_npz(Path(path)).items()}
         except Exception as error:  # a file can be anything
             reason = getattr(error, "strerror", None) or "damaged, or of another format"
             expected = f"an npz file with a row per world; it cannot be read ({reason})"
