@@ -39,7 +39,7 @@ TINY = [
     *SMALL,
     "web.episode=false",
     *("job.vision.channels=[4,8]", "job.vision.features=8", "job.vision.shift=1"),
-    *("job.vision.pool=40", "job.vision.uses=2", "job.episodes=4", "job.noisy_episodes=0"),
+    *("job.vision.pool=40", "job.vision.uses=2", "job.episodes=4"),
     *("job.hidden=[16]", "job.batches=12", "job.batch_size=16", "job.save_every=6"),
     "gate.success.rate=0.0",
 ]

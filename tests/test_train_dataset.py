@@ -22,7 +22,8 @@ from mjstack.episodes.stage import Progress, Stage
 from mjstack.errors import MjstackError
 from mjstack.jobs.train import check_train
 from mjstack.train.dataset import read_demonstrations
-from mjstack.train.demonstrations import Demonstrations, play_expert
+from mjstack.train.demonstrations import Demonstrations
+from mjstack.train.rounds import make_round
 from mjstack.train.trainer import observed_widths
 
 REACH = ("task=reach", "sim=native", "nworld=3")
@@ -49,12 +50,11 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "dataset"
 
 
-def test_a_dataset_has_what_the_expert_would_show(dataset: Path) -> None:
+def test_a_dataset_has_what_the_expert_would_show(dataset: Path, tmp_path: Path) -> None:
     """The same starts, so the same steps; torchrun's processes share the episodes."""
-    sizes = ["job.episodes=3", "job.noisy_episodes=0"]
-    cfg = load_config([*TRAIN, *sizes, f"job.dataset={dataset}"])
+    cfg = load_config([*TRAIN, "job.episodes=3", f"job.dataset={dataset}"])
     stage = Stage(cfg)
-    played = play_expert(stage)
+    played = make_round(stage, tmp_path, None, 0)
     read = read_demonstrations(stage, played.widths)
     assert torch.equal(read.ends, played.ends)
     torch.testing.assert_close(read.seen, played.seen)

@@ -28,6 +28,8 @@ BAD: dict[tuple[str, ...], list[tuple[list[str], str]]] = {
         ),
         (["job.leave_out=[joint_vle]"], "Did you mean 'joint_vel'?"),
         (["observation@job.observation=nope"], "nope"),
+        (["job.gripper_noise=0.1"], "'job.gripper_noise' does not exist"),
+        (["job.episodes=1"], "job.episodes=1: expected at least 2"),
         (["job.batches=0"], "job.batches=0: expected an integer of at least 1"),
         (["job.hidden=[0]"], "job.hidden=[0]"),
         (["trainer=clon"], "Did you mean 'clone'?"),

@@ -5,6 +5,7 @@ does, in the expert's episodes and, with rounds, in states to which the policy i
 import math
 import time
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,7 +18,7 @@ from mjstack.errors import ConfigError, MjstackError, UnknownName
 from mjstack.sim.memory import free_memory
 from mjstack.train.clone_learner import CloneLearner
 from mjstack.train.dataset import check_dataset, read_demonstrations
-from mjstack.train.demonstrations import Demonstrations, batches_of, lead_gripper, play_expert
+from mjstack.train.demonstrations import Demonstrations
 from mjstack.train.rounds import make_round
 from mjstack.train.trainer import LAST, Trained, Trainer, earlier_state, observed_widths
 
@@ -32,10 +33,11 @@ def check_clone(stage: Stage) -> range:
     widths = observed_widths(stage)
     if job.dataset is not None:
         return check_dataset(stage, widths)
-    if job.rounds:
-        batches = (job.rounds + 1) * math.ceil(job.episodes / cfg.nworld)
-        return range(cfg.seed, cfg.seed + batches)
-    return range(cfg.seed, cfg.seed + len(batches_of(job, cfg.nworld)))
+    if job.episodes < 2:
+        expected = "at least 2, because one of them is for validation"
+        raise ConfigError("job.episodes", job.episodes, expected)
+    batches = (job.rounds + 1) * math.ceil(job.episodes / cfg.nworld)
+    return range(cfg.seed, cfg.seed + batches)
 
 
 def _check_rounds(stage: Stage, job: CloneJobCfg) -> None:
@@ -56,9 +58,6 @@ def _check_rounds(stage: Stage, job: CloneJobCfg) -> None:
             f"torchrun has started {processes} processes, and trainer=dagger runs in one",
             "Start it without torchrun, or set trainer=clone",
         )
-    if job.episodes < 2:
-        expected = "at least 2, because one of them is for validation"
-        raise ConfigError("job.episodes", job.episodes, expected)
 
 
 def _check_vision(stage: Stage, job: CloneJobCfg) -> None:
@@ -97,20 +96,25 @@ def train_clone(stage: Stage, folder: Path) -> Trained:
         stage.progress.print_line(f"train: {folder} is trained already, and is judged anew")
         return _trained(job, folder, earlier[1])
 
-    # The expert's episodes, which give the scale
-    began = time.perf_counter()
-    first = _demonstrate(stage, folder)
+    # The first episodes give the scale
+    if job.dataset is None:
+        first = make_round(stage, folder, None, 0)
+        who = "" if job.rounds == 0 else "round 0: "
+        _print_success(stage, f"{who}the expert", first)
+    else:
+        began = time.perf_counter()
+        first = read_demonstrations(stage, observed_widths(stage))
+        first = replace(first, seconds=time.perf_counter() - began)
     if len(first.ends) < 2:
         raise MjstackError(
             f"{first.source}: {len(first.ends)} of {first.played}"
             " episodes succeeded, expected two at least",
             "Ask for more (job.episodes), or look at why with gates=[success]",
         )
-    seconds = time.perf_counter() - began
 
     # Rounds: in the worlds of the next one the policy of a round shows its success.
     parts = [first]
-    with closing(CloneLearner(stage, first, folder, seconds)) as learner:
+    with closing(CloneLearner(stage, first, folder)) as learner:
         if earlier:
             learner.restore(*earlier)
         if not job.rounds:
@@ -118,8 +122,9 @@ def train_clone(stage: Stage, folder: Path) -> Trained:
         for number in range(1, job.rounds + 1):
             learner.process(Demonstrations.join(parts))
             learner.learn((number - 1) * job.batches, number * job.batches)
-            part, success = make_round(stage, folder, learner.policy, number)
+            part = make_round(stage, folder, learner.policy, number)
             parts.append(part)
+            success = _print_success(stage, f"round {number}: the policy alone", part)
             if len(learner.curve) < number:
                 learner.conclude(number, success)
     for path in folder.glob("round-*.safetensors"):
@@ -133,16 +138,13 @@ def _is_complete(job: CloneJobCfg, facts: dict[str, Any]) -> bool:
     return bool(facts["done"] == job.batches)
 
 
-def _demonstrate(stage: Stage, folder: Path) -> Demonstrations:
-    """Episodes of a dataset or of the expert."""
-    job = cast(CloneJobCfg, stage.cfg.job)
-    if job.rounds:
-        return make_round(stage, folder, None, 0)[0]
-    if job.dataset is None:
-        demonstrations = play_expert(stage)
-    else:
-        demonstrations = read_demonstrations(stage, observed_widths(stage))
-    return lead_gripper(demonstrations, len(stage.cfg.robot.gripper_joints))
+def _print_success(stage: Stage, who: str, episodes: Demonstrations) -> float:
+    """Print the share of successes in the judged episodes of all ranks, and return it."""
+    counts = torch.tensor([episodes.succeeded, episodes.judged])
+    stage.ranks.sum_(counts)
+    succeeded, judged = counts.tolist()
+    stage.progress.print_line(f"train: {who} succeeded in {succeeded} of {judged} episodes")
+    return float(succeeded / judged)
 
 
 def _trained(job: CloneJobCfg, folder: Path, facts: dict[str, Any]) -> Trained:

@@ -48,21 +48,14 @@ class CloneLearner(Learner):
         stage: Stage,
         demonstrations: Demonstrations,
         folder: Path,
-        expert_s: float,
     ) -> None:
-        """Make the network with the scale of the first demonstrations.
-
-        Args:
-            stage: The stage.
-            demonstrations: The first episodes.
-            folder: Where policies and state are written.
-            expert_s: Time in which the episodes were played or read [s].
+        """Make the network with the scale of the first demonstrations; the folder gets policies
+        and state.
         """
         cfg = with_observation(stage.cfg)
         self._job = job = cast(CloneJobCfg, cfg.job)
         super().__init__(stage, cfg, folder, job.save_every)
         self.trainer = "dagger" if job.rounds else "clone"
-        self._expert_s = expert_s
         ranks = stage.ranks
         device = demonstrations.seen.device
         size = max(1, job.batch_size // ranks.size)
@@ -117,7 +110,7 @@ class CloneLearner(Learner):
         self._expert = {
             "episodes": int(counts[0]),
             "episodes_played": int(counts[1]),
-            "expert_s": self._expert_s,
+            "expert_s": demonstrations.seconds,
             "source": demonstrations.source,
         }
         self._average.set_range(*demonstrations.labels.aminmax(dim=0))

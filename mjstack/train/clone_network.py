@@ -7,7 +7,6 @@ import mujoco
 import torch
 from torch import Tensor
 
-from mjstack.config.functions import offered
 from mjstack.config.schema import CloneJobCfg, Config, ObservationTermCfg
 from mjstack.distributed import Ranks
 from mjstack.managers.observation import column_noise, slide_joints
@@ -41,24 +40,15 @@ def make_network(cfg: Config, demonstrations: Demonstrations, ranks: Ranks) -> P
 
 def input_noise(cfg: Config, model: mujoco.MjModel, widths: Mapping[str, int]) -> Tensor:
     """Half-width of the noise on each column of the observation in a training, shape ``(n,)``.
-
-    Measured jaws have more of it. Their joint target depends on where they are more than any other,
-    and a policy that answers with where they are lets them drift. ``widths`` are the numbers of
-    each term.
+    ``widths`` are the numbers of each term.
     """
     job = cast(CloneJobCfg, cfg.job)
-    robot = cfg.robot
-    slides = slide_joints(model, robot.joints)
-    travel = [abs(a - b) for a, b in zip(robot.gripper_open, robot.gripper_closed, strict=True)]
+    slides = slide_joints(model, cfg.robot.joints)
     widest: list[float] = []
     for name, width in widths.items():
         term = cast(ObservationTermCfg, cfg.observation[job.group].terms[name])
         columns = column_noise(term, width // term.history, slides)
-        columns = [job.input_noise * column for column in columns]
-        if offered(term.func, "unit") == "joint" and len(columns) == len(robot.joints):
-            for jaw, span in enumerate(travel, start=-len(travel)):
-                columns[jaw] += job.gripper_noise * span
-        widest += [term.scale * column for column in term.history * columns]
+        widest += [job.input_noise * term.scale * column for column in term.history * columns]
     return torch.tensor(widest)
 
 

@@ -1,8 +1,11 @@
-"""Rounds of a training: the policy drives a part of the time, and the expert's answers in the
-states to which that leads are recorded.
+"""Rounds of a training: the expert drives, or the policy a part of the time, and the expert's
+answers in the states to which that leads are recorded.
 """
 
 import math
+import time
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -14,22 +17,24 @@ from mjstack.drivers.driver import Driver
 from mjstack.drivers.policy import PolicyDriver
 from mjstack.envs import Env
 from mjstack.episodes.batches import BatchPlan, play_batches
-from mjstack.episodes.recorder import Channels, Read
+from mjstack.episodes.recorder import Channels, Read, start_and_every_step
 from mjstack.episodes.stage import Stage
 from mjstack.managers.view import random_uniform
 from mjstack.policy import Policy
 from mjstack.policy.checkpoint import read_state, write_state
-from mjstack.train.demonstrations import Demonstrations, LabelDriver, demonstration_channels
+from mjstack.train.demonstrations import Demonstrations
 from mjstack.train.trainer import with_observation
 
 _TENSORS = ("seen", "labels", "ends", "driven")  # of `Demonstrations`, in the file of a round
+_FACTS = ("widths", "played", "judged", "succeeded", "seconds", "source")
 
 
-class MixedDriver(LabelDriver):
+class MixedDriver(Driver):
     """The expert or the policy drives, as a draw for every world and spell says. In some worlds the
-    policy drives alone.
+    policy drives alone. Phases, errors and retries are the expert's.
 
     Attributes:
+        label: The expert's joint targets of the last step, shape ``(nworld, nu)``.
         driven: Where the expert drives this step, shape ``(nworld,)``, int8.
     """
 
@@ -53,12 +58,18 @@ class MixedDriver(LabelDriver):
             alone: Number of worlds, the first ones, in which the policy drives alone.
             spell: Control steps for which one of them drives before it is drawn anew.
         """
-        super().__init__(expert, env)
+        super().__init__(env.nworld, expert.steps, env.device, expert.phases)
+        self.phase = expert.phase
+        self.error = expert.error
+        self.retries = expert.retries
+        self._expert = expert
+        self._env = env
         self._policy = policy
         self._beta = beta
         self._spell = spell
+        self.label = torch.zeros((env.nworld, len(env.index.ctrl)), device=env.device)
         self.driven = torch.ones(env.nworld, dtype=torch.int8, device=env.device)
-        self._alone = torch.arange(env.nworld, device=env.device) < alone
+        self._alone = env.world < alone
 
     def command(self) -> Tensor:
         """Joint targets of the next step, shape ``(nworld, nu)``."""
@@ -73,48 +84,56 @@ class MixedDriver(LabelDriver):
         return torch.where(drives, self.label, action)
 
 
-def _read_driven(env: Env, driver: Driver) -> Read:
-    driven = cast(MixedDriver, driver).driven
-    return lambda: {"driven": driven}
+def _channels(job: CloneJobCfg) -> Sequence[Channels]:
+    """What is recorded of an episode: observations before each step, positions too where images are
+    rendered from them, the labels, and who drove.
+    """
+
+    def read_before(env: Env, driver: Driver) -> Read:
+        observations = env.observation_manager.groups[job.group]
+        if not job.vision.cameras:
+            return lambda: {"observation": observations}
+        qpos = env.sim.qpos
+        return lambda: {"observation": observations, "qpos": qpos.float()}
+
+    def read_answer(env: Env, driver: Driver) -> Read:
+        mixed = cast(MixedDriver, driver)
+        return lambda: {"label": mixed.label, "driven": mixed.driven}
+
+    return [Channels(read_before, start_and_every_step), Channels(read_answer)]
 
 
-def make_round(
-    stage: Stage, folder: Path, policy: Policy | None, number: int
-) -> tuple[Demonstrations, float]:
+def make_round(stage: Stage, folder: Path, policy: Policy | None, number: int) -> Demonstrations:
     """Play a round, or read it where an earlier call has played it.
 
-    Returns:
-        Its steps with the expert's labels, and the share of successes of the policy alone.
+    Args:
+        stage: The stage.
+        folder: That of the training, in which rounds are kept.
+        policy: The policy so far; None: the expert drives alone.
+        number: Of the round; 0 is the expert's.
     """
+    job = cast(CloneJobCfg, stage.cfg.job)
+    if not job.rounds:
+        return _play_round(stage, policy, number)
     path = folder / f"round-{number}.safetensors"
     if not path.exists():
-        write_state(path, *_play_round(stage, policy, number))
+        played = _play_round(stage, policy, number)
+        tensors = {name: getattr(played, name) for name in _TENSORS}
+        write_state(path, tensors, {name: getattr(played, name) for name in _FACTS})
     tensors, facts = read_state(path)
-    seen, labels, ends, driven = (tensors[name].to(stage.backend[1]) for name in _TENSORS)
-    part = Demonstrations(
-        seen=seen,
-        labels=labels,
-        ends=ends,
-        driven=driven,
-        widths=facts["widths"],
-        played=facts["played"],
-        source="rounds of the expert and the policy",
-    )
-    return part, facts["success"]
+    values: dict[str, Any] = {name: tensors[name].to(stage.backend[1]) for name in _TENSORS}
+    return Demonstrations(**values, **facts)
 
 
-def _play_round(
-    stage: Stage, policy: Policy | None, number: int
-) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Play a round, with the expert alone where there is no policy yet.
-
-    Returns:
-        Steps with the expert's labels, by the names of `Demonstrations`; and ``widths`` of the
-        observation's terms and the share of ``success`` of the policy alone, or of the expert.
+def _play_round(stage: Stage, policy: Policy | None, number: int) -> Demonstrations:
+    """Play a round, each rank in its worlds. Episodes that are not finite are left out; without
+    rounds those that the task's check does not accept, too.
     """
     cfg = stage.cfg
     job = cast(CloneJobCfg, cfg.job)
+    began = time.perf_counter()
     nworld = min(cfg.nworld, job.episodes)
+    worlds = stage.ranks.share(nworld)
     beta = job.beta * job.beta_decay ** (number - 1) if policy else 1.0
     share = 1.0 if number in (0, job.rounds) else job.alone
     alone = math.ceil(share * nworld)
@@ -129,25 +148,28 @@ def _play_round(
         return MixedDriver(expert, learner, env, beta=beta, alone=alone, spell=spell)
 
     parts = []
-    successes = 0
     for batch in play_batches(
         stage,
-        [BatchPlan(seed, range(nworld)) for seed in range(first, first + batches)],
-        [*demonstration_channels(job), Channels(_read_driven)],
+        [BatchPlan(seed, worlds) for seed in range(first, first + batches)],
+        _channels(job),
         cfg=with_observation(stage.driven(cfg.reset)),
         driver=drive,
-        label=f"steps of round {number} of {job.rounds}",
+        label=f"steps of round {number} of {job.rounds}" if job.rounds else "steps of the expert",
     ):
-        successes += int(batch.succeeded[:alone].sum())
-        # Nothing is learned from a world whose state is not finite
-        finite = batch.finite().nonzero()[:, 0]
-        parts.append(Demonstrations.of(batch, finite, job))
-    who = "the policy alone" if policy else "the expert"
-    episodes = alone * batches
-    stage.progress.print_line(
-        f"train: round {number}: {who} succeeded in {successes} of {episodes} episodes"
-    )
+        # The last batch may have more worlds than episodes are missing.
+        counted = batch.env.world < job.episodes - (batch.plan.seed - first) * nworld
+        judged = counted & (batch.env.world < alone)
+        usable = counted & batch.finite()
+        if not job.rounds:
+            usable &= batch.succeeded
+        parts.append(
+            replace(
+                Demonstrations.of(batch, usable.nonzero()[:, 0], job),
+                played=int(counted.sum()),
+                judged=int(judged.sum()),
+                succeeded=int((judged & batch.succeeded).sum()),
+            )
+        )
+    source = f"the expert, seeds {first} to {first + batches - 1}"
     played = Demonstrations.join(parts)
-    tensors = {name: getattr(played, name) for name in _TENSORS}
-    facts = {"widths": played.widths, "played": batches * nworld, "success": successes / episodes}
-    return tensors, facts
+    return replace(played, seconds=time.perf_counter() - began, source=source)

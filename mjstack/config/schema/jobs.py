@@ -118,10 +118,6 @@ class CloneJobCfg(TrainJobCfg):
 
     dataset: str | None = spec(None)
     """Folder of a dataset from which it learns; null: from the expert, who plays now."""
-    command_noise: float = spec(unit="rad", ge=0.0)
-    """Standard deviation of that noise, which changes slowly."""
-    gripper_noise: float = spec(unit="share", ge=0.0)
-    """Noise, besides, on the measured jaws that training sees: half its width, of their travel."""
     chunk: int = spec(unit="steps", ge=1, le=1000)
     """Joint targets of one answer."""
     execute: int = spec(unit="steps", ge=1, le=1000)
@@ -135,8 +131,6 @@ class CloneJobCfg(TrainJobCfg):
     """Share of the policy's weights that a batch keeps: they are an average."""
     episodes: int = spec(unit="episodes", ge=1)
     """Episodes that the expert plays."""
-    noisy_episodes: int = spec(unit="episodes", ge=0)
-    """Episodes more with noise on the executed commands; labels stay the expert's."""
     hidden: list[int] = spec(ge=1, le=65536)
     """Widths of the network's hidden layers."""
     batches: int = spec(ge=1)
