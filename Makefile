@@ -9,7 +9,7 @@ READY_DEV := $(VENV)/.installed-dev
 READY_DOCS := $(VENV)/.installed-docs
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt
 
-.PHONY: run test test-rest test-all docs setup clean
+.PHONY: run test test-rest test-all fuzz docs setup clean
 
 run: $(READY)
 	$(BIN)/python scripts/run.py robot=so101 nworld=32 $(ARGS)
@@ -31,6 +31,10 @@ test-rest: $(READY_DEV)
 	$(PYTEST) -m full
 
 test-all: test test-rest
+
+# Odd command lines, four times as many as test-rest tries.
+fuzz: $(READY_DEV)
+	$(BIN)/python tests/test_fuzz.py commands 0-999
 
 # build/site/index.html opens from the disk. The build fetches nothing.
 docs: $(READY_DOCS)

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import json
-import os
 import random
 import re
 import shutil
 import sys
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import chdir, suppress
 from dataclasses import asdict
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 import yaml
 from environments import configure, one_second_episode
+from policies import write_policy
+from safetensors.torch import load_file, save
 
 from mjstack import load_config
 from mjstack.cli import run
@@ -30,6 +33,7 @@ def _words(text: str) -> list[str]:
 
 
 QUICK = ["nworld=2", "sim=native", "gates=[baseline]"]
+SHORT = [*QUICK[:2], *one_second_episode()]
 JOBS = _words("gates collect export replay reachability train")
 CHOSEN = [*_words("task=stack task=box task=reach"), *(f"job={job}" for job in JOBS)]
 GROUPS = _words("""
@@ -243,27 +247,34 @@ _MUTATIONS = (
 
 
 def damaged_folders(fixture: Path) -> Make:
-    """A run and a dataset, each with one or two files damaged."""
-    home = os.getcwd()
-    os.chdir(fixture)
-    short = [*QUICK[:2], *one_second_episode()]
-    gates = ["gates=[batch]", *short, "hydra.run.dir=run"]
-    collect = ["job=collect", *short, "job.keep_failures=true", "job.episodes=2", "job.folder=set"]
-    assert (run(gates), run(collect)) == (1, 0)
-    os.chdir(home)
+    """Policies that gate *batch* is to play (the first 300 cases), datasets that *collect* goes on
+    with or a clone learns from (the next 100), and runs of which a world is to be played again. One
+    or two files of each are damaged.
+    """
+    play = ["controller=policy", "policy=policy", "gates=[batch]", *SHORT]
+    seen = ["observation=state", "+observation.policy.noise=false"]
+    collect = ["job=collect", *SHORT, *seen, "job.keep_failures=true", "job.folder=set"]
+    train = ["job=train", "trainer=clone", "job.dataset=set/dataset", *SHORT, "job.folder=trained"]
+    train += ["job.batches=2", "job.batch_size=16", "job.hidden=[8]"]
+    with chdir(fixture):
+        write_policy(Path("policy"), load_config(["sim=native"]))
+        assert run([*collect, "job.episodes=2"]) == 0
+        assert run(["gates=[batch]", *SHORT, "hydra.run.dir=run"]) == 1
     for picture in fixture.rglob("*.png"):
         picture.unlink()
 
     def make(case: int, cwd: Path) -> list[str]:
         draw = random.Random(f"folder {case}")
-        name = draw.choice(("run", "set"))
+        name = "policy" if case < 300 else "set" if case < 400 else "run"
         shutil.copytree(fixture / name, cwd / name)
         for _ in range(draw.choice((1, 1, 1, 2))):
             files = [path for path in sorted((cwd / name).rglob("*")) if _counts(path)]
             _damage(draw, draw.choice(files), cwd)
-        if name == "run" or draw.random() < 0.1:
-            return ["job=replay", f"run={name}", f"world={draw.choice(('1', '0:0'))}"]
-        return [arg.replace("episodes=2", "episodes=3") for arg in collect]
+        if name == "policy":
+            return play
+        if name == "set":
+            return draw.choice(([*collect, "job.episodes=3"], train))
+        return ["job=replay", "run=run", f"world={draw.choice(('1', '0:0'))}"]
 
     return make
 
@@ -272,13 +283,14 @@ def _counts(path: Path) -> bool:
     """Whether something reads it; what is behind a link is not the case's own."""
     if path.is_symlink():
         return False
-    return path.suffix in {".json", ".yaml", ".npz", ".parquet"} or path.name in (".hydra", "meta")
+    kinds = {".json", ".yaml", ".npz", ".parquet", ".safetensors"}
+    return path.suffix in kinds or path.name in (".hydra", "meta")
 
 
 def _damage(draw: random.Random, path: Path, cwd: Path) -> None:
     """Cut, replace, remove or redirect a file, or change a value in it."""
     kind = draw.choice(("cut", "text", "text", "gone", "link", "kind", *["value"] * 6))
-    is_data = path.suffix in {".json", ".yaml", ".npz"}
+    is_data = path.suffix in {".json", ".yaml", ".npz", ".safetensors"}
     if path.is_dir() or (kind == "value" and not is_data):
         kind = draw.choice(("gone", "link", "kind"))
     if kind == "cut":
@@ -314,6 +326,9 @@ def _change_value(draw: random.Random, path: Path) -> None:
         data[name] = np.array(draw.choice(arrays))
         np.savez(path, **data)
         return
+    if path.suffix == ".safetensors":
+        _change_weights(draw, path)
+        return
     text = path.read_text()
     data = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
     node = data
@@ -332,14 +347,28 @@ def _change_value(draw: random.Random, path: Path) -> None:
     path.write_text(json.dumps(data) if path.suffix == ".json" else yaml.safe_dump(data))
 
 
+def _change_weights(draw: random.Random, path: Path) -> None:
+    """Another tensor in a policy, whose policy.json knows the new file."""
+    tensors = load_file(path)
+    name = draw.choice(sorted(tensors))
+    value = tensors.pop(name)
+    others = (value * np.nan, value.double(), value.flatten()[:1], torch.zeros(3), None)
+    if (other := draw.choice(others)) is not None:
+        tensors[name] = other.contiguous()
+    content = save(tensors)
+    digest = sha256(content).hexdigest()
+    path.unlink()
+    (path.parent / f"weights-{digest[:12]}.safetensors").write_bytes(content)
+    facts = json.loads((path.parent / "policy.json").read_text())
+    facts["weights_sha256"] = digest
+    (path.parent / "policy.json").write_text(json.dumps(facts))
+
+
 def is_short(args: list[str]) -> bool:
     """Whether a command line that passed its check can be run to its end."""
     text = " ".join(args)
     long = (
         r"seconds|seeds|repetitions|steps|iterations|physics_dt|decimation|scaling|solver|timing"
-        r"|video|view|minutes|launcher|range|job.episodes=[^23]|/proc|nworld=(?![12]\b)"
+        r"|video|view|minutes|launcher|range|/proc|nworld=(?![12]\b)"
     )
-    if "job=collect" in text:  # a hundred episodes by default
-        return bool(re.search(r"job\.episodes=[23]\b", text)) and not re.search(long, text)
-    quick = text.startswith("job=replay") or set(QUICK) <= set(args)
-    return quick and not re.search(long, text)
+    return set(QUICK) <= set(args) and not re.search(long, text)

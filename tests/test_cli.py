@@ -118,6 +118,7 @@ LINES = [
     ("cameras=[front,wirst]", "cameras=wirst: 'wirst' does not exist. Did you mean 'wrist'?"),
     ("-sc", "-sc: expected install=SHELL or uninstall=SHELL alone."),
     ("devices=2 job=reachability sim=native", "torchrun, devices: expected"),
+    ("job.name=collect nworld=2", "job.name=collect: expected the one of a job's file"),
     ("-m sim=native seed=0,1 devices=2", ALONE),
     ("-m hydra/launcher=gpus sim=native seed=0,1 devices=2", ALONE),
     ("--gate.batch.seeds=[1]", "flag '--gate.batch.seeds=[1]' does not exist. "),

@@ -1,5 +1,8 @@
-"""Seeded command lines and damaged folders. The check of each passes, or ends in one line and exit
-status 2 with nothing written; a tenth of those that pass is run to its end.
+"""Seeded command lines, and damaged folders of policies, datasets and runs.
+
+The check of each passes, or ends in one line and exit status 2. Then nothing is written. Nothing
+in the home folder changes, and no process is left. A tenth of the command lines that pass, and
+twenty of the folders, are run to the end.
 
 The cases run in forked children of a process of their own, whose modules are loaded already:
 ``python tests/test_fuzz.py commands 17 200-220`` runs these cases and prints what they say.
@@ -40,11 +43,13 @@ from fuzz_cases import CHOSEN, QUICK, Make, command_lines, damaged_folders, is_s
 from mjstack.config.load import compose
 from mjstack.config.session import hydra_session
 
-COUNTS = {"commands": 1000, "folders": 200}
+COUNTS = {"commands": 250, "folders": 500}
+REAL = 20  # folders that commands in a process of their own are given
 CASES = {"commands": command_lines, "folders": damaged_folders}
+UNTOUCHED = ("policy", "run")  # what is only read
 PASSED = 77  # exit status of a child whose check has passed
 ENDS = {PASSED: "passed", 0: "shown, or run", 2: "one line"}
-SECONDS = 40  # of processor time that a check may take; the slowest of them takes three
+SECONDS = 20  # of processor time that a check may take; the slowest of them takes three
 AT_ONCE = 3  # the process that forks works too
 
 
@@ -66,20 +71,25 @@ class Outcome(NamedTuple):
     out: str
     err: str
     changed: list[str]
+    left: bool
     seconds: float
 
     def problem(self, *, ran: bool = False) -> str:
         """Why that is not one of the answers that are allowed; empty if it is."""
         if "Traceback" in self.out + self.err:
             return "a traceback"
+        if self.left:
+            return "a process is left"
+        goes_on = self.status in (0, 1, PASSED)
+        allowed = re.compile(rf"cwd/(?!({'|'.join(UNTOUCHED)})(/|$))")
+        if wrote := [name for name in self.changed if not (goes_on and allowed.match(name))]:
+            return f"wrote {', '.join(wrote[:3])}"
         if self.status == 2:
             lines = [line for line in self.err.splitlines() if line.strip()]
             if len(lines) != 1 or not lines[0].startswith("mjstack: "):
                 return f"{len(lines)} lines on stderr"
             if re.search(r"[\x00-\x08\x0b-\x1f\x7f]", lines[0]):
                 return "control characters"
-            if self.changed:
-                return f"wrote {', '.join(self.changed[:3])}"
             return "" if not self.out.strip() else "exit 2 with output"
         if self.status in ((0, 1) if ran else (0, PASSED)):
             return ""
@@ -97,6 +107,7 @@ class Child:
 
     case: int
     ran: bool
+    real: bool
     args: list[str]
     home: Path
     before: dict[str, str]
@@ -122,10 +133,10 @@ def main(kind: str, *numbers: str) -> int:
         talks = len(cases) < 30
         counts: Counter[str] = Counter()
 
-        def judge(numbers: Sequence[int], *, run: bool = False) -> list[int]:
+        def judge(numbers: Sequence[int], *, run: bool = False, real: bool = False) -> list[int]:
             """Count how cases end, and return those that pass and are short."""
             passed = []
-            for child, outcome in _fork_all(numbers, make, fixture, run=run):
+            for child, outcome in _fork_all(numbers, make, fixture, run=run, real=real):
                 problem = outcome.problem(ran=run)
                 counts["bad"] += bool(problem)
                 counts[problem or ENDS.get(outcome.status, f"status {outcome.status}")] += 1
@@ -137,8 +148,12 @@ def main(kind: str, *numbers: str) -> int:
             return passed
 
         passed = judge(cases)
-        tenth = min(counts["passed"] // 10 + 1, len(passed))
-        judge(passed if talks else random.Random(kind).sample(passed, tenth), run=True)
+        draw = random.Random(kind)
+        if kind == "folders":
+            judge(draw.sample(cases, min(REAL, len(cases))), run=True, real=True)
+        else:
+            tenth = min(counts["passed"] // 10 + 1, len(passed))
+            judge(passed if talks else draw.sample(passed, tenth), run=True)
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     print(
         f"{len(cases)} cases: {dict(counts)}; {time.monotonic() - began:.0f} s, of which the"
@@ -148,14 +163,14 @@ def main(kind: str, *numbers: str) -> int:
 
 
 def _fork_all(
-    cases: Sequence[int], make: Make, fixture: Path, *, run: bool = False
+    cases: Sequence[int], make: Make, fixture: Path, *, run: bool = False, real: bool = False
 ) -> Iterator[tuple[Child, Outcome]]:
     """Fork a child per case, some at a time."""
     running: dict[int, Child] = {}
     waiting = iter(cases)
     while True:
         while len(running) < AT_ONCE and (case := next(waiting, None)) is not None:
-            child = _fork(case, make, fixture, run)
+            child = _fork(case, make, fixture, run, real)
             running[child.pid] = child
         if not running:
             return
@@ -169,11 +184,14 @@ def _fork_all(
                     os.killpg(child.pid, signal.SIGKILL)
 
 
-def _fork(case: int, make: Make, fixture: Path, run: bool) -> Child:
+def _fork(case: int, make: Make, fixture: Path, run: bool, real: bool = False) -> Child:
     home = Path(tempfile.mkdtemp(dir=fixture))
     (home / "cwd").mkdir()
+    for name in (".bashrc", "notes.txt", "policy/policy.json", "run/report.json"):
+        (home / "user" / name).parent.mkdir(parents=True, exist_ok=True)
+        (home / "user" / name).write_text("the user's")
     args = make(case, home / "cwd")
-    child = Child(case, run, args, home, _content(home / "cwd"))
+    child = Child(case, run, real, args, home, _content(home))
     child.pid = os.fork()
     if not child.pid:
         _be_the_command(child)
@@ -192,6 +210,13 @@ def _be_the_command(child: Child) -> None:
             os.dup2(file, number)
         resource.setrlimit(resource.RLIMIT_CPU, (3 * SECONDS if child.ran else SECONDS,) * 2)
         resource.setrlimit(resource.RLIMIT_AS, (2**34, 2**34))
+        caches = Path.home()  # of matplotlib and Warp
+        os.environ |= {
+            f"XDG_{name.upper()}_HOME": f"{caches}/.{name}" for name in ("cache", "config")
+        }
+        os.environ["HOME"] = str(child.home / "user")
+        if child.real:
+            os.execv(sys.executable, [sys.executable, "-m", "mjstack", *child.args])
         if not child.ran:
             from hydra._internal.hydra import Hydra
 
@@ -219,10 +244,19 @@ def _pass(*_: object, **__: object) -> None:
 
 def _outcome(child: Child, status: int) -> Outcome:
     out, err = ((child.home / name).read_text(errors="replace") for name in ("out", "err"))
-    now = _content(child.home / "cwd")
-    changed = sorted(name for name in now | child.before if now.get(name) != child.before.get(name))
+    now = _content(child.home)
+    changed = sorted(
+        name
+        for name in now | child.before
+        if now.get(name) != child.before.get(name) and name not in ("out", "err")
+    )
     shutil.rmtree(child.home, ignore_errors=True)
-    return Outcome(status, out, err, changed, time.monotonic() - child.began)
+    left = True
+    try:
+        os.killpg(child.pid, 0)
+    except ProcessLookupError:
+        left = False
+    return Outcome(status, out, err, changed, left, time.monotonic() - child.began)
 
 
 def _content(folder: Path) -> dict[str, str]:

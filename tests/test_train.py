@@ -245,6 +245,9 @@ def test_a_folder_belongs_to_one_training(tmp_path: Path) -> None:
     with pytest.raises(MjstackError, match=r"another configuration: job\.chunk="):
         check_train(load_config([*REACH, f"job.folder={out}", "job.chunk=4"]))
     state, facts = read_state(out / STATE)
+    write_state(out / STATE, state, facts | {"done": -5})
+    assert run([*REACH, f"job.folder={out}"]) == 1
+    assert "done is -5. Remove it to train anew" in report(out)["train"]["reason"]
     facts["made_with"]["device"] = "cuda"
     write_state(out / STATE, state, facts)
     assert run([*REACH, f"job.folder={out}"]) == 1

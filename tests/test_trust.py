@@ -343,6 +343,12 @@ def test_a_policy_cannot_claim_more_than_it_is(tmp_path: Path) -> None:
     many["observation"]["widths"] = dict.fromkeys(terms, 1)
     path.write_text(json.dumps(many))
     assert "terms, expected at most 100" in refused(lambda: load_policy(folder))
+    odd = json.loads(facts)
+    next(iter(odd["observation"]["terms"].values()))["clip"] = [True, True]
+    path.write_text(json.dumps(odd))
+    assert ".clip=[True, True]: expected a list of 2 numbers" in refused(
+        lambda: load_policy(folder)
+    )
     path.write_text(facts)
     os.truncate(next(folder.glob("weights-*")), 2**32)
     assert "it has 4294967296 bytes" in refused(lambda: load_policy(folder))

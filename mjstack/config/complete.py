@@ -1,5 +1,6 @@
 """Complete a composed configuration: terms as dataclasses, and what follows from other values."""
 
+import re
 from dataclasses import fields
 from functools import cache, reduce
 from pathlib import Path
@@ -89,7 +90,7 @@ def typed(key: str, node: Any, kind: type) -> Any:
     try:
         typed = OmegaConf.merge(_schema(kind), {k: node[k] for k in node if k not in untyped})
     except OmegaConfBaseException as error:
-        name = str(error.full_key).partition(".")[0]
+        name = re.split(r"[.\[]", str(error.full_key))[0]  # of a list, full_key has the number too
         raise ConfigError(f"{key}.{name}", node[name], accepted(kind, items[name])) from error
     missing = sorted(OmegaConf.missing_keys(typed))
     if missing:

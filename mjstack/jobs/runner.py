@@ -268,6 +268,8 @@ def check_job(cfg: Config, overrides: Sequence[str] = ()) -> CheckedJob:
         raise ConfigError("job.func", cfg.job.func, "a mjstack.jobs.Job")
     for override in overrides:
         key, _, value = override.lstrip("+~").partition("=")
+        if key in ("job.name", "job.func"):  # reports and replays go by them
+            raise ConfigError(key, value, "the one of a job's file", "Choose the job: job=NAME")
         if job.keys is not None and re.split(r"[.@/]", key)[0] not in job.keys:
             expected = f"only {', '.join(job.keys[1:])} beside job={cfg.job.name}"
             raise ConfigError(key, value, expected, "Leave it out")

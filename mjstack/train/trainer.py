@@ -129,8 +129,10 @@ def earlier_state(stage: Stage, folder: Path) -> tuple[dict[str, Tensor], dict[s
             f"{folder} has a training with {before}, and this one has {now}. Set job.folder to"
             " another folder"
         )
+    reason = "" if type(done := facts["done"]) is int and done >= 0 else f"done is {done}"
     for name, value in tensors.items():
         if value.is_floating_point() and not bool(value.isfinite().all()):
             reason = f"{name} has numbers that are not finite"
-            raise FolderError(f"{folder / STATE}: {reason}", "Remove it to train anew")
+    if reason:
+        raise FolderError(f"{folder / STATE}: {reason}", "Remove it to train anew")
     return tensors, facts
