@@ -19,10 +19,11 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from mjstack.files import to_csv  # noqa: E402
+from mjstack.files import to_csv, write_atomic  # noqa: E402
 from mjstack.process import Child  # noqa: E402
-from mjstack.report.markdown import save_tables  # noqa: E402
+from mjstack.report.markdown import to_markdown  # noqa: E402
 from mjstack.report.picture import figure  # noqa: E402
+from mjstack.report.sections import Part, Section  # noqa: E402
 from mjstack.report.table import Console, Table  # noqa: E402
 
 SPEEDS = {
@@ -147,7 +148,12 @@ def write(folder: Path, runs: list[Run]) -> None:
             axes.set(xlabel="ratio over the number of GPUs (1: perfect)")
             axes.grid(alpha=0.3, axis="x")
 
-    save_tables(folder / "many", title, table, [], to_csv(rows), draw if rows else None)
+    picture = folder / "many.png"
+    if rows:
+        draw(picture)
+    write_atomic(folder / "many.csv", to_csv(rows))
+    parts: list[Part] = [table, *([picture] if picture.exists() else [])]
+    write_atomic(folder / "many.md", to_markdown([Section(title=title, parts=parts, level=1)]))
 
 
 def main() -> None:

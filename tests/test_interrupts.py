@@ -43,10 +43,10 @@ SECONDS = 2.0  # of processor time, in which an interrupted command ends
 @pytest.mark.parametrize("kind", ["gates", "collect"])
 def test_a_command_that_is_interrupted(kind: str) -> None:
     done = subprocess.run(
-        [sys.executable, __file__, kind, "20"], capture_output=True, text=True, timeout=600
+        [sys.executable, __file__, kind, "10"], capture_output=True, text=True, timeout=600
     )
     assert done.returncode == 0, done.stdout[-5000:] + done.stderr[-3000:]
-    assert "20 runs" in done.stdout
+    assert "10 runs" in done.stdout
 
 
 @pytest.mark.full
