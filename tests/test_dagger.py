@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import time
 from pathlib import Path
 
 import pytest
 import torch
+from compositions import load_config
 from policies import curve, interrupted, report, same
+from test_ranks import play, rank_process, start
 
 import mjstack.train.rounds as rounds
 from mjstack.cli import run
+from mjstack.distributed import Ranks
 from mjstack.drivers.driver import Driver
+from mjstack.episodes.stage import Stage
+from mjstack.errors import ConfigError, FolderError
 from mjstack.policy import load_policy
+from mjstack.policy.checkpoint import read_state
+from mjstack.train.clone import check_clone
 from mjstack.train.clone_learner import CloneLearner
+from mjstack.train.trainer import STATE
 
 TINY = (
     *("job=train", "task=reach", "sim=native", "nworld=4", "job.rounds=2"),
@@ -44,6 +55,54 @@ def test_rounds_leave_a_policy_and_go_on_bit_for_bit(tmp_path: Path) -> None:
     other = curve(parts)
     for name in ("success", "validation_loss"):
         assert rows[name].tolist() == other[name].tolist()
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("moment", [STATE, "round-1-0.safetensors"])
+def test_two_ranks_give_one_policy_and_go_on_bit_for_bit(moment: str, tmp_path: Path) -> None:
+    """The second one is killed when the first one has written a file."""
+    sizes = ["nworld=5", "job.episodes=5", "job.batches=100", "job.save_every=10", "devices=2"]
+    args = [*TINY, *sizes, "web.episode=false"]
+    text = play(0, [*args, f"job.folder={tmp_path}/whole"], tmp_path)
+    assert text.count("round 2: the policy alone succeeded in") == 1
+    assert report(tmp_path / "whole")["train"]["metrics"]["episodes"] == 10
+    assert read_state(tmp_path / "whole" / STATE)[1]["made_with"]["processes"] == 2
+
+    command = [*args, f"job.folder={tmp_path}/parts"]
+    process = start(0, command, tmp_path)
+    rank = rank_process(process.pid, 1)
+    until = time.monotonic() + 120.0
+    while not (tmp_path / "parts" / moment).exists():
+        assert time.monotonic() < until
+        time.sleep(0.005)
+    os.kill(rank, signal.SIGKILL)
+    process.communicate(timeout=120)
+    assert process.returncode == 1
+    done = read_state(tmp_path / "parts" / STATE)[1]["done"]
+    assert 0 < done < 200
+    play(0, command, tmp_path)
+    assert same(tmp_path / "whole/last", tmp_path / "parts/last")
+    assert not list((tmp_path / "parts").glob("round-*"))
+    rows = [curve(tmp_path / name) for name in ("whole", "parts")]
+    for name in ("success", "validation_loss"):
+        assert rows[0][name].tolist() == rows[1][name].tolist()
+
+
+def test_a_round_of_another_number_of_ranks_is_refused(tmp_path: Path) -> None:
+    stage = Stage(load_config([*TINY, "nworld=2", "job.episodes=2"]))
+    rounds.make_round(stage, tmp_path, None, 0)
+    other = stage.with_config(stage.cfg, ranks=Alone(0, 2))
+    with pytest.raises(FolderError, match=r"'processes': 1\}, and this one has .*'processes': 2\}"):
+        rounds.make_round(other, tmp_path, None, 0)
+    with pytest.raises(ConfigError, match="episodes=2: expected at least 4, because one of each"):
+        check_clone(other)
+
+
+class Alone(Ranks):
+    """One of two ranks, whose flags are those of both."""
+
+    def any(self, flag: bool) -> bool:
+        return flag
 
 
 def test_the_share_of_the_expert() -> None:

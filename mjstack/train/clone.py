@@ -33,8 +33,8 @@ def check_clone(stage: Stage) -> range:
     widths = observed_widths(stage)
     if job.dataset is not None:
         return check_dataset(stage, widths)
-    if job.episodes < 2:
-        expected = "at least 2, because one of them is for validation"
+    if job.episodes < 2 * stage.ranks.size:
+        expected = f"at least {2 * stage.ranks.size}, because one of each rank's is for validation"
         raise ConfigError("job.episodes", job.episodes, expected)
     batches = (job.rounds + 1) * math.ceil(job.episodes / cfg.nworld)
     return range(cfg.seed, cfg.seed + batches)
@@ -53,11 +53,6 @@ def _check_rounds(stage: Stage, job: CloneJobCfg) -> None:
     if job.dataset is not None:
         expected = "null, because trainer=dagger asks the expert itself"
         raise ConfigError("job.dataset", job.dataset, expected, "Set trainer=clone")
-    if (processes := stage.ranks.size) > 1:
-        raise MjstackError(
-            f"torchrun has started {processes} processes, and trainer=dagger runs in one",
-            "Start it without torchrun, or set trainer=clone",
-        )
 
 
 def _check_vision(stage: Stage, job: CloneJobCfg) -> None:
@@ -127,8 +122,9 @@ def train_clone(stage: Stage, folder: Path) -> Trained:
             success = _print_success(stage, f"round {number}: the policy alone", part)
             if len(learner.curve) < number:
                 learner.conclude(number, success)
-    for path in folder.glob("round-*.safetensors"):
-        path.unlink()
+    if stage.ranks.writes:  # the others have read theirs
+        for path in folder.glob("round-*.safetensors"):
+            path.unlink()
     return _trained(job, folder, learner.facts())
 
 

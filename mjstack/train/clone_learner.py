@@ -113,7 +113,9 @@ class CloneLearner(Learner):
             "expert_s": demonstrations.seconds,
             "source": demonstrations.source,
         }
-        self._average.set_range(*demonstrations.labels.aminmax(dim=0))
+        ranges = self._ranks.gather([part.cpu() for part in demonstrations.labels.aminmax(dim=0)])
+        low, high = (torch.stack(parts) for parts in zip(*ranges, strict=True))
+        self._average.set_range(low.amin(0), high.amax(0))
         self._seen = demonstrations.seen
         self._labels = demonstrations.labels
         episode = demonstrations.episode()

@@ -21,9 +21,9 @@ from mjstack.episodes.recorder import Channels, Read, start_and_every_step
 from mjstack.episodes.stage import Stage
 from mjstack.managers.view import random_uniform
 from mjstack.policy import Policy
-from mjstack.policy.checkpoint import read_state, write_state
+from mjstack.policy.checkpoint import write_state
 from mjstack.train.demonstrations import Demonstrations
-from mjstack.train.trainer import with_observation
+from mjstack.train.trainer import earlier_state, made_with, with_observation
 
 _TENSORS = ("seen", "labels", "ends", "driven")  # of `Demonstrations`, in the file of a round
 _FACTS = ("widths", "played", "judged", "succeeded", "seconds", "source")
@@ -104,24 +104,33 @@ def _channels(job: CloneJobCfg) -> Sequence[Channels]:
 
 
 def make_round(stage: Stage, folder: Path, policy: Policy | None, number: int) -> Demonstrations:
-    """Play a round, or read it where an earlier call has played it.
+    """Play a round, or read it where an earlier call has played it in every rank. Each rank keeps
+    its own part.
 
     Args:
         stage: The stage.
         folder: That of the training, in which rounds are kept.
         policy: The policy so far; None: the expert drives alone.
         number: Of the round; 0 is the expert's.
+
+    Raises:
+        FolderError: It was played on another kind of device or in another number of ranks.
     """
     job = cast(CloneJobCfg, stage.cfg.job)
     if not job.rounds:
         return _play_round(stage, policy, number)
-    path = folder / f"round-{number}.safetensors"
-    if not path.exists():
+    ranks = stage.ranks
+    name = f"round-{number}-{ranks.rank}.safetensors"
+    if ranks.any(not (folder / name).exists()):
         played = _play_round(stage, policy, number)
-        tensors = {name: getattr(played, name) for name in _TENSORS}
-        write_state(path, tensors, {name: getattr(played, name) for name in _FACTS})
-    tensors, facts = read_state(path)
-    values: dict[str, Any] = {name: tensors[name].to(stage.backend[1]) for name in _TENSORS}
+        tensors = {key: getattr(played, key) for key in _TENSORS}
+        facts = {fact: getattr(played, fact) for fact in _FACTS}
+        write_state(folder / name, tensors, facts | {"made_with": made_with(stage)})
+    state = earlier_state(stage, folder, name)
+    assert state is not None
+    tensors, facts = state
+    del facts["made_with"]
+    values: dict[str, Any] = {key: tensors[key].to(stage.backend[1]) for key in _TENSORS}
     return Demonstrations(**values, **facts)
 
 

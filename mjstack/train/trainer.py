@@ -113,15 +113,18 @@ def made_with(stage: Stage) -> dict[str, Any]:
     return {"device": stage.backend[1].partition(":")[0], "processes": stage.ranks.size}
 
 
-def earlier_state(stage: Stage, folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
-    """The state that an earlier call has left in a training's folder; None without one.
+def earlier_state(
+    stage: Stage, folder: Path, name: str = STATE
+) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
+    """A state that an earlier call has left in a training's folder; None without one.
 
     Raises:
         FolderError: It had another kind of device or number of processes, or cannot be read.
     """
-    if not (folder / STATE).exists():
+    path = folder / name
+    if not path.exists():
         return None
-    tensors, facts = read_state(folder / STATE)
+    tensors, facts = read_state(path)
     now = made_with(stage)
     before = facts["made_with"]
     if before != now:
@@ -129,10 +132,10 @@ def earlier_state(stage: Stage, folder: Path) -> tuple[dict[str, Tensor], dict[s
             f"{folder} has a training with {before}, and this one has {now}. Set job.folder to"
             " another folder"
         )
-    reason = "" if type(done := facts["done"]) is int and done >= 0 else f"done is {done}"
-    for name, value in tensors.items():
+    reason = "" if type(done := facts.get("done", 0)) is int and done >= 0 else f"done is {done}"
+    for key, value in tensors.items():
         if value.is_floating_point() and not bool(value.isfinite().all()):
-            reason = f"{name} has numbers that are not finite"
+            reason = f"{key} has numbers that are not finite"
     if reason:
-        raise FolderError(f"{folder / STATE}: {reason}", "Remove it to train anew")
+        raise FolderError(f"{path}: {reason}", "Remove it to train anew")
     return tensors, facts
