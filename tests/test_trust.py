@@ -33,7 +33,7 @@ from mjstack.errors import MjstackError
 from mjstack.files import read_inside
 from mjstack.jobs import check_job
 from mjstack.policy import load_policy, save_policy
-from mjstack.policy.checkpoint import read_state
+from mjstack.policy.checkpoint import read_state, write_state
 from mjstack.process import Child
 
 ROOT = Path(__file__).parents[1]
@@ -346,9 +346,9 @@ def test_a_policy_cannot_claim_more_than_it_is(tmp_path: Path) -> None:
     odd = json.loads(facts)
     next(iter(odd["observation"]["terms"].values()))["clip"] = [True, True]
     path.write_text(json.dumps(odd))
-    assert ".clip=[True, True]: expected a list of 2 numbers" in refused(
-        lambda: load_policy(folder)
-    )
+    line = refused(lambda: load_policy(folder))
+    assert line.startswith(f"{path}: observation.policy.terms.")
+    assert ".clip=[True, True]: expected a list of 2 numbers" in line
     path.write_text(facts)
     os.truncate(next(folder.glob("weights-*")), 2**32)
     assert "it has 4294967296 bytes" in refused(lambda: load_policy(folder))
@@ -385,6 +385,12 @@ def test_a_policy_that_a_training_saves_meanwhile_is_read_again(
 
     monkeypatch.setattr("mjstack.policy.checkpoint.read_inside", save_before)
     assert torch.equal(load_policy(folder).network.layers[0].bias, newer.network.layers[0].bias)
+
+
+def test_no_training_goes_on_from_numbers_that_are_not_finite(tmp_path: Path) -> None:
+    path = tmp_path / "training.safetensors"
+    write_state(path, {"count": torch.tensor(3), "bias": torch.tensor([1.0, torch.nan])}, {})
+    assert "bias has numbers that are not finite" in refused(lambda: read_state(path))
 
 
 def damage_record(**changes: Any) -> Callable[[Path], object]:

@@ -22,7 +22,7 @@ NO_KEY = "Simplify the model, or run sim=native"
 
 # Each fault and what to do, in the order in which `FaultLatch.record` stacks them.
 _FIXES = {
-    "actions were not finite": "Check what the policy returns",
+    "actions were not finite": "Check the policy, and the starts that reset terms make",
     "the state is not finite": "Lower the gains or the timestep, or add the termination non_finite",
     "the reward is not finite": "Correct the term",
     "an observation is not finite": "Correct the term",

@@ -103,7 +103,7 @@ class ActionManager:
         if not action.is_cuda and not self._whole and not bool(copy.isfinite().all()):
             world = int((~copy.isfinite()).any(1).nonzero()[0, 0])
             value = f"{action[world].tolist()} in world {world}"
-            fix = "Check what the policy returns"
+            fix = "Check the policy, and the starts that reset terms make"
             raise ArgumentError("action", value, "finite numbers", fix)
 
     def apply(self) -> None:

@@ -318,9 +318,9 @@ def _read_terms(key: str, nodes: Mapping[str, Any], model: type, path: Path) -> 
     kind = "action term" if model is TermCfg else "observation term"
     terms = {}
     for name, node in nodes.items():
-        term = typed(f"{key}.{name}", node, model)
-        check_term(f"{path}: {key}.{name}", term.func, kind, path)
-        terms[name] = term
+        label = f"{path}: {key}.{name}"
+        terms[name] = typed(label, node, model)
+        check_term(label, terms[name].func, kind, path)
     return terms
 
 
@@ -351,8 +351,11 @@ def read_state(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Tensors and facts of `write_state`.
 
     Raises:
-        FolderError: The file cannot be read.
+        FolderError: The file cannot be read, or has numbers that are not finite.
     """
     with reading(path, "Remove it to train anew"), safe_open(path, "pt") as file:
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        for name, value in tensors.items():
+            if value.is_floating_point() and not bool(value.isfinite().all()):
+                raise ValueError(f"{name} has numbers that are not finite")
         return tensors, json.loads(file.metadata()["facts"])
