@@ -19,7 +19,7 @@ from mjstack.sim.memory import free_memory
 from mjstack.train.clone_learner import CloneLearner
 from mjstack.train.dataset import check_dataset, read_demonstrations
 from mjstack.train.demonstrations import Demonstrations
-from mjstack.train.rounds import make_round
+from mjstack.train.rounds import make_round, round_file
 from mjstack.train.trainer import LAST, Trained, Trainer, earlier_state, observed_widths
 
 
@@ -123,8 +123,9 @@ def train_clone(stage: Stage, folder: Path) -> Trained:
             if len(learner.curve) < number:
                 learner.conclude(number, success)
     if stage.ranks.writes:  # the others have read theirs
-        for path in folder.glob("round-*.safetensors"):
-            path.unlink()
+        for number in range(job.rounds + 1):
+            for rank in range(stage.ranks.size):
+                (folder / round_file(number, rank)).unlink(missing_ok=True)
     return _trained(job, folder, learner.facts())
 
 

@@ -103,6 +103,11 @@ def _channels(job: CloneJobCfg) -> Sequence[Channels]:
     return [Channels(read_before, start_and_every_step), Channels(read_answer)]
 
 
+def round_file(number: int, rank: int) -> str:
+    """Name of the file in which a rank keeps its part of a round."""
+    return f"round-{number}-{rank}.safetensors"
+
+
 def make_round(stage: Stage, folder: Path, policy: Policy | None, number: int) -> Demonstrations:
     """Play a round, or read it where an earlier call has played it in every rank. Each rank keeps
     its own part.
@@ -120,7 +125,7 @@ def make_round(stage: Stage, folder: Path, policy: Policy | None, number: int) -
     if not job.rounds:
         return _play_round(stage, policy, number)
     ranks = stage.ranks
-    name = f"round-{number}-{ranks.rank}.safetensors"
+    name = round_file(number, ranks.rank)
     if ranks.any(not (folder / name).exists()):
         played = _play_round(stage, policy, number)
         tensors = {key: getattr(played, key) for key in _TENSORS}
