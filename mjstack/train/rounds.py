@@ -47,6 +47,7 @@ class MixedDriver(Driver):
         beta: float,
         alone: int,
         spell: int,
+        length: float,
     ) -> None:
         """Take the drivers.
 
@@ -57,8 +58,10 @@ class MixedDriver(Driver):
             beta: Share of the time in which the expert drives.
             alone: Number of worlds, the first ones, in which the policy drives alone.
             spell: Control steps for which one of them drives before it is drawn anew.
+            length: Share of the expert's steps that the episode has.
         """
-        super().__init__(env.nworld, expert.steps, env.device, expert.phases)
+        steps = math.ceil(length * expert.steps)
+        super().__init__(env.nworld, steps, env.device, expert.phases)
         self.phase = expert.phase
         self.error = expert.error
         self.retries = expert.retries
@@ -159,7 +162,9 @@ def _play_round(stage: Stage, policy: Policy | None, number: int) -> Demonstrati
         # Whole answers: the policy takes over where it is queried.
         spell = job.execute * max(1, round(job.spell / env.cfg.timing.step_dt / job.execute))
         expert = stage.driver(env)
-        return MixedDriver(expert, learner, env, beta=beta, alone=alone, spell=spell)
+        return MixedDriver(
+            expert, learner, env, beta=beta, alone=alone, spell=spell, length=job.length
+        )
 
     parts = []
     for batch in play_batches(

@@ -113,6 +113,8 @@ class CloneJobCfg(TrainJobCfg):
     """Factor of ``beta`` from round to round."""
     spell: float = spec(unit="s", gt=0.0)
     """Time for which the expert or the policy drives before it is drawn anew."""
+    length: float = spec(gt=0.0, le=1.0)
+    """Share of the task's episode that is played. An expert without a clock needs less of it."""
     alone: float = spec(gt=0.0, le=1.0)
     """Share of the worlds in which the policy drives alone: their success is that of a round."""
 
