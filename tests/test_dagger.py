@@ -124,7 +124,8 @@ def test_the_share_of_the_expert() -> None:
             return self.value
 
     expert, policy = Constant(1.0), Constant(2.0)
-    driver = rounds.MixedDriver(expert, policy, env, beta=0.5, alone=10, spell=25)
+    driver = rounds.MixedDriver(expert, policy, env, beta=0.5, alone=10, spell=25, length=0.5)
+    assert driver.steps == 75
     seen = []
     for step in range(0, 1000, 25):
         env.episode_step.fill_(step)

@@ -3,7 +3,8 @@
 import itertools
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,18 @@ def reads_starts_file(reset: Mapping[str, TermCfg]) -> bool:
 def places_objects(term: TermCfg) -> bool:
     """Whether a reset term puts objects anywhere in a region, its parameter ``xy``."""
     return "xy" in term.params and bool(offered(term.func, "places_objects"))
+
+
+def with_region(
+    reset: Mapping[str, TermCfg], change: Callable[[list[float]], list[float]]
+) -> dict[str, TermCfg]:
+    """Reset terms with other regions for the objects' starts: a function of their half-widths."""
+    return {
+        name: replace(term, params=term.params | {"xy": change(list(term.params["xy"]))})
+        if places_objects(term)
+        else term
+        for name, term in reset.items()
+    }
 
 
 def starts_midway(term: TermCfg) -> bool:

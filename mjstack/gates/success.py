@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from typing_extensions import override
 
-from mjstack.config.check import places_objects, reads_starts_file
+from mjstack.config.check import places_objects, reads_starts_file, with_region
 from mjstack.config.schema import Config
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
@@ -28,10 +28,9 @@ def success_config(cfg: Config) -> Config:
     """The configuration under which the gate plays: its controller, and how its worlds start."""
     t = cfg.gate.success
     reset = dict(cfg.reset if reads_starts_file(cfg.reset) else t.reset)
-    if t.region is not None:
-        for name, term in reset.items():
-            if places_objects(term):
-                reset[name] = replace(term, params=term.params | {"xy": list(t.region)})
+    region = t.region
+    if region is not None:
+        reset = with_region(reset, lambda xy: region)
     name = cfg.controller.name if cfg.controller.name in FEEDBACK else CLOSED_LOOP
     return replace(cfg, reset=reset, controller=replace(cfg.controller, name=name))
 
@@ -122,10 +121,6 @@ class _StartsWriter(Observer):
 
 def _describe_start(cfg: Config) -> str:
     """How worlds start, in a few words."""
-    regions = [
-        term.params["xy"]
-        for term in cfg.reset.values()
-        if places_objects(term) and "xy" in term.params
-    ]
+    regions = [term.params["xy"] for term in cfg.reset.values() if places_objects(term)]
     where = "".join(f", objects within {x:g} x {y:g} m of their places" for x, y in regions)
     return f"gate.success.reset ({', '.join(cfg.reset)}{where})"

@@ -23,7 +23,7 @@ from mjstack.managers.view import random_uniform
 from mjstack.policy import Policy
 from mjstack.policy.checkpoint import write_state
 from mjstack.train.demonstrations import Demonstrations
-from mjstack.train.trainer import earlier_state, made_with, with_observation
+from mjstack.train.trainer import earlier_state, made_with, training_config
 
 _TENSORS = ("seen", "labels", "ends", "driven")  # of `Demonstrations`, in the file of a round
 _FACTS = ("widths", "played", "judged", "succeeded", "seconds", "source")
@@ -171,7 +171,7 @@ def _play_round(stage: Stage, policy: Policy | None, number: int) -> Demonstrati
         stage,
         [BatchPlan(seed, worlds) for seed in range(first, first + batches)],
         _channels(job),
-        cfg=with_observation(stage.driven(cfg.reset)),
+        cfg=training_config(stage),
         driver=drive,
         label=f"steps of round {number} of {job.rounds}" if job.rounds else "steps of the expert",
     ):

@@ -8,7 +8,7 @@ from typing import Any, cast
 
 from torch import Tensor
 
-from mjstack.config.check import starts_midway
+from mjstack.config.check import starts_midway, with_region
 from mjstack.config.schema import (
     Backend,
     CloneJobCfg,
@@ -17,9 +17,9 @@ from mjstack.config.schema import (
     PpoJobCfg,
     TermCfg,
 )
-from mjstack.envs import Env, build_env, driven_config
+from mjstack.envs import Env, build_env
 from mjstack.episodes.stage import Stage
-from mjstack.errors import FolderError, UnknownName, renamed_keys
+from mjstack.errors import ConfigError, FolderError, MjstackError, UnknownName, renamed_keys
 from mjstack.policy.checkpoint import read_state
 
 # In the folder of a training: two policies, and what it needs to go on.
@@ -101,11 +101,28 @@ def with_observation(cfg: Config) -> Config:
     return replace(cfg, observation={job.group: observed_group(job)})
 
 
+def training_config(stage: Stage) -> Config:
+    """The configuration of the episodes in which a new policy learns."""
+    job = cast(CloneJobCfg, stage.cfg.job)
+    reset = with_region(stage.cfg.reset, lambda xy: [(1.0 + job.wider) * half for half in xy])
+    return with_observation(stage.driven(reset))
+
+
 def observed_widths(stage: Stage) -> dict[str, int]:
-    """Numbers of each term of a new policy's observation, in order."""
-    cfg = with_observation(driven_config(stage.cfg, reset={}))
-    with renamed_keys({"observation": "job.observation"}), one_world(stage, cfg) as env:
-        return env.observation_manager.term_dims[cast(CloneJobCfg, cfg.job).group]
+    """Numbers of each term of a new policy's observation, in order.
+
+    Raises:
+        MjstackError: A term of its episodes cannot be used.
+    """
+    job = cast(CloneJobCfg, stage.cfg.job)
+    names = {"observation": "job.observation"}
+    try:
+        with renamed_keys(names), one_world(stage, training_config(stage)) as env:
+            return env.observation_manager.term_dims[job.group]
+    except ConfigError as error:
+        if job.wider == 0.0 or not error.key.startswith("reset."):
+            raise
+        raise MjstackError(f"{error}", f"Or set job.wider=0, in place of {job.wider:g}") from error
 
 
 def made_with(stage: Stage) -> dict[str, Any]:

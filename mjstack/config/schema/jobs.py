@@ -113,6 +113,9 @@ class CloneJobCfg(TrainJobCfg):
     """Factor of ``beta`` from round to round."""
     spell: float = spec(unit="s", gt=0.0)
     """Time for which the expert or the policy drives before it is drawn anew."""
+    wider: float = spec(ge=0.0, le=1.0)
+    """Share by which the region of random starts is wider in training than in the configuration, so
+    that starts at its edge have others all round."""
     length: float = spec(gt=0.0, le=1.0)
     """Share of the task's episode that is played. An expert without a clock needs less of it."""
     alone: float = spec(gt=0.0, le=1.0)
