@@ -11,9 +11,8 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-import torch
 from compositions import load_config
-from environments import Keep
+from environments import CUDA, Keep
 
 from mjstack.config.schema import Backend, Config
 from mjstack.episodes.run import Run
@@ -118,13 +117,7 @@ def robot(request: pytest.FixtureRequest) -> str:
 BACKENDS = [
     "native",
     "mjwarp",
-    pytest.param(
-        "mjwarp-cuda",
-        marks=[
-            pytest.mark.gpu,
-            pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here"),
-        ],
-    ),
+    pytest.param("mjwarp-cuda", marks=CUDA),
 ]
 
 

@@ -5,7 +5,7 @@ time.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, reduce
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -30,8 +30,11 @@ from mjstack.sim.sizes import resolve_env_sizes
 if TYPE_CHECKING:
     from mjstack.sim.mjwarp import MjwarpSimulation
 
-CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
-DEVICES = ["cpu", pytest.param("cuda:0", marks=[pytest.mark.gpu, CUDA])]
+CUDA = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here"),
+]
+DEVICES = ["cpu", pytest.param("cuda:0", marks=CUDA)]
 TASKS = ("stack", "reach")
 STATE = ("qpos", "qvel", "act", "ctrl")
 POSES = ("xpos", "xquat", "site_xpos", "geom_xpos")
@@ -52,6 +55,11 @@ _model = cache(lambda robot: build_model(configure(robot=robot)))
 def configure(*overrides: str, robot: str = "so101") -> Config:
     """A configuration of the caller's own."""
     return load_config((f"robot={robot}", *overrides))
+
+
+def on_cuda(test: Callable) -> Callable:
+    """Mark a test that needs a CUDA device."""
+    return reduce(lambda marked, mark: mark(marked), CUDA, test)
 
 
 @cache

@@ -6,17 +6,10 @@ from collections.abc import Iterator
 
 import mujoco
 import numpy as np
-import pytest
 import torch
 
 from mjstack.config.schema import RobotCfg
 from mjstack.kinematics.batched_ik import BatchedIk
-
-CUDA = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here"),
-]
-DEVICES = ["cpu", pytest.param("cuda:0", marks=CUDA)]
 
 
 class Arm:

@@ -14,7 +14,8 @@ import pytest
 import torch
 import warp as wp
 from compositions import load_config
-from ik_arm import CUDA, DEVICES, Arm, results, tensors
+from environments import CUDA, DEVICES
+from ik_arm import Arm, results, tensors
 from test_robot_models import REPO, upstream
 
 from mjstack.episodes.stage import Stage

@@ -17,7 +17,7 @@ from box_checker import BLUE, RED, BoxOutcome
 from box_recordings import World, faster_stage, feed, put_cube, recording
 from check_cases import Altered, Cases, rules_of
 from compositions import load_config
-from environments import at_double_speed
+from environments import CUDA, at_double_speed
 
 from mjstack.config.schema import Backend
 from mjstack.envs import Env
@@ -143,14 +143,10 @@ def test_scripted_controller_passes_the_success_gate() -> None:
         assert (world.phase[-window:] == len(names) - 1).all()  # no hurry at the end
 
 
-ON_CUDA = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here"),
-]
 PLAYED = [
     ("rebot", "open_loop", "cpu"),
     *(
-        pytest.param(r, c, "cuda:0", marks=ON_CUDA)
+        pytest.param(r, c, "cuda:0", marks=CUDA)
         for r in ("so101", "rebot")
         for c in ("closed_loop", "open_loop")
     ),

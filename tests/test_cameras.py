@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 from compositions import load_config, make_env, refusal
-from environments import CUDA, at_double_speed, has_gl
+from environments import CUDA, at_double_speed, has_gl, on_cuda
 from gymnasium.utils.env_checker import check_env
 
 from mjstack.adapters.gymnasium import GymnasiumEnv, GymnasiumVectorEnv
@@ -42,7 +42,7 @@ from mjstack.sim import cameras as sim_cameras
 
 GL = pytest.mark.skipif(not has_gl(), reason="MuJoCo does not draw offscreen here")
 NATIVE = pytest.param("native", marks=GL)
-MJWARP_CUDA = pytest.param("mjwarp-cuda", marks=[pytest.mark.gpu, CUDA])
+MJWARP_CUDA = pytest.param("mjwarp-cuda", marks=CUDA)
 ALL = ("rgb", "depth", "segmentation")
 Make = Callable[..., Env]
 
@@ -242,8 +242,7 @@ def test_a_diverged_world_harms_no_other(make: Make, backend: str) -> None:
     assert torch.equal(env.images["images.front"][::2], whole[::2])
 
 
-@pytest.mark.gpu
-@CUDA
+@on_cuda
 def test_replayed_steps_draw_what_eager_steps_draw(make: Make) -> None:
     ends = []
     chosen = ["termination.time_out.params.steps=4", "scene.cameras.wrist.rate=25.0"]
@@ -261,8 +260,7 @@ def test_replayed_steps_draw_what_eager_steps_draw(make: Make) -> None:
         assert (off <= 1e-4).float().mean() > 0.99, name
 
 
-@pytest.mark.gpu
-@CUDA
+@on_cuda
 def test_a_step_with_images_reads_nothing_from_the_device(make: Make) -> None:
     """Torch raises at every host read, also in steps that reset worlds."""
     chosen = ["looks=randomized", "reset=randomized", "termination.time_out.params.steps=5"]

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from compositions import load_config
-from environments import at_double_speed, one_second_episode
+from environments import at_double_speed, on_cuda, one_second_episode
 
 import mjstack
 from mjstack.config.schema import Backend
@@ -639,8 +639,7 @@ def test_bad_values_give_one_line(override: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+@on_cuda
 def test_gate_on_cuda(new_run: NewRun) -> None:
     run = new_run("sim=mjwarp", "nworld=64", "batch=auto", "gate.capacity.random_steps=100")
     (result,) = run_capacity(run)

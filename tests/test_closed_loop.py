@@ -9,7 +9,7 @@ import pytest
 import torch
 from check_cases import limits
 from compositions import load_config, make_env
-from environments import at_double_speed
+from environments import at_double_speed, on_cuda
 
 from mjstack.drivers.closed_loop import ClosedLoopDriver, make_expert
 from mjstack.drivers.tilt import _keeps, _places
@@ -263,8 +263,7 @@ def test_other_actions_are_refused() -> None:
 
 
 @pytest.mark.full
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+@on_cuda
 def test_captured_commands_are_the_eager_ones() -> None:
     """Steps with the controller in them replay as one graph, and it reads nothing from
     the device.

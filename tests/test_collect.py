@@ -24,7 +24,7 @@ import pytest
 import torch
 from compositions import load_config, put
 from dataset_checker import check_dataset, contents
-from environments import at_double_speed, one_second_episode, stack_starts
+from environments import at_double_speed, on_cuda, one_second_episode, stack_starts
 from stubs import episodes_of, fake_batches, pairs
 
 from mjstack.cli import run
@@ -673,8 +673,7 @@ def test_mjwarp_demonstrations(folder: Path) -> None:
 
 
 @pytest.mark.full
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+@on_cuda
 def test_demonstrations_on_cuda(folder: Path) -> None:
     """Captured steps are the eager ones, as far as two runs on CUDA agree, and the last step is one
     of rest on the stack.

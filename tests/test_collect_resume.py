@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from dataset_checker import check_dataset
-from environments import configure, one_second_episode
+from environments import configure, on_cuda, one_second_episode
 from stubs import episodes_of, fake_batches, pairs
 
 from mjstack.cli import run
@@ -323,8 +323,7 @@ def test_real_worlds_are_the_same_again(tmp_path: Path, monkeypatch: pytest.Monk
     )
 
 
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+@on_cuda
 def test_ctrl_c_on_cuda(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(job, "play_batches", play_batches)

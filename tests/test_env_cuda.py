@@ -6,13 +6,11 @@ import math
 
 import pytest
 import torch
+from environments import CUDA
 
 import mjstack
 
-pytestmark = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here"),
-]
+pytestmark = CUDA
 
 
 @pytest.mark.parametrize("action", ["joint_relative", "joint_delta", "ee_delta"])

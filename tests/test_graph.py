@@ -11,7 +11,7 @@ import pytest
 import torch
 import warp as wp
 from compositions import make_env
-from environments import CUDA, DEVICES, actions, configure, returned
+from environments import CUDA, DEVICES, actions, configure, on_cuda, returned
 
 from mjstack.envs import Env
 from mjstack.errors import MjstackError
@@ -20,7 +20,7 @@ from mjstack.rng import uniform
 from mjstack.sim.draws import draw_uniform
 from mjstack.sim.graph import StepGraph
 
-BACKENDS = ["mjwarp", pytest.param("mjwarp-cuda", marks=[pytest.mark.gpu, CUDA])]
+BACKENDS = ["mjwarp", pytest.param("mjwarp-cuda", marks=CUDA)]
 
 
 def make(backend: str, graph: str, nworld: int, *overrides: str) -> Env:
@@ -102,8 +102,7 @@ def test_the_kernel_draws_what_the_generator_draws(device: str) -> None:
 
 
 @pytest.mark.full
-@pytest.mark.gpu
-@CUDA
+@on_cuda
 @pytest.mark.parametrize("graph", ["require", "auto"])
 def test_a_term_that_reads_the_device_is_named(
     graph: str, caplog: pytest.LogCaptureFixture
@@ -174,8 +173,7 @@ def test_without_capture_the_work_just_runs() -> None:
 
 
 @pytest.mark.full
-@pytest.mark.gpu
-@CUDA
+@on_cuda
 def test_an_episode_of_the_gate_is_captured_and_accepted() -> None:
     from mjstack.episodes.stage import Stage
 

@@ -8,7 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from ik_arm import DEVICES, Arm, results, tensors
+from environments import DEVICES
+from ik_arm import Arm, results, tensors
 
 from mjstack.config.schema import RobotCfg
 from mjstack.errors import ArgumentError, ConfigError, MjstackError

@@ -304,9 +304,7 @@ def test_reset_starts_from_the_worlds_own_qpos0(backend: str, make_fields: Make)
     assert torch.equal(sim.qpos, expected)
 
 
-@pytest.mark.parametrize(
-    "mjwarp", ["mjwarp", pytest.param("mjwarp-cuda", marks=[pytest.mark.gpu, CUDA])]
-)
+@pytest.mark.parametrize("mjwarp", ["mjwarp", pytest.param("mjwarp-cuda", marks=CUDA)])
 def test_backends_agree(make_fields: Make, get_stage: GetStage, mjwarp: str) -> None:
     finals = []
     for backend in ("native", mjwarp):

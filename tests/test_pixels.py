@@ -11,6 +11,7 @@ from typing import cast
 import pytest
 import torch
 from compositions import load_config, make_env
+from environments import on_cuda
 from policies import interrupted, report, same
 
 from mjstack.cli import run
@@ -25,7 +26,6 @@ from mjstack.train.clone_network import vision_of
 from mjstack.train.demonstrations import Demonstrations
 from mjstack.train.images import Augmentation, ImagePool
 
-CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 CAMERAS = [
     "cameras=[front,wrist]",
     "scene.cameras.front.size=[16,24]",
@@ -258,8 +258,7 @@ def test_two_cores_train_reach_from_pixels(tmp_path: Path) -> None:
 
 
 @pytest.mark.full
-@pytest.mark.gpu
-@CUDA
+@on_cuda
 def test_cuda_learns_and_plays_in_graphs(tmp_path: Path) -> None:
-    on_cuda = [each.replace("sim.device=cpu", "sim.device=cuda:0") for each in TINY]
-    assert success_rate([*on_cuda, "graph=require"], tmp_path) >= 0.0
+    command = [each.replace("sim.device=cpu", "sim.device=cuda:0") for each in TINY]
+    assert success_rate([*command, "graph=require"], tmp_path) >= 0.0

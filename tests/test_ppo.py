@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from environments import at_double_speed, configure, mask_of, on_new_sim
+from environments import at_double_speed, configure, mask_of, on_cuda, on_new_sim
 from policies import (
     assert_drives,
     curve,
@@ -238,8 +238,7 @@ def test_the_expert_plays_at_the_beginning(tmp_path: Path) -> None:
     assert "expert" not in report(out)["success"]["notes"]["starts"]
 
 
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+@on_cuda
 def test_a_training_on_cuda(tmp_path: Path) -> None:
     """Steps and judged rollouts are captured, in a second call too."""
     out = tmp_path / "training"

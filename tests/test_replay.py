@@ -14,10 +14,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 from check_cases import rules_of
 from compositions import load_config, put, refusal
-from environments import at_double_speed, has_gl, one_second_episode, stack_starts
+from environments import at_double_speed, has_gl, on_cuda, one_second_episode, stack_starts
 from omegaconf import OmegaConf
 
 from mjstack.cli import run
@@ -430,8 +429,7 @@ def test_mjwarp_world_is_played_on_both_engines(
         assert np.abs(ours["object_pos_m"][-1] - theirs["object_pos_m"][-1]).max() < 0.002
 
 
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+@on_cuda
 def test_cuda_world_ends_near_where_it_did(
     replay: Callable[..., tuple[int, dict]], tmp_path: Path
 ) -> None:

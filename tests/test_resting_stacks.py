@@ -10,7 +10,7 @@ import mujoco_warp as mjw
 import pytest
 import torch
 from compositions import load_config
-from environments import CUDA
+from environments import on_cuda
 
 from mjstack.config.schema import Backend
 from mjstack.math import quat_from_yaw
@@ -57,8 +57,7 @@ def moving_stacks(*, primitive: bool) -> int:
     return int((fastest > 0.02).sum())
 
 
-@pytest.mark.gpu
-@CUDA
+@on_cuda
 @pytest.mark.parametrize("primitive", [True, False])
 def test_random_stacks_come_to_rest(primitive: bool) -> None:
     """With the convex collider some never do. When MJWarp mends it this fails: then drop the

@@ -12,7 +12,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from environments import at_double_speed, configure, mask_of, on_shared_sim, quats, stack_starts
+from environments import (
+    at_double_speed,
+    configure,
+    mask_of,
+    on_cuda,
+    on_shared_sim,
+    quats,
+    stack_starts,
+)
 
 from mjstack.cli import run
 from mjstack.config.schema import Config
@@ -156,8 +164,7 @@ def test_a_masked_reset_writes_its_worlds_alone(backend: str, tmp_path: Path) ->
 
 
 @pytest.mark.full
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+@on_cuda
 def test_a_captured_step_starts_worlds_from_the_file(tmp_path: Path) -> None:
     write_starts(started("mjwarp-cuda", configure("reset=randomized")), tmp_path / "worlds.npz")
     cfg = from_file(tmp_path / "worlds.npz", "task=reach", "action=joint_delta", "graph=require")

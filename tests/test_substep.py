@@ -6,7 +6,7 @@ import mujoco
 import pytest
 import torch
 import warp as wp
-from environments import configure
+from environments import DEVICES, configure, on_cuda
 
 from mjstack.config.schema import Backend
 from mjstack.scene import SceneIndex, build_model
@@ -15,9 +15,6 @@ from mjstack.sim.fused.step import StepPlan, can_rearrange
 from mjstack.sim.mjwarp import MjwarpSimulation
 from mjstack.sim.mujoco_warp import mjw
 from mjstack.sim.sizes import resolve_env_sizes
-
-CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
-DEVICES = ["cpu", pytest.param("cuda:0", marks=[pytest.mark.gpu, CUDA])]
 
 
 def worlds(robot: str, device: str, step: str) -> MjwarpSimulation:
@@ -86,8 +83,7 @@ def test_a_step_ends_where_mjwarps_own_does(step: str, robot: str, device: str) 
 
 
 @pytest.mark.full
-@pytest.mark.gpu
-@CUDA
+@on_cuda
 @pytest.mark.parametrize("robot", ["so101", "rebot"])
 def test_branches_count_and_sense_what_one_after_the_other_does(robot: str) -> None:
     """Cubes at rest, red between the jaws: a few decimation from one state, where rounding has no

@@ -17,7 +17,7 @@ import pytest
 import torch
 from check_cases import rules_of
 from compositions import checked, load_config, put, refusal
-from environments import CUDA, at_double_speed, configure, one_second_episode
+from environments import at_double_speed, configure, on_cuda, one_second_episode
 
 from mjstack.cli import run
 from mjstack.config.schema import Config
@@ -480,8 +480,7 @@ def test_worst_regions_of_made_up_episodes() -> None:
 
 
 @pytest.mark.full
-@pytest.mark.gpu
-@CUDA
+@on_cuda
 def test_steps_with_the_tracker_are_one_graph(
     robot: str, new_run: Callable[..., Run], tmp_path: Path
 ) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from compositions import load_config
-from environments import at_double_speed
+from environments import at_double_speed, on_cuda
 
 from mjstack.bench import env_step, episode, physics, timing
 from mjstack.bench.env_step import measure_env_step
@@ -526,8 +526,7 @@ def test_missing_power_says_why(
 
 
 @pytest.mark.full
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+@on_cuda
 def test_episode_costs_hardly_more_than_bare_steps(new_run: Callable[..., Run]) -> None:
     run = new_run(
         "sim=mjwarp",
