@@ -65,9 +65,11 @@ def make_env(
     return build_env(load_config([*overrides, *values]))
 
 
-def refusal(check: Callable[[], object], *words: str) -> str:
+def refusal(
+    check: Callable[[], object], *words: str, kind: type[MjstackError] = MjstackError
+) -> str:
     """The line in which something is refused before anything is written; it has some words."""
-    with pytest.raises(MjstackError) as caught:
+    with pytest.raises(kind) as caught:
         check()
     assert caught.value.exit_code == 2
     message = str(caught.value)

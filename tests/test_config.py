@@ -5,19 +5,17 @@ one line.
 from __future__ import annotations
 
 import runpy
-from collections.abc import Callable
 from itertools import zip_longest
 from pathlib import Path
 
 import pytest
 from check_cases import limits
-from compositions import checked
+from compositions import checked, refusal
 
 from mjstack.config import load_config
 from mjstack.config.help import list_keys
 from mjstack.config.schema import Backend, CloneJobCfg, Config
 from mjstack.config.session import CONFIG_FOLDER
-from mjstack.errors import MjstackError
 from mjstack.jobs.gates import check_machine
 from mjstack.tasks.check import make_check
 
@@ -184,18 +182,9 @@ BAD_VALUES = [
 ]
 
 
-def refused(check: Callable[[], object], words: str) -> None:
-    """The check refuses with one line that has these words."""
-    with pytest.raises(MjstackError) as caught:
-        check()
-    assert caught.value.exit_code == 2
-    assert "\n" not in str(caught.value)
-    assert words in str(caught.value)
-
-
 @pytest.mark.parametrize(("override", "words"), BAD_VALUES)
 def test_a_bad_value_is_one_line(override: str, words: str) -> None:
-    refused(lambda: checked(override), words)
+    refusal(lambda: checked(override), words)
 
 
 BAD = [
@@ -266,7 +255,7 @@ BAD = [
 @pytest.mark.full
 @pytest.mark.parametrize(("overrides", "words"), BAD, ids=[" ".join(o) for o, _ in BAD])
 def test_bad_input_is_one_line(overrides: list[str], words: str) -> None:
-    refused(lambda: make_check(load_config(overrides)), words)
+    refusal(lambda: make_check(load_config(overrides)), words)
 
 
 REFUSED_BY_THE_CHECK = [
@@ -295,7 +284,7 @@ def test_the_whole_job_is_checked_before_its_folder_exists(
     overrides: list[str], words: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("MENAGERIE_ROOT", str(tmp_path))
-    refused(lambda: check_machine(load_config(["gates=[baseline]", *overrides])), words)
+    refusal(lambda: check_machine(load_config(["gates=[baseline]", *overrides])), words)
 
 
 def test_a_swapped_function_does_not_inherit_parameters() -> None:

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -16,6 +15,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from compositions import refusal
 
 from mjstack import load_config
 from mjstack.config.fingerprint import config_content
@@ -70,15 +70,6 @@ def test_a_profile_without_start_title_and_ik_joints_gets_them() -> None:
     assert load_config(["robot.title=''"]).robot.title == "so101"
 
 
-def refusal(make: Callable[[], object], error: type[MjstackError] = MjstackError) -> str:
-    """The one line that a call is refused with."""
-    with pytest.raises(error) as caught:
-        make()
-    assert "\n" not in str(caught.value)
-    assert caught.value.exit_code == 2
-    return str(caught.value)
-
-
 @pytest.mark.full
 @pytest.mark.parametrize(
     ("overrides", "message"),
@@ -90,7 +81,7 @@ def refusal(make: Callable[[], object], error: type[MjstackError] = MjstackError
     ],
 )
 def test_a_robot_without_its_file_is_refused(overrides: list[str], message: str) -> None:
-    assert message in refusal(lambda: build_model(load_config(overrides)), ConfigError)
+    refusal(lambda: build_model(load_config(overrides)), message, kind=ConfigError)
 
 
 SERVO = '<position name="elbow" joint="elbow" kp="500" kv="20" forcerange="-40 40"/>'
@@ -113,14 +104,14 @@ def test_a_file_that_does_not_fit_the_profile_is_refused(
     old: str, new: str, error: type[MjstackError], message: str, tmp_path: Path
 ) -> None:
     cfg = changed(tmp_path, old, new)
-    assert re.search(message, refusal(lambda: robot_spec(cfg.robot, cfg.model), error))
+    assert re.search(message, refusal(lambda: robot_spec(cfg.robot, cfg.model), kind=error))
 
 
 @pytest.mark.parametrize("name", ["floor", "table", "red"])
 def test_a_file_with_a_name_of_the_scene_is_refused(name: str, tmp_path: Path) -> None:
     geom = f'<worldbody><geom name="{name}" size="0.01" pos="0 0 2"/>'
     cfg = changed(tmp_path, "<worldbody>", geom)
-    assert f"scene stack: repeated name '{name}'" in refusal(lambda: build_model(cfg))
+    refusal(lambda: build_model(cfg), f"scene stack: repeated name '{name}'")
 
 
 def test_a_servo_is_found_by_its_joint_and_limited_as_the_joint_is(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -81,13 +81,6 @@ def lean(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     sys.modules.pop("lean", None)
 
 
-def refused(args: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """The one line with which a command line is refused."""
-    assert run(args) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    return line
-
-
 def test_an_environment_of_another_folder(lean: Path) -> None:
     env = mjstack.make_env(["task=lean"], config_dir=lean, nworld=2, device="cpu")
     try:
@@ -113,12 +106,14 @@ def test_the_search_path_is_an_override_too(lean: Path) -> None:
 
 
 @pytest.mark.full
-def test_help_and_cfg_see_the_folder(lean: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_and_cfg_see_the_folder(
+    lean: Path, capsys: pytest.CaptureFixture[str], refused: Callable[..., str]
+) -> None:
     assert run(["--config-dir", str(lean), "--help"]) == 0
     assert "stack, box, lean, reach" in " ".join(capsys.readouterr().out.split())
     assert run([f"--config-dir={lean}", "task=lean", "--cfg", "job", "-p", "task.name"]) == 0
     assert capsys.readouterr().out == "lean\n"
-    assert "Did you mean 'lean'?" in refused(["-cd", str(lean), "task=lea"], capsys)
+    assert "Did you mean 'lean'?" in refused("-cd", str(lean), "task=lea")
 
 
 @pytest.mark.parametrize(
@@ -133,19 +128,17 @@ def test_help_and_cfg_see_the_folder(lean: Path, capsys: pytest.CaptureFixture[s
     ],
 )
 def test_a_file_that_does_not_fit_is_named(
-    text: str, part: str, lean: Path, capsys: pytest.CaptureFixture[str]
+    text: str, part: str, lean: Path, refused: Callable[..., str]
 ) -> None:
     file = lean / "task" / "lean.yaml"
     file.write_text(f"{TASK.partition('task:')[0]}{text}\n")
-    line = refused(["--config-dir", str(lean), "task=lean"], capsys)
+    line = refused("--config-dir", str(lean), "task=lean")
     assert str(file) in line
     assert part in line
 
 
 @pytest.mark.full
-def test_a_sweep_and_a_replay(
-    lean: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_sweep_and_a_replay(lean: Path, tmp_path: Path) -> None:
     flags = ["--config-dir", str(lean), "-m", "task=stack", "gates=[upright]"]
     reset = "+reset.lean={func: lean.lean}"
     swapped = (
@@ -168,7 +161,7 @@ def test_a_sweep_and_a_replay(
 
 @pytest.mark.full
 def test_a_gate_of_one_s_own(
-    lean: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    lean: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], refused: Callable[..., str]
 ) -> None:
     flags = ["--config-dir", str(lean), "gates=[upright]"]
     assert run([*flags, "hydra.run.dir=a"]) == 0
@@ -181,22 +174,22 @@ def test_a_gate_of_one_s_own(
     out = capsys.readouterr().out
     assert "gate.upright.limit=1.0\n  Accepts a number above 0 [m]." in out
     assert "task.check.window=50\n" in out
-    said = refused([*flags, "gate.upright.limit=0.0"], capsys)
+    said = refused(*flags, "gate.upright.limit=0.0")
     assert said == "mjstack: gate.upright.limit=0.0: expected a number above 0 [m]."
-    assert "Did you mean 'limit'?" in refused([*flags, "+gate.upright.limits=1.0"], capsys)
-    assert "Did you mean 'upright'?" in refused([*flags, "gate.uprigt.limit=1.0"], capsys)
-    assert "Available: baseline" in refused(["gates=[upright]"], capsys)
+    assert "Did you mean 'limit'?" in refused(*flags, "+gate.upright.limits=1.0")
+    assert "Did you mean 'upright'?" in refused(*flags, "gate.uprigt.limit=1.0")
+    assert "Available: baseline" in refused("gates=[upright]")
 
 
-def test_a_bad_folder_is_refused(lean: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert f"Name {lean}." in refused(["--config-dir", str(lean.parent)], capsys)
-    missing = refused(["task=lean"], capsys)
+def test_a_bad_folder_is_refused(lean: Path, refused: Callable[..., str]) -> None:
+    assert f"Name {lean}." in refused("--config-dir", str(lean.parent))
+    missing = refused("task=lean")
     assert missing.startswith("mjstack: task=lean: 'lean' does not exist. Available: ")
     assert missing.endswith(" A choice of your own needs --config-dir DIR.")
-    assert "no such folder" in refused(["--config-dir", "nowhere"], capsys)
-    assert "expected a list" in refused(["hydra.searchpath=3"], capsys)
+    assert "no such folder" in refused("--config-dir", "nowhere")
+    assert "expected a list" in refused("hydra.searchpath=3")
     shutil.copy(lean / "task" / "lean.yaml", lean / "task" / "box.yaml")
-    assert "task/box.yaml is mjstack's own" in refused(["--config-dir", str(lean)], capsys)
+    assert "task/box.yaml is mjstack's own" in refused("--config-dir", str(lean))
 
 
 def test_an_installed_package_registers_its_configuration(lean: Path) -> None:
