@@ -31,7 +31,7 @@ from mjstack.envs.buffers import (
 )
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Progress, Stage
-from mjstack.errors import FaultError, MjstackError, Unreachable
+from mjstack.errors import FaultError, Unreachable
 from mjstack.gates import capacity as capacity_module
 from mjstack.gates.batch import run_batch
 from mjstack.gates.capacity import run_capacity
@@ -613,30 +613,6 @@ def test_batch_measures_where_capacity_does_not_run(new_run: NewRun) -> None:
     metrics = result.metrics
     assert metrics["world_steps_per_s"] == pytest.approx(3000 / metrics["episode_s"])
     assert int(metrics["peak_constraint_rows_per_world"]) <= 184
-
-
-BAD = {
-    **{f"gate.capacity.margin={value}": "gate.capacity.margin=" for value in ("0.9", "nan", "inf")},
-    "gate.capacity.random_steps=0": "gate.capacity.random_steps=0",
-    "gate.capacity.probe_steps=0": "gate.capacity.probe_steps=0",
-    "gate.capacity.probe_nworld=-1": "gate.capacity.probe_nworld=-1",
-    "gate.capacity.cpu_nworld=0": "gate.capacity.cpu_nworld=0",
-    "gate.capacity.reset.cubes.parms.yaw=1": "parms",
-    "batch.auto=perhaps": "batch.auto",
-    "batch=automatic": "Did you mean 'auto'?",
-    "batch.naconmax=8": "'batch.naconmax' does not exist. Did you mean 'batch.nconmax'?",
-    "batch.naccdmax=8": "'batch.naccdmax' does not exist. Did you mean 'batch.nccdmax'?",
-}
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("override", BAD)
-def test_bad_values_give_one_line(override: str) -> None:
-    with pytest.raises(MjstackError) as caught:
-        load_config([override])
-    assert caught.value.exit_code == 2
-    assert BAD[override] in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 @on_cuda

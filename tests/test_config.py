@@ -179,6 +179,15 @@ BAD_VALUES = [
     ("robot.ik_joints=[elbow]", "elbow_flex"),
     ("robot.approach_axis=[0,0,2]", "a vector of length 1"),
     ("nworld=99999999999", "expected an integer from 1 to 2147483647 [worlds]"),
+    (f"seed={1 << 32}", f"seed={1 << 32}"),
+    *(
+        (f"gate.capacity.margin={value}", "gate.capacity.margin=")
+        for value in ("0.9", "nan", "inf")
+    ),
+    ("gate.capacity.random_steps=0", "gate.capacity.random_steps=0"),
+    ("gate.capacity.probe_steps=0", "gate.capacity.probe_steps=0"),
+    ("gate.capacity.probe_nworld=-1", "gate.capacity.probe_nworld=-1"),
+    ("gate.capacity.cpu_nworld=0", "gate.capacity.cpu_nworld=0"),
 ]
 
 
@@ -219,6 +228,14 @@ BAD = [
     (["sim.nworlds=3"], "nworld'?"),
     (["nworlds=3"], "nworld'?"),
     (["reward.progress.wait=1"], "wait"),
+    (["reward.porgress.weight=3"], "Did you mean 'reward.progress'?"),
+    (["reward.progress.params.force=1"], "To add it, write +reward.progress.params.force=..."),
+    (["termination.time_out.params.step=3"], "steps'?"),
+    (["gate.capacity.reset.cubes.parms.yaw=1"], "parms"),
+    (["batch.auto=perhaps"], "batch.auto"),
+    (["batch=automatic"], "Did you mean 'auto'?"),
+    (["batch.naconmax=8"], "'batch.naconmax' does not exist. Did you mean 'batch.nconmax'?"),
+    (["batch.naccdmax=8"], "'batch.naccdmax' does not exist. Did you mean 'batch.nccdmax'?"),
     (
         ["scene.objects.red.fixed=true", "scene.objects.blue.fixed=true"],
         "expected at least one object that is not fixed",
