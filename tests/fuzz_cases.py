@@ -34,7 +34,7 @@ def _words(text: str) -> list[str]:
 
 QUICK = ["nworld=2", "sim=native", "gates=[baseline]"]
 SHORT = [*QUICK[:2], *one_second_episode()]
-JOBS = _words("gates collect export replay reachability train")
+JOBS = _words("gates collect export replay train")
 CHOSEN = [*_words("task=stack task=box task=reach"), *(f"job={job}" for job in JOBS)]
 GROUPS = _words("""
 robot model scene timing solver batch sim action observation reset termination reward

@@ -117,7 +117,7 @@ LINES = [
     ("hydra/launcher=nope", ". Others are plugins of Hydra, which pip installs, such as hydra-"),
     ("cameras=[front,wirst]", "cameras=wirst: 'wirst' does not exist. Did you mean 'wrist'?"),
     ("-sc", "-sc: expected install=SHELL or uninstall=SHELL alone."),
-    ("devices=2 job=reachability sim=native", "torchrun, devices: expected"),
+    ("devices=2 job=play sim=native", "torchrun, devices: expected"),
     ("job.name=collect nworld=2", "job.name=collect: expected the one of a job's file"),
     ("-m sim=native seed=0,1 devices=2", ALONE),
     ("-m hydra/launcher=gpus sim=native seed=0,1 devices=2", ALONE),

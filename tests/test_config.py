@@ -206,8 +206,8 @@ BAD = [
         " job=collect.",
     ),
     (
-        ["job=play", "job.margin=0.1"],
-        "job.margin is a key of job=reachability, and this is job=play. Set job=reachability.",
+        ["job=collect", "job.fps=30"],
+        "job.fps is a key of job=play, and this is job=collect. Set job=play.",
     ),
     (["=3"], "=3: "),
     (["nworld"], "override 'nworld' cannot be read: expected key=value"),
@@ -221,8 +221,7 @@ BAD = [
     (["gate=batch"], "gates=[...]"),
     (
         ["job=play_schema"],
-        "Did you mean 'play'? Available: collect, export, gates, play, reachability, replay,"
-        " train.",
+        "Did you mean 'play'? Available: collect, export, gates, play, replay, train.",
     ),
     (["nworld=2.5"], "nworld"),
     (["sim.nworlds=3"], "nworld'?"),

@@ -424,7 +424,7 @@ def test_texts_are_plain_and_short(
         (["view=web", "web.host=::1"], "web.host=::1: expected an address of this machine"),
         (["view=web", "web.port=0"], "web.port=0: expected an integer from 1 to 65535"),
         (["view=web", "gates=[capacity]"], "expected gates with baseline, parity, batch or"),
-        (["view=web", "job=reachability"], "expected false with job=reachability"),
+        (["view=web", "job=collect"], "expected false with job=collect"),
         (["view=true", "job=train", "trainer=clone"], "expected web or false with job=train"),
         (["view=perhaps"], "view=perhaps: expected one of false, true, web"),
     ],

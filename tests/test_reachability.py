@@ -1,12 +1,13 @@
-"""What the arm reaches: against MuJoCo and mink, regions that are refused, obstacles, and the job's
-files.
+"""What the arm reaches: against MuJoCo and mink, regions that are refused, obstacles, and the map
+of the tool.
 """
 
 from __future__ import annotations
 
 import csv
-import json
 import math
+import runpy
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,22 +16,18 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+import reachability
 import torch
-from compositions import load_config, make_env, put, refusal
+from compositions import load_config, make_env
 from environments import configure, on_shared_sim
 
 import mjstack
-from mjstack.cli import run
-from mjstack.config.check import validate
 from mjstack.config.schema import Config
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, ParameterError
-from mjstack.jobs import check_job, reachability
-from mjstack.jobs.reachability import ReachLevel, find_levels, find_region
 from mjstack.kinematics.mink_ik import GraspIk
 from mjstack.kinematics.reach import PointReach
 from mjstack.mdp.starts.placement import Placement
-from mjstack.report.record import GateResult
 from mjstack.scene import SceneIndex, build_model
 
 GetStage = Callable[[str], Stage]
@@ -59,15 +56,14 @@ def grasp_point(ik: GraspIk, cfg: Config, q: np.ndarray, gripper: list[float]) -
 def test_solutions_are_where_mujoco_says(get_stage: GetStage, robot: str, grip: str) -> None:
     cfg = get_stage(robot).cfg
     gripper = cfg.robot.gripper_open if grip == "open" else cfg.robot.gripper_closed
-    reach = PointReach(get_stage(robot).model, cfg.robot, gripper)
     ik = GraspIk(cfg.robot, cfg.model, tolerance=5e-4, iterations=60)
     points = points_over(cfg, 20)
-    for found in (reach.solve(points), reach.solve_upright(points, 5e-4)):
-        assert found.distance.max() < 5e-4
-        for point, q, distance in zip(points, found.q, found.distance, strict=True):
-            at = grasp_point(ik, cfg, q, gripper)
-            assert np.linalg.norm(at - point) == pytest.approx(distance, abs=1e-9)
-            assert ik.solve(point, np.array(gripper), ik.home)[1] < 5e-4  # mink gets there too
+    found, distances = PointReach(get_stage(robot).model, cfg.robot, gripper).solve(points)
+    assert distances.max() < 5e-4
+    for point, q, distance in zip(points, found, distances, strict=True):
+        at = grasp_point(ik, cfg, q, gripper)
+        assert np.linalg.norm(at - point) == pytest.approx(distance, abs=1e-9)
+        assert ik.solve(point, np.array(gripper), ik.home)[1] < 5e-4  # mink gets there too
 
 
 def open_reach(get_stage: GetStage, robot: str) -> tuple[Config, mujoco.MjModel, PointReach]:
@@ -79,39 +75,41 @@ def open_reach(get_stage: GetStage, robot: str) -> tuple[Config, mujoco.MjModel,
 
 @pytest.mark.full
 def test_the_tilt_is_that_of_the_gripper_and_the_smallest(get_stage: GetStage, robot: str) -> None:
-    cfg, model, reach = open_reach(get_stage, robot)
+    cfg, model, _ = open_reach(get_stage, robot)
+    reach = reachability.Upright(model, cfg, "open")
     points = points_over(cfg, 4)
-    upright = reach.solve_upright(points, 5e-4)
-    any_ = reach.solve(points)
-    assert (upright.tilt <= any_.tilt + 1e-9).all()
+    q_upright, distances, tilts = reach.solve_upright(points)
+    assert distances.max() < 5e-4
     data = mujoco.MjData(model)
     last = model.joint(cfg.robot.arm_joints[-1])
     joints = sorted(cfg.robot.ik_joints, key=cfg.robot.arm_joints.index)
-    for point, q, tilt in zip(points, upright.q, upright.tilt, strict=True):
+    for point, q, tilt in zip(points, q_upright, tilts, strict=True):
         home = zip(cfg.robot.joints, cfg.robot.home, strict=True)
         solution = zip(joints, q, strict=True)
         for name, value in (dict(home) | cfg.robot.locked | dict(solution)).items():
             data.qpos[model.joint(name).qposadr[0]] = value
         mujoco.mj_kinematics(model, data)
         axis = data.xaxis[last.id] * np.sign(data.xaxis[last.id] @ (point - data.xanchor[last.id]))
-        assert math.acos(-axis[2]) == pytest.approx(tilt, abs=1e-6)
+        assert math.degrees(math.acos(-axis[2])) == pytest.approx(tilt, abs=1e-4)
     # Nothing better is found from many other postures.
     rng = np.random.default_rng(3)
-    for point, tilt in zip(points, upright.tilt, strict=True):
+    for point, tilt in zip(points, tilts, strict=True):
         start = rng.uniform(reach._low, reach._high, (300, len(reach._low)))
         many = np.tile(point, (300, 1))
-        found = reach._look(reach._descend(reach._descend(start, many, 0.02), many), many)
-        assert found.tilt[found.distance < 5e-4].min() > tilt - math.radians(0.5)
+        goals = np.column_stack((many, np.tile([0.0, 0.0, -reachability.POINTING], (300, 1))))
+        found = reach.point.descend(reach.descend(start, goals), many)
+        distance = np.linalg.norm(reach.point.forward(found)[1] - many, axis=1)
+        assert reach.tilt(found)[distance < 5e-4].min() > tilt - 0.5
 
 
 @pytest.mark.full
 def test_out_of_reach_is_as_far_as_it_is(get_stage: GetStage, robot: str) -> None:
     _, _, reach = open_reach(get_stage, robot)
     far = np.array([[1.5, 0.0, 0.2], [1.6, 0.0, 0.2]])
-    distance = reach.solve(far).distance
+    distance = reach.solve(far)[1]
     # Stretched towards it: nothing of the range of 200,000 postures is nearer.
     q = np.random.default_rng(0).uniform(reach._low, reach._high, (200_000, len(reach._low)))
-    nearest = reach._look(q, far[:1]).distance.min()
+    nearest = np.linalg.norm(reach.forward(q)[1] - far[:1], axis=1).min()
     assert 0.0 < distance[0] <= nearest
     assert distance[1] - distance[0] == pytest.approx(0.1, abs=1e-3)
 
@@ -119,9 +117,10 @@ def test_out_of_reach_is_as_far_as_it_is(get_stage: GetStage, robot: str) -> Non
 @pytest.mark.full
 def test_joints_stay_within_both_ranges(get_stage: GetStage, robot: str) -> None:
     cfg, model, reach = open_reach(get_stage, robot)
+    upright = reachability.Upright(model, cfg, "open")
     points = np.random.default_rng(1).uniform([-0.3, -0.6, 0.0], [0.8, 0.6, 0.6], (200, 3))
     joints = sorted(cfg.robot.ik_joints, key=cfg.robot.arm_joints.index)
-    for q in (reach.solve(points).q, reach.solve_upright(points, 5e-4).q):
+    for q in (reach.solve(points)[0], upright.solve_upright(points)[0]):
         for name, values in zip(joints, q.T, strict=True):
             for low, high in (model.joint(name).range, model.actuator(name).ctrlrange):
                 assert values.min() >= low - 1e-12
@@ -149,7 +148,7 @@ def test_a_region_beyond_the_arm_is_refused(robot: str, xy: str, says: str | Non
     assert message.startswith("reset.cubes.params.xy=[")
     assert says in message
     assert "mm out of reach" in message
-    assert "job=reachability" in message
+    assert "tools/reachability.py" in message
     assert "\n" not in message
 
 
@@ -355,150 +354,72 @@ def test_cubes_that_are_close_find_a_pair_that_fits() -> None:
     assert float(apart.min()) >= 2.0 * math.sqrt(2.0) * 0.022 + 0.04
 
 
-def level(cfg: Config, reached: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> ReachLevel:
-    x, y = np.meshgrid(*reachability.axes(cfg))
-    tilt = np.where(reached(x, y), 17.0, np.nan)
-    return ReachLevel(
-        name="grasp", height=0.0, gripper="open", residual=np.zeros_like(tilt), tilt=tilt
-    )
-
-
-def sizes(region: GateResult) -> list[float]:
-    """The largest square, both sides of the largest rectangle, and the tilt."""
-    return list(region.metrics.values())[2:]
-
-
 @pytest.mark.full
 def test_regions_stay_inside_what_is_reached() -> None:
-    cfg = load_config(["job=reachability", "job.step=0.005", "job.margin=0.01"])
-    x0, y0 = cfg.scene.objects["red"].xy
-    half_plane = level(cfg, lambda x, y: (x <= x0 + 0.08) & (y >= y0 - 0.09))
-    region = find_region(cfg, [half_plane], "red")
+    cfg = load_config()
+    scene = cfg.scene
+    x0, y0 = scene.objects["red"].xy
+    spaced = [center + np.arange(-0.2, 0.2001, 0.005) for center in scene.table_center[:2]]
+    points = np.stack(np.meshgrid(*spaced), axis=-1).reshape(-1, 2)
+    x, y = points.T
+
+    def region(reached: np.ndarray) -> tuple[bool, float, tuple[float, float]]:
+        return reachability.find_region(cfg, points, reached, "red", 0.005, 0.01)
+
     # From the last point that is reached, a step short of the first that is not: a margin less.
-    square, *largest, tilt = sizes(region)
+    half_plane = (x <= x0 + 0.08 + 1e-9) & (y >= y0 - 0.09 - 1e-9)
+    fits, square, largest = region(half_plane)
+    assert fits
     assert square == pytest.approx(0.07, abs=0.005)
     assert 0.0 <= 0.07 - largest[0] <= 0.005
     assert 0.0 <= 0.08 - largest[1] <= 0.005
-    assert region.status == "pass"
-    assert tilt == 17.0
-    near = level(cfg, lambda x, y: x <= x0 + 0.055)
-    assert find_region(cfg, [half_plane, near], "red").status == "fail"
-    island = find_region(cfg, [level(cfg, lambda x, y: x < x0 - 0.05)], "red")
-    assert sizes(island) == [0.0, 0.0, 0.0, pytest.approx(math.nan, nan_ok=True)]
-    assert island.status == "fail"
-    everywhere = sizes(find_region(cfg, [level(cfg, lambda x, y: x < 9.0)], "red"))
-    scene = cfg.scene
+    assert not region(half_plane & (x <= x0 + 0.055))[0]
+    assert region(x < x0 - 0.05) == (False, 0.0, (0.0, 0.0))
+    cfg.scene.table_half[:2] = [0.18, 0.19]
+    _, _, largest = region(x < 9.0)
     for k in (0, 1):  # the table's edge ends it, for a cube of any yaw
-        edge = (
-            scene.table_half[k]
-            - abs((x0, y0)[k] - scene.table_center[k])
-            - math.sqrt(2.0) * scene.objects["red"].half_height
-        )
-        assert 0.0 <= edge - everywhere[1 + k] <= 0.001
+        off_center = abs((x0, y0)[k] - scene.table_center[k])
+        edge = scene.table_half[k] - off_center - math.sqrt(2.0) * scene.objects["red"].half_height
+        assert 0.0 <= edge - largest[k] <= 0.001
 
 
 @pytest.mark.full
-def test_a_region_without_a_point_of_the_map_has_no_tilt() -> None:
-    region = "scene.random_xy=[0.001,0.001]"
-    cfg = load_config(["job=reachability", "job.step=0.07", region])
-    everywhere = level(cfg, lambda x, y: x < 9.0)
-    assert math.isnan(sizes(find_region(cfg, [everywhere], "red"))[3])
-
-
-@pytest.mark.full
-def test_levels_are_the_controllers(robot: str) -> None:
-    cfg = load_config([f"robot={robot}", "job=reachability"])
-    h = cfg.robot.approach_height + 0.022
-    levels = find_levels(cfg)
-    assert levels == {
-        "grasp": (pytest.approx(0.022), "open"),
-        "approach": (pytest.approx(h), "open"),
-        "carry": levels["carry"],
-    }
-    assert levels["carry"] == (pytest.approx(h + 0.09), "open")
-    cfg = load_config(["job=reachability", "controller.phases.lift_red.offset=[0,0,0.2]"])
-    assert find_levels(cfg)["carry"] == (pytest.approx(0.312), "closed")
-
-
-def test_the_job_leaves_a_map(
-    robot: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_the_tool_maps_the_table(
+    robot: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    args = ["job=reachability", f"robot={robot}", "job.step=0.04", f"hydra.run.dir={tmp_path}"]
-    status = run([*args, "job.margin=0"])
-    report = json.loads((tmp_path / "report.json").read_text())
-    gates = {gate["name"]: gate for gate in report["gates"]}
-    assert list(gates) == ["grasp", "approach", "carry", "red", "blue"]
-    # Between points that are 40 mm apart the worse counts, which the SO-101's region may not
-    # survive.
-    assert status == (0 if report["status"] == "pass" else 1)
+    region = ["scene.random_xy=[0.12,0.05]"] if robot == "so101" else []
+    options = [f"robot={robot}", *region, "--step=0.04", f"--folder={tmp_path}"]
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setattr(sys, "argv", ["reachability", *options])
+    runpy.run_path(str(Path(reachability.__file__)), run_name="__main__")
+    out = capsys.readouterr().out
+    assert "largest square" in out
+    (red,) = (line for line in out.splitlines() if line.startswith("│ red "))
+    assert ("not reached" in red) is (robot == "so101")
+    assert (tmp_path / "reachability.png").stat().st_size > 10_000
+
+    # Heights are the driver's
+    cfg = load_config([f"robot={robot}"])
+    approach = pytest.approx(cfg.robot.approach_height + 0.022)
+    carry = pytest.approx(cfg.robot.approach_height + 0.022 + 0.09)
+    levels = {"grasp": (pytest.approx(0.022), "open"), "approach": (approach, "open")}
+    assert reachability.find_levels(cfg) == levels | {"carry": (carry, "open")}
+
+    # Points are as PointReach has them
     with (tmp_path / "reachability.csv").open() as file:
         rows = list(csv.DictReader(file))
-    cfg = load_config([f"robot={robot}"])
     reach = PointReach(build_model(cfg), cfg.robot, cfg.robot.gripper_open)
     for row in rows[:: len(rows) // 7]:
         z = cfg.scene.table_top + cfg.scene.objects["red"].half_height
         point = np.array([[float(row["x_m"]), float(row["y_m"]), z]])
-        distance = float(reach.solve(point).distance[0])
+        distance = float(reach.solve(point)[1][0])
         assert (row["grasp_reached"] == "1") is (distance <= 5e-4)
         assert float(row["grasp_residual_m"]) == pytest.approx(distance, rel=0.01, abs=2e-6)
         assert (row["grasp_tilt_deg"] != "nan") is (row["grasp_reached"] == "1")
-    share = np.mean([row["grasp_reached"] == "1" for row in rows])
-    assert gates["grasp"]["metrics"]["reached_fraction"] == pytest.approx(share)
-    text = (tmp_path / "report.md").read_text()
-    assert "| red | " in text
-    assert "the largest square is " in text
-    assert "![reachability.png](reachability.png)" in text
-    assert (tmp_path / "reachability.png").stat().st_size > 10_000
-    assert "largest square" in capsys.readouterr().out
-
-
-@pytest.mark.full
-def test_a_region_that_is_not_reached_fails_the_job(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    args = ["job=reachability", "job.step=0.04", "scene.random_xy=[0.12,0.05]"]
-    assert run([*args, f"hydra.run.dir={tmp_path}"]) == 1
-    out = " ".join(capsys.readouterr().out.split())
-    assert "scene.random_xy 0.12 x 0.05 m is not reached with 10 mm to spare" in out
-    assert json.loads((tmp_path / "report.json").read_text())["status"] == "fail"
-
-
-@pytest.mark.full
-def test_an_interrupted_job_keeps_its_levels(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    whole = reachability.map_level
-
-    def stop_later(stage: Stage, name: str, *rest: object) -> ReachLevel:
-        if name == "carry":
-            raise KeyboardInterrupt
-        return whole(stage, name, *rest)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(reachability, "map_level", stop_later)
-    assert run(["job=reachability", "job.step=0.05", f"hydra.run.dir={tmp_path}"]) == 130
-    report = json.loads((tmp_path / "report.json").read_text())
-    assert report["status"] == "interrupted"
-    assert [gate["name"] for gate in report["gates"]] == ["grasp", "approach"]
-    head = (tmp_path / "reachability.csv").read_text().splitlines()[0]
-    assert "approach_tilt_deg" in head
-    assert "carry" not in head
-
-
-@pytest.mark.full
-@pytest.mark.parametrize(
-    ("value", "says"),
-    [
-        ("job.step=0", "job.step=0"),
-        ("job.step=0.0001", "job.step=0.0001: expected 0.00"),
-        ("job.step=1.0", "job.step=1.0"),
-        ("job.margin=-0.01", "job.margin=-0.01"),
-        ("job.margin=nan", "job.margin=nan"),
-    ],
-)
-def test_bad_settings_are_refused_in_one_line(value: str, says: str) -> None:
-    cfg = put(load_config(["job=reachability"]), value)
-
-    assert says in refusal(lambda: (validate(cfg), check_job(cfg)))
+    assert {row["grasp_reached"] for row in rows} >= {"1"}
 
 
 def test_a_native_environment_checks_reach_without_warp() -> None:

@@ -1,11 +1,10 @@
-"""Reach of an arm: inverse kinematics of many points at once in NumPy, for checks and maps.
+"""Reach of an arm: inverse kinematics of many points at once in NumPy, for checks.
 
 `mink_ik` plans and `batched_ik` runs with the worlds. Here points have nothing to do with worlds,
-Warp is not loaded, and the gripper's tilt matters too.
+and Warp is not loaded.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -14,27 +13,12 @@ from mjstack.config.schema import RobotCfg
 from mjstack.scene.index import approach_body, joint_limits, locked_home
 
 _ITERATIONS = 60  # at most, per start
-_DAMPING = 1e-3  # [m/rad] of the steps towards a point
+_DAMPING = 1e-3  # [m/rad] at the point; it grows with the distance
 _MAX_STEP = 0.3  # [rad, m] per joint and iteration
 _CONVERGED = 1e-6  # [m]
 _STILL = 1e-5  # [rad, m] a smaller step ends the search
-_POINTING = 0.02  # [m/rad] weight of the approach axis against the position
 # [rad] off home, of each hinge after the first: every start has its own branch of solutions
-_STARTS = (0.0, -0.6, 0.6)
-
-
-class Reached(NamedTuple):
-    """Solutions at the points.
-
-    Attributes:
-        q: Positions of the ik joints [rad, m], shape ``(n, joints)``.
-        distance: Distance of the grasp point from the point [m], shape ``(n,)``.
-        tilt: Angle of the approach axis to straight down [rad], shape ``(n,)``.
-    """
-
-    q: np.ndarray
-    distance: np.ndarray
-    tilt: np.ndarray
+STARTS = (0.0, -0.6, 0.6)
 
 
 class PointReach:
@@ -44,13 +28,16 @@ class PointReach:
     where they are locked.
     """
 
-    def __init__(self, model: mujoco.MjModel, robot: RobotCfg, gripper: Sequence[float]) -> None:
+    def __init__(
+        self, model: mujoco.MjModel, robot: RobotCfg, gripper: Sequence[float], ahead: float = 0.0
+    ) -> None:
         """Read axes and limits of the ik joints.
 
         Args:
             model: A compiled model that contains the robot, alone or in a scene. It is not kept.
             robot: The robot's profile.
             gripper: Joint positions of the gripper [rad, m].
+            ahead: How far along the approach axis the point is that stands for the grasp point [m].
         """
         data = mujoco.MjData(model)
         home = locked_home(robot)
@@ -66,47 +53,35 @@ class PointReach:
         self._anchors = data.xanchor[joints].copy()
         self._axes = data.xaxis[joints].copy()
         sites = [model.site(name).id for name in robot.grasp_sites]
-        self._tip = data.site_xpos[sites].mean(axis=0)
         turned = data.xmat[approach_body(model, robot)].reshape(3, 3)
-        self._pointing = turned @ robot.approach_axis
+        self._tip = data.site_xpos[sites].mean(axis=0) + ahead * turned @ robot.approach_axis
         self._low, self._high = joint_limits(model, [model.joint(j).name for j in joints])
 
-    def solve(self, points: np.ndarray) -> Reached:
+    def solve(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Bring the grasp point as near to each point as possible, from a few starts.
 
         Args:
             points: Targets [m], shape ``(n, 3)``.
+
+        Returns:
+            Positions of the ik joints [rad, m], shape ``(n, joints)``, and the distance that is
+            left [m], shape ``(n,)``.
         """
-        best = self._look(np.tile(self._home, (len(points), 1)), points)
-        for off in _STARTS:
-            if (best.distance <= _CONVERGED).all():
+        best = np.tile(self._home, (len(points), 1))
+        distance = np.linalg.norm(points - self.forward(best)[1], axis=1)
+        for off in STARTS:
+            if (distance <= _CONVERGED).all():
                 break
-            solutions = self._search(self._start(points, off), points)
-            _replace(best, solutions, solutions.distance < best.distance)
-        return best
+            q = self.descend(self.start(points, off), points)
+            left = np.linalg.norm(points - self.forward(q)[1], axis=1)
+            better = left < distance
+            best[better] = q[better]
+            distance[better] = left[better]
+        return best, distance
 
-    def solve_upright(self, points: np.ndarray, tolerance: float) -> Reached:
-        """Solve, and of the solutions within tolerance take the one with the least tilt.
-
-        Args:
-            points: Targets [m], shape ``(n, 3)``.
-            tolerance: Distance that counts as reached [m].
-        """
-        best = self.solve(points)
-        reached = best.distance <= tolerance
-        goals = points[reached]
-        upright = self._look(best.q[reached], goals)
-        for start in [upright.q, *(self._start(goals, off) for off in _STARTS)]:
-            solutions = self._search(self._descend(start, goals, _POINTING), goals)
-            better = (solutions.distance <= tolerance) & (solutions.tilt < upright.tilt)
-            _replace(upright, solutions, better)
-        for values, upright_values in zip(best, upright, strict=True):
-            values[reached] = upright_values
-        return best
-
-    def _start(self, points: np.ndarray, off: float) -> np.ndarray:
-        """Home with the other hinges bent by ``off``; a first hinge that is upright turns towards
-        the points.
+    def start(self, points: np.ndarray, off: float) -> np.ndarray:
+        """Home with the other hinges bent by ``off`` [rad]; a first hinge that is upright turns
+        towards the points.
         """
         q = np.tile(self._home + off * self._hinges, (len(points), 1))
         q[:, 0] = self._home[0]
@@ -117,23 +92,18 @@ class PointReach:
             q[:, 0] += np.sign(up) * np.angle((points - self._anchors[0]) @ plane * arm.conj())
         return np.clip(q, self._low, self._high)
 
-    def _descend(self, start: np.ndarray, points: np.ndarray, pointing: float = 0.0) -> np.ndarray:
-        """Damped least squares within the limits; with ``pointing`` the approach axis counts
-        too.
-        """
+    def descend(self, start: np.ndarray, goals: np.ndarray) -> np.ndarray:
+        """Damped least squares towards goals of `forward`, within the limits."""
         q = start.copy()
-        left = np.arange(len(points))
-        weights = np.repeat([1.0, pointing], 3)
-        goals = np.column_stack((points, np.tile([0.0, 0.0, -1.0], (len(points), 1))))
+        left = np.arange(len(goals))
         for _ in range(_ITERATIONS):
             if not left.size:
                 break
-            jacobian, pose = self._forward(q[left])
-            error = weights * (goals[left] - pose)
-            far = np.linalg.norm(error[:, :3], axis=1)
-            damping = _DAMPING + (0.0 if pointing else 0.05) * far
+            jacobian, pose = self.forward(q[left])
+            error = goals[left] - pose
+            damping = _DAMPING + 0.05 * np.linalg.norm(error, axis=1)
             before = q[left]
-            step = self._step(before, weights[:, None] * jacobian, error, damping)
+            step = self._step(before, jacobian, error, damping)
             q[left] = np.clip(before + step, self._low, self._high)
             left = left[np.abs(q[left] - before).max(axis=1) >= _STILL]
         return q
@@ -153,9 +123,9 @@ class PointReach:
         largest = np.abs(step).max(axis=1, keepdims=True)
         return step * np.minimum(1.0, _MAX_STEP / np.maximum(largest, 1e-12))
 
-    def _forward(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Grasp point and pointing direction, shape ``(n, 6)``, and their Jacobian, shape
-        ``(n, 6, joints)``.
+    def forward(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The Jacobian of the grasp point, shape ``(n, 3, joints)``, and the grasp point [m], shape
+        ``(n, 3)``.
 
         A product of exponentials: each joint moves the links after it about, or along, its axis at
         home.
@@ -175,26 +145,8 @@ class PointReach:
             else:
                 shift = shift + axes[:, k] * moved[:, None]
         tip = rotation @ self._tip + shift
-        direction = rotation @ self._pointing
-        turning = self._hinges[:, None]
-        rows = np.where(turning, np.cross(axes, tip[:, None] - anchors), axes)
-        pointing = turning * np.cross(axes, direction[:, None])
-        jacobian = np.concatenate((rows, pointing), axis=2).swapaxes(1, 2)
-        return jacobian, np.column_stack((tip, direction))
-
-    def _search(self, start: np.ndarray, points: np.ndarray) -> Reached:
-        return self._look(self._descend(start, points), points)
-
-    def _look(self, q: np.ndarray, points: np.ndarray) -> Reached:
-        pose = self._forward(q)[1]
-        distance = np.linalg.norm(points - pose[:, :3], axis=1)
-        return Reached(q, distance, np.arccos(np.clip(-pose[:, 5], -1.0, 1.0)))
-
-
-def _replace(best: Reached, solutions: Reached, better: np.ndarray) -> None:
-    """Write the solutions of some points over those so far."""
-    for values, new in zip(best, solutions, strict=True):
-        values[better] = new[better]
+        rows = np.where(self._hinges[:, None], np.cross(axes, tip[:, None] - anchors), axes)
+        return rows.swapaxes(1, 2), tip
 
 
 def _rotations(axis: np.ndarray, angles: np.ndarray) -> np.ndarray:

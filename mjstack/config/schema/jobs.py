@@ -17,16 +17,6 @@ class JobCfg:
 
 
 @dataclass(slots=True)
-class ReachabilityJobCfg(JobCfg):
-    """A map of the positions that the arm reaches, and the largest region for random starts."""
-
-    step: float = spec(unit="m", gt=0.0)
-    """Distance of the map's points."""
-    margin: float = spec(unit="m", ge=0.0)
-    """A region counts as reached if it is still reached with this margin all round."""
-
-
-@dataclass(slots=True)
 class CollectJobCfg(JobCfg):
     """Demonstrations of the closed-loop expert, as a dataset."""
 
@@ -194,7 +184,6 @@ class PpoJobCfg(TrainJobCfg):
 TRAINER_SCHEMAS = {"ppo": PpoJobCfg}
 # Jobs with keys of their own; the others have `JobCfg`.
 JOB_SCHEMAS = {
-    "reachability": ReachabilityJobCfg,
     "collect": CollectJobCfg,
     "play": PlayJobCfg,
     "train": CloneJobCfg,

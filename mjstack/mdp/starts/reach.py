@@ -32,7 +32,9 @@ def require_reach(env: EnvView, region: Sequence[float]) -> None:
         if failure := out_of_reach(env, thing, xy):
             expected = f"a region that the arm reaches; {failure[1]}"
             fix = f"Make the region smaller, or move the object (scene.objects.{thing}.xy)"
-            raise ParameterError("xy", region, expected, f"{fix}; job=reachability draws a map")
+            raise ParameterError(
+                "xy", region, expected, f"{fix}; tools/reachability.py draws a map"
+            )
 
 
 def out_of_reach(env: EnvView, name: str, xy: np.ndarray) -> tuple[int, str] | None:
@@ -58,8 +60,8 @@ def out_of_reach(env: EnvView, name: str, xy: np.ndarray) -> tuple[int, str] | N
     for gripper in np.unique(openings):
         reach = PointReach(env.sim.model, env.cfg.robot, env.cfg.robot.grips[gripper])
         columns = openings == gripper
-        solved = reach.solve(points[:, columns].reshape(-1, 3))
-        distances[:, columns] = solved.distance.reshape(len(xy), -1)
+        left = reach.solve(points[:, columns].reshape(-1, 3))[1]
+        distances[:, columns] = left.reshape(len(xy), -1)
     if (distances <= env.cfg.controller.ik_tolerance).all():
         return None
 

@@ -179,7 +179,7 @@ class FromStartsFile:
         for number, name in enumerate(objects):
             if failure := out_of_reach(env, name, starts[:, number, :2]):
                 world, problem = failure
-                fix = "Move it closer; job=reachability draws a map"
+                fix = "Move it closer; tools/reachability.py draws a map"
                 expected = f"a place that the arm reaches; {problem}"
                 raise table.wrong(expected, fix, world, [f"{name}_xy"])
 
