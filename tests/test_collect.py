@@ -75,9 +75,9 @@ def gate_episode(cfg: Config) -> SimpleNamespace:
         stage.model, cfg, cfg.nworld, backend=Backend.native, fields=required_fields(cfg.reset)
     )
     try:
-        commands = CommandRecorder()
-        episode = stage.play(sim, cfg.reset, [commands])
-        return SimpleNamespace(result=episode.result, commands=commands.recorded)
+        recorder = CommandRecorder()
+        episode = stage.play(sim, cfg.reset, [recorder])
+        return SimpleNamespace(result=episode.result, commands=recorder.commands)
     finally:
         sim.close()
 
@@ -162,8 +162,7 @@ def test_names_of_a_history_and_of_a_strange_term() -> None:
 
 def test_actions_are_what_the_gates_command(demos: SimpleNamespace) -> None:
     """And they are what went to the actuators: the same episode in the gates' own loop."""
-    recorded = demos.judged.commands
-    commands = torch.stack([recorded.command() for _ in range(STEPS)], dim=1).numpy()
+    commands = demos.judged.commands.transpose(0, 1).numpy()
     for number, row in enumerate(episodes_of(demos.dataset)):
         action = steps_of(demos.dataset, number)["action"].astype(np.float32)
         assert np.array_equal(action, commands[row["world"]])

@@ -89,7 +89,7 @@ PATHS: dict[str, dict[str, str] | None] = {
     "tasks/progress.py": {"Progress": "__call__"},
     "tasks/reach.py": {"ReachSuccess": "__init__", "ReachCheck": "placed trace"},
     "drivers/open_loop.py": {"JointTrajectory": "command"},
-    "drivers/driver.py": {"Recorded OpenLoopDriver": "command"},
+    "drivers/driver.py": {"OpenLoopDriver": "command"},
     "drivers/closed_loop.py": {
         "ClosedLoopDriver": "command _advance _judge_grasp _turn",
         "": "_put",

@@ -99,9 +99,7 @@ def _task_targets(stage: Stage, sim: Simulation, steps: int) -> tuple[State, lis
     snapshots = Snapshots([first - 1])
     recorder = CommandRecorder()
     stage.play(sim, stage.cfg.reset, [snapshots, recorder])
-    recorded = recorder.recorded
-    targets = [recorded.command() for _ in range(min(first + steps, recorded.steps))][first:]
-    return snapshots.states[first - 1], targets
+    return snapshots.states[first - 1], list(recorder.commands[first : first + steps])
 
 
 def _random_targets(stage: Stage, sim: Simulation, steps: int) -> tuple[State, list[torch.Tensor]]:

@@ -6,6 +6,8 @@ import time
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from mjstack.bench.timing import (
     NO_METER,
@@ -15,7 +17,8 @@ from mjstack.bench.timing import (
     Measurement,
     lost_worlds,
 )
-from mjstack.drivers.driver import Recorded
+from mjstack.drivers.driver import OpenLoopDriver
+from mjstack.drivers.open_loop import JointTrajectory
 from mjstack.episodes.recorder import CommandRecorder
 from mjstack.episodes.rollout import FEEDBACK, Episode, Observer, rollout
 from mjstack.episodes.stage import Stage
@@ -108,13 +111,13 @@ def measure_episode(
 
 
 def play_bare(
-    stage: Stage, sim: "MjwarpSimulation", recorded: Recorded | None = None
+    stage: Stage, sim: "MjwarpSimulation", commands: Tensor | None = None
 ) -> tuple[float, str]:
     """Play the same commands from the same start with bare steps.
 
-    Joint trajectories are evaluated in the loop, as in the episode; ``recorded`` has the commands
-    of a driver that cannot give them again. Overflow bits stay until a reset, so that one look at
-    the end has all.
+    Joint trajectories are evaluated in the loop, as in the episode; ``commands`` are those of a
+    driver that cannot give them again, shape ``(steps, nworld, nu)``. Overflow bits stay until a
+    reset, so that one look at the end has all.
 
     Returns:
         Seconds, and why they do not count: empty where they do.
@@ -126,7 +129,13 @@ def play_bare(
     if sim.device.type == "cuda" and cfg.graph != "off" and not step.captured:
         return math.nan, "the bare steps could not be captured"
     env = stage.start(sim, cfg.reset)
-    driver = stage.driver(env) if recorded is None else recorded
+    if commands is None:
+        driver = stage.driver(env)
+    else:  # a knot at every step
+        numbers = torch.arange(len(commands), device=sim.device)[:, None]
+        weights = torch.ones_like(numbers, dtype=commands.dtype)
+        knots = commands.transpose(0, 1)
+        driver = OpenLoopDriver(JointTrajectory(knots, weights, numbers, np.zeros(len(knots))), [])
 
     def physics() -> None:
         for _ in range(cfg.timing.decimation):
@@ -148,13 +157,13 @@ def _play(stage: Stage, sim: Simulation, meter: EnergyMeter, out: Measurement) -
     """
     cfg = stage.cfg
     mjwarp = sim.backend == "mjwarp"
-    commands = CommandRecorder()
+    recorder = CommandRecorder()
     keep = mjwarp and cfg.controller.name in FEEDBACK
-    recorders: list[Observer] = [commands] if keep else []
+    recorders: list[Observer] = [recorder] if keep else []
     episode = stage.play(sim, cfg.reset, [*recorders, EnergyObserver(meter)])
     if mjwarp:
-        recorded = commands.recorded if keep else None
-        bare, problem = play_bare(stage, cast("MjwarpSimulation", sim), recorded)
+        commands = recorder.commands if keep else None
+        bare, problem = play_bare(stage, cast("MjwarpSimulation", sim), commands)
         out.problem = out.problem or problem
         out.samples.setdefault("bare_seconds", []).append(bare)
         out.samples.setdefault("bare_ratio", []).append(episode.timing.seconds / bare)

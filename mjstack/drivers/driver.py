@@ -64,43 +64,19 @@ def require_actions(cfg: Config, terms: Mapping[str, TermCfg], expected: str) ->
         raise ArgumentError("env", f"actions for {repeats} control steps", expected, fix)
 
 
-class Recorded(Driver):
-    """Joint targets of an episode of another driver, given again.
-
-    Memory: ``steps * nworld * (4 * nu + 2)`` bytes on the device, 0.85 GB for 2,000 steps of 16,384
-    worlds with six joint targets. ``job=replay`` needs none of it: it plays a world from its seed.
-    """
-
-    def __init__(self, source: Driver, commands: Tensor, phases: Tensor) -> None:
-        """Take the driver, its commands ``(steps, nworld, nu)`` and phases ``(steps, nworld)``."""
-        super().__init__(len(source.phase), source.steps, source.phase.device, source.phases)
-        self.error = source.error
-        self.retries = source.retries
-        self._commands = commands
-        self._phases = phases
-        self._next = torch.zeros(1, dtype=torch.int64, device=source.phase.device)
-
-    def command(self) -> Tensor:
-        """Commands of the next step, shape ``(nworld, nu)``."""
-        out = self._commands.index_select(0, self._next)[0]
-        self.phase.copy_(self._phases.index_select(0, self._next)[0])
-        self._next.add_(1).clamp_(max=self.steps - 1)  # past the end the last one holds
-        return out
-
-
 class OpenLoopDriver(Driver):
     """Plays joint trajectories once, from the start that they were planned for: every world is in
     the same phase.
     """
 
     def __init__(self, trajectory: JointTrajectory, phases: list[Phase]) -> None:
-        """Take the trajectory, which must be on the device."""
+        """Take the trajectory, which must be on the device, and its phases, if it has any."""
         device = trajectory.knots.device
         super().__init__(len(trajectory.knots), trajectory.steps, device, phases)
         self.error = torch.as_tensor(trajectory.waypoint_error, device=device)
         self._trajectory = trajectory
-        lengths = torch.tensor([phase.stop - phase.start for phase in phases], device=device)
-        self._phase_at = torch.arange(len(phases), device=device).repeat_interleave(lengths)
+        numbers = [k for k, phase in enumerate(phases) for _ in range(phase.start, phase.stop)]
+        self._phase_at = torch.tensor(numbers or [0] * self.steps, device=device)
         self._next = torch.zeros(1, dtype=torch.int64, device=device)
 
     def command(self) -> Tensor:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mjstack.drivers.driver import Driver, Recorded
+from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.rollout import Observer, State
 
@@ -116,21 +116,22 @@ class WorldRecorder(Recorder):
 def _read_commands(env: Env, driver: Driver) -> Read:
     ctrl = env.sim.ctrl
     columns = env.index.on(env.device, ctrl.dtype).ctrl
-    return lambda: {
-        "ctrl": columns.read(ctrl).float(),
-        "phase": driver.phase.to(torch.int16),
-    }
+    return lambda: {"ctrl": columns.read(ctrl).float()}
 
 
 class CommandRecorder(Recorder):
-    """Records the joint targets of all worlds."""
+    """Records the joint targets of all worlds.
+
+    Memory: ``steps * nworld * 4 * nu`` bytes on the device, 0.79 GB for 2,000 steps of 16,384
+    worlds with six joint targets.
+    """
 
     channels = (Channels(_read_commands),)
 
     @property
-    def recorded(self) -> Recorded:
-        """A driver that gives them again from the first step on."""
-        return Recorded(self.driver, self.rows["ctrl"], self.rows["phase"])
+    def commands(self) -> Tensor:
+        """Shape ``(steps, nworld, nu)``, float32."""
+        return self.rows["ctrl"]
 
 
 def _read_state(env: Env, driver: Driver) -> Read:
