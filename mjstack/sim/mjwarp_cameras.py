@@ -127,20 +127,18 @@ class MjwarpCameras(Cameras):
         rc = self._context
         camera = self.cameras[name]
         number = self._numbers[name]
-        copies = {
-            "rgb": (copy_rgb, [rc.rgb_data, rc.rgb_adr]),
-            "depth": (copy_depth, [rc.depth_data, rc.depth_adr]),
-            "segmentation": (copy_labels, [rc.seg_data, rc.seg_adr, self._labels]),
-        }
-        for output in camera.outputs:
-            kernel, inputs = copies[output]
-            image = out[f"{PREFIXES[output]}.{name}"]
-            wp.launch(
-                kernel,
-                dim=(self._nworld, *camera.size),
-                inputs=[due, number, self._places[number], *inputs],
-                outputs=[wp.from_torch(image)],
-            )
+        images = [
+            wp.from_torch(out[f"{prefix}.{name}"]) if output in camera.outputs else None
+            for output, prefix in PREFIXES.items()
+        ]
+        pixels = [rc.rgb_adr, rc.depth_adr, rc.seg_adr, rc.rgb_data, rc.depth_data, rc.seg_data]
+        places = self._places[number]
+        wp.launch(
+            copy_pixels,
+            dim=(self._nworld, *camera.size),
+            inputs=[due, number, places, *pixels, self._labels, camera.size[1]],
+            outputs=images,
+        )
 
 
 @wp.kernel(enable_backward=False)
@@ -160,53 +158,38 @@ def send_away(
 
 
 @wp.kernel(enable_backward=False)
-def copy_rgb(
+def copy_pixels(
     due: wp.array2d[bool],
     number: int,
     places: wp.array[int],
-    pixels: wp.array2d[wp.uint32],
-    first: wp.array[int],
-    out: wp.array4d[wp.uint8],
-) -> None:
-    """Red, green and blue of the worlds that are due, from words of alpha, red, green and blue."""
-    world, y, x = wp.tid()  # type: ignore[misc]
-    if due[world, number]:
-        word = pixels[world, first[number] + places[y * out.shape[2] + x]]
-        out[world, y, x, 0] = wp.uint8(word >> wp.uint32(16))
-        out[world, y, x, 1] = wp.uint8(word >> wp.uint32(8))
-        out[world, y, x, 2] = wp.uint8(word)
-
-
-@wp.kernel(enable_backward=False)
-def copy_depth(
-    due: wp.array2d[bool],
-    number: int,
-    places: wp.array[int],
-    pixels: wp.array2d[float],
-    first: wp.array[int],
-    out: wp.array4d[float],
-) -> None:
-    """Depth of the worlds that are due."""
-    world, y, x = wp.tid()  # type: ignore[misc]
-    if due[world, number]:
-        out[world, y, x, 0] = pixels[world, first[number] + places[y * out.shape[2] + x]]
-
-
-@wp.kernel(enable_backward=False)
-def copy_labels(
-    due: wp.array2d[bool],
-    number: int,
-    places: wp.array[int],
-    pixels: wp.array2d[wp.vec2i],
-    first: wp.array[int],
+    first_word: wp.array[int],
+    first_depth: wp.array[int],
+    first_geom: wp.array[int],
+    words: wp.array2d[wp.uint32],
+    depths: wp.array2d[float],
+    geoms: wp.array2d[wp.vec2i],
     labels: wp.array[int],
-    out: wp.array3d[int],
+    width: int,
+    rgb: wp.array4d[wp.uint8],
+    depth: wp.array4d[float],
+    segmentation: wp.array3d[int],
 ) -> None:
-    """Labels of the geoms that the worlds which are due show; -1 where there is none."""
+    """Images of the worlds that are due, where there is memory for them: red, green and blue from
+    words of alpha, red, green and blue; depth; labels of geoms, -1 where there is none.
+    """
     world, y, x = wp.tid()  # type: ignore[misc]
-    if due[world, number]:
-        geom = pixels[world, first[number] + places[y * out.shape[2] + x]][0]
+    if not due[world, number]:
+        return
+    place = places[y * width + x]
+    if rgb:
+        word = words[world, first_word[number] + place]
+        rgb[world, y, x, 0] = wp.uint8(word >> wp.uint32(16))
+        rgb[world, y, x, 1] = wp.uint8(word >> wp.uint32(8))
+        rgb[world, y, x, 2] = wp.uint8(word)
+    if depth:
+        depth[world, y, x, 0] = depths[world, first_depth[number] + place]
+    if segmentation:
+        geom = geoms[world, first_geom[number] + place][0]
+        segmentation[world, y, x] = -1
         if geom >= 0:
-            out[world, y, x] = labels[geom]
-        else:
-            out[world, y, x] = -1
+            segmentation[world, y, x] = labels[geom]
