@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 from compositions import load_config
+from doc_blocks import ROOT, write_files
 
-from mjstack.drivers.roles import Role, find_roles
+from mjstack import load_config as load_from
+from mjstack.config.schema import Config
+from mjstack.drivers.roles import ObjectRoles, Role, find_roles
 from mjstack.drivers.state_based import StateBasedDriver
 from mjstack.envs import Env
 from mjstack.episodes.stage import Stage
@@ -37,9 +41,42 @@ def started(get_stage: GetStage, robot: str, *overrides: str, nworld: int) -> tu
 )
 def test_episodes_are_accepted(get_stage: GetStage, robot: str, task: str, steps: int) -> None:
     """The episode is as long as the expert needs, and the window of rest."""
-    own = get_stage(robot, f"task={task}", EXPERT, "sim=native", "reset=randomized")
-    cfg = replace(own.cfg, task=replace(own.cfg.task, episode_steps=steps))
-    stage = own.with_config(cfg)
+    accept(get_stage(robot, f"task={task}", EXPERT, "sim=native", "reset=randomized"), steps)
+
+
+@pytest.mark.parametrize(
+    ("robot", "task", "steps"),
+    [
+        ("so101", "lift", 170),
+        pytest.param("rebot", "lift", 170, marks=pytest.mark.full),
+        pytest.param("so101", "tower", 520, marks=pytest.mark.full),
+        pytest.param("rebot", "tower", 520, marks=pytest.mark.full),
+    ],
+)
+def test_tasks_of_ones_own_are_accepted(
+    robot: str, task: str, steps: int, folder: Callable[[str], Path]
+) -> None:
+    choices = [f"robot={robot}", f"task={task}", EXPERT, "sim=native", "reset=randomized"]
+    accept(Stage(load_from(choices, config_dir=folder(task))), steps)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """The configuration folder of an example, or of a task of the guide."""
+    guide = tmp_path_factory.mktemp("guide")
+    write_files((ROOT / "docs" / "own_tasks.md").read_text(encoding="utf-8"), guide)
+
+    def find(task: str) -> Path:
+        example = ROOT / "examples" / task / "conf"
+        return example if example.is_dir() else guide / task / "conf"
+
+    return find
+
+
+def accept(whole: Stage, steps: int) -> None:
+    """Play an episode of that many steps in a few worlds, all of which succeed."""
+    cfg = replace(whole.cfg, task=replace(whole.cfg.task, episode_steps=steps))
+    stage = whole.with_config(cfg)
     episode = stage.play(stage.batch_simulation(4), cfg.reset)
     assert not episode.failed.any(), stage.check.rules.failing(episode.failed)
 
@@ -68,17 +105,40 @@ def test_a_command_is_a_function_of_the_state(get_stage: GetStage) -> None:
 def test_roles_are_found_in_the_phases() -> None:
     cfg = load_config(["task=box"])
     phases = build_phases(cfg)
-    names, rows = find_roles(cfg, phases, ["red", "blue"])
-    assert names == ["red", "blue"]
-    roles = [f"{phases[k].name}" for k in rows[1]]
+    found = find_roles(cfg, phases)
+    assert [roles.name for roles in found] == ["red", "blue"]
+    roles = [f"{phases[k].name}" for k in found[1].phases]
     assert roles == [
         f"{each}_blue"
         for each in ("approach", "descend", "close", "carry", "hold", "open", "retreat")
     ]
     assert len(roles) == len(Role)
-    _, ((over, *others),) = find_roles(
-        reach := load_config(["task=reach"]), build_phases(reach), []
-    )
-    assert (over, set(others)) == (0, {1})
-    with pytest.raises(ConfigError, match="another controller, because task stack has no goals"):
-        find_roles(stack := load_config(), build_phases(stack), [])
+    ((_, way, (over, *others)),) = find(load_config(["task=reach"]))
+    assert (way, over, set(others)) == ("approach", 0, {1})
+
+
+def test_an_object_that_nothing_lets_go_of_is_kept(folder: Callable[[str], Path]) -> None:
+    cfg = load_from(["task=lift"], config_dir=folder("lift"))
+    ((name, way, numbers),) = find(cfg)
+    names = list(cfg.controller.phases)
+    assert (name, way, names[numbers[Role.close]]) == ("can", "grasp", "grasp")
+    assert {names[k] for k in numbers[Role.carry :]} == {"lift"}
+
+
+def find(cfg: Config) -> list[ObjectRoles]:
+    return find_roles(cfg, build_phases(cfg))
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        (["grasp_red.grasps=null", "place_stack.level=center", "release.level=center",
+          "grasp_red.retry=null"], "grasp no object, and do not keep to a single one"),
+        (["above_blue.anchor=red", "place_stack.anchor=red", "place_stack.level=center"],
+         "let go of red where it is, which no state tells from before"),
+    ],
+)  # fmt: skip
+def test_what_no_state_tells_is_refused(changes: list[str], why: str) -> None:
+    cfg = load_config([f"controller.phases.{change}" for change in changes])
+    with pytest.raises(ConfigError, match=f"because the phases of task stack {why}"):
+        find(cfg)

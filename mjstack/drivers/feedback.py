@@ -18,7 +18,7 @@ from mjstack.kinematics.batched_ik import BatchedIk
 from mjstack.managers.view import EnvView
 from mjstack.math import atan2
 from mjstack.mdp.geometry import gripper_opening, objects_in_hand, place_xy, pose_w, robot
-from mjstack.scene.phases import Target, build_phases, source_names
+from mjstack.scene.phases import Phase, build_phases, source_names
 
 STAY = 0.3  # how much a roll made so far weighs against the face that is nearer
 
@@ -72,8 +72,11 @@ class FeedbackDriver(Driver):
         self._n_arm = env.index.n_arm
         self._nominal = torch.as_tensor(nominal, dtype=torch.float32, device=device)
 
-        # Targets of the phases, a row per phase
-        targets = [phase.target or Target(0, -1, (0.0, 0.0), 0.0, 0.0) for phase in self._plan]
+        # Targets of the phases, a row per phase: without its own, a phase has the one before
+        self._aimed: list[Phase] = []
+        for phase in self._plan:
+            self._aimed.append(phase if phase.target else self._aimed[-1])
+        targets = [phase.target for phase in self._aimed if phase.target]
         self._target = torch.tensor([[*t.offset, t.z] for t in targets], device=device)
         self._source = torch.tensor([t.source for t in targets], device=device)
         self._toward = torch.tensor([max(t.toward, 0) for t in targets], device=device)

@@ -1,7 +1,8 @@
-"""Roles of the configured phases in bringing objects to their goals, for the state-based expert."""
+"""Roles of the configured phases in moving objects, for the state-based expert."""
 
 from collections.abc import Sequence
 from enum import IntEnum
+from typing import Literal, NamedTuple
 
 from mjstack.config.schema import Config
 from mjstack.errors import ConfigError
@@ -20,52 +21,71 @@ class Role(IntEnum):
     retreat = 6
 
 
-def find_roles(
-    cfg: Config, phases: Sequence[Phase], goals: Sequence[str]
-) -> tuple[list[str], list[list[int]]]:
-    """The objects of a task, and for each the number of the phase that plays each `Role`.
+class ObjectRoles(NamedTuple):
+    """What the phases do with an object.
+
+    Attributes:
+        name: The object.
+        way: The jaws grasp it, or the grasp point only goes there.
+        phases: Number of the phase that plays each `Role`. One that nothing follows, such as the
+            lift of an object that is kept, plays those after it too.
+    """
+
+    name: str
+    way: Literal["grasp", "approach"]
+    phases: list[int]
+
+
+def find_roles(cfg: Config, phases: Sequence[Phase]) -> list[ObjectRoles]:
+    """What the phases do with each object that they move, in their order.
 
     Args:
         cfg: The configuration.
         phases: Its phases.
-        goals: Objects with goals.
 
     Raises:
-        ConfigError: The phases do not bring an object to its goal, or there is none and the phases
-            have more than one target.
+        ConfigError: They do nothing that a state tells.
     """
-    things = cfg.scene.objects
-    if not goals:
-        moves = [k for k, phase in enumerate(phases) if phase.target is not None]
-        anchor = str(phases[moves[0]].spec.anchor) if moves else ""
-        targets = {(phase.spec.anchor or anchor, phase.spec.gripper) for phase in phases}
-        if len(targets) != 1 or anchor not in things:
-            raise _refusal(cfg, "has no goals")
-        return [anchor], [[moves[0]] + [moves[-1]] * (len(Role) - 1)]
-    sources = source_names(cfg.scene)
-    rows = []
-    for name in goals:
-        number = sources.index(name)
-        closes = [k for k, phase in enumerate(phases) if phase.grasped == number]
-        carries = [k for k, phase in enumerate(phases) if phase.carried == number]
-        if not closes or not carries or closes[0] == 0:
-            raise _refusal(cfg, f"does not bring {name} to its goal in its phases")
-        close = closes[-1]
+    names = source_names(cfg.scene)
+    moves = [k for k, phase in enumerate(phases) if phase.target is not None]
+    moved: dict[str, ObjectRoles] = {}
+    for close, phase in enumerate(phases):
+        if phase.grasped < 0:
+            continue
+        name = names[phase.grasped]
+        if close == 0:
+            raise _refusal(cfg, f"grasp {name} without a phase before that leads to it")
+        carries = [k for k in moves if k > close and phases[k].carried == phase.grasped] or [close]
+        place = carries[-1]
+        last, retreat = _find_release(phases, place)
+        if last != place and phases[place].spec.anchor in (name, None):
+            raise _refusal(cfg, f"let go of {name} where it is, which no state tells from before")
         over = close - 1
         while over > 0 and phases[over - 1].spec.anchor == name:
             over -= 1
-        place = carries[-1]
-        carry = carries[-2] if len(carries) > 1 else place
-        after = [k for k in range(place + 1, len(phases)) if phases[k].target is not None]
-        last = after[0] if after else place
-        retreat = after[1] if len(after) > 1 else last
-        rows.append([over, close - 1, close, carry, place, last, retreat])
-    return list(goals), rows
+        row = [over, close - 1, close, carries[-2:][0], place, last, retreat]
+        moved[name] = ObjectRoles(name, "grasp", row)
+    if not moved:
+        anchor = str(phases[moves[0]].spec.anchor) if moves else ""
+        targets = {(phase.spec.anchor or anchor, phase.spec.gripper) for phase in phases}
+        if len(targets) != 1 or anchor not in cfg.scene.objects:
+            raise _refusal(cfg, "grasp no object, and do not keep to a single one")
+        row = [moves[0]] + [moves[-1]] * (len(Role) - 1)
+        moved[anchor] = ObjectRoles(anchor, "approach", row)
+    return list(moved.values())
+
+
+def _find_release(phases: Sequence[Phase], place: int) -> tuple[int, int]:
+    """Numbers of the phase that lets go of what was placed, and of the next that leads away."""
+    after = range(place + 1, len(phases))
+    last = next((k for k in after if phases[k].target or phases[k].spec.gripper == "open"), place)
+    return last, next((k for k in after if k > last and phases[k].target), last)
 
 
 def _refusal(cfg: Config, why: str) -> ConfigError:
-    expected = f"another controller, because task {cfg.task.name} {why}"
-    return ConfigError("controller", cfg.controller.name, expected, "Set controller=closed_loop")
+    expected = f"another controller, because the phases of task {cfg.task.name} {why}"
+    fix = "Set controller=closed_loop, or trainer=clone to train a policy"
+    return ConfigError("controller", cfg.controller.name, expected, fix)
 
 
 def follows_anchor(phase: Phase, things: Sequence[str]) -> bool:

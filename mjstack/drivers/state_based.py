@@ -45,8 +45,7 @@ _STUCK = 0.010  # m: so much higher above it, where the arm is at a standstill
 _STILL = 0.3  # rad/s, m/s: a joint that moves faster is not
 _REACH = 0.013  # m: an object whose surface is so near the grasp point is between the jaws
 _AT_GOAL = 0.007  # m: horizontally so near its goal, an object is let go of,
-_ABOVE = 0.004  # if it is this little higher than the phases let go of it,
-_BELOW = 0.010  # and no lower than this under its goal
+_ABOVE = 0.004  # if it is at most this much higher than the phases let go of it
 _LEFT = 0.08  # m: so near an object that was let go of, the gripper keeps its tilt
 _OFF_CENTER = (0.015, 0.015, 0.010)  # m: so far from the grasp point, an object is made up for
 
@@ -72,15 +71,15 @@ class _Due(NamedTuple):
 class StateBasedDriver(FeedbackDriver):
     """Joint targets that are a function of the simulation's state: no clock, no memory.
 
-    The objects that `EpisodeCheck.goals` names go to their goals one after the other, as far as
+    The objects that the phases grasp go to their goals one after the other, as far as
     `EpisodeCheck.placed` and the measured positions do not find them there. The configured phases
     say where the grasp point goes: over the object, down, close, up and over its goal, down, open,
     up. The state says which of these is due in each world. The grasp point stays as high above a
     target as it is away from it horizontally, the jaws are turned or the gripper is not open, and
     moves straight up where it is too low. A held object that is off the grasp point is made up
-    for.
+    for. One that no phase lets go of, as in a lift, is kept where the phases bring it last.
 
-    In a task without goals, such as reach, the grasp point goes to the only target of the phases.
+    Where nothing is grasped, as in reach, the grasp point goes to the only target of the phases.
 
     A check judges it as it judges a policy: it has no phases. ``error`` and ``retries`` stay 0.
 
@@ -93,7 +92,8 @@ class StateBasedDriver(FeedbackDriver):
         """Allocate for the environment's worlds; arguments as of `FeedbackDriver`.
 
         Raises:
-            MjstackError: As of `FeedbackDriver`, or the task has no goals.
+            MjstackError: As of `FeedbackDriver`, the task has no check, or its phases do nothing
+                that a state tells, see `find_roles`.
         """
         super().__init__(env, nominal, clock=False)
         cfg = env.cfg
@@ -101,21 +101,25 @@ class StateBasedDriver(FeedbackDriver):
         plan = self._plan
         self.due = torch.zeros_like(self.phase)
 
-        # The task: objects and the phases that bring each to its goal
+        # The task: objects, the phases that move each, and its column of `EpisodeCheck.placed`
         self._check = make_check(cfg)
         self._view = self._check.view(env)
-        self._goals = list(self._check.goals(self._view.step()))
-        moved, roles = find_roles(cfg, plan, self._goals)
+        moved = find_roles(cfg, plan)
         things = list(cfg.scene.objects)
-        self._roles = torch.tensor(roles, device=device)
-        self._moved = torch.tensor([things.index(name) for name in moved], device=device)
-        size = [max(cfg.scene.objects[name].half) + _REACH for name in moved]
+        judged = self._check.objects
+        columns = [judged.index(r.name) if r.name in judged else len(judged) for r in moved]
+        self._judged = torch.tensor(columns, device=device)
+        self._moved = torch.tensor([things.index(r.name) for r in moved], device=device)
+        self._grasps = torch.tensor([r.way == "grasp" for r in moved], device=device)
+        self._roles = torch.tensor([r.phases for r in moved], device=device)
+        self._leaves = self._roles[:, Role.open] != self._roles[:, Role.place]
+        size = [max(cfg.scene.objects[r.name].half) + _REACH for r in moved]
         self._reach = torch.tensor(size, device=device)
 
         # Heights of targets: over an anchor that may stand anywhere, or over the table
-        above = [phase.target.above if phase.target else 0.0 for phase in plan]
+        above = [phase.target.above if phase.target else 0.0 for phase in self._aimed]
         self._above = torch.tensor(above, device=device)
-        follows = [follows_anchor(phase, things) for phase in plan]
+        follows = [follows_anchor(phase, things) for phase in self._aimed]
         self._follows = torch.tensor(follows, device=device)
         self._off_center = torch.tensor(_OFF_CENTER, device=device)
 
@@ -212,20 +216,18 @@ class StateBasedDriver(FeedbackDriver):
         """
         pos = state.pos.index_select(1, self._moved)
         between = self._gap(state) <= self._reach
-        grasped = state.in_hand.index_select(1, self._moved) & between
-        if not self._goals:
-            return torch.zeros_like(grasped), torch.zeros_like(grasped), between
-        step = self._view.step()
-        placed = self._view.columns(self._goals).read(self._check.placed(step))
-        goals = torch.stack(list(self._check.goals(step).values()), dim=1).float()
+        grasped = state.in_hand.index_select(1, self._moved) & between & self._grasps
+        placed = self._check.placed(self._view.step())
+        unknown = torch.zeros_like(placed[:, :1])  # of an object that the check does not judge
+        placed = torch.cat((placed, unknown), dim=1).index_select(1, self._judged)
         releases = [
             self._point(state, row[Role.place].expand(len(pos))) - self._grasp_offset(row)
             for row in self._roles
         ]
         offset = pos - torch.stack(releases, dim=1)
         across = torch.linalg.vector_norm(offset[..., :2], dim=2)
-        low = (offset[..., 2] <= _ABOVE) & (pos[..., 2] >= goals[..., 2] - _BELOW)
-        return (across <= _AT_GOAL) & low | placed & ~grasped, grasped, between
+        there = (across <= _AT_GOAL) & (offset[..., 2] <= _ABOVE)
+        return (there | placed & ~grasped) & self._leaves, grasped, between
 
     def _lead_point(self, state: State, due: _Due) -> tuple[Tensor, Tensor]:
         """Where the grasp point is led in this step [m], shape ``(nworld, 3)``, and the number of
@@ -317,7 +319,7 @@ class StateBasedDriver(FeedbackDriver):
         return self._cfg.controller.yaw_alignment * rolls.gather(0, nearest)[0] - roll
 
     def _gap(self, state: State) -> Tensor:
-        """Distance of the grasp point from each object with a goal [m], ``(nworld, objects)``."""
+        """Distance of the grasp point from each moved object [m], ``(nworld, objects)``."""
         pos = state.pos.index_select(1, self._moved)
         return torch.linalg.vector_norm(state.point[:, None] - pos, dim=2)
 
