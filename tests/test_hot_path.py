@@ -98,7 +98,7 @@ PATHS: dict[str, dict[str, str] | None] = {
     "drivers/feedback.py": {"FeedbackDriver": "_observe _aim _last_seen _measure _keep_finite"},
     "drivers/state_based.py": {
         "StateBasedDriver": (
-            "command _decide _find_delivered _lead_point _tilted _turn_left _point _grasp_offset"
+            "command _decide _find_delivered _lead_point _tilted _turn_left _point _grasp_offsets"
         ),
     },
     "train/rounds.py": {"MixedDriver": "command"},

@@ -47,6 +47,8 @@ def test_episodes_are_accepted(get_stage: GetStage, robot: str, task: str, steps
 @pytest.mark.parametrize(
     ("robot", "task", "steps"),
     [
+        ("so101", "push", 180),
+        pytest.param("rebot", "push", 260, marks=pytest.mark.full),
         ("so101", "lift", 170),
         pytest.param("rebot", "lift", 170, marks=pytest.mark.full),
         pytest.param("so101", "tower", 520, marks=pytest.mark.full),
@@ -125,6 +127,40 @@ def test_an_object_that_nothing_lets_go_of_is_kept(folder: Callable[[str], Path]
     assert {names[k] for k in numbers[Role.carry :]} == {"lift"}
 
 
+def test_closed_jaws_that_leave_an_object_for_its_goal_push_it(
+    folder: Callable[[str], Path],
+) -> None:
+    cfg = load_from(["task=push"], config_dir=folder("push"))
+    ((name, way, numbers),) = find(cfg)
+    names = list(cfg.controller.phases)
+    assert (name, way) == ("puck", "push")
+    roles = ["above", "descend", "descend", "push", "push", "release", "retreat"]
+    assert [names[k] for k in numbers] == roles
+    first, *others = build_phases(cfg)
+    held = replace(first, spec=replace(first.spec, gripper="open"))
+    # Without the gripper opening, what leads away comes after the push.
+    up = [replace(phase, spec=replace(phase.spec, gripper="closed")) for phase in others[2:]]
+    ((_, _, numbers),) = find_roles(cfg, [held, others[0], others[1], up[1]])
+    assert numbers == [0, 1, 1, 2, 2, 3, 3]
+
+
+def test_a_push_goes_on_from_wherever_the_arm_is(folder: Callable[[str], Path]) -> None:
+    """Pulled up in the middle of a push."""
+    choices = ["task=push", EXPERT, "sim=native", "reset=jitter"]
+    stage = Stage(load_from(choices, config_dir=folder("push")))
+    env = stage.start(stage.batch_simulation(1), stage.cfg.reset)
+    driver = stage.driver(env)
+    for step in range(160):
+        command = driver.command().clone()
+        if 45 <= step < 55:
+            command[:, 1] -= 0.05
+        env.step(command)
+    puck = stage.check.view(env).step()
+    assert stage.check.placed(puck).all()
+    assert puck.untouched.all()
+    env.close()
+
+
 def find(cfg: Config) -> list[ObjectRoles]:
     return find_roles(cfg, build_phases(cfg))
 
@@ -133,7 +169,8 @@ def find(cfg: Config) -> list[ObjectRoles]:
     ("changes", "why"),
     [
         (["grasp_red.grasps=null", "place_stack.level=center", "release.level=center",
-          "grasp_red.retry=null"], "grasp no object, and do not keep to a single one"),
+          "grasp_red.retry=null", "lift_red.gripper=open"],
+         "neither grasp an object, nor push one with closed jaws, nor keep"),
         (["above_blue.anchor=red", "place_stack.anchor=red", "place_stack.level=center"],
          "let go of red where it is, which no state tells from before"),
     ],

@@ -26,13 +26,13 @@ class ObjectRoles(NamedTuple):
 
     Attributes:
         name: The object.
-        way: The jaws grasp it, or the grasp point only goes there.
+        way: The jaws grasp it, push it while they are closed, or the grasp point only goes there.
         phases: Number of the phase that plays each `Role`. One that nothing follows, such as the
             lift of an object that is kept, plays those after it too.
     """
 
     name: str
-    way: Literal["grasp", "approach"]
+    way: Literal["grasp", "push", "approach"]
     phases: list[int]
 
 
@@ -49,34 +49,53 @@ def find_roles(cfg: Config, phases: Sequence[Phase]) -> list[ObjectRoles]:
     names = source_names(cfg.scene)
     moves = [k for k, phase in enumerate(phases) if phase.target is not None]
     moved: dict[str, ObjectRoles] = {}
+    way: Literal["grasp", "push"]
     for close, phase in enumerate(phases):
-        if phase.grasped < 0:
+        later = [k for k in moves if k > close]
+        if phase.grasped >= 0:
+            name = names[phase.grasped]
+            if close == 0:
+                raise _refusal(cfg, f"grasp {name} without a phase before that leads to it")
+            way = "grasp"
+            down = close - 1
+            places = [k for k in later if phases[k].carried == phase.grasped] or [close]
+        elif later and _pushes(phase, phases[later[0]]) and phase.spec.anchor in cfg.scene.free:
+            name = str(phase.spec.anchor)
+            way = "push"
+            down = close
+            places = later[:1]
+        else:
             continue
-        name = names[phase.grasped]
-        if close == 0:
-            raise _refusal(cfg, f"grasp {name} without a phase before that leads to it")
-        carries = [k for k in moves if k > close and phases[k].carried == phase.grasped] or [close]
-        place = carries[-1]
-        last, retreat = _find_release(phases, place)
-        if last != place and phases[place].spec.anchor in (name, None):
+        last, retreat = _find_release(phases, places[-1])
+        if last != places[-1] and phases[places[-1]].spec.anchor in (name, None):
             raise _refusal(cfg, f"let go of {name} where it is, which no state tells from before")
-        over = close - 1
+        over = down
         while over > 0 and phases[over - 1].spec.anchor == name:
             over -= 1
-        row = [over, close - 1, close, carries[-2:][0], place, last, retreat]
-        moved[name] = ObjectRoles(name, "grasp", row)
+        row = [over, down, close, places[-2:][0], places[-1], last, retreat]
+        moved[name] = ObjectRoles(name, way, row)
     if not moved:
         anchor = str(phases[moves[0]].spec.anchor) if moves else ""
         targets = {(phase.spec.anchor or anchor, phase.spec.gripper) for phase in phases}
         if len(targets) != 1 or anchor not in cfg.scene.objects:
-            raise _refusal(cfg, "grasp no object, and do not keep to a single one")
+            why = "neither grasp an object, nor push one with closed jaws, nor keep to a single one"
+            raise _refusal(cfg, why)
         row = [moves[0]] + [moves[-1]] * (len(Role) - 1)
         moved[anchor] = ObjectRoles(anchor, "approach", row)
     return list(moved.values())
 
 
+def _pushes(phase: Phase, later: Phase) -> bool:
+    """Whether closed jaws go from beside an object to another anchor, and push it there."""
+    closed = phase.spec.gripper == later.spec.gripper == "closed"
+    free = max(phase.grasped, phase.carried, later.grasped, later.carried) < 0
+    return closed and free and phase.target is not None and phase.spec.anchor != later.spec.anchor
+
+
 def _find_release(phases: Sequence[Phase], place: int) -> tuple[int, int]:
-    """Numbers of the phase that lets go of what was placed, and of the next that leads away."""
+    """Numbers of the phase that lets go of what was placed, and of the next that leads away: the
+    same one, if the gripper opens in none before it.
+    """
     after = range(place + 1, len(phases))
     last = next((k for k in after if phases[k].target or phases[k].spec.gripper == "open"), place)
     return last, next((k for k in after if k > last and phases[k].target), last)

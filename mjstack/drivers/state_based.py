@@ -19,8 +19,10 @@ from mjstack.tasks.check import make_check
 
 # How fast
 _SPEED = 0.5  # m/s, of the grasp point
-_CARRY_SPEED = 0.25  # m/s, with an object
-_SLOWING = 0.5  # largest share of the distance that is left, in one step
+_CARRY_SPEED = 0.25  # m/s, with an object in the jaws
+_PUSH_SPEED = 0.1  # m/s, with one before them
+_SLOWING = 0.5  # largest share of the distance that is left, in one step,
+_PUSH_SLOWING = 0.4  # and with an object before the jaws
 _JOINT = 0.25  # rad, m: largest lead of a joint
 _ROLL = 0.1  # rad: largest lead of the roll
 _BEYOND = 10.0  # what a roll beyond the joint's range costs, per rad
@@ -47,12 +49,15 @@ _REACH = 0.013  # m: an object whose surface is so near the grasp point is betwe
 _AT_GOAL = 0.007  # m: horizontally so near its goal, an object is let go of,
 _ABOVE = 0.004  # if it is at most this much higher than the phases let go of it
 _LEFT = 0.08  # m: so near an object that was let go of, the gripper keeps its tilt
+_BESIDE = 0.015  # m: so near the way from beside an object to where they push it, jaws push it,
+_SHUT = 0.3  # if they are open by no more than this share of their opening
 _OFF_CENTER = (0.015, 0.015, 0.010)  # m: so far from the grasp point, an object is made up for
 
 
 class _Due(NamedTuple):
     """The next thing to do: the role, the phases of the object's roles, the object's number,
-    whether it is grasped, whether the grasp point is led along with it, whether the way is a
+    from its centre to the grasp point that moves it, whether the jaws are to push it, whether it
+    is grasped or being pushed, whether the grasp point is led along with it, whether the way is a
     funnel, how far the roll is off, and whether objects were let go of before, and the gripper is
     still beside one.
     """
@@ -60,6 +65,8 @@ class _Due(NamedTuple):
     role: Tensor
     phases: Tensor
     object: Tensor
+    offset: Tensor
+    pushes: Tensor
     grasped: Tensor
     led: Tensor
     funnel: Tensor
@@ -79,7 +86,9 @@ class StateBasedDriver(FeedbackDriver):
     moves straight up where it is too low. A held object that is off the grasp point is made up
     for. One that no phase lets go of, as in a lift, is kept where the phases bring it last.
 
-    Where nothing is grasped, as in reach, the grasp point goes to the only target of the phases.
+    An object that closed jaws push is moved likewise: over the place beside it, down, to the object
+    and with it to its goal, open, up. Where nothing is moved, as in reach, the grasp point goes to
+    the only target of the phases.
 
     A check judges it as it judges a policy: it has no phases. ``error`` and ``retries`` stay 0.
 
@@ -111,10 +120,15 @@ class StateBasedDriver(FeedbackDriver):
         self._judged = torch.tensor(columns, device=device)
         self._moved = torch.tensor([things.index(r.name) for r in moved], device=device)
         self._grasps = torch.tensor([r.way == "grasp" for r in moved], device=device)
+        self._pushed = [k for k, r in enumerate(moved) if r.way == "push"]
+        self._pushes = torch.tensor([r.way == "push" for r in moved], device=device)
+        self._opened = torch.tensor([p.spec.gripper == "open" for p in plan], device=device)
         self._roles = torch.tensor([r.phases for r in moved], device=device)
         self._leaves = self._roles[:, Role.open] != self._roles[:, Role.place]
+        self._lets_go = self._opened[self._roles[:, Role.open]]
         size = [max(cfg.scene.objects[r.name].half) + _REACH for r in moved]
-        self._reach = torch.tensor(size, device=device)
+        beside = self._target[self._roles[:, Role.down], :2].norm(dim=1) * self._pushes
+        self._reach = torch.tensor(size, device=device) + beside
 
         # Heights of targets: over an anchor that may stand anywhere, or over the table
         above = [phase.target.above if phase.target else 0.0 for phase in self._aimed]
@@ -153,7 +167,8 @@ class StateBasedDriver(FeedbackDriver):
         for column, value in self._locked:
             start[:, column] = value
         if self._aligns:
-            start[:, self._roll_column] += due.turn.clamp(-_ROLL, _ROLL) * (due.role == Role.down)
+            rolls = (due.role == Role.down) | due.pushes
+            start[:, self._roll_column] += due.turn.clamp(-_ROLL, _ROLL) * rolls
         approach = None if self._tilt is None else self._tilted(state, due, phase)
         posture = self._nominal[phase] if cfg.posture_gain > 0.0 else None
         if approach is not None:
@@ -175,14 +190,16 @@ class StateBasedDriver(FeedbackDriver):
     def _decide(self, state: State) -> _Due:
         """The next thing to do in every world."""
         # The first object that is not done
-        delivered, grasped, between = self._find_delivered(state)
-        letting_go = delivered & between & (state.opening < _OPEN)[:, None]
+        offsets = self._grasp_offsets(state)
+        delivered, grasped, between = self._find_delivered(state, offsets)
+        letting_go = delivered & between & (state.opening < _OPEN)[:, None] & self._lets_go
         done = delivered & ~letting_go
         number = done.long().cumprod(1).sum(1)
         all_done = number == done.shape[1]
         number = number.clamp(max=done.shape[1] - 1)
         phases = self._roles[number]
         thing = self._moved[number]
+        pushes = self._pushes[number]
         grasped = grasped[self._worlds, number] & ~all_done
         letting_go = letting_go[self._worlds, number]
 
@@ -202,29 +219,38 @@ class StateBasedDriver(FeedbackDriver):
             role,
             phases,
             thing,
+            offsets[self._worlds, number],
+            pushes,
             grasped,
             led=grasped | letting_go | foreign,
             funnel=(role == Role.down) | (role == Role.place) | (role == Role.retreat),
-            turn=self._turn_left(state, thing),
+            turn=self._turn_left(state, thing, pushes),
             later=number > 0,
             beside=(done & (self._gap(state) <= _LEFT)).any(1),
         )
 
-    def _find_delivered(self, state: State) -> tuple[Tensor, Tensor, Tensor]:
-        """Whether each object is where it is let go of, is grasped, and is between the jaws, each
-        ``(nworld, objects)``, bool.
+    def _find_delivered(self, state: State, offsets: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Whether each object is where it is let go of, is grasped or being pushed, and is between
+        or before the jaws, each ``(nworld, objects)``, bool.
         """
         pos = state.pos.index_select(1, self._moved)
         between = self._gap(state) <= self._reach
         grasped = state.in_hand.index_select(1, self._moved) & between & self._grasps
+        for k in self._pushed:
+            # On the way from beside it to where they push it, closed jaws push it.
+            off = state.point - pos[:, k] - offsets[:, k]
+            beside = self._point(state, self._roles[k, Role.down].expand(len(pos)))
+            way = (beside - pos[:, k] - offsets[:, k])[:, :2]
+            share = (off[:, :2] * way).sum(1) / way.square().sum(1).clamp(min=1e-9)
+            miss = off[:, :2] - share.clamp(0.0, 1.0)[:, None] * way
+            near = torch.linalg.vector_norm(miss, dim=1) <= _BESIDE
+            between[:, k] = near & (off[:, 2] <= _BESIDE)
+            grasped[:, k] = between[:, k] & (state.opening <= _SHUT)
         placed = self._check.placed(self._view.step())
         unknown = torch.zeros_like(placed[:, :1])  # of an object that the check does not judge
         placed = torch.cat((placed, unknown), dim=1).index_select(1, self._judged)
-        releases = [
-            self._point(state, row[Role.place].expand(len(pos))) - self._grasp_offset(row)
-            for row in self._roles
-        ]
-        offset = pos - torch.stack(releases, dim=1)
+        places = [self._point(state, row[Role.place].expand(len(pos))) for row in self._roles]
+        offset = pos - (torch.stack(places, dim=1) - offsets)
         across = torch.linalg.vector_norm(offset[..., :2], dim=2)
         there = (across <= _AT_GOAL) & (offset[..., 2] <= _ABOVE)
         return (there | placed & ~grasped) & self._leaves, grasped, between
@@ -238,14 +264,21 @@ class StateBasedDriver(FeedbackDriver):
         # Where it goes: an object in the jaws is what arrives, one of another goal is let go here
         phase = due.phases[self._worlds, due.role]
         thing = state.pos[self._worlds, due.object]
-        off = point - thing - self._grasp_offset(due.phases)
+        pushing = due.grasped & due.pushes
+        off = point - thing - due.offset
+        touches = 1.0 - torch.linalg.vector_norm(off[:, :2], dim=1) / _BESIDE
         far = torch.linalg.vector_norm(point - thing, dim=1) > self._reach.amax()
         off = torch.minimum(torch.maximum(off, -self._off_center), self._off_center)
+        off[:, 2] *= ~due.pushes  # fingers of any height push
         end = self._point(state, phase) + off * due.led[:, None]
         end = torch.where((due.led & far)[:, None], point, end)
+        # Jaws that push go to the object first.
+        share = torch.where(pushing, touches.clamp(min=0.0), 1.0)
+        end = torch.lerp(thing + due.offset, end, share[:, None])
 
         # How high on the way there
-        before = torch.where(due.grasped, Role.carry, Role.over)
+        away = (due.role == Role.retreat) & due.pushes
+        before = torch.where(due.grasped, Role.carry, torch.where(away, Role.retreat, Role.over))
         before = due.phases[self._worlds, before]
         clear = self._point(state, self._roles[0, Role.retreat].expand_as(phase))[:, 2]
         most = torch.maximum(self._point(state, before)[:, 2], end[:, 2])
@@ -253,7 +286,9 @@ class StateBasedDriver(FeedbackDriver):
         across = torch.linalg.vector_norm((end - point)[:, :2], dim=1)
         higher = _FUNNEL * (across - _NEAR).clamp(min=0.0)
         ready = _ROLL_FUNNEL * (due.turn.abs() - _TURNED).clamp(min=0.0)
-        ready = ready + _GRIP_FUNNEL * (_OPEN - state.opening).clamp(min=0.0)
+        opens = self._opened[due.phases[:, Role.down]]
+        lack = torch.where(opens, _OPEN - state.opening, state.opening - (1.0 - _OPEN))
+        ready = ready + _GRIP_FUNNEL * lack.clamp(min=0.0)
         higher = higher + ready * (due.role == Role.down)
         way = torch.minimum(end[:, 2] + higher * due.funnel, most)
         level = 1.0 - ((way - point[:, 2]) / _UP_FIRST - 0.33).clamp(0.0, 1.0)
@@ -261,11 +296,14 @@ class StateBasedDriver(FeedbackDriver):
         # How far in this step
         move = torch.cat(((end - point)[:, :2] * level[:, None], (way - point[:, 2])[:, None]), 1)
         distance = torch.linalg.vector_norm(move, dim=1)
-        speed = torch.where(due.grasped, _CARRY_SPEED, _SPEED) * self._cfg.timing.step_dt
-        lead = self._lead * torch.minimum(speed, _SLOWING * distance)
+        slow = torch.where(due.pushes, _PUSH_SPEED, _CARRY_SPEED)
+        speed = torch.where(due.grasped, slow, _SPEED) * self._cfg.timing.step_dt
+        slowing = torch.where(pushing, _PUSH_SLOWING, _SLOWING)
+        lead = self._lead * torch.minimum(speed, slowing * distance)
         # Fingers that touch the table are not pressed onto it.
         lead = torch.where(due.role == Role.close, distance.clamp(max=_DEPTH), lead)
         target = point + move * (lead / distance.clamp(min=1e-6))[:, None]
+        target[:, 2] = torch.where(pushing, way, target[:, 2])  # a slow arm must not sink
         return target, torch.where(due.funnel & (higher > _HIGH), before, phase)
 
     def _tilted(self, state: State, due: _Due, phase: Tensor) -> Tensor:
@@ -291,9 +329,9 @@ class StateBasedDriver(FeedbackDriver):
         upright = a * z[:, None] + torch.linalg.cross(turn, a) + turn * along
         return torch.where(due.led[:, None], upright, tilt)
 
-    def _turn_left(self, state: State, thing: Tensor) -> Tensor:
-        """How far the open jaws have to roll to the nearer face of an object [rad], shape
-        ``(nworld,)``.
+    def _turn_left(self, state: State, thing: Tensor, pushes: Tensor) -> Tensor:
+        """How far the open jaws have to roll to the nearer face of an object, or those that push
+        one to where they are locked [rad], shape ``(nworld,)``.
         """
         if not self._aligns:
             return torch.zeros_like(state.opening)
@@ -316,7 +354,8 @@ class StateBasedDriver(FeedbackDriver):
         low, high = self._rolls
         beyond = (low - rolls).clamp(min=0.0) + (rolls - high).clamp(min=0.0)
         nearest = ((rolls - STAY * roll).abs() + _BEYOND * beyond).argmin(0, keepdim=True)
-        return self._cfg.controller.yaw_alignment * rolls.gather(0, nearest)[0] - roll
+        goal = self._cfg.controller.yaw_alignment * rolls.gather(0, nearest)[0]
+        return goal * ~pushes - roll
 
     def _gap(self, state: State) -> Tensor:
         """Distance of the grasp point from each moved object [m], ``(nworld, objects)``."""
@@ -331,10 +370,16 @@ class StateBasedDriver(FeedbackDriver):
         z = torch.where(self._follows[phase], height, aim[:, 2])
         return torch.cat((aim[:, :2], z[:, None]), dim=1)
 
-    def _grasp_offset(self, phases: Tensor) -> Tensor:
-        """From an object's centre to the grasp point that grasps it, by the phases of its roles
-        [m], shape ``(..., 3)``.
+    def _grasp_offsets(self, state: State) -> Tensor:
+        """From each moved object's centre to the grasp point that grasps it, or pushes it to its
+        goal, by the phases [m], shape ``(nworld, objects, 3)``.
         """
-        above = self._above[phases[..., Role.close]]
-        zero = torch.zeros_like(above)
-        return torch.stack((zero, zero, above), dim=-1)
+        pos = state.pos.index_select(1, self._moved)
+        offsets = torch.zeros_like(pos)
+        offsets[..., 2] = self._above[self._roles[:, Role.close]]
+        for k in self._pushed:
+            place = self._roles[k, Role.place].expand(len(pos))
+            offsets[:, k] = self._point(state, place)
+            offsets[:, k, :2] -= self._last_seen(self._source, place)[:, :2]
+            offsets[:, k, 2] -= pos[:, k, 2]
+        return offsets
