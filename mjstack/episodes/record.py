@@ -23,8 +23,6 @@ SUCCESS_FAILING = "success_failing_worlds.csv"  # where the batch gate has the o
 REGIONS = "success_regions.csv"
 _FACTS = ("seed", "backend", "device", "seconds", "steps")
 _NAMES = ("object_names", "phase_names")
-CIRCUMSTANCES = ("start_places", "retries", "unreachable", "sign", "sign_phase", "sign_step")
-"""Names of the arrays about where an episode started and where it went wrong."""
 
 
 def circumstances(episode: Episode, monitor: FailureMonitor) -> dict[str, np.ndarray]:

@@ -32,6 +32,7 @@ from mjstack.report.write import safely_write
 from mjstack.sim import Simulation
 
 log = logging.getLogger(__name__)
+_MOST_PLOTTED = 20_000  # episodes on the page; of more, the failing ones
 
 
 def play_seeds(
@@ -75,7 +76,7 @@ def play_seeds(
         try:
             player.play(range(cfg.seed, cfg.seed + count), sim)
         finally:
-            tally.write_failing()  # once: its rows grow with the seeds
+            tally.write_failing()  # once: it grows with the seeds
     if tally.again:
         seeds = name_worlds(tally.again, count, what="seeds")
         tally.details.append(f"an earlier call has played {seeds}")
@@ -118,9 +119,9 @@ class _Player:
                 self._count(record)
         except Exception as error:
             check_interrupt()
-            if not tally.seeds or run.stage.ranks.size > 1:
+            if not tally.records or run.stage.ranks.size > 1:
                 raise
-            seed = seeds[len(tally.seeds)]
+            seed = seeds[len(tally.records)]
             log.exception("seed %d broke", seed)
             why = first_line(error)
             left = f"seed {seed}" if seed == seeds[-1] else f"seeds {seed} to {seeds[-1]}"
@@ -189,23 +190,21 @@ def _worlds(tally: EpisodeTally, run: Run) -> Worlds:
     scene = run.cfg.scene
     table = (scene.table_center[:2], scene.table_half[:2])
     rules = tally.check.rules
-    arrays = {
-        name: np.concatenate([values[name] for _, _, values in tally.plotted])
-        for name in tally.plotted[0][2]
-    }
-    start = arrays.pop("start")
-    bits = arrays.pop("failed").tolist()
-    if len(bits) < tally.episodes:
+    bits = tally.array("failed")
+    plotted = np.flatnonzero((bits != 0) | (np.arange(len(bits)) < _MOST_PLOTTED))
+    if len(plotted) < len(bits):
         tally.details.append(
-            f"report.html shows {len(bits):,} of the {tally.episodes:,} {tally.noun}: the first"
-            " ones, and all that failed"
+            f"report.html shows {len(plotted):,} of the {len(bits):,} {tally.noun}: the first ones,"
+            " and all that failed"
         )
+    measured = tally.records[0].named("value")
     worlds = Worlds(
-        names=[n for seed, worlds, _ in tally.plotted for n in tally.names(seed, worlds.tolist())],
-        broken=[rules.broken(failed) if failed else [] for failed in bits],
+        names=tally.names(plotted),
+        broken=[rules.broken(failed) for failed in bits[plotted].tolist()],
         rules=rules.texts,
-        values=arrays,
+        values={name: tally.array(f"value.{name}")[plotted] for name in measured},
     )
+    start = tally.array("start_qpos")[plotted]
     moving = [world for world in run.page.worlds3d.get(tally.gate, []) if not world.twin]
     for name, (at, _) in run.stage.index.objects.items():
         xy = slice(at, at + 2)

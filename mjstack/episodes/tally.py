@@ -1,16 +1,15 @@
 """Sums over a gate's episodes, and their report."""
 
-import math
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from mjstack.config.session import search_path_args
 from mjstack.episodes.failures import describe_sign
-from mjstack.episodes.record import CIRCUMSTANCES, FAILING, EpisodeRecord
+from mjstack.episodes.record import FAILING, EpisodeRecord
 from mjstack.episodes.rollout import Episode
 from mjstack.errors import name_worlds
 from mjstack.files import to_csv
@@ -21,13 +20,12 @@ from mjstack.report.text import format_percent
 from mjstack.report.write import safely_write
 from mjstack.tasks.check import EpisodeCheck
 
-_MOST_PLOTTED = 20_000  # episodes on the page; of more, the failing ones
 _MOST_NAMED = 100  # episodes a line in report.md; the table of failing ones has all
 
 
 @dataclass(eq=False, kw_only=True, slots=True)
 class EpisodeTally:
-    """Sums over the seeds: numbers, and the failing episodes by name.
+    """The records of a gate's seeds, and what they add up to.
 
     Attributes:
         gate: Whose episodes.
@@ -36,24 +34,9 @@ class EpisodeTally:
         check: The task's.
         path: The file of failing episodes; None where nothing is written.
         replayed: Whether job=replay takes the run.
-        seeds: Those that were played.
-        succeeded: For each seed, which worlds succeeded, shape ``(nworld,)``, bool.
-        circumstances: For each seed, if they were recorded, by name.
-        object_names: Names of the objects of circumstances.
-        phase_names: Names of the phases of circumstances.
-        plotted: Episodes that the run's page plots: seed, worlds, their bits, values and starts.
-        failed: Names of the failing episodes.
-        broken: The same by the name of the rule that was broken.
-        unreachable: Names of the episodes with a target out of reach.
-        low: Smallest of everything measured, by name.
-        high: Largest of everything measured, by name.
-        ends: Hashes of the final states, an array for each seed.
-        rows: Cells of the table of failing episodes, by column.
-        seconds: Wall time of the steps [s].
-        steps: Physics steps of all worlds.
+        records: Those of the seeds, without ``qpos``; ``end`` is its hash for each world.
         first: The first seed's episode, of this rank's worlds; None where the seed was read back.
         again: Seeds that an earlier call has played.
-        places: Where worlds were played: the host and device of each rank, by its first world.
         notes: Backend and buffer sizes in words.
         problems: Why the gate fails at any rate of success.
         details: Remarks.
@@ -65,107 +48,77 @@ class EpisodeTally:
     check: EpisodeCheck
     path: Path | None
     replayed: bool
-    seeds: list[int] = field(default_factory=list)
-    succeeded: list[np.ndarray] = field(default_factory=list)
-    circumstances: list[dict[str, np.ndarray]] = field(default_factory=list)
-    object_names: list[str] = field(default_factory=list)
-    phase_names: list[str] = field(default_factory=list)
-    plotted: list[tuple[int, np.ndarray, dict[str, np.ndarray]]] = field(default_factory=list)
-    failed: list[str] = field(default_factory=list)
-    broken: dict[str, list[str]] = field(default_factory=dict)
-    unreachable: list[str] = field(default_factory=list)
-    low: dict[str, float] = field(default_factory=dict)
-    high: dict[str, float] = field(default_factory=dict)
-    ends: list[np.ndarray] = field(default_factory=list)
-    rows: list[dict[str, object]] = field(default_factory=list)
-    seconds: float = 0.0
-    steps: int = 0
+    records: list[EpisodeRecord] = field(default_factory=list)
     first: Episode | None = None
     again: list[int] = field(default_factory=list)
-    places: dict[int, str] = field(default_factory=dict)
     notes: dict[str, str] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
     details: list[str] = field(default_factory=list)
 
+    def add(self, record: EpisodeRecord) -> None:
+        """Count one seed. Some 150 bytes of a world are kept, without its final positions."""
+        # Rounded: on CUDA even identical worlds differ in the last digits. Adding 0 makes -0 the
+        # same as 0.
+        rounded = np.round(record.qpos, 4) + 0.0
+        worlds = record.worlds | {"end": np.array([hash(row.tobytes()) for row in rounded])}
+        del worlds["qpos"]
+        self.records.append(replace(record, worlds=worlds))
+
+    def array(self, name: str) -> np.ndarray:
+        """An array of `EpisodeRecord.worlds` over the episodes of all seeds."""
+        return np.concatenate([record.worlds[name] for record in self.records])
+
     @property
     def episodes(self) -> int:
         """Number of episodes played."""
-        return sum(len(succeeded) for succeeded in self.succeeded)
+        return sum(len(record.failed) for record in self.records)
 
     @property
     def successes(self) -> int:
         """Number of episodes that succeeded."""
-        return self.episodes - len(self.failed)
+        return sum(int(record.succeeded.sum()) for record in self.records)
 
     @property
-    def distinct_ends(self) -> int:
-        """Number of distinct final states."""
-        return len(np.unique(np.concatenate(self.ends)))
+    def seconds(self) -> float:
+        """Wall time of the steps [s]."""
+        return sum(record.seconds for record in self.records)
 
-    def add(self, record: EpisodeRecord) -> None:
-        """Count one seed. Some 9 bytes of a world that has not failed are kept, and its
-        circumstances.
-        """
-        self.seeds.append(record.seed)
-        self.succeeded.append(record.succeeded)
-        self.seconds += record.seconds
-        self.steps += record.steps
-        self.places = record.ranks
-        self.failed += self.names(record.seed, np.flatnonzero(record.failed).tolist())
-        for rule, worlds in self.check.rules.failing(record.failed).items():
-            self.broken.setdefault(rule, []).extend(self.names(record.seed, worlds))
-        self.rows += record.failing_rows(self.check.rules)
-        room = max(0, _MOST_PLOTTED - sum(len(worlds) for _, worlds, _ in self.plotted))
-        plotted = np.flatnonzero((record.failed != 0) | (np.arange(len(record.failed)) < room))
-        measured = record.named("value")
-        arrays = {"failed": record.failed, "start": record.start, **measured}
-        self.plotted.append((record.seed, plotted, {k: v[plotted] for k, v in arrays.items()}))
-        if "sign" in record.worlds:
-            self.object_names = record.object_names
-            self.phase_names = record.phase_names
-            self.circumstances.append({name: record.worlds[name] for name in CIRCUMSTANCES})
-            unreachable = np.flatnonzero(record.worlds["unreachable"]).tolist()
-            self.unreachable += self.names(record.seed, unreachable)
-        # NaN, which a diverged world has, is handed on
-        for name, values in (measured | record.named("measured")).items():
-            self.low[name] = float(np.minimum(self.low.get(name, math.inf), values.min()))
-            self.high[name] = float(np.maximum(self.high.get(name, -math.inf), values.max()))
-        # Rounded: on CUDA even identical worlds differ in the last digits. Adding 0 makes -0 the
-        # same as 0.
-        rounded = np.round(record.qpos, 4) + 0.0
-        self.ends.append(np.array([hash(row.tobytes()) for row in rounded]))
+    def names(self, episodes: Sequence[int] | np.ndarray) -> list[str]:
+        """Names of episodes, counted over all seeds, as ``world=`` of job=replay takes them."""
+        seeds = [f"{record.seed}:" if self.several else "" for record in self.records]
+        places = (divmod(int(episode), len(self.records[0].failed)) for episode in episodes)
+        return [f"{seeds[seed]}{world}" for seed, world in places]
 
     def write_failing(self) -> None:
         """Write the table of failing episodes, if there are any. A full disk takes no result
         back.
         """
-        if self.rows and self.path is not None:
-            text = to_csv(self.rows)
-            problem = safely_write(self.path, Path.write_text, text, stops=False)
+        rows = [row for record in self.records for row in record.failing_rows(self.check.rules)]
+        if rows and self.path is not None:
+            problem = safely_write(self.path, Path.write_text, to_csv(rows), stops=False)
             has = f"{self.path.name} has every failing episode with what was measured"
             self.details.append(problem or has)
-
-    def names(self, seed: int, worlds: Sequence[int]) -> list[str]:
-        """Names of a seed's episodes, as ``world=`` of job=replay takes them."""
-        return [f"{seed}:{world}" if self.several else str(world) for world in worlds]
 
     def metrics(self) -> dict[str, float]:
         """Counts, the success rate with its interval, and the extremes of what was measured."""
         metrics: dict[str, float] = {
-            "worlds": len(self.succeeded[0]),
-            "seeds": len(self.seeds),
+            "worlds": len(self.records[0].failed),
+            "seeds": len(self.records),
             "episodes": self.episodes,
             **rate_metrics(self.successes, self.episodes),
         }
+        # NaN, which a diverged world has, is handed on
         for metric, (value, side) in self.check.summaries.items():
-            metrics[metric] = (self.low if side == "min" else self.high)[value]
-        metrics["waypoint_error_max_m"] = self.high["waypoint_error_m"]
+            values = self.array(f"value.{value}")
+            metrics[metric] = float(values.min() if side == "min" else values.max())
+        metrics["waypoint_error_max_m"] = float(self.array("measured.waypoint_error_m").max())
         for name in ("contacts", "constraint_rows"):
-            metrics[f"peak_{name}_per_world"] = int(self.high[f"peak_{name}"])
+            metrics[f"peak_{name}_per_world"] = int(self.array(f"measured.peak_{name}").max())
         if self.several:
-            for seed, succeeded in zip(self.seeds, self.succeeded, strict=True):
-                metrics[f"seed{seed}.succeeded"] = int(succeeded.sum())
-        return metrics | {f"failed.{rule}": len(names) for rule, names in self.broken.items()}
+            for record in self.records:
+                metrics[f"seed{record.seed}.succeeded"] = int(record.succeeded.sum())
+        broken = self.check.rules.failing(self.array("failed"))
+        return metrics | {f"failed.{rule}": len(episodes) for rule, episodes in broken.items()}
 
     @property
     def summary(self) -> str:
@@ -176,34 +129,6 @@ class EpisodeTally:
             f"{self.successes} of {self.episodes} {self.noun} succeeded ({rate}, 95 % interval"
             f" {format_percent(low, '')} to {format_percent(high)})"
         )
-
-    @property
-    def failures(self) -> str:
-        """The failing episodes and their rules in words; empty without any."""
-        if not self.failed:
-            return ""
-        counts = "; ".join(
-            f"{self.check.rules.texts[rule]} in {len(names)}" for rule, names in self.broken.items()
-        )
-        return f"{name_worlds(self.failed, self.episodes, what=self.noun)} failed: {counts}"
-
-    def all_details(self) -> list[str]:
-        """Lines of the report: the failing episodes by rule, and remarks."""
-        named = [("target out of reach", self.unreachable)] if self.unreachable else []
-        named += [(self.check.rules.texts[rule], names) for rule, names in self.broken.items()]
-        return [
-            f"{text}: {name_worlds(names, self.episodes, _MOST_NAMED, self.noun)}"
-            for text, names in named
-        ] + self.details
-
-    @property
-    def way_to_look(self) -> str:
-        """The command that replays a failing episode; empty if there is none."""
-        if not self.failed or self.path is None or not self.replayed:
-            return ""
-        gate = "" if self.path.name == FAILING else f"{self.gate}:"
-        run = shlex.join([*search_path_args(), "job=replay", f"run={self.path.parent}"])
-        return f". To look at one: {run} world={gate}{self.failed[0]}"
 
     def result(
         self,
@@ -223,45 +148,63 @@ class EpisodeTally:
             thresholds: More of them than the check's.
             tables: More of them than `tables`.
         """
+        failed = np.flatnonzero(self.array("failed"))
+        broken = {
+            self.check.rules.texts[rule]: episodes
+            for rule, episodes in self.check.rules.failing(self.array("failed")).items()
+        }
+        reason = [*parts]
+        if len(failed):
+            counts = "; ".join(f"{text} in {len(episodes)}" for text, episodes in broken.items())
+            reason.append(f"{self._name(failed, 8)} failed: {counts}")
+        look = ""
+        if len(failed) and self.path is not None and self.replayed:
+            gate = "" if self.path.name == FAILING else f"{self.gate}:"
+            run = shlex.join([*search_path_args(), "job=replay", f"run={self.path.parent}"])
+            look = f". To look at one: {run} world={gate}{self.names(failed[:1])[0]}"
+        if "sign" in self.records[0].worlds and self.array("unreachable").any():
+            unreachable = np.flatnonzero(self.array("unreachable"))
+            broken = {"target out of reach": unreachable.tolist()} | broken
+        named = [f"{text}: {self._name(which, _MOST_NAMED)}" for text, which in broken.items()]
         return GateResult(
             name=self.gate,
             status=Status.passed if passed and not self.problems else Status.failed,
-            reason="; ".join(filter(None, [*parts, self.failures, *self.problems]))
-            + self.way_to_look,
+            reason="; ".join([*reason, *self.problems]) + look,
             thresholds=self.check.thresholds() | thresholds,
             metrics=self.metrics() | metrics,
             notes=self.notes,
-            details=self.all_details(),
+            details=named + self.details,
             tables=[*self.tables(), *tables],
         )
 
+    def _name(self, episodes: Sequence[int] | np.ndarray, limit: int) -> str:
+        """How many episodes, and the names of the first ones."""
+        return name_worlds(self.names(episodes), self.episodes, limit, self.noun)
+
     def tables(self) -> list[Table]:
-        """Tables of the report: seeds, and first signs of failure."""
+        """Tables of the report: ranks, seeds, and first signs of failure."""
         tables = []
-        if self.places:
-            firsts = [*self.places, len(self.succeeded[0])]
+        last = self.records[-1]
+        if last.ranks:
+            firsts = [*last.ranks, len(last.failed)]
             rows = [
                 [f"{first:,} to {end - 1:,}", where]
-                for (first, where), end in zip(self.places.items(), firsts[1:], strict=True)
+                for (first, where), end in zip(last.ranks.items(), firsts[1:], strict=True)
             ]
-            title = f"Which rank played which world (seed {self.seeds[-1]})"
+            title = f"Which rank played which world (seed {last.seed})"
             tables.append(Table(title=title, header=["worlds", "where"], rows=rows))
         if self.several:
             header = ["seed", "episodes", "succeeded", "rate", "95 % interval"]
-            rows = [
-                [str(seed), str(len(flags)), str(flags.sum()), *rate_cells(flags.sum(), len(flags))]
-                for seed, flags in zip(self.seeds, self.succeeded, strict=True)
-            ]
+            counts = [(r.seed, len(r.failed), int(r.succeeded.sum())) for r in self.records]
+            rows = [[str(seed), str(n), str(k), *rate_cells(k, n)] for seed, n, k in counts]
             tables.append(Table(title="Seeds", header=header, rows=rows))
-        signs: dict[tuple[int, int], list[str]] = {}
-        for seed, arrays, succeeded in zip(
-            self.seeds, self.circumstances, self.succeeded, strict=False
-        ):
-            for world in np.flatnonzero(~succeeded).tolist():
-                key = int(arrays["sign_phase"][world]), int(arrays["sign"][world])
-                signs.setdefault(key, []).extend(self.names(seed, [world]))
-        if signs:
-            phases = [*self.phase_names, ""]  # the last one for no sign, -1
+        failed = np.flatnonzero(self.array("failed"))
+        if "sign" in last.worlds and len(failed):
+            signs: dict[tuple[int, int], list[str]] = {}
+            keys = (self.array(name)[failed].tolist() for name in ("sign_phase", "sign"))
+            for name, *key in zip(self.names(failed), *keys, strict=True):
+                signs.setdefault(tuple(key), []).append(name)
+            phases = [*last.phase_names, ""]  # the last one for no sign, -1
             rows = [
                 [
                     describe_sign(sign, phases[phase]),

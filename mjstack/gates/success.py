@@ -54,9 +54,9 @@ def run_success(run: Run) -> list[GateResult]:
         observers=lambda seed: [_StartsWriter(success_run, seed, unwritten)],
     )
     tally.details = unwritten + tally.details
-    starts = np.concatenate([seed["start_places"] for seed in tally.circumstances])
-    retries = np.concatenate([seed["retries"] for seed in tally.circumstances])
-    succeeded = np.concatenate(tally.succeeded)
+    starts = tally.array("start_places")
+    retries = tally.array("retries")
+    succeeded = tally.array("failed") == 0
     retried = retries > 0
     retried_succeeded = int((retried & succeeded).sum())
     regions = find_regions(
@@ -65,14 +65,14 @@ def run_success(run: Run) -> list[GateResult]:
         cell=t.cell,
         yaw_cell_deg=t.yaw_cell_deg,
         episodes=t.cell_episodes,
-        objects=tally.object_names,
+        objects=tally.records[0].object_names,
     )
     metrics = {
         "distinct_starts": len(np.unique(np.round(starts, 6).reshape(len(starts), -1), axis=0)),
         "retried": int(retried.sum()),
         "retries": int(retries.sum()),
         "retried_succeeded": retried_succeeded,
-        "unreachable": len(tally.unreachable),
+        "unreachable": int(tally.array("unreachable").sum()),
         "episode_s": tally.seconds,
     }
     reads = reads_starts_file(cfg.reset)
