@@ -71,16 +71,6 @@ def test_a_saved_policy_gives_the_same_bits(tmp_path: Path) -> None:
     assert {"mjstack", "mujoco", "torch"} == set(loaded.versions)
 
 
-@pytest.mark.parametrize("version", [3, 4])
-def test_a_policy_of_version_0_1_is_read(version: int, folder: Path) -> None:
-    """Without action terms its actions are joint targets."""
-    terms = load_policy(folder).action
-    assert terms == configure("action=joint_absolute").action
-    edit(lambda d: d.update(format=version))(folder)
-    change("action", "terms", value={})(folder)
-    assert load_policy(folder).action == terms
-
-
 def test_a_checkout_that_is_not_installed_saves(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -285,7 +275,8 @@ DAMAGED: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda f: (f / "policy.json").write_text((f / "policy.json").read_text()[:200]),
         "cannot be read (JSONDecodeError",
     ),
-    "another format": (change("format", value=7), "has format 7, expected 3 to 5"),
+    "another format": (change("format", value=7), "has format 7, expected 5, which mjstack"),
+    "version 0.1": (change("format", value=4), "has format 4 of version 0.1, expected 5"),
     "another network": (change("network", "hidden", value=[16]), "cannot be read"),
     "no number": (change("action", "execute", value=0), "cannot be read"),
     "a key less": (edit(lambda d: d["config"]["robot"].pop("home")), "cannot be read (KeyError"),

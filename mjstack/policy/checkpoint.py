@@ -30,7 +30,6 @@ from mjstack.files import read_inside, reading, write_atomic
 from mjstack.policy.network import PolicyNetwork, Vision
 
 FORMAT = 5  # grows when an older mjstack could not read what is written
-_OLDER = (3, 4)  # of version 0.1: they have no terms where actions are joint targets
 _NAME_ANOTHER = "Name a policy that job=train has written, such as outputs/mine/last"
 # A stranger's files may ask for more than this.
 _MOST_COUNT = 1_000_000
@@ -206,10 +205,11 @@ def load_policy(folder: Path) -> Policy:
         raise FolderError(f"policy={folder}: {reason}", _NAME_ANOTHER)
     with reading(path, _NAME_ANOTHER):
         facts = json.loads(read_inside(path))
-        if facts["format"] not in (*_OLDER, FORMAT):
+        if facts["format"] != FORMAT:
+            of = " of version 0.1" if facts["format"] in (3, 4) else ""
             raise FolderError(
-                f"policy={folder}: has format {facts['format']}, expected {_OLDER[0]} to {FORMAT},"
-                f" which mjstack {mjstack.__version__} reads",
+                f"policy={folder}: has format {facts['format']}{of}, expected {FORMAT}, which"
+                f" mjstack {mjstack.__version__} reads",
                 "Use the mjstack that wrote it, or train it again",
             )
         policy = _from_facts(facts, path)
@@ -240,7 +240,6 @@ def _from_facts(facts: Mapping[str, Any], path: Path) -> Policy:
     """The policy of a file, its weights without memory, so that sizes of a stranger take none."""
     seen = facts["observation"]
     action = facts["action"]
-    terms = action["terms"] or facts["config"]["controller"]["action"]
     # A term may have no numbers here, such as headings where nothing is a box.
     widths = {name: _whole(name, width, least=0) for name, width in seen["widths"].items()}
     vision = _read_vision(facts)
@@ -258,7 +257,7 @@ def _from_facts(facts: Mapping[str, Any], path: Path) -> Policy:
         observation=_read_group(seen, path),
         widths=widths,
         execute=_whole("action.execute", action["execute"], most=_MOST_STEPS),
-        action=_read_terms("action", terms, TermCfg, path),
+        action=_read_terms("action", action["terms"], TermCfg, path),
         config=facts["config"],
         training=dict(facts["training"]),
         versions=dict(facts["versions"]),
