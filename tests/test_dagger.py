@@ -5,8 +5,11 @@ from __future__ import annotations
 import os
 import signal
 import time
+from collections import Counter
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from compositions import load_config
@@ -19,10 +22,12 @@ from mjstack.distributed import Ranks
 from mjstack.drivers.driver import Driver
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, FolderError
+from mjstack.math import wilson_interval
 from mjstack.policy import load_policy
 from mjstack.policy.checkpoint import read_state
-from mjstack.train.clone import check_clone
+from mjstack.train.clone import _judge, check_clone
 from mjstack.train.clone_learner import CloneLearner
+from mjstack.train.demonstrations import Demonstrations
 from mjstack.train.trainer import STATE
 
 TINY = (
@@ -55,6 +60,58 @@ def test_rounds_leave_a_policy_and_go_on_bit_for_bit(tmp_path: Path) -> None:
     other = curve(parts)
     for name in ("success", "validation_loss"):
         assert rows[name].tolist() == other[name].tolist()
+
+
+def test_the_report_of_a_training_that_fails(tmp_path: Path) -> None:
+    """Success by round with its interval, the rules that failed, times, and failing worlds."""
+    sizes = ["job.alone=0.5", "job.batches=1", "gate.success.rate=1"]
+    assert run([*TINY, *sizes, f"job.folder={tmp_path}"]) == 1
+    rows = curve(tmp_path)
+    assert rows["judged"].tolist() == [2.0, 4.0]  # alone in all worlds of the last round
+    for row in rows:
+        successes, judged = round(row["success"] * row["judged"]), int(row["judged"])
+        low, high = wilson_interval(successes, judged)
+        assert (row["success_low95"], row["success_high95"]) == (low, high)
+        assert row["failedREACHED"] == judged - successes  # genfromtxt leaves the dot out
+    assert rows["failedREACHED"].sum() > 0.0
+    assert (rows["played_s"] > 0.0).all()
+    gates = report(tmp_path)
+    tables = {table["title"]: table for table in gates["train"]["tables"]}
+    broken = tables["Judged episodes that broke a rule"]
+    assert broken["header"] == ["round", "judged", "REACHED"]
+    assert [row[1] for row in broken["rows"]] == ["2", "4"]
+    assert [row[0] for row in tables["Time"]["rows"]] == ["expert", "training", "judgement"]
+    metrics = gates["train"]["metrics"]
+    assert metrics["expert_s"] > rows["played_s"].sum()  # the expert's own round too
+    assert gates["success"]["metrics"]["failed.REACHED"] > 0
+    assert np.load(tmp_path / "motion_success.npz")["failed"].any()  # on the page
+    assert (tmp_path / "episode.html").exists()
+
+
+def test_rules_are_counted_over_batches_and_ranks() -> None:
+    parts = [
+        Demonstrations(
+            **dict.fromkeys(("seen", "labels"), torch.zeros((1, 1))),
+            ends=torch.ones(1, dtype=torch.int64),
+            widths={},
+            judged=4,
+            succeeded=succeeded,
+            broken=broken,
+            seconds=seconds,
+        )
+        for succeeded, broken, seconds in ((1, {"A": 3}, 2.0), (3, {"A": 1, "B": 1}, 1.0))
+    ]
+    joined = Demonstrations.join(parts)
+    assert (joined.judged, joined.succeeded, joined.broken) == (8, 4, {"A": 4, "B": 1})
+
+    class Two(Ranks):
+        def gather(self, value: Any) -> list[Any]:
+            return [value, (3, 4, 5.0, Counter({"B": 1}))]
+
+    stage = Stage(load_config(TINY), ranks=Two())
+    figures = _judge(stage, "the policy", parts[0])
+    assert (figures["success"], figures["judged"], figures["played_s"]) == (0.5, 8, 5.0)
+    assert (figures["failed.A"], figures["failed.B"]) == (3, 1)
 
 
 @pytest.mark.full

@@ -27,10 +27,13 @@ from mjstack.jobs.showing import check_showing
 from mjstack.report.picture import save_curves
 from mjstack.report.record import GateResult, Status
 from mjstack.report.table import Table
-from mjstack.train.trainer import LAST, Trainer, whole_starts
+from mjstack.report.text import label
+from mjstack.train.trainer import FAILED, LAST, Trainer, whole_starts
 
 NAME = "train"
 CONFIG = "training.json"  # the configuration of the training in the folder
+_TIMES = ("expert_s", "training_s")  # metrics of a training: parts of its time
+_ENDS = ("low", "high")  # of an interval
 # Keys of the job; changing one of these changes no training.
 _WITHOUT_EFFECT = ("folder", "test_seed", "iterations", "minutes", "max_minutes")
 
@@ -96,8 +99,13 @@ def _run(trainer: Trainer, run: Run, folder: Path) -> None:
         write_atomic(folder / CONFIG, json.dumps(training_config(run.cfg), indent=1) + "\n")
     run_guarded(run, NAME, partial(_train, trainer, folder), "worlds")
     if run.artifacts.results[NAME].status is Status.passed:
-        judged = judged_stage(run.stage, folder / LAST)
-        run_guarded(run.on(judged), "success", run_success)
+        judged = run.on(judged_stage(run.stage, folder / LAST))
+        run_guarded(judged, "success", run_success)
+        trained = run.artifacts.results[NAME]
+        times = {name: trained.metrics[name] for name in _TIMES if name in trained.metrics}
+        times["judgement_s"] = judged.artifacts.results["success"].seconds
+        rows = [[label(name), f"{seconds:.1f} s"] for name, seconds in times.items()]
+        trained.tables.append(Table(title="Time", header=["part", "time"], rows=rows))
 
 
 def judged_stage(stage: Stage, policy: Path) -> Stage:
@@ -129,12 +137,22 @@ def _train(trainer: Trainer, folder: Path, run: Run) -> list[GateResult]:
         title = f"{run.cfg.robot.title}, task {run.cfg.task.name}: training"
         lines = {name.replace("_", " "): [row[name] for row in rows] for name in trained.lines}
         at = [row[trained.abscissa] for row in rows]
-        picture = (at, lines, title, trained.abscissa, trained.scale)
+        bands = {
+            name.replace("_", " "): [[row[f"{name}_{end}95"] for row in rows] for end in _ENDS]
+            for name in trained.lines
+            if all(f"{name}_low95" in row for row in rows)
+        }
+        picture = (at, lines, title, trained.abscissa, trained.scale, bands)
         run.draw(f"{NAME}.png", save_curves, *picture)
     seconds = time.perf_counter() - began
     last = rows[-1]
     figures = ", ".join(f"{name.replace('_', ' ')} {last[name]:.4g}" for name in trained.lines)
-    columns = {name.replace("_", " "): name for name in last}
+    rules = {name.removeprefix(FAILED): name for name in last if name.startswith(FAILED)}
+    columns = {name.replace("_", " "): name for name in last if name not in rules.values()}
+    tables = [Table.of(columns, rows, "Curve")]
+    if rules:
+        counted = {name: name for name in (trained.abscissa, "judged")}
+        tables.append(Table.of(counted | rules, rows, "Judged episodes that broke a rule"))
     return [
         GateResult(
             name=NAME,
@@ -144,7 +162,7 @@ def _train(trainer: Trainer, folder: Path, run: Run) -> list[GateResult]:
             seconds=seconds,
             metrics=trained.metrics,
             notes=trained.notes,
-            tables=[Table.of(columns, rows, "Curve")],
+            tables=tables,
         )
     ]
 

@@ -273,13 +273,17 @@ def save_curves(
     title: str,
     label: str,
     scale: str = "log",
+    bands: Mapping[str, Sequence[Sequence[float]]] | None = None,
 ) -> None:
     """Plot values over a number that counts, on a ``log`` or ``linear`` scale, a line for each by
-    its name.
+    its name; ``bands`` are the lower and the upper ends of their intervals, for those that have
+    some.
     """
     with figure(path, title, figsize=(7.5, 4.5)) as (_, axes):
         for name, values in lines.items():
             axes.plot(at, values, ".-", label=name)
+            if bands and name in bands:
+                axes.fill_between(at, *bands[name], alpha=0.2)
         axes.set(xlabel=label, yscale=scale)
         axes.grid(alpha=0.3, which="both")
         axes.legend(frameon=False)

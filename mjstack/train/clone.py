@@ -4,6 +4,7 @@ does, in the expert's episodes and, with rounds, in states to which the policy i
 
 import math
 import time
+from collections import Counter
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -15,12 +16,20 @@ from mjstack.config.schema import CloneJobCfg
 from mjstack.episodes.rollout import STATE_BASED
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, MjstackError, UnknownName
+from mjstack.math import wilson_interval
 from mjstack.sim.memory import free_memory
 from mjstack.train.clone_learner import CloneLearner
 from mjstack.train.dataset import check_dataset, read_demonstrations
 from mjstack.train.demonstrations import Demonstrations
 from mjstack.train.rounds import make_round, round_file
-from mjstack.train.trainer import LAST, Trained, Trainer, earlier_state, observed_widths
+from mjstack.train.trainer import (
+    FAILED,
+    LAST,
+    Trained,
+    Trainer,
+    earlier_state,
+    observed_widths,
+)
 
 
 def check_clone(stage: Stage) -> range:
@@ -95,7 +104,7 @@ def train_clone(stage: Stage, folder: Path) -> Trained:
     if job.dataset is None:
         first = make_round(stage, folder, None, 0)
         who = "" if job.rounds == 0 else "round 0: "
-        _print_success(stage, f"{who}the expert", first)
+        _judge(stage, f"{who}the expert", first)
     else:
         began = time.perf_counter()
         first = read_demonstrations(stage, observed_widths(stage))
@@ -119,9 +128,9 @@ def train_clone(stage: Stage, folder: Path) -> Trained:
             learner.learn((number - 1) * job.batches, number * job.batches)
             part = make_round(stage, folder, learner.policy, number)
             parts.append(part)
-            success = _print_success(stage, f"round {number}: the policy alone", part)
+            figures = _judge(stage, f"round {number}: the policy alone", part)
             if len(learner.curve) < number:
-                learner.conclude(number, success)
+                learner.conclude(number, figures)
     if stage.ranks.writes:  # the others have read theirs
         for number in range(job.rounds + 1):
             for rank in range(stage.ranks.size):
@@ -135,13 +144,29 @@ def _is_complete(job: CloneJobCfg, facts: dict[str, Any]) -> bool:
     return bool(facts["done"] == job.batches)
 
 
-def _print_success(stage: Stage, who: str, episodes: Demonstrations) -> float:
-    """Print the share of successes in the judged episodes of all ranks, and return it."""
-    counts = torch.tensor([episodes.succeeded, episodes.judged])
-    stage.ranks.sum_(counts)
-    succeeded, judged = counts.tolist()
+def _judge(stage: Stage, who: str, episodes: Demonstrations) -> dict[str, float]:
+    """Print how many judged episodes of all ranks succeeded, and return their figures.
+
+    Returns:
+        ``success``, their share, with its 95 % interval; ``judged``, their number; ``played_s``,
+        the time in which the slowest rank played the round [s]; and how many broke each rule,
+        ``failed.<rule>``.
+    """
+    facts = (episodes.succeeded, episodes.judged, episodes.seconds, Counter(episodes.broken))
+    successes, numbers, seconds, broken = zip(*stage.ranks.gather(facts), strict=True)
+    succeeded = sum(successes)
+    judged = sum(numbers)
     stage.progress.print_line(f"train: {who} succeeded in {succeeded} of {judged} episodes")
-    return float(succeeded / judged)
+    low, high = wilson_interval(succeeded, judged)
+    rules: Counter[str] = sum(broken, Counter())
+    return {
+        "success": succeeded / judged,
+        "success_low95": low,
+        "success_high95": high,
+        "judged": judged,
+        "played_s": max(seconds),
+        **{f"{FAILED}{rule}": count for rule, count in rules.items()},
+    }
 
 
 def _trained(job: CloneJobCfg, folder: Path, facts: dict[str, Any]) -> Trained:
@@ -159,6 +184,10 @@ def _trained(job: CloneJobCfg, folder: Path, facts: dict[str, Any]) -> Trained:
     if job.rounds:
         best = max(row["success"] for row in curve)
         metrics |= {"rounds": job.rounds, "best_training_success": best}
+        metrics["expert_s"] += curve[-1].get("played_s", 0.0)  # the round of the last policy
+        # A row has the rules that were broken in its round
+        rules = {name: 0 for row in curve for name in row if name.startswith(FAILED)}
+        curve = [{k: v for k, v in row.items() if k not in rules} | rules | row for row in curve]
         return Trained(metrics=metrics, notes=notes, curve=curve, abscissa="round")
     lines = ["loss", "validation_loss"]
     return Trained(metrics=metrics, notes=notes, curve=curve, lines=lines, scale="log")

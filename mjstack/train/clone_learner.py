@@ -280,9 +280,9 @@ class CloneLearner(Learner):
         else:
             super()._save(**figures)
 
-    def conclude(self, number: int, success: float) -> None:
-        """End a round, with the success of its policy."""
-        self._save(round=number, success=success)
+    def conclude(self, number: int, figures: Mapping[str, float]) -> None:
+        """End a round, with figures of its policy's episodes, ``success`` among them."""
+        self._save(round=number, **figures)
 
     def _notes(self) -> dict[str, Any]:
         return {"episodes": self._expert["episodes"]}

@@ -3,6 +3,7 @@ expert has given.
 """
 
 import itertools
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -27,6 +28,7 @@ class Demonstrations:
         played: Episodes that were played, kept or not.
         judged: Of these, those in which the policy drove alone, or the expert in its own ones.
         succeeded: Of these, those that the task's check accepted.
+        broken: How many of these broke a rule of the check, by the rule's name.
         seconds: Time in which they were played or read [s].
         source: Where they come from, in words.
         qpos: Positions before each step, from which images are drawn, shape ``(steps of all
@@ -42,6 +44,7 @@ class Demonstrations:
     played: int = 0
     judged: int = 0
     succeeded: int = 0
+    broken: Mapping[str, int] = field(default_factory=dict)
     seconds: float = 0.0
     source: str = ""
     qpos: Tensor | None = None
@@ -80,6 +83,7 @@ class Demonstrations:
             played=sum(part.played for part in parts),
             judged=sum(part.judged for part in parts),
             succeeded=sum(part.succeeded for part in parts),
+            broken=sum((Counter(part.broken) for part in parts), Counter()),
             seconds=sum(part.seconds for part in parts),
             source=parts[0].source,
             qpos=torch.cat(states) if states else None,

@@ -26,7 +26,7 @@ from mjstack.train.demonstrations import Demonstrations
 from mjstack.train.trainer import earlier_state, made_with, training_config
 
 _TENSORS = ("seen", "labels", "ends", "driven")  # of `Demonstrations`, in the file of a round
-_FACTS = ("widths", "played", "judged", "succeeded", "seconds", "source")
+_FACTS = ("widths", "played", "judged", "succeeded", "broken", "seconds", "source")
 
 
 class MixedDriver(Driver):
@@ -181,12 +181,14 @@ def _play_round(stage: Stage, policy: Policy | None, number: int) -> Demonstrati
         usable = counted & batch.finite()
         if not job.rounds:
             usable &= batch.succeeded
+        failing = stage.check.rules.failing(batch.episode.failed[judged.cpu().numpy()])
         parts.append(
             replace(
                 Demonstrations.of(batch, usable.nonzero()[:, 0], job),
                 played=int(counted.sum()),
                 judged=int(judged.sum()),
                 succeeded=int((judged & batch.succeeded).sum()),
+                broken={rule: len(worlds) for rule, worlds in failing.items()},
             )
         )
     source = f"the expert, seeds {first} to {first + batches - 1}"

@@ -26,6 +26,7 @@ from mjstack.policy.checkpoint import read_state
 LAST = "last"
 BEST = "best"
 STATE = "training.safetensors"
+FAILED = "failed."  # a column of the curve: judged episodes that broke the rule of this name
 
 
 @dataclass(kw_only=True, slots=True)
