@@ -22,13 +22,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 import mjstack
-from mjstack.cli_sweep import (
-    check_jobs,
-    claim_sweep,
-    expand,
-    hydra_path,
-    print_sweep,
-)
+from mjstack.cli_sweep import check_jobs, claim_sweep, expand, hydra_path, print_sweep
 from mjstack.config.explain import own_overrides
 from mjstack.config.help import help_text, key_help
 from mjstack.config.load import compose, extended_search_path, to_config
@@ -40,13 +34,7 @@ from mjstack.config.session import (
     search_path,
     search_path_args,
 )
-from mjstack.errors import (
-    MjstackError,
-    RankError,
-    UnknownName,
-    describe_error,
-    suggest,
-)
+from mjstack.errors import MjstackError, RankError, UnknownName, describe_error, suggest
 from mjstack.files import claim_folder, write_atomic
 from mjstack.interrupt import EXIT_CODE, begin_job
 from mjstack.process import is_rank
@@ -236,7 +224,7 @@ def run_job(cfg: DictConfig) -> Report:
     nothing has been checked yet.
     """
     from mjstack.jobs.sweep_folder import SweepJob, add_jobs  # they load torch
-    from mjstack.jobs.sweep_table import sweep_config, update_summary
+    from mjstack.jobs.sweep_table import update_summary
 
     logging.raiseExceptions = False  # a full disk would print a traceback for each line of run.log
     settings = HydraConfig.get()
@@ -251,8 +239,7 @@ def run_job(cfg: DictConfig) -> Report:
                 print(f"job {job.number}: {done.status}, done before", flush=True)
                 _save_config(cfg, folder)  # Hydra has just put one with interpolations there
                 return done
-            earlier = job.set_aside()
-            if earlier is not None and earlier.resumes == cfg.job.name == "gates":
+            if job.set_aside():
                 cfg.resume = str(folder)
                 _checked.clear()
         checked = _checked.pop(tuple(overrides), None) or _check(cfg, overrides)
@@ -260,7 +247,7 @@ def run_job(cfg: DictConfig) -> Report:
             _save_config(cfg, folder)
         result = checked.run(folder, overrides)
         if sweep is not None:
-            update_summary(sweep, sweep_config(cfg), {settings.job.num: result})
+            update_summary(sweep, cfg, {settings.job.num: result})
     _results.append(result)
     if result.status is Status.interrupted:
         raise KeyboardInterrupt

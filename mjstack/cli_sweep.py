@@ -119,22 +119,16 @@ def claim_sweep(master: DictConfig, jobs: Sequence["SweepJob"]) -> Iterator[Path
     if queued:
         Queueing.of(master.hydra.launcher).slots()
     named = cast(dict, OmegaConf.to_container(master.hydra.sweep, resolve=False))
-    by_hour = "${now:" in str(named["dir"])
-    marker = "" if by_hour else SWEEP
+    hourly = "${now:" in str(named["dir"])
+    marker = "" if hourly else SWEEP
     key = "hydra.sweep.dir"
-    with claim_folder(folder, marker=marker, numbered=by_hour, shared=queued, key=key) as claimed:
+    with claim_folder(folder, marker=marker, numbered=hourly, shared=queued, key=key) as claimed:
         master.hydra.sweep.dir = str(claimed)
         master.hydra.overrides.hydra.append(_sweep_dir(claimed))  # of its jobs
-        add_jobs(
-            claimed,
-            [
-                replace(
-                    job,
-                    folder=Path(os.path.normpath(claimed / os.path.relpath(job.folder, folder))),
-                )
-                for job in jobs
-            ],
-        )
+        names = (os.path.relpath(job.folder, folder) for job in jobs)
+        paths = (Path(os.path.normpath(claimed / name)) for name in names)
+        moved = [replace(job, folder=path) for job, path in zip(jobs, paths, strict=True)]
+        add_jobs(claimed, moved)
         yield claimed
 
 

@@ -10,8 +10,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO
 
-from mjstack.interrupt import check_interrupt
-
 POLL = 0.1  # s, between two looks at processes
 _GRACE = 30.0  # s, in which an interrupted process must have ended
 
@@ -79,20 +77,6 @@ class Child(subprocess.Popen[bytes]):
     def seconds(self) -> float:
         """Time since it started."""
         return time.monotonic() - self._began
-
-    def follow(self) -> int:
-        """Wait until it ends, and return its exit status. It is stopped if this is left earlier.
-
-        Raises:
-            KeyboardInterrupt: The command was interrupted.
-        """
-        try:
-            while (code := self.poll()) is None:
-                check_interrupt()
-                time.sleep(POLL)
-            return code
-        finally:
-            stop_all([self])
 
 
 def stop_all(children: Collection[Child]) -> None:

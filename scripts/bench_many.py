@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from mjstack.files import to_csv, write_atomic  # noqa: E402
-from mjstack.process import Child  # noqa: E402
+from mjstack.process import Child, stop_all  # noqa: E402
 from mjstack.report.markdown import to_markdown  # noqa: E402
 from mjstack.report.picture import figure  # noqa: E402
 from mjstack.report.sections import Part, Section  # noqa: E402
@@ -58,7 +58,10 @@ def measure(what: str, worlds: int, gpus: int, args: argparse.Namespace) -> Run:
             command += [f"hydra.run.dir={folder}"]
         with (Path(place) / "output.log").open("wb") as output:
             child = Child(command, output, folder=Path(place))
-            run: Run = {"status": child.follow(), "seconds": child.seconds}
+            try:
+                run: Run = {"status": child.wait(), "seconds": child.seconds}
+            finally:
+                stop_all([child])
         try:
             run |= read(what, folder, gpus, run["seconds"])
         except (OSError, KeyError, ValueError, IndexError) as error:

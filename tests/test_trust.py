@@ -245,7 +245,7 @@ def test_the_working_folder_is_not_imported_from(
     if start == "a job of a sweep":
         log = tmp_path / "output.log"
         with log.open("wb") as output:
-            Child(args, output).follow()
+            Child(args, output).wait()
         text = log.read_text()
     else:
         command = [sys.executable, *start.split(), *args]

@@ -31,14 +31,14 @@ class GpuLauncher(Launcher):
         # Hydra looks at every plugin, and these load torch.
         from mjstack.cli_sweep import hydra_path, place_job
         from mjstack.jobs.sweep import Queueing, run_jobs
-        from mjstack.jobs.sweep_table import sweep_config, update_summary
+        from mjstack.jobs.sweep_table import update_summary
 
         jobs = []
         for number, overrides in enumerate(job_overrides, initial_job_idx):
             cfg = self._loader.load_sweep_config(self._config, list(overrides))
             jobs.append(place_job(cfg, number, overrides))
         folder = hydra_path(self._config, "sweep.dir")
-        finish = partial(update_summary, folder, sweep_config(self._config))
+        finish = partial(update_summary, folder, self._config)
         reports = run_jobs(folder, jobs, Queueing.of(self._queueing), finish)
         return [
             JobReturn(overrides=job.overrides, status=JobStatus.COMPLETED, _return_value=report)

@@ -101,11 +101,10 @@ class _Running:
         if self.late:
             end = f"not done after {self.child.seconds:.0f} s (hydra.launcher.minutes)"
         cause = next((f": {line}" for line in reversed(lines) if line.startswith("mjstack: ")), "")
-        stopped = code == 130 and not self.late
         return Report(
             folder=job.folder,
             overrides=list(job.overrides),
-            status=Status.interrupted if stopped else Status.failed,
+            status=Status.interrupted if code == 130 and not self.late else Status.failed,
             gates=[GateResult(name="job", status=Status.failed, reason=f"{end}{cause} ({path})")],
         )
 
@@ -132,10 +131,8 @@ def run_jobs(
         FolderError: The folder has the jobs of another sweep.
         KeyboardInterrupt: The command was interrupted; so were its jobs.
     """
-    queueing = queueing or Queueing()
-    slots = queueing.slots()
+    queue = _Queue(jobs, queueing or Queueing())
     add_jobs(folder, jobs)
-    queue = _Queue(jobs, slots, queueing)
     try:
         while len(queue.reports) < len(jobs):
             count = len(queue.reports)
@@ -161,11 +158,11 @@ class _Queue:
         reports: Reports, by the number of the job.
     """
 
-    def __init__(self, jobs: Sequence[SweepJob], slots: list[Slot], queueing: Queueing) -> None:
+    def __init__(self, jobs: Sequence[SweepJob], queueing: Queueing) -> None:
         self.running: dict[Slot, _Running] = {}
         self.reports: dict[int, Report] = {}
         self._waiting = list(jobs)
-        self._slots = slots
+        self._slots = queueing.slots()
         self._limit = math.inf if queueing.minutes is None else 60.0 * queueing.minutes
         self._elsewhere: set[int] = set()  # printed that another command runs them
         self._failed = {  # and are repeated
@@ -195,8 +192,7 @@ class _Queue:
     def begin(self) -> None:
         """Start waiting jobs as long as there are slots, and take results that are there."""
         for job in list(self._waiting):
-            done = None if job.number in self._failed else job.result()
-            if done is not None:
+            if job.number not in self._failed and (done := job.result()) is not None:
                 self._print(f"job {job.number}: {done.status}, done before")
                 self.reports[job.number] = done
                 self._waiting.remove(job)
@@ -209,8 +205,7 @@ class _Queue:
         """Start a job, unless another command has it; return whether the slot could be had."""
         anew = job.number in self._failed
         with ExitStack() as locks:
-            log = lock_file(job.folder / LOG)
-            if log is None:
+            if (log := lock_file(job.folder / LOG)) is None:
                 if job.number not in self._elsewhere:
                     self._elsewhere.add(job.number)
                     self._print(f"job {job.number}: another command is running it")
@@ -220,14 +215,11 @@ class _Queue:
             if not anew and job.result() is not None:  # just ended elsewhere
                 return True
             if slot.lock is not None:
-                gpu = lock_file(slot.lock)
-                if gpu is None:  # another sweep's
+                if (gpu := lock_file(slot.lock)) is None:  # another sweep's
                     self._slots.append(self._slots.pop(self._slots.index(slot)))
                     return False
                 locks.enter_context(gpu)
-            earlier = job.set_aside(anew=anew)
-            goes_on = earlier is not None and earlier.resumes == "gates"
-            key = "resume" if goes_on else "hydra.run.dir"
+            key = "resume" if job.set_aside(anew=anew) else "hydra.run.dir"
             args = [*job.overrides, f"{key}={quoted(job.folder)}", *search_path_args()]
             logged = log.tell()
             child = Child(args, log, env=slot.env, cores=slot.cores)

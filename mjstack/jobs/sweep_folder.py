@@ -35,20 +35,16 @@ class SweepJob:
         report = self.report()
         return report if report is not None and report.status in _ENDED else None
 
-    def set_aside(self, *, anew: bool = False) -> Report | None:
+    def set_aside(self, *, anew: bool = False) -> bool:
         """Make room for a run: move what an earlier one has left into a folder beside this one,
-        unless the job goes on with it and shall not begin anew.
-
-        Returns:
-            The report of the run with which the job goes on.
+        unless the job goes on with it and shall not begin anew. Return whether the job goes on
+        where ``resume`` says so.
         """
-        earlier = self.report()
-        if earlier is None:  # the run refuses other files
-            return None
-        if earlier.resumes and not anew:
-            return earlier
-        move_aside(self.folder)
-        return None
+        earlier = self.report()  # without one, the run refuses other files
+        if earlier is not None and (anew or not earlier.resumes):
+            move_aside(self.folder)
+            return False
+        return earlier is not None and earlier.resumes == "gates"
 
 
 def add_jobs(folder: Path, jobs: Sequence[SweepJob]) -> None:

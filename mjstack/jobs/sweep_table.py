@@ -32,12 +32,12 @@ def sweep_config(master: DictConfig) -> SweepCfg:
     return cast(SweepCfg, OmegaConf.to_object(master.sweep))
 
 
-def update_summary(folder: Path, sweep: SweepCfg, reports: Mapping[int, Report]) -> None:
-    """Write the tables when a job has ended, for a command that may be killed before its end.
-    Arguments as of `write_summary`. A full disk ends no job.
+def update_summary(folder: Path, master: DictConfig, reports: Mapping[int, Report]) -> None:
+    """Write the tables when a job has ended, for a command that may be killed before its end. A
+    full disk ends no job.
     """
     with suppress(OSError):
-        write_summary(folder, sweep, reports)
+        write_summary(folder, sweep_config(master), reports)
 
 
 def write_summary(
@@ -80,8 +80,7 @@ def write_summary(
         notes += [f"{name}: {value}" for value in values]
     write_atomic(folder / "summary.csv", to_csv(rows))
     parts: list[Part] = [table, *([picture] if picture.exists() else []), notes]
-    text = to_markdown([Section(title=title, parts=parts, level=1)])
-    write_atomic(folder / "summary.md", text)
+    write_atomic(folder / "summary.md", to_markdown([Section(title=title, parts=parts, level=1)]))
     return replace(table, title=title), problem
 
 
