@@ -191,13 +191,13 @@ def claim_folder(
 
 
 def _run_files(folder: Path) -> list[Path]:
-    """Everything in a folder beside what a run that never began leaves: logs, Hydra's files and a
-    report that is half-written.
+    """Everything in a folder beside what a run or a sweep that never began leaves: logs, Hydra's
+    files and JSON that is half-written.
     """
     return sorted(
         path
         for path in folder.glob("*")
-        if path.name != ".hydra" and path.suffix != ".log" and not path.match(".report.json.*")
+        if path.name != ".hydra" and path.suffix != ".log" and not path.match(".*.json.*")
     )
 
 

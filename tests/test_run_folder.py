@@ -302,6 +302,7 @@ HALF = {".hydra/config.yaml": "a: [", ".hydra/hydra.yaml": "", "run.log": "2026"
         (HALF, COLLECTING),
         (COLLECT | HALF, COLLECTING),
         ({".report.json.x1": "{"} | HALF, COLLECTING),
+        ({".sweep.json.x1": "{"} | HALF, {}),
         ({"report.json": '{"resumes": "collect"}'} | HALF, COLLECTING),
         ({"report.json": '{"resumes": "train 12"}'} | HALF, TRAINING),
     ],
