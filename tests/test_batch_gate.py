@@ -125,7 +125,7 @@ def test_failing_worlds_are_a_table(two_seeds: tuple[Path, GateResult, list[str]
         assert record.failed[world] == RULES["STACKED"]
         assert row["rules"] == "STACKED"
         assert float(row["xy_err_m"]) > 0.00134
-        for name, values in record.named("value").items():
+        for name, values in record.values.items():
             assert float(row[name]) == pytest.approx(values[world], rel=1e-5)
 
 

@@ -165,10 +165,10 @@ def test_shares_played_apart_join_to_the_whole(finished: Path) -> None:
         for batch in play_batches(own, [BatchPlan(1, own.worlds)]):
             parts.append(record_of(own, batch, None))
     joined = EpisodeRecord.join(parts)
-    whole = EpisodeRecord.read(finished, 1, whole=True)
+    whole = EpisodeRecord.read(finished, 1)
     assert whole is not None
     assert list(joined.ranks) == [0, 1]
-    assert len(np.unique(joined.start, axis=0)) == 3
+    assert len(np.unique(joined.worlds["start_qpos"], axis=0)) == 3
     assert joined.worlds.keys() <= whole.worlds.keys()
     for name, values in joined.worlds.items():
         np.testing.assert_array_equal(values, whole.worlds[name], err_msg=name)
@@ -345,14 +345,13 @@ def test_another_configuration_is_refused(
 
 
 def test_a_record_of_an_older_version_is_refused(finished: Path, tmp_path: Path) -> None:
-    """It lacks what a result needs; a replay reads it all the same."""
+    """It lacks what a result needs."""
     with np.load(finished / "worlds_seed0.npz") as held:
         rest = {key: held[key] for key in held.files if not key.startswith("measured.")}
         del rest["steps"]
     np.savez(tmp_path / "worlds_seed0.npz", **rest)
-    assert EpisodeRecord.read(tmp_path, 0) is not None
     with pytest.raises(MjstackError, match="cannot be read"):
-        EpisodeRecord.read(tmp_path, 0, whole=True)
+        EpisodeRecord.read(tmp_path, 0)
 
 
 def test_an_environment_of_later_worlds_starts_and_ends_like_them() -> None:

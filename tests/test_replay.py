@@ -103,12 +103,12 @@ def test_failing_world_fails_again_bit_for_bit(
     assert (gate["name"], gate["status"]) == ("replay_native", "fail")
     as_recorded = "as recorded, and it ends bit for bit where it did"
     assert gate["reason"] == f"failed: not stacked; {as_recorded}"
-    assert gate["metrics"]["xy_err_m"] == record.named("value")["xy_err_m"][2]
+    assert gate["metrics"]["xy_err_m"] == record.values["xy_err_m"][2]
     assert gate["thresholds"]["xy_err_m"] == 0.00134
     broken = [line for line in gate["details"] if "BROKEN" in line]
     assert len(broken) == 1
     assert broken[0].startswith("STACKED: BROKEN, not stacked: stacked_steps 0, xy_err_m ")
-    assert f"xy_err_m {record.named('value')['xy_err_m'][2]:.4g}, dz_m" in broken[0]
+    assert f"xy_err_m {record.values['xy_err_m'][2]:.4g}, dz_m" in broken[0]
     assert broken[0].endswith("(wanted: at least 50)")
     assert len(gate["details"]) == len(RULES)
     with np.load(out / "trajectory.npz") as held:
@@ -260,8 +260,7 @@ def test_a_start_that_is_not_the_recorded_one_is_refused(
     assert report["provenance"].pop("starts_schema") == 2
     (folder / "report.json").write_text(json.dumps(report))
     record = record_of(folder, 1)
-    assert record.start is not None
-    record.start[3, 14] += 0.002
+    record.worlds["start_qpos"][3, 14] += 0.002
     write_npz(folder / record_name("batch", record.seed), record.arrays())
     monkeypatch.chdir(tmp_path)
     assert run(["job=replay", f"run={folder}", f"world={SUCCEEDED}"]) == 2

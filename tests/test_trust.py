@@ -440,7 +440,7 @@ def test_damage_is_one_line(name: str, stranger: Path) -> None:
 def test_a_record_is_read_as_it_was_written(own: Path) -> None:
     record = EpisodeRecord.read(own, 0)
     assert record is not None
-    assert record.qpos.shape == record.start.shape == (2, 20)
+    assert record.qpos.shape == record.worlds["start_qpos"].shape == (2, 20)
 
 
 @pytest.mark.full

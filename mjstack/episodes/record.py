@@ -95,14 +95,10 @@ class EpisodeRecord:
         return self.worlds["qpos"]
 
     @property
-    def start(self) -> np.ndarray:
-        """Positions at the start, shape ``(nworld, nq)``."""
-        return self.worlds["start_qpos"]
-
-    def named(self, prefix: str) -> dict[str, np.ndarray]:
-        """The measurements of a prefix (``value`` or ``measured``), by name with unit."""
-        names = [name for name in self.worlds if name.startswith(f"{prefix}.")]
-        return {name.removeprefix(f"{prefix}."): self.worlds[name] for name in names}
+    def values(self) -> dict[str, np.ndarray]:
+        """The measurements of the check, by name with unit."""
+        named = ((name.partition("."), array) for name, array in self.worlds.items())
+        return {name: array for (kind, _, name), array in named if kind == "value"}
 
     @classmethod
     def join(cls, parts: Sequence["EpisodeRecord"]) -> "EpisodeRecord":
@@ -121,16 +117,13 @@ class EpisodeRecord:
         )
 
     @classmethod
-    def read(
-        cls, folder: Path, seed: int, gate: str = "batch", *, whole: bool = False
-    ) -> "EpisodeRecord | None":
+    def read(cls, folder: Path, seed: int, gate: str = "batch") -> "EpisodeRecord | None":
         """Read the record of a gate's seed in a run's folder; None if the gate did not get there.
 
         Args:
             folder: The folder.
             seed: The seed.
             gate: The gate.
-            whole: With all that the gate's result needs, which records of old versions lack.
 
         Raises:
             FolderError: The file cannot be read.
@@ -140,10 +133,10 @@ class EpisodeRecord:
             return None
         with reading(path, "Run the gate again"):
             arrays = read_npz(path)
-            ranks = [arrays.pop(name, np.empty(0)) for name in ("rank_first_world", "rank_place")]
+            ranks = [arrays.pop(name) for name in ("rank_first_world", "rank_place")]
             arrays.pop("sign_names", None)
             record = cls(
-                **{n: arrays.pop(n).item() for n in _FACTS if whole or n in arrays},
+                **{n: arrays.pop(n).item() for n in _FACTS},
                 **{n: arrays.pop(n).tolist() for n in _NAMES if n in arrays},
                 worlds=arrays,
                 ranks=dict(zip(*(rank.tolist() for rank in ranks), strict=True)),
@@ -182,7 +175,7 @@ class EpisodeRecord:
                 "world": world,
                 "rules": " ".join(rules.broken(int(self.failed[world]))),
                 **(self._sign_cells(world) if "sign" in self.worlds else {}),
-                **{name: f"{values[world]:.6g}" for name, values in self.named("value").items()},
+                **{name: f"{values[world]:.6g}" for name, values in self.values.items()},
             }
             for world in np.flatnonzero(self.failed).tolist()
         ]

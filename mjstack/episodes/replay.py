@@ -77,8 +77,7 @@ class WorldTrace(Recorder):
         starts = ("start_", "field.")
         self.arrays = {k: v[0] if k.startswith(starts) else v for k, v in rows.items()}
         names = np.array([phase.name for phase in self.driver.phases] or [""])
-        step_dt = self.env.cfg.timing.step_dt
-        self.arrays["time_s"] = np.arange(1, len(rows["phase"]) + 1) * step_dt
+        self.arrays["time_s"] = np.arange(1, len(rows["phase"]) + 1) * self.env.cfg.timing.step_dt
         self.arrays["phase"] = names[rows["phase"]]
 
     def explain(self, episode: Episode) -> list[str]:

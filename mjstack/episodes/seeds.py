@@ -166,7 +166,7 @@ class _Player:
         folder = self.run.folder
         if cfg.resume is None or folder is None:
             return None
-        record = EpisodeRecord.read(folder, seed, self.tally.gate, whole=True)
+        record = EpisodeRecord.read(folder, seed, self.tally.gate)
         if record is not None and len(record.failed) != cfg.nworld:
             raise FolderError(
                 f"resume={folder}: has {len(record.failed)} worlds of seed {seed}, expected"
@@ -197,7 +197,7 @@ def _worlds(tally: EpisodeTally, run: Run) -> Worlds:
             f"report.html shows {len(plotted):,} of the {len(bits):,} {tally.noun}: the first ones,"
             " and all that failed"
         )
-    measured = tally.records[0].named("value")
+    measured = tally.records[0].values
     worlds = Worlds(
         names=tally.names(plotted),
         broken=[rules.broken(failed) for failed in bits[plotted].tolist()],

@@ -131,8 +131,8 @@ def _first_sign(monitor: FailureMonitor, episode: Episode) -> str:
     sign = int(monitor.sign[0])
     text = "none"
     if sign:
-        names = [phase.name for phase in monitor.driver.phases] or [""]
-        phase = names[int(monitor.phase[0])]
+        phases = monitor.driver.phases
+        phase = phases[int(monitor.phase[0])].name if phases else ""
         text = f"{describe_sign(sign, phase)}, seen in step {int(monitor.step[0])}"
     retries = int(episode.retries[0])
     return f"first sign of failure: {text}; grasps tried again: {retries}"
@@ -180,20 +180,16 @@ def _compare(
 def _replay_failing(plan: ReplayPlan, run: Run, folder: Path) -> None:
     """Play all failing worlds on each backend, and leave a table; ranks share the seeds."""
     rows: dict[tuple[int, int], dict[str, Any]] = {}
-    for backend, device in plan.where:
-        play = partial(_play_failing, plan, backend, device, rows, folder)
+    for number, (backend, _) in enumerate(plan.where):
+        play = partial(_play_failing, plan, number, rows, folder)
         run_guarded(run, f"replay_{backend}", play, "worlds")
 
 
 def _play_failing(
-    plan: ReplayPlan,
-    backend: Backend,
-    device: str,
-    rows: dict[tuple[int, int], dict[str, Any]],
-    folder: Path,
-    run: Run,
+    plan: ReplayPlan, number: int, rows: dict[tuple[int, int], dict], folder: Path, run: Run
 ) -> list[GateResult]:
     """Play them on one backend: worlds of a seed together, and apart from those that succeeded."""
+    backend, device = plan.where[number]
     stage = run.stage
     ranks = stage.ranks
     if ranks.size > 1 and backend is Backend.mjwarp and device.startswith("cuda"):
@@ -206,10 +202,10 @@ def _play_failing(
         simulate=partial(simulate_alone, stage, backend, device),
     )
     played: list[tuple[int, int, int]] = []  # seed, world and bits
-    for number, batch in enumerate(batches, 1):
+    for done, batch in enumerate(batches, 1):
         failed = zip(batch.plan.worlds, batch.episode.failed.tolist(), strict=True)
         played += [(batch.plan.seed, world, bits) for world, bits in failed]
-        stage.progress.advance("seeds", number, len(share))
+        stage.progress.advance("seeds", done, len(share))
     played = sorted(world for part in ranks.gather(played) for world in part)
     again = sum(bits != 0 for _, _, bits in played)
     same = sum(bits == plan.bits[seed][world] for seed, world, bits in played)

@@ -144,7 +144,7 @@ def check_start(plan: ReplayPlan) -> None:
         FolderError: It would start elsewhere.
     """
     stage = plan.stage
-    recorded = plan.record.start[plan.world]
+    recorded = plan.record.worlds["start_qpos"][plan.world]
     # MJWarp takes longer to load than the native start does to compute, and rounding may have it
     # draw otherwise.
     for backend, device in dict.fromkeys([_NATIVE, plan.where[0]]):
