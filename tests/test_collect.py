@@ -7,11 +7,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import os
 import re
-import signal
-import subprocess
-import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -518,7 +514,9 @@ def test_finished_batches_are_kept(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """The second batch ends in the middle of its episodes."""
+    """The second batch ends in the middle of its episodes. What goes on is in
+    test_collect_resume.py.
+    """
     write = PartWriter.write
 
     def broken(self: PartWriter, episode: Any, *args: Any) -> None:
@@ -526,11 +524,9 @@ def test_finished_batches_are_kept(
             raise error
         write(self, episode, *args)
 
-    args = ["nworld=2", "job.episodes=5"]
     play_nothing()
-    with monkeypatch.context() as inner:
-        inner.setattr(PartWriter, "write", broken)
-        assert collect(*args) == code
+    monkeypatch.setattr(PartWriter, "write", broken)
+    assert collect("nworld=2", "job.episodes=5") == code
     assert pairs(folder / "dataset") == [(0, 0), (0, 1)]
     report = report_of(folder)
     assert report["status"] == status
@@ -540,9 +536,6 @@ def test_finished_batches_are_kept(
         assert "2 committed episodes are kept" in line
     else:
         assert report["gates"][0]["reason"].startswith("interrupted; 2 episodes, 5 asked for")
-    play_nothing()
-    assert collect(*args) == 0
-    assert pairs(folder / "dataset") == [(0, 0), (0, 1), (1, 0), (1, 1), (2, 0)]
 
 
 @pytest.mark.full
@@ -568,51 +561,6 @@ def test_brackets_in_names_are_printed(
     out = capsys.readouterr().out
     assert "Arm [/b], " in out
     assert "dataset: outputs/[b]/dataset\n" in out
-
-
-@pytest.mark.full
-def test_a_kill_in_the_middle_of_a_batch(folder: Path, play_nothing: PlayNothing) -> None:
-    """Killed in the second batch, when an episode of it is on the disk: the first one is kept."""
-    kill = """
-import os, signal
-from mjstack.cli import run
-from mjstack.datasets.part import PartWriter
-from mjstack.jobs import collect
-from stubs import fake_batches
-
-collect.play_batches = fake_batches(lambda seed, world: world == 1, noise=True)
-write = PartWriter.write
-
-def killed(self, episode, *args):
-    write(self, episode, *args)
-    if episode.seed == 1:
-        os.kill(os.getpid(), signal.SIGKILL)
-
-PartWriter.write = killed
-run(ARGS)
-"""
-    args = ["nworld=7", "job.episodes=8"]
-    program = f"ARGS = {[*COMMAND, *args]!r}\n{kill}"
-    path = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
-    command = [sys.executable, "-c", program]
-    env = os.environ | {"PYTHONPATH": path}
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=env)
-    assert done.returncode == -signal.SIGKILL, done.stderr
-    left = contents(folder / "dataset" / "data")
-    before = {name: data for name, data in left.items() if "/." not in name}
-    assert len(before) == 1 < len(left)
-    first = [(0, 0), *((0, world) for world in range(2, 7))]
-    assert pairs(folder / "dataset") == first
-    assert report_of(folder)["status"] == "interrupted"
-    # A kill a little later, in a second call, would leave this.
-    (folder / ".hydra" / "config.yaml").write_text("")
-    play_nothing(lambda seed, world: world == 1, noise=True)
-    assert run([*COMMAND, *args]) == 0
-    assert pairs(folder / "dataset") == [*first, (1, 0), (1, 2)]
-    assert before.items() <= contents(folder / "dataset" / "data").items()
-    check_dataset(folder / "dataset")
-    assert batches_of(folder) == [(7, 6, 6), (3, 2, 2)]
-    assert report_of(folder)["gates"][0]["metrics"]["succeeded"] == 8
 
 
 @pytest.mark.full
