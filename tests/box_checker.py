@@ -6,66 +6,27 @@ right."""
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
 import numpy as np
+from check_cases import BLUE, Outcome, Recording
 
 from mjstack.config.schema import Config
 from mjstack.tasks.check import make_check
 
-RED = 0
-BLUE = 1
 COLORS = ("red", "blue")
 SIGNS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
-@dataclass
-class BoxRecording:
-    """One world at every step end.
-
-    Attributes:
-        phase: Name of its phase, shape ``(steps,)``; None for a driver without phases.
-        pose: Red's and blue's, shape ``(steps, 2, 7)``.
-        velocity: Likewise, as MuJoCo has it, shape ``(steps, 2, 6)``.
-        jaw_force: Of each jaw on each cube [N], shape ``(steps, 2, jaws, 3)``.
-        support_force: Of whatever else touches each cube [N], shape ``(steps, 2, n, 3)``.
-        gripper: Joint positions, shape ``(steps, n_gripper)``.
-        xpos: All bodies at the end, shape ``(nbody, 3)``.
-        xquat: Likewise, shape ``(nbody, 4)``.
-        step_count: Physics steps the world has made.
-        overflow: Whether it lost contacts or constraint rows.
-        finite_elsewhere: Whether the rest of its state stayed finite.
-    """
-
-    phase: np.ndarray | None
-    pose: np.ndarray
-    velocity: np.ndarray
-    jaw_force: np.ndarray
-    support_force: np.ndarray
-    gripper: np.ndarray
-    xpos: np.ndarray
-    xquat: np.ndarray
-    step_count: int
-    overflow: bool = False
-    finite_elsewhere: bool = True
-
-
-@dataclass
-class BoxOutcome:
-    """Names of the broken rules, and the numbers behind them, named as the check names them."""
-
-    failed: set[str] = field(default_factory=set)
-    values: dict[str, float] = field(default_factory=dict)
-
-
-def check_box_world(rec: BoxRecording, cfg: Config, model: mujoco.MjModel) -> BoxOutcome:
+def check_box_world(rec: Recording, cfg: Config, model: mujoco.MjModel) -> Outcome:
     """Judges one world."""
     rules = make_check(cfg).t
     box = cfg.scene.box
-    out = BoxOutcome()
+    out = Outcome()
     assert box is not None
+    assert rec.support_force is not None
     steps = len(rec.pose)
     top = cfg.scene.table_center[2] + cfg.scene.table_half[2]
     wanted = sum(round(p.seconds / cfg.timing.step_dt) for p in cfg.controller.phases.values())
@@ -329,28 +290,18 @@ def rest_until(still: np.ndarray, last: int) -> int:
     return last - (moving[-1] if len(moving) else -1)
 
 
-def lowest_geometry(rec: BoxRecording, bodies: list[str], model: mujoco.MjModel) -> float:
-    """Smallest z of the colliding geoms of some bodies, from points on their surfaces."""
-    lowest = np.inf
-    down = np.array([0.0, 0.0, -1.0])
+def lowest_geometry(rec: Recording, bodies: list[str], model: mujoco.MjModel) -> float:
+    """Smallest z of the colliding geoms of some bodies, by MuJoCo's distance from the floor."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    floor = model.geom("floor").id
+    lowest = 2.0
     for geom in range(model.ngeom):
         body = model.geom_bodyid[geom]
-        if model.body(body).name not in bodies or not (
-            model.geom_contype[geom] or model.geom_conaffinity[geom]
-        ):
-            continue
-        step = rotations(rec.xquat[None, body])[0]
-        turn = step @ rotations(model.geom_quat[None, geom])[0]
-        center = rec.xpos[body] + step @ model.geom_pos[geom]
-        size = model.geom_size[geom]
-        kind = mujoco.mjtGeom(model.geom_type[geom])
-        if kind == mujoco.mjtGeom.mjGEOM_BOX:
-            points = [turn @ (size * s) for s in SIGNS]
-        elif kind == mujoco.mjtGeom.mjGEOM_SPHERE:
-            points = [size[0] * down]
-        elif kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
-            points = [turn @ [0.0, 0.0, end] + size[0] * down for end in (-size[1], size[1])]
-        else:
-            raise NotImplementedError(kind)
-        lowest = min(lowest, *(float((center + p)[2]) for p in points))
+        collides = model.geom_contype[geom] or model.geom_conaffinity[geom]
+        if model.body(body).name in bodies and collides:
+            turn = rotations(rec.xquat[None, body])[0]
+            data.geom_xpos[geom] = rec.xpos[body] + turn @ model.geom_pos[geom]
+            data.geom_xmat[geom] = (turn @ rotations(model.geom_quat[None, geom])[0]).ravel()
+            lowest = min(lowest, mujoco.mj_geomDistance(model, data, floor, geom, 2.0, None))
     return lowest

@@ -1,14 +1,17 @@
-"""Alterations of an succeeded recording, each with the rules that it has to break; for the check of
-either task.
+"""What the checks of both tasks are compared by: a recorded world, its outcome, and alterations of
+a recording that succeeded, each with the rules that it has to break.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
+import numpy as np
+import pytest
 from compositions import load_config
 
 from mjstack.config.schema import Config
@@ -26,6 +29,8 @@ def rules_of(task: str) -> Rules:
     return make_check(load_config([f"task={task}"])).rules
 
 
+RED = 0
+BLUE = 1
 Alter = Callable[[Any], None]
 Altered = dict[str, tuple[CheckResult, int, Any]]
 STOPPED_EARLY = (
@@ -34,10 +39,51 @@ STOPPED_EARLY = (
 
 
 @dataclass
+class Recording:
+    """One world at every step end.
+
+    Attributes:
+        phase: Name of its phase, shape ``(steps,)``; None for a driver without phases.
+        pose: Red's and blue's, shape ``(steps, 2, 7)``.
+        velocity: Likewise, as MuJoCo has it, shape ``(steps, 2, 6)``.
+        jaw_force: Of each jaw on each cube [N], shape ``(steps, 2, jaws, 3)``.
+        support_force: Of whatever else touches each cube [N], shape ``(steps, 2, n, 3)``; None in a
+            scene without such sensors.
+        gripper: Joint positions, shape ``(steps, n_gripper)``.
+        xpos: All bodies at the end, shape ``(nbody, 3)``.
+        xquat: Likewise, shape ``(nbody, 4)``.
+        step_count: Physics steps the world has made.
+        overflow: Whether it lost contacts or constraint rows.
+        finite_elsewhere: Whether the rest of its state stayed finite.
+    """
+
+    phase: np.ndarray | None
+    pose: np.ndarray
+    velocity: np.ndarray
+    jaw_force: np.ndarray
+    support_force: np.ndarray | None
+    gripper: np.ndarray
+    xpos: np.ndarray
+    xquat: np.ndarray
+    step_count: int
+    overflow: bool = False
+    finite_elsewhere: bool = True
+
+
+@dataclass
+class Outcome:
+    """Names of the broken rules, and the numbers behind them, named as the check names them."""
+
+    failed: set[str] = field(default_factory=set)
+    values: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass
 class Cases:
-    """Cases by name. A world has at least ``step_count`` and ``overflow``."""
+    """Cases by name, and how near the numbers of a check are to those of the plain checker."""
 
     rules: Rules
+    rel: float
     alter: dict[str, Alter] = field(default_factory=dict)
     breaks: dict[str, set[str]] = field(default_factory=dict)
 
@@ -81,3 +127,11 @@ class Cases:
     def broken(self, result: CheckResult, k: int = 0) -> set[str]:
         """Names of the rules that a world broke."""
         return set(self.rules.broken(int(result.failed[k])))
+
+    def assert_same(self, result: CheckResult, k: int, expected: Outcome) -> None:
+        """A world's rules and numbers are the plain checker's."""
+        assert self.broken(result, k) == expected.failed
+        for name, value in expected.values.items():
+            near = math.degrees(1e-6) if name.endswith("_deg") else 1e-6
+            near_value = pytest.approx(value, abs=near, rel=self.rel, nan_ok=True)
+            assert float(result.values[name][k]) == near_value, name

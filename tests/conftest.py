@@ -7,12 +7,14 @@ from __future__ import annotations
 import gc
 import os
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 from compositions import load_config
-from environments import CUDA, Keep
+from environments import CUDA, DEVICES
+from recordings import recording
 
 from mjstack.config.schema import Backend, Config
 from mjstack.episodes.run import Run
@@ -91,19 +93,14 @@ def make_sim(get_stage: Callable[[str], Stage]) -> Callable[..., Simulation]:
 def recorded(
     get_stage: Callable[[str], Stage], make_sim: Callable[..., Simulation]
 ) -> Callable[[str], SimpleNamespace]:
-    """A native episode of four jittered worlds per robot: cube poses and velocities at every step
-    end, and the result.
-    """
-    made: dict[str, SimpleNamespace] = {}
+    """A native episode of four jittered worlds per robot."""
 
+    @cache
     def get(robot: str) -> SimpleNamespace:
-        if robot not in made:
-            stage = get_stage(robot)
-            sim = make_sim("native", 4, robot=robot)
-            keep = Keep()
-            episode = stage.play(sim, stage.cfg.reset, [keep])
-            made[robot] = keep.recording(stage, episode)
-        return made[robot]
+        stage = get_stage(robot)
+        with recording(stage) as recordings:
+            stage.play(make_sim("native", 4, robot=robot), stage.cfg.reset)
+        return recordings[0]
 
     return get
 
@@ -111,6 +108,12 @@ def recorded(
 @pytest.fixture(params=ROBOTS)
 def robot(request: pytest.FixtureRequest) -> str:
     """Either robot."""
+    return request.param
+
+
+@pytest.fixture(params=DEVICES)
+def device(request: pytest.FixtureRequest) -> str:
+    """Warp's CPU device, and CUDA where there is one."""
     return request.param
 
 

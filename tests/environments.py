@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cache, reduce
+from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -18,9 +19,8 @@ from compositions import load_config
 from numpy.typing import ArrayLike
 
 from mjstack.config.schema import Backend, Config
-from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
-from mjstack.episodes.rollout import Episode, Observer
+from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.stage import Stage
 from mjstack.managers import required_fields
 from mjstack.scene import SceneIndex, build_model
@@ -157,6 +157,19 @@ def quats(yaw: np.ndarray) -> np.ndarray:
     return np.stack((np.cos(0.5 * yaw), zero, zero, np.sin(0.5 * yaw)), axis=-1)
 
 
+def record_of(folder: Path, seed: int = 0, gate: str = "batch") -> EpisodeRecord:
+    """What a gate has left of the worlds of a seed."""
+    record = EpisodeRecord.read(folder, seed, gate)
+    assert record is not None
+    return record
+
+
+def two_starts(red_x: float = 0.31, **others: ArrayLike) -> dict[str, np.ndarray]:
+    """Those of two worlds, the red cube of the second at an x [m]."""
+    red = [(0.33, -0.13, 0.0), (red_x, -0.1, 0.3)]
+    return stack_starts(red, [(0.33, 0.06, 0.0), (0.34, 0.08, -0.5)], **others)
+
+
 def stack_starts(red: ArrayLike, blue: ArrayLike, **others: ArrayLike) -> dict[str, np.ndarray]:
     """The arrays of a starts file with both cubes, from x, y [m] and yaw [rad] of every world."""
     starts = {name: np.asarray(values) for name, values in others.items()}
@@ -250,36 +263,10 @@ def assert_traces(a: Trace, b: Trace, rows: Any, other: Any, backend: str) -> No
         assert_rows(x, y, rows, other, backend, f"step {t}:")
 
 
-class Keep(Observer):
-    """Keeps actions and states at every step end."""
-
-    def start(self, env: Env, driver: Driver) -> None:
-        super().start(env, driver)
-        self.actions: list[torch.Tensor] = []
-        self._states: dict[str, list[torch.Tensor]] = {"qpos": [], "qvel": [], "sensordata": []}
-
-    def after_step(self, step: int) -> None:
-        self.actions.append(self.env.action_manager.action.clone())
-        for name, rows in self._states.items():
-            rows.append(getattr(self.env.sim, name).clone())
-
-    def recording(self, stage: Stage, episode: Episode) -> SimpleNamespace:
-        """Cube poses and velocities, forces and the gripper at every step end, each ``(nworld,
-        steps, ...)``, and the result.
-        """
-        index = stage.index
-        qpos, qvel, force = (torch.stack(rows, 1).numpy() for rows in self._states.values())
-        return SimpleNamespace(
-            pose=np.stack([qpos[..., a : a + 7] for a in index.object_qpos], axis=2),
-            velocity=np.stack([qvel[..., a : a + 6] for a in index.object_qvel], axis=2),
-            force=force,
-            gripper=qpos[..., index.robot_qpos[index.n_arm :]],
-            jaw_force=index.jaw_force,
-            result=episode.result,
-            step_count=self.env.sim.step_count.numpy().copy(),
-            cfg=stage.cfg,
-            phases=stage.planner.phases,
-        )
+def start_moving(sim: Simulation, stage: Stage) -> None:
+    """Home, jittered cubes, and a command that moves every joint."""
+    stage.start(sim, stage.cfg.reset)
+    sim.ctrl[:, torch.from_numpy(stage.index.ctrl)] += 0.05
 
 
 class StubViews(SimpleNamespace):

@@ -7,28 +7,12 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
 
 import numpy as np
+from check_cases import BLUE, RED, Outcome, Recording
 
 from mjstack.config.schema import Config
 from mjstack.tasks.check import make_check
-
-RED = 0
-BLUE = 1
-
-
-@dataclass
-class Outcome:
-    """Names of the broken rules, and the numbers behind them."""
-
-    failed: set[str]
-    xy_err: float
-    dz: float
-    rest_speed: float
-    peak_speed: float
-    rest_position: float
-    rest_rotation: float
 
 
 def rotation_matrix(quat: np.ndarray) -> np.ndarray:
@@ -58,58 +42,33 @@ def rotation_between(a: np.ndarray, b: np.ndarray) -> float:
     return 4.0 * math.asin(min(1.0, 0.5 * chord)) if math.isfinite(chord) else math.nan
 
 
-def _in(step: int, span: tuple[int, int]) -> bool:
-    return span[0] <= step < span[1]
-
-
-def check_world(
-    pose: np.ndarray,
-    velocity: np.ndarray,
-    cfg: Config,
-    phases: list,
-    *,
-    jaw_force: np.ndarray,
-    gripper: np.ndarray,
-    step_count: int,
-    overflow: bool = False,
-    finite_elsewhere: bool = True,
-) -> Outcome:
-    """Judges one world.
-
-    Args:
-        pose: Red's and blue's pose at every step end, shape ``(steps, 2, 7)``.
-        velocity: Their velocity, shape ``(steps, 2, 6)``.
-        cfg: Thresholds, table and cubes.
-        phases: Names with first and last (exclusive) step; empty for a driver without phases.
-        jaw_force: Of each jaw on red [N], shape ``(steps, jaws, 3)``.
-        gripper: Positions of its joints, shape ``(steps, n)``.
-        step_count: Physics steps the world has made.
-        overflow: Whether it lost contacts or constraint rows.
-        finite_elsewhere: Whether the rest of its state stayed finite.
-    """
+def check_world(rec: Recording, cfg: Config) -> Outcome:
+    """Judges one world."""
     rules = make_check(cfg).t
     scene = cfg.scene
     half = scene.objects["red"].half_height
     top = scene.table_center[2] + scene.table_half[2]
+    pose = rec.pose
+    velocity = rec.velocity
+    phase = rec.phase
     steps = len(pose)
-    span = {p.name: (p.start, p.stop) for p in phases}
     failed: set[str] = set()
 
-    if not (np.isfinite(pose).all() and np.isfinite(velocity).all() and finite_elsewhere):
+    if not (np.isfinite(pose).all() and np.isfinite(velocity).all() and rec.finite_elsewhere):
         failed.add("FINITE")
-    whole = phases[-1].stop if phases else cfg.task.episode_steps
-    if step_count != steps * cfg.timing.decimation or steps != whole:
+    whole = sum(round(p.seconds / cfg.timing.step_dt) for p in cfg.controller.phases.values())
+    if rec.step_count != steps * cfg.timing.decimation or steps != whole:
         failed.add("STEPS")
-    if overflow:
+    if rec.overflow:
         failed.add("OVERFLOW")
 
     airborne = [lowest_corner(p[RED], half) - top > rules.airborne_height for p in pose]
 
-    pressed = np.linalg.norm(jaw_force, axis=-1) > 1e-5
+    pressed = np.linalg.norm(rec.jaw_force[:, RED], axis=-1) > 1e-5
     before = range(steps - rules.window)
-    if phases:
-        lifting = [f for f in range(steps) if any(_in(f, span[n]) for n in rules.lift_phases)]
-        carrying = list(range(*span[rules.carry_phase]))
+    if phase is not None:
+        lifting = [f for f in range(steps) if phase[f] in rules.lift_phases]
+        carrying = [f for f in range(steps) if phase[f] == rules.carry_phase]
     else:
         airborne = [up and pressed[f].all() for f, up in enumerate(airborne)]
         lifting = list(before)
@@ -123,7 +82,7 @@ def check_world(
     if lifted_at is None:
         failed.add("LIFT")
 
-    if not phases:  # the lift comes first
+    if phase is None:  # the lift comes first
         carrying = [f for f in before if lifted_at is not None and f >= lifted_at]
     carried = False
     run_steps: list[int] = []
@@ -154,7 +113,7 @@ def check_world(
             failed.add("SUPPORTED")
 
     closed = np.array(cfg.robot.gripper_closed)
-    opening = (gripper - closed) / (np.array(cfg.robot.gripper_open) - closed)
+    opening = (rec.gripper - closed) / (np.array(cfg.robot.gripper_open) - closed)
     for step in window:
         if pressed[step].any() or not (opening[step] >= rules.open_fraction).all():
             failed.add("RELEASED")
@@ -185,12 +144,12 @@ def check_world(
         failed.add("REST_ROTATION")
 
     last = pose[-1]
-    return Outcome(
-        failed=failed,
-        xy_err=float(np.linalg.norm(last[RED, :2] - last[BLUE, :2])),
-        dz=float(last[RED, 2] - last[BLUE, 2]),
-        rest_speed=rest_speed,
-        peak_speed=float(np.max(peaks)),
-        rest_position=rest_position,
-        rest_rotation=rest_rotation,
-    )
+    values = {
+        "xy_err_m": float(np.linalg.norm(last[RED, :2] - last[BLUE, :2])),
+        "dz_m": float(last[RED, 2] - last[BLUE, 2]),
+        "rest_speed_m_per_s": rest_speed,
+        "peak_speed_m_per_s": float(np.max(peaks)),
+        "rest_position_m": rest_position,
+        "rest_rotation_deg": math.degrees(rest_rotation),
+    }
+    return Outcome(failed, values)

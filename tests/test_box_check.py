@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from box_checker import BLUE, RED, BoxOutcome
-from box_recordings import World, faster_stage, feed, put_cube, recording
-from check_cases import Altered, Cases, rules_of
+from check_cases import BLUE, RED, Altered, Cases, rules_of
 from compositions import load_config
 from environments import CUDA, at_double_speed
+from recordings import World, faster_stage, feed, put_cube, recording
 
 from mjstack.config.schema import Backend
 from mjstack.envs import Env
@@ -28,12 +27,11 @@ from mjstack.episodes.stage import Stage
 from mjstack.gates.success import run_success
 from mjstack.report.record import Status
 from mjstack.sim import make_simulation
-from mjstack.tasks.check import CheckResult
 
 pytestmark = pytest.mark.full
 
 RULES = rules_of("box")
-CASES = Cases(RULES)
+CASES = Cases(RULES, rel=1e-5)
 HAIR = 2e-6  # [m], [m/s]: a good deal more than float32 rounds at these sizes
 LEVEL = [1.0, 0.0, 0.0, 0.0]
 
@@ -82,14 +80,6 @@ def scripted() -> SimpleNamespace:
     return rec
 
 
-def assert_same(result: CheckResult, k: int, expected: BoxOutcome) -> None:
-    assert CASES.broken(result, k) == expected.failed
-    for name, value in expected.values.items():
-        assert float(result.values[name][k]) == pytest.approx(
-            value, abs=1e-6, rel=1e-5, nan_ok=True
-        ), name
-
-
 def test_recorded_episodes() -> None:
     """As they were judged while they were played, and fed to the check once more, in float32 and as
     one batch.
@@ -101,8 +91,8 @@ def test_recorded_episodes() -> None:
     for k, world in enumerate(worlds):
         expected = world.outcome
         broken.append(expected.failed)
-        assert_same(result, k, expected)
-        assert_same(recs[k // 2].result, k % 2, expected)
+        CASES.assert_same(result, k, expected)
+        CASES.assert_same(recs[k // 2].result, k % 2, expected)
     assert broken == [set(), {"DROP_RED", "CARRY_RED", "SETTLED_RED", "INSIDE"}, set(), set()]
 
 
@@ -188,8 +178,8 @@ def test_mjwarp_fills_the_box(robot: str, controller: str, device: str) -> None:
     for k, world in enumerate(few):
         expected = world.outcome
         assert expected.failed == set()
-        assert_same(result, k, expected)
-        assert_same(episode.result, k, expected)
+        CASES.assert_same(result, k, expected)
+        CASES.assert_same(episode.result, k, expected)
 
 
 Alter = Callable[[World, int, str], None]
@@ -484,7 +474,7 @@ def altered() -> Altered:
 def test_altered_recording(name: str, altered: Altered) -> None:
     result, k, world = altered[name]
     assert CASES.broken(result, k) == CASES.breaks[name]
-    assert_same(result, k, world.outcome)
+    CASES.assert_same(result, k, world.outcome)
 
 
 @pytest.mark.parametrize("more", [-1, 60])
@@ -532,7 +522,7 @@ def test_expert_episodes_of_the_box_pass_without_phases() -> None:
     result = feed(worlds, torch.float32, phased=False)
     broken = [set(RULES.broken(int(bits))) for bits in result.failed]
     for k, world in enumerate(worlds):
-        assert_same(result, k, world.outcome_without_phases)
+        CASES.assert_same(result, k, world.outcome_without_phases)
     assert [broken[k] for k in (0, 2, 3)] == [set()] * 3
     assert {"DROP_RED", "SETTLED_RED", "INSIDE"} <= broken[1]
     assert not any(name.endswith("_BLUE") for name in broken[1])
@@ -562,7 +552,7 @@ def test_cheats_in_the_box_break_a_rule() -> None:
     broken = {}
     for k, (name, world) in enumerate(worlds.items()):
         broken[name] = CASES.broken(result, k)
-        assert_same(result, k, world.outcome_without_phases)
+        CASES.assert_same(result, k, world.outcome_without_phases)
     red = {f"{rule}_RED" for rule in ("GRASP", "LIFT", "CARRY", "RELEASE", "SETTLED")}
     assert broken["no_grasp"] == red | {"ORDER"}
     assert broken["early_blue"] == {"ORDER"}
@@ -612,4 +602,4 @@ def test_a_fall_over_the_box_is_a_drop_without_phases() -> None:
         alter, color = name.rsplit("_", 1)
         expected = set() if alter == "low" else {f"DROP_{color.upper()}"}
         assert CASES.broken(result, k) == expected, name
-        assert_same(result, k, world.outcome_without_phases)
+        CASES.assert_same(result, k, world.outcome_without_phases)

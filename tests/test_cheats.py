@@ -14,12 +14,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from check_cases import rules_of
-from environments import Keep
-from stack_checker import BLUE, RED
-from test_stack_check import World, feed, reference
+from check_cases import BLUE, RED, rules_of
+from recordings import Recorder, World, feed
 
 from mjstack.drivers.driver import Driver
+from mjstack.episodes.recorder import CommandRecorder
 from mjstack.episodes.rollout import play_episode
 from mjstack.episodes.stage import Stage
 from mjstack.sim import Simulation
@@ -50,9 +49,9 @@ def drive(
     @cache
     def expert(robot: str) -> torch.Tensor:
         stage = get_stage(robot)
-        keep = Keep()
-        stage.play(make_sim("native", NWORLD, robot=robot), stage.cfg.reset, [keep])
-        return torch.stack(keep.actions)
+        commands = CommandRecorder()
+        stage.play(make_sim("native", NWORLD, robot=robot), stage.cfg.reset, [commands])
+        return commands.rows["ctrl"].clone()
 
     def play(
         robot: str, change: Callable[[torch.Tensor, dict[str, slice]], None]
@@ -61,12 +60,12 @@ def drive(
         targets = expert(robot).clone()
         change(targets, {p.name: slice(p.start, p.stop) for p in stage.planner.phases})
         env = stage.start(make_sim("native", NWORLD, robot=robot), stage.cfg.reset)
-        keep = Keep()
-        episode = play_episode(env, Targets(targets), [keep])
-        rec = keep.recording(stage, episode)
+        recorder = Recorder()
+        episode = play_episode(env, Targets(targets), [recorder])
+        rec = recorder.recording(stage, episode)
         broken = [set(RULES.broken(int(bits))) for bits in episode.failed]
         for k in (0, NWORLD - 1):
-            assert reference(World.of(rec, k), phased=False).failed == broken[k]
+            assert World.of(rec, k).outcome_without_phases.failed == broken[k]
         return broken
 
     return play
@@ -136,34 +135,34 @@ def recording(recorded: Callable[[str], SimpleNamespace]) -> World:
 
 def judge(world: World) -> set[str]:
     """The broken rules, on which the plain checker agrees."""
-    broken = set(RULES.broken(int(feed([world], world.rec, phased=False).failed[0])))
-    assert reference(world, phased=False).failed == broken
+    broken = set(RULES.broken(int(feed([world], phased=False).failed[0])))
+    assert world.outcome_without_phases.failed == broken
     return broken
 
 
 def fly(world: World, first: int, steps: int = 25) -> None:
     """From a step on red is in free flight, out of the jaws, onto blue, where it comes to rest."""
-    land = world.pose[-1, RED].copy()
+    land = world.poses[-1, RED].copy()
     at = np.linspace(0.0, 1.0, steps)[:, None]
-    start = world.pose[first, RED, :3].copy()
+    start = world.poses[first, RED, :3].copy()
     path = start + at * (land[:3] - start)
     path[:, 2:] += 4.0 * 0.08 * at * (1.0 - at)
-    world.pose[first : first + steps, RED, :3] = path
-    world.pose[first + steps :, RED] = land
+    world.poses[first : first + steps, RED, :3] = path
+    world.poses[first + steps :, RED] = land
     for jaw in (0, 1):
-        world.jaw(jaw)[first:] = 0.0
+        world.jaw(RED, jaw)[first:] = 0.0
 
 
 def test_a_throw_is_no_carry(recording: World) -> None:
     """Held up for long enough, then thrown onto blue."""
-    fly(recording, recording.steps("above_blue").start)
+    fly(recording, recording.steps("above_blue")[0])
     assert judge(recording) == {"CARRY"}
 
 
 def test_a_throw_from_the_table_is_no_lift(recording: World) -> None:
     """Flung up when it has been in the air for nine steps, which is one too few."""
-    top = recording.rec.cfg.scene.table_top
-    up = np.flatnonzero(recording.pose[:, RED, 2] - 0.022 - top > recording.t.airborne_height)
+    top = recording.stage.cfg.scene.table_top
+    up = np.flatnonzero(recording.poses[:, RED, 2] - 0.022 - top > recording.t.airborne_height)
     fly(recording, int(up[0]) + recording.t.lift_steps - 1)
     assert judge(recording) == {"LIFT", "CARRY"}
 
@@ -171,51 +170,50 @@ def test_a_throw_from_the_table_is_no_lift(recording: World) -> None:
 @pytest.mark.parametrize("both", [False, True])
 def test_a_cube_pushed_up_the_others_side_is_not_carried(recording: World, both: bool) -> None:
     """Along the table to blue, and up its side, with one jaw, or with either in turn."""
-    flight = slice(recording.steps("lift_red").start, recording.steps("place_stack").stop)
+    flight = slice(recording.steps("lift_red")[0], recording.steps("place_stack")[-1] + 1)
     n = flight.stop - flight.start
-    place = recording.pose[-1, RED].copy()
-    side = recording.pose[-1, BLUE, :3] - np.array([0.0, 0.045, 0.0])
+    place = recording.poses[-1, RED].copy()
+    side = recording.poses[-1, BLUE, :3] - np.array([0.0, 0.045, 0.0])
     above = [*side[:2], place[2]]
-    corners = np.array([recording.pose[0, RED, :3], side, above, place[:3]])
+    corners = np.array([recording.poses[0, RED, :3], side, above, place[:3]])
     at = np.linspace(0.0, 3.0, n)
     path = [np.interp(at, range(4), corners[:, axis]) for axis in range(3)]
-    recording.pose[flight, RED, :3] = np.stack(path, axis=1)
-    recording.pose[flight, RED, 3:] = recording.pose[0, RED, 3:]
-    recording.pose[flight.stop :, RED] = place
+    recording.poses[flight, RED, :3] = np.stack(path, axis=1)
+    recording.poses[flight, RED, 3:] = recording.poses[0, RED, 3:]
+    recording.poses[flight.stop :, RED] = place
     steps = np.arange(flight.start, flight.stop)
     for jaw in (0, 1):
-        recording.jaw(jaw)[flight.stop :] = 0.0
+        recording.jaw(RED, jaw)[flight.stop :] = 0.0
         pushes = steps % 2 == jaw if both else jaw == 0
-        recording.jaw(jaw)[flight] = np.where(np.broadcast_to(pushes, n)[:, None], 1.0, 0.0)
+        recording.jaw(RED, jaw)[flight] = np.where(np.broadcast_to(pushes, n)[:, None], 1.0, 0.0)
     assert judge(recording) == {"LIFT", "CARRY"}
 
 
 def test_a_fall_in_the_last_step_is_no_stack(recording: World) -> None:
-    recording.pose[-1, RED, :3] = recording.pose[-1, BLUE, :3] + [0.0, 0.045, 0.0]
-    recording.velocity[-1, RED, 2] = -0.3
+    recording.poses[-1, RED, :3] = recording.poses[-1, BLUE, :3] + [0.0, 0.045, 0.0]
+    recording.velocities[-1, RED, 2] = -0.3
     assert {"STACKED", "REST_POSITION"} <= judge(recording)
 
 
 def test_a_jaw_that_touches_in_one_step_is_no_release(recording: World) -> None:
-    recording.jaw(0)[-1, 2] = 2e-5
+    recording.jaw(RED, 0)[-1, 2] = 2e-5
     assert judge(recording) == {"RELEASED"}
 
 
 def test_a_grip_that_slips_every_ninth_step_is_no_lift(recording: World) -> None:
     for jaw in (0, 1):
-        recording.jaw(jaw)[::9] = 0.0
+        recording.jaw(RED, jaw)[::9] = 0.0
     assert judge(recording) == {"LIFT", "CARRY"}
-    assert not feed([recording], recording.rec).failed.any()  # with phases the jaws do not count
+    assert not feed([recording]).failed.any()  # with phases the jaws do not count
 
 
 @pytest.mark.full
 def test_a_lift_in_the_settled_window_comes_too_late(recording: World) -> None:
     """The same flight, shifted so that all of it but the last step before the window is in it."""
-    first = np.flatnonzero((recording.jaw(0) != 0.0).any(1))[0]
-    late = len(recording.pose) - recording.t.window - 9
-    for name in ("pose", "force"):
-        values = getattr(recording, name)
+    first = np.flatnonzero((recording.jaw(RED, 0) != 0.0).any(1))[0]
+    late = len(recording.poses) - recording.t.window - 9
+    for values in (recording.poses, recording.sensordata):
         shifted = np.roll(values, late - first, axis=0)
         shifted[:late] = values[0]
-        setattr(recording, name, shifted)
+        values[:] = shifted
     assert judge(recording) >= {"LIFT", "CARRY"}

@@ -13,9 +13,9 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from check_cases import limits
+from check_cases import BLUE, RED, limits
 from environments import StubViews, actions, configure, on_shared_sim, returned
-from stack_checker import BLUE, RED, lowest_corner
+from stack_checker import lowest_corner
 
 from mjstack.config.schema import Config
 from mjstack.envs import Env

@@ -1,5 +1,5 @@
-"""Recorded episodes of the box task: whole batches at every step end, and single worlds for the
-checker or for alterations.
+"""Recorded episodes: whole batches at every step end, and single worlds for the plain checker of
+the task or for alterations.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from box_checker import BLUE, RED, BoxOutcome, BoxRecording, check_box_world
-from check_cases import STOPPED_EARLY, limits
+from box_checker import check_box_world
+from check_cases import BLUE, RED, STOPPED_EARLY, Outcome, Recording, limits
 from compositions import load_config
 from environments import StubViews, at_double_speed
+from stack_checker import check_world
 
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
@@ -35,8 +36,7 @@ Disturb = Callable[[Env, str], None]
 class Recorder(Observer):
     """Keeps every world's state and phase at every step end."""
 
-    def __init__(self, names: list[str], disturb: Disturb | None) -> None:
-        self._names = names
+    def __init__(self, disturb: Disturb | None = None) -> None:
         self._disturb = disturb
         self._rows: dict[str, list[np.ndarray]] = {name: [] for name in (*STATE, "phase")}
 
@@ -50,32 +50,31 @@ class Recorder(Observer):
         phase = self._driver.phase.cpu().numpy().copy()
         self._rows["phase"].append(phase)
         if self._disturb is not None:
-            self._disturb(self.env, self._names[phase[-1]])
+            self._disturb(self.env, self._driver.phases[phase[-1]].name)
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Rows of all steps, and what a world ends with."""
+    def recording(self, stage: Stage, episode: Episode, **others: Any) -> SimpleNamespace:
+        """Rows of all steps, what a world ends with, and the result."""
         sim = self.env.sim
         sim.kinematics()
-        ends = ("xpos", "xquat", "step_count", "overflow")
-        return {name: np.stack(rows, 1) for name, rows in self._rows.items()} | {
-            name: getattr(sim, name).cpu().numpy().copy() for name in ends
-        }
+        arrays = {name: np.stack(rows, 1) for name, rows in self._rows.items()}
+        for name in ("xpos", "xquat", "step_count", "overflow"):
+            arrays[name] = getattr(sim, name).cpu().numpy().copy()
+        views = {"stage": stage, "episode": episode, "result": episode.result}
+        return SimpleNamespace(**views, **arrays, **others)
 
 
 @contextmanager
 def recording(stage: Stage, disturb: Disturb | None = None) -> Iterator[list[SimpleNamespace]]:
     """Recordings of the episodes that the stage, or one that a gate derives from it, plays."""
     recordings: list[SimpleNamespace] = []
-    names = [phase.name for phase in stage.planner.phases]
 
     def play(
         env: Env, driver: Driver, observers: Sequence[Observer] = (), **kwargs: Any
     ) -> Episode:
-        recorder = Recorder(names, disturb)
+        recorder = Recorder(disturb)
         episode = play_episode(env, driver, [*observers, recorder], **kwargs)
         watch = next((o for o in observers if isinstance(o, FailureMonitor)), None)
-        views = {"episode": episode, "result": episode.result, "watch": watch}
-        recordings.append(SimpleNamespace(stage=stage, **views, **recorder.arrays()))
+        recordings.append(recorder.recording(stage, episode, watch=watch))
         return episode
 
     with pytest.MonkeyPatch.context() as patch:
@@ -135,6 +134,11 @@ class World:
         """Thresholds."""
         return limits(self.stage.cfg)
 
+    @property
+    def window(self) -> slice:
+        """The last steps, in which everything rests."""
+        return slice(-self.t.window, None)
+
     def steps(self, *names: str) -> np.ndarray:
         """Numbers of the steps of some phases."""
         numbers = [i for i, p in enumerate(self.stage.planner.phases) if p.name in names]
@@ -146,15 +150,25 @@ class World:
         first = np.flatnonzero(np.diff(self.phase, prepend=-1))
         return [self.stage.planner.phases[number].name for number in self.phase[first]]
 
+    @property
+    def poses(self) -> np.ndarray:
+        """A view of both cubes' poses, shape ``(steps, 2, 7)``."""
+        at = self.stage.index.object_qpos[RED]
+        return self.qpos[:, at : at + 14].reshape(-1, 2, 7)
+
+    @property
+    def velocities(self) -> np.ndarray:
+        """A view of their velocities, shape ``(steps, 2, 6)``."""
+        at = self.stage.index.object_qvel[RED]
+        return self.qvel[:, at : at + 12].reshape(-1, 2, 6)
+
     def pose(self, cube: int) -> np.ndarray:
         """A view of a cube's pose, shape ``(steps, 7)``."""
-        at = self.stage.index.object_qpos[cube]
-        return self.qpos[:, at : at + 7]
+        return self.poses[:, cube]
 
     def velocity(self, cube: int) -> np.ndarray:
         """A view of its velocity, shape ``(steps, 6)``."""
-        at = self.stage.index.object_qvel[cube]
-        return self.qvel[:, at : at + 6]
+        return self.velocities[:, cube]
 
     def jaw(self, cube: int, jaw: int) -> np.ndarray:
         """A view of a jaw's force on it, shape ``(steps, 3)``."""
@@ -173,19 +187,23 @@ class World:
         return self.qpos[:, index.robot_qpos[index.n_arm]]
 
     @property
-    def recording(self) -> BoxRecording:
+    def recording(self) -> Recording:
         index = self.stage.index
-        cubes = (RED, BLUE)
+        supports = [
+            np.stack([self.support(cube, j) for j in range(len(index.support_force[name]))], 1)
+            for cube, name in enumerate(NAMES)
+            if name in index.support_force
+        ]
         names = np.array([p.name for p in self.stage.planner.phases])
         poses = [c for a in index.object_qpos for c in range(a, a + 7)]
-        return BoxRecording(
+        return Recording(
             phase=names[self.phase],
-            pose=np.stack([self.pose(c) for c in cubes], 1),
-            velocity=np.stack([self.velocity(c) for c in cubes], 1),
-            jaw_force=np.stack([np.stack([self.jaw(c, j) for j in (0, 1)], 1) for c in cubes], 1),
-            support_force=np.stack(
-                [np.stack([self.support(c, j) for j in (0, 1)], 1) for c in cubes], 1
+            pose=self.poses,
+            velocity=self.velocities,
+            jaw_force=np.stack(
+                [np.stack([self.jaw(c, j) for j in (0, 1)], 1) for c in (RED, BLUE)], 1
             ),
+            support_force=np.stack(supports, 1) if supports else None,
             gripper=self.qpos[:, index.robot_qpos[index.n_arm :]],
             xpos=self.xpos,
             xquat=self.xquat,
@@ -195,14 +213,18 @@ class World:
         )
 
     @property
-    def outcome(self) -> BoxOutcome:
+    def outcome(self) -> Outcome:
         """The verdict of the plain checker."""
-        return check_box_world(self.recording, self.stage.cfg, self.stage.model)
+        return self._judged(self.recording)
 
     @property
-    def outcome_without_phases(self) -> BoxOutcome:
+    def outcome_without_phases(self) -> Outcome:
         """The same of a driver without phases."""
-        recording = replace(self.recording, phase=None)
+        return self._judged(replace(self.recording, phase=None))
+
+    def _judged(self, recording: Recording) -> Outcome:
+        if self.stage.cfg.task.name == "stack":
+            return check_world(recording, self.stage.cfg)
         return check_box_world(recording, self.stage.cfg, self.stage.model)
 
 
