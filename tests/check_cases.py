@@ -78,6 +78,15 @@ class Outcome:
     values: dict[str, float] = field(default_factory=dict)
 
 
+def counted(rec: Recording, cfg: Config) -> set[str]:
+    """The first three rules, which any task has."""
+    steps = sum(round(p.seconds / cfg.timing.step_dt) for p in cfg.controller.phases.values())
+    finite = np.isfinite(rec.pose).all() and np.isfinite(rec.velocity).all()
+    made = rec.step_count == steps * cfg.timing.decimation and len(rec.pose) == steps
+    broken = {"FINITE": not (finite and rec.finite_elsewhere), "STEPS": not made}
+    return {name for name, bad in (broken | {"OVERFLOW": rec.overflow}).items() if bad}
+
+
 @dataclass
 class Cases:
     """Cases by name, and how near the numbers of a check are to those of the plain checker."""
@@ -112,6 +121,18 @@ class Cases:
             return alter
 
         return register
+
+    def add_values(self, values: dict[str, tuple[str, str, Any, Any]]) -> None:
+        """Registers changes of an array: the rules that break, the array of a world, where, and the
+        other value or what makes it of the value.
+        """
+
+        def change(world: Any, array: str, at: Any, value: Any) -> None:
+            part = getattr(world, array)
+            part[at] = value(part[at]) if callable(value) else value
+
+        for name, (rules, *args) in values.items():
+            self.add(name, {*rules.split()}, lambda w, args=args: change(w, *args))
 
     def play(self, fresh: Callable[[], Any], feed: Callable[[list[Any]], CheckResult]) -> Altered:
         """Every case as one world of one batch: by name the batch's result, the world's number in

@@ -13,10 +13,10 @@ from types import SimpleNamespace
 
 import pytest
 from compositions import load_config
-from environments import CUDA, DEVICES
+from environments import CUDA, DEVICES, on_backend
 from recordings import recording
 
-from mjstack.config.schema import Backend, Config
+from mjstack.config.schema import Config
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
 from mjstack.sim import Simulation, make_simulation
@@ -79,10 +79,8 @@ def make_sim(get_stage: Callable[[str], Stage]) -> Callable[..., Simulation]:
         key = (backend, nworld, robot, overrides)
         if key not in made:
             cfg = load_config([f"robot={robot}", *overrides])
-            kind = Backend.native if backend == "native" else Backend.mjwarp
-            device = "cuda:0" if backend == "mjwarp-cuda" else "cpu"
             model = get_stage(robot).model
-            made[key] = make_simulation(model, cfg, nworld, backend=kind, device=device)
+            made[key] = make_simulation(model, cfg, nworld, **on_backend(backend))
         made[key].reset()
         return made[key]
 

@@ -4,7 +4,8 @@ time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import cache, reduce
 from pathlib import Path
 from types import SimpleNamespace
@@ -62,6 +63,17 @@ def on_cuda(test: Callable) -> Callable:
     return reduce(lambda marked, mark: mark(marked), CUDA, test)
 
 
+@contextmanager
+def no_host_reads() -> Iterator[None]:
+    """Torch raises at every read from the device."""
+    torch.cuda.synchronize()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        yield
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+
+
 @cache
 def has_gl() -> bool:
     """Whether MuJoCo draws offscreen on this machine; where it does not, there is no scene.png."""
@@ -93,6 +105,12 @@ def one_second_episode() -> tuple[str, ...]:
     )
 
 
+def on_backend(backend: str) -> dict[str, Any]:
+    """Backend and device of a simulation, by the name that tests have for both."""
+    engine, _, cuda = backend.partition("-")
+    return {"backend": Backend(engine), "device": "cuda:0" if cuda else "cpu"}
+
+
 def new_sim(backend: str, nworld: int, robot: str = "so101") -> Simulation:
     """A simulation with every field that a reset term of mjstack writes, and room for random
     actions.
@@ -102,8 +120,7 @@ def new_sim(backend: str, nworld: int, robot: str = "so101") -> Simulation:
         _model(robot),
         cfg,
         nworld,
-        backend=Backend.native if backend == "native" else Backend.mjwarp,
-        device="cuda:0" if backend == "mjwarp-cuda" else "cpu",
+        **on_backend(backend),
         fields=required_fields(cfg.reset),
         sizes=resolve_env_sizes(cfg),
     )
@@ -190,6 +207,12 @@ def actions(env: Env, steps: int, seed: int = 0) -> list[torch.Tensor]:
         rows.append(torch.rand((steps, len(low)), generator=generator, dtype=low.dtype))
     draw = low + (high - low) * torch.stack(rows, dim=1)
     return list(draw.to(env.device))
+
+
+def zeros(env: Env, **kwargs: Any) -> torch.Tensor:
+    """Actions of 0."""
+    shape = (env.nworld, env.action_manager.action_dim)
+    return torch.zeros(shape, **({"device": env.device} | kwargs))
 
 
 def mask_of(env: Env, *worlds: int) -> torch.Tensor:

@@ -9,7 +9,7 @@ import itertools
 import math
 
 import numpy as np
-from check_cases import BLUE, RED, Outcome, Recording
+from check_cases import BLUE, RED, Outcome, Recording, counted
 
 from mjstack.config.schema import Config
 from mjstack.tasks.check import make_check
@@ -52,15 +52,7 @@ def check_world(rec: Recording, cfg: Config) -> Outcome:
     velocity = rec.velocity
     phase = rec.phase
     steps = len(pose)
-    failed: set[str] = set()
-
-    if not (np.isfinite(pose).all() and np.isfinite(velocity).all() and rec.finite_elsewhere):
-        failed.add("FINITE")
-    whole = sum(round(p.seconds / cfg.timing.step_dt) for p in cfg.controller.phases.values())
-    if rec.step_count != steps * cfg.timing.decimation or steps != whole:
-        failed.add("STEPS")
-    if rec.overflow:
-        failed.add("OVERFLOW")
+    failed = counted(rec, cfg)
 
     airborne = [lowest_corner(p[RED], half) - top > rules.airborne_height for p in pose]
 

@@ -362,9 +362,17 @@ def _rolling(w: World, cube: int, color: str) -> None:
 both("rolling", "SETTLED_*", _rolling)
 
 
-@CASES.case("INSIDE")
-def red_knocked_in_the_last_step(w: World) -> None:
-    w.velocity(RED)[-1, 0] = 0.05
+CASES.add_values(
+    {
+        "red_knocked_in_the_last_step": ("INSIDE", "velocities", np.s_[-1, RED, 0], 0.05),
+        "quaternions_of_either_sign": ("", "poses", np.s_[::2, :, 3:], np.negative),
+        "not_a_number_in_one_step": ("FINITE", "velocities", np.s_[5, RED, 3], math.nan),
+        "arm_not_a_number": ("FINITE", "qpos", np.s_[7, 0], math.nan),
+        "infinite_velocity_at_the_end": (
+            *("FINITE INSIDE", "velocities", np.s_[-1, BLUE, 0], math.inf),
+        ),
+    }
+)
 
 
 @CASES.case("INSIDE")
@@ -395,27 +403,6 @@ def _jaws_at(w: World, by: float) -> None:
 
 CASES.add("jaws_just_too_low", {"JAW_CLEAR"}, lambda w: _jaws_at(w, -HAIR))
 CASES.add("jaws_just_high_enough", set(), lambda w: _jaws_at(w, HAIR))
-
-
-@CASES.case()
-def quaternions_of_either_sign(w: World) -> None:
-    for cube in (RED, BLUE):
-        w.pose(cube)[::2, 3:] *= -1.0
-
-
-@CASES.case("FINITE")
-def not_a_number_in_one_step(w: World) -> None:
-    w.velocity(RED)[5, 3] = math.nan
-
-
-@CASES.case("FINITE")
-def arm_not_a_number(w: World) -> None:
-    w.qpos[7, 0] = math.nan
-
-
-@CASES.case("FINITE", "INSIDE")
-def infinite_velocity_at_the_end(w: World) -> None:
-    w.velocity(BLUE)[-1, 0] = math.inf
 
 
 @CASES.case("FINITE", "LIFT_RED", "CARRY_RED", "SETTLED_RED", "INSIDE")

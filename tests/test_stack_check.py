@@ -36,7 +36,6 @@ def test_recorded_episodes(
 # Alterations of a recording whose last steps have been made ideal.
 
 
-# Values: the rules that break, where, and the other value or what makes it of the value.
 THERE_AND_BACK = np.sin(np.linspace(0.0, 2.0 * np.pi, 50))[:, None]
 TILTED = [math.cos(0.2), math.sin(0.2), 0.0, 0.0]
 SPIN = 0.0502 / (math.sqrt(3.0) * 0.022)
@@ -67,13 +66,7 @@ VALUES: dict[str, tuple[str, str, Any, Any]] = {
 }
 
 
-def _set(w: World, array: str, at: Any, value: Any) -> None:
-    values = getattr(w, array)
-    values[at] = value(values[at]) if callable(value) else value
-
-
-for name, (rules, *args) in VALUES.items():
-    CASES.add(name, {*rules.split()}, lambda w, args=args: _set(w, *args))
+CASES.add_values(VALUES)
 
 
 @CASES.case("STACKED")
