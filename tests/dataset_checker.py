@@ -25,6 +25,11 @@ def contents(folder: Path) -> dict[str, bytes]:
     }
 
 
+def with_column(table: pa.Table, name: str, values: Any) -> pa.Table:
+    """A table with other values of a column."""
+    return table.set_column(table.schema.get_field_index(name), name, values)
+
+
 def check_dataset(folder: Path) -> StoredDataset:
     """Types and dimensions are those of info.json; indices, timestamps and places run on without a
     gap; every number is finite; tasks, lengths and totals agree; the statistics of each episode and

@@ -22,7 +22,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from dataset_checker import check_dataset, contents
+from dataset_checker import check_dataset, contents, with_column
 
 from mjstack.datasets import (
     DatasetSpec,
@@ -625,12 +625,7 @@ def edit_table(path: Path, change: Callable[[pa.Table], pa.Table]) -> None:
 
 def set_column(name: str, value: Any) -> Callable[[pa.Table], pa.Table]:
     """Puts one value into every row of a column."""
-
-    def change(table: pa.Table) -> pa.Table:
-        column = table.schema.get_field_index(name)
-        return table.set_column(column, name, [[value] * len(table)])
-
-    return change
+    return lambda table: with_column(table, name, [[value] * len(table)])
 
 
 DATA = "data/chunk-000/file-000.parquet"
@@ -738,9 +733,7 @@ def test_every_row_has_its_features_shape(first: Any, second: Any, tmp_path: Pat
     path = tmp_path / DATA
     table = pq.read_table(path)
     rows = [first, second, *table["action"].to_pylist()[2:]]
-    column = table.schema.get_field_index("action")
-    values = pa.array(rows, pa.list_(pa.float32()))
-    pq.write_table(table.set_column(column, "action", values), path)
+    pq.write_table(with_column(table, "action", pa.array(rows, pa.list_(pa.float32()))), path)
     with pytest.raises(FolderError, match="rows of action without 2 numbers"):
         read_dataset(tmp_path).frames("action")
 

@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from compositions import load_config, refusal
+from dataset_checker import with_column
 from policies import report
 
 from mjstack.cli import run
@@ -118,8 +119,7 @@ def reshape_rows(lengths: dict[int, int | None]) -> Callable[[pa.Table], pa.Tabl
         rows = table["action"].to_pylist()
         for row, length in lengths.items():
             rows[row] = None if length is None else (2 * rows[row])[:length]
-        number = table.schema.get_field_index("action")
-        return table.set_column(number, "action", pa.array(rows, pa.list_(pa.float32())))
+        return with_column(table, "action", pa.array(rows, pa.list_(pa.float32())))
 
     return change
 
@@ -179,9 +179,8 @@ def test_without_a_success_all_episodes_count(dataset: Path, tmp_path: Path) -> 
     def fail_the_second(table: pa.Table) -> pa.Table:
         success = np.array(table["next.success"].to_pylist())
         success[299] = False
-        number = table.column_names.index("next.success")
         column = pa.array(success.reshape(-1), table.schema.field("next.success").type)
-        return table.set_column(number, "next.success", column)
+        return with_column(table, "next.success", column)
 
     folder = copied(dataset, tmp_path, as_lerobot)
     change_table(folder, fail_the_second)
@@ -275,8 +274,7 @@ def test_a_damaged_column_is_one_line(name: str, dataset: Path, tmp_path: Path) 
     folder = copied(dataset, tmp_path)
     file, column, values, says = COLUMNS[name]
     table = pq.read_table(folder / file)
-    number = table.schema.get_field_index(column)
-    pq.write_table(table.set_column(number, column, pa.array(values)), folder / file)
+    pq.write_table(with_column(table, column, pa.array(values)), folder / file)
     assert says in refusal_of([f"job.dataset={folder}"])
 
 
@@ -301,7 +299,7 @@ def test_degrees_are_refused(dataset: Path, tmp_path: Path) -> None:
     def in_degrees(table: pa.Table) -> pa.Table:
         degrees = np.rad2deg(np.array(table["action"].to_pylist(), np.float32)).reshape(-1)
         column = pa.FixedSizeListArray.from_arrays(pa.array(degrees), 6)
-        return table.set_column(table.column_names.index("action"), "action", column)
+        return with_column(table, "action", column)
 
     folder = copied(dataset, tmp_path)
     change_table(folder, in_degrees)
