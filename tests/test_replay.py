@@ -16,7 +16,14 @@ import numpy as np
 import pytest
 from check_cases import rules_of
 from compositions import load_config, put, refusal
-from environments import at_double_speed, has_gl, on_cuda, one_second_episode, stack_starts
+from environments import (
+    at_double_speed,
+    has_gl,
+    on_cuda,
+    one_second_episode,
+    record_of,
+    two_starts,
+)
 from omegaconf import OmegaConf
 
 from mjstack.cli import run
@@ -63,28 +70,11 @@ def failing(earlier: Path) -> tuple[Path, int, dict]:
     return out, *replay_into(out, earlier, f"world={FAILING}")
 
 
-@pytest.fixture
-def replay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[int, dict]]:
-    """Replays with some arguments into ``out``; returns the exit status and the report."""
-    monkeypatch.chdir(tmp_path)
-
-    def do(folder: Path, *args: str) -> tuple[int, dict]:
-        return replay_into(Path("out"), folder, *args)
-
-    return do
-
-
 def refusal_of(*values: str) -> str:
     """The line in which the job refuses a folder."""
     cfg = put(load_config(["job=replay"]), *values)
     cfg.world = None if cfg.world is None else str(cfg.world)
     return refusal(lambda: (validate(cfg), check_job(cfg, ["job=replay", *values])))
-
-
-def record_of(folder: Path, seed: int) -> EpisodeRecord:
-    record = EpisodeRecord.read(folder, seed)
-    assert record is not None
-    return record
 
 
 def copy_of(folder: Path, tmp_path: Path) -> Path:
@@ -169,15 +159,13 @@ def test_trajectory_holds_the_episode(
 
 
 @pytest.mark.full
-def test_another_verdict_is_said(
-    earlier: Path, replay: Callable[..., tuple[int, dict]], tmp_path: Path
-) -> None:
+def test_another_verdict_is_said(earlier: Path, tmp_path: Path) -> None:
     folder = copy_of(earlier, tmp_path)
     record = record_of(folder, 0)
     record.failed[0] = RULES["CARRY"]
     record.qpos[0, 14] += 0.002  # somewhere in blue's position
     write_npz(folder / record_name("batch", record.seed), record.arrays())
-    status, report = replay(folder, "world=0")
+    status, report = replay_into(tmp_path / "out", folder, "world=0")
     (gate,) = report["gates"]
     differs = "NOT as recorded (red not carried): its objects end 2 mm from where they did, "
     assert gate["reason"].startswith("succeeded, ")
@@ -272,13 +260,8 @@ def test_a_start_that_is_not_the_recorded_one_is_refused(
 
 def carry(red_x: float = 0.31, red_mass: float = 0.09) -> bytes:
     """A starts file of two worlds, the second one's cube at a place and with a mass."""
-    starts = stack_starts(
-        [(0.33, -0.13, 0.0), (red_x, -0.1, 0.3)],
-        [(0.33, 0.06, 0.0), (0.34, 0.08, -0.5)],
-        red_mass_kg=[0.08, red_mass],
-    )
     file = io.BytesIO()
-    np.savez(file, **starts)
+    np.savez(file, **two_starts(red_x, red_mass_kg=[0.08, red_mass]))
     return file.getvalue()
 
 
@@ -302,12 +285,13 @@ def from_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.full
 @pytest.mark.parametrize("gate", ["batch", "success"])
 def test_a_run_from_a_file_replays_from_its_own_copy(
-    gate: str, from_file: Path, replay: Callable[..., tuple[int, dict]], tmp_path: Path
+    gate: str, from_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.chdir(tmp_path)
     assert (from_file / "starts_played.npz").read_bytes() == carry()
     # A file of that name where the replay is called
     (tmp_path / "carry.npz").write_bytes(carry(red_x=0.32))
-    _, report = replay(from_file, f"world={gate}:1")
+    _, report = replay_into(tmp_path / "out", from_file, f"world={gate}:1")
     (found,) = report["gates"]
     assert found["reason"].endswith("as recorded, and it ends bit for bit where it did")
     with np.load(tmp_path / "out" / "trajectory.npz") as held:
@@ -343,13 +327,11 @@ def test_another_layout_is_refused(
 
 
 @pytest.mark.full
-def test_what_the_start_does_not_show_is_found_at_the_end(
-    from_file: Path, replay: Callable[..., tuple[int, dict]], tmp_path: Path
-) -> None:
+def test_what_the_start_does_not_show_is_found_at_the_end(from_file: Path, tmp_path: Path) -> None:
     """Another mass."""
     folder = copy_of(from_file, tmp_path)
     (folder / "starts_played.npz").write_bytes(carry(red_mass=0.1))
-    status, report = replay(folder, "world=batch:1")
+    status, report = replay_into(tmp_path / "out", folder, "world=batch:1")
     assert "; NOT as recorded (the same result): its objects end " in report["gates"][0]["reason"]
     assert status == 1
 
@@ -389,13 +371,11 @@ def test_copies_of_layouts(tmp_path: Path) -> None:
 
 
 @pytest.mark.full
-def test_sim_native_plays_native_alone_and_randomized_fields_are_kept(
-    replay: Callable[..., tuple[int, dict]], tmp_path: Path
-) -> None:
+def test_sim_native_plays_native_alone_and_randomized_fields_are_kept(tmp_path: Path) -> None:
     folder = tmp_path / "random"
     args = ["gates=[batch]", "sim=native", "nworld=3", "reset=randomized"]
     run([*args, *one_second_episode(), f"hydra.run.dir={folder}"])
-    _, report = replay(folder, "world=2", "sim=native")
+    _, report = replay_into(tmp_path / "out", folder, "world=2", "sim=native")
     assert report["gates"][0]["reason"].endswith(
         "as recorded, and it ends bit for bit where it did"
     )
@@ -405,13 +385,11 @@ def test_sim_native_plays_native_alone_and_randomized_fields_are_kept(
 
 
 @pytest.mark.full
-def test_mjwarp_world_is_played_on_both_engines(
-    replay: Callable[..., tuple[int, dict]], tmp_path: Path
-) -> None:
+def test_mjwarp_world_is_played_on_both_engines(tmp_path: Path) -> None:
     folder = tmp_path / "warp"
     args = ["gates=[batch]", "sim=mjwarp", "sim.device=cpu", "nworld=2"]
     assert run([*args, *one_second_episode(), f"hydra.run.dir={folder}"]) == 1
-    status, report = replay(folder, "world=1")
+    status, report = replay_into(tmp_path / "out", folder, "world=1")
     assert status == 1
     warp, native = report["gates"]
     assert (warp["name"], native["name"]) == ("replay_mjwarp", "replay_native")
@@ -429,14 +407,12 @@ def test_mjwarp_world_is_played_on_both_engines(
 
 
 @on_cuda
-def test_cuda_world_ends_near_where_it_did(
-    replay: Callable[..., tuple[int, dict]], tmp_path: Path
-) -> None:
+def test_cuda_world_ends_near_where_it_did(tmp_path: Path) -> None:
     folder = tmp_path / "cuda"
     args = ["gates=[batch]", "sim=mjwarp", "sim.device=cuda:0", "nworld=64"]
     assert run([*args, f"hydra.run.dir={folder}"]) == 0
     record = record_of(folder, 0)
-    status, report = replay(folder, "world=41")
+    status, report = replay_into(tmp_path / "out", folder, "world=41")
     assert status == 0
     warp, _ = report["gates"]
     assert "as recorded" in warp["reason"]
