@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 from compositions import load_config, make_env, refusal
-from environments import CUDA, at_double_speed, has_gl, on_cuda
+from environments import CUDA, at_double_speed, has_gl, no_host_reads, on_cuda, zeros
 from gymnasium.utils.env_checker import check_env
 
 from mjstack.adapters.gymnasium import GymnasiumEnv, GymnasiumVectorEnv
@@ -75,10 +75,6 @@ def make() -> Iterator[Make]:
         env.close()
 
 
-def still(env: Env) -> torch.Tensor:
-    return torch.zeros((env.nworld, env.action_manager.action_dim), device=env.device)
-
-
 def drawn_anew(env: Env, camera: str) -> list[bool]:
     """Whether each world's image is not all sevens."""
     return [bool((image != 7).any()) for image in env.images[f"images.{camera}"]]
@@ -99,7 +95,7 @@ def test_images_of_both_backends(make: Make, mjwarp: str) -> None:
         first, _ = env.reset(seed=3)
         pairs = product(("images", "depth", "segmentation"), ("front", "wrist"))
         assert set(env.images) == {".".join(pair) for pair in pairs}
-        obs, *_, extras = env.step(still(env))
+        obs, *_, extras = env.step(zeros(env))
         assert set(first) == set(obs) == {"policy", "privileged", *env.images}
         assert set(extras["final_obs"]) == {"policy", "privileged"}
         found[backend] = {name: image.cpu() for name, image in env.images.items()}
@@ -183,7 +179,7 @@ def test_a_slow_camera_is_drawn_every_few_steps_and_at_resets(make: Make, backen
     for _ in range(8):
         for image in env.images.values():
             image.fill_(7)
-        obs, _, _, truncated, extras = env.step(still(env))
+        obs, _, _, truncated, extras = env.step(zeros(env))
         assert obs["images.front"] is env.images["images.front"]
         assert all(drawn_anew(env, "top"))
         drawn.append(drawn_anew(env, "front"))
@@ -224,7 +220,7 @@ def test_a_policy_that_decides_seldom_gets_an_image_per_decision(make: Make) -> 
     for _ in range(5):
         for image in env.images.values():
             image.fill_(7)
-        env.step(still(env))
+        env.step(zeros(env))
         drawn.append([drawn_anew(env, name)[0] for name in ("front", "wrist")])
     # Every 5 steps, so after 5 (seen at 6) and 10 steps.
     assert drawn == [[True, False], [True, False], [True, True], [True, False], [True, True]]
@@ -251,7 +247,7 @@ def test_replayed_steps_draw_what_eager_steps_draw(make: Make) -> None:
         env = make("mjwarp-cuda", f"graph={graph}", *chosen, nworld=64)
         env.reset(seed=0)
         for _ in range(9):
-            env.step(still(env))
+            env.step(zeros(env))
         ends.append({name: image.clone() for name, image in env.images.items()})
         assert env.graph.captured == (graph == "require")
     for name, image in ends[0].items():
@@ -267,14 +263,10 @@ def test_a_step_with_images_reads_nothing_from_the_device(make: Make) -> None:
     chosen += ["scene.cameras.front.terminal=true", "scene.cameras.wrist.rate=10.0"]
     env = make("mjwarp-cuda", *chosen, *small("front", "wrist", outputs=ALL), nworld=16)
     env.reset(seed=0)
-    env.step(still(env))
-    torch.cuda.synchronize()
-    torch.cuda.set_sync_debug_mode("error")
-    try:
+    env.step(zeros(env))
+    with no_host_reads():
         for _ in range(11):
-            env.step(still(env))
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
+            env.step(zeros(env))
     assert (env.episode >= 2).all()
     env.faults.raise_first()
 
@@ -404,7 +396,7 @@ def test_states_are_drawn_later_as_they_were(make: Make, backend: str) -> None:
     config = ["looks=randomized", "reset=randomized", *small("front", "wrist", outputs=ALL)]
     env = make(backend, *config, nworld=3)
     env.reset(seed=2)
-    env.step(still(env))
+    env.step(zeros(env))
     engine = Backend.native if backend == "native" else Backend.mjwarp
     renderer = StateRenderer(
         env.sim.model, env.cfg, 5, backend=engine, device=str(env.device), fields=[*env.sim.fields]
@@ -488,7 +480,6 @@ def test_images_that_compare_too_little_fail(monkeypatch: pytest.MonkeyPatch) ->
 
 @GL
 @pytest.mark.full
-@pytest.mark.parametrize("robot", ["so101", "rebot"])
 def test_parity_compares_images_here_and_elsewhere(robot: str, tmp_path: Path) -> None:
     overrides = [f"robot={robot}", "gates=[parity]", "sim=mjwarp", "sim.device=cpu"]
     overrides += [*at_double_speed(robot), *small("front", "top", "wrist", size=128)]
@@ -532,7 +523,7 @@ def test_parity_compares_images_here_and_elsewhere(robot: str, tmp_path: Path) -
 @GL
 @pytest.mark.full
 def test_throughput_and_capacity_count_images() -> None:
-    quick = ("measurements=[env_step,cameras]", "repetitions=2", "env_steps=3", "action_share=0.1")
+    quick = ("measurements=[env_step,cameras]", "repetitions=1", "env_steps=3", "action_share=0.1")
     overrides = ["gates=[capacity,throughput]", "sim=native", "nworld=4", *at_double_speed()]
     overrides += [*(f"gate.throughput.{value}" for value in quick), "gate.capacity.random_steps=3"]
     run = Run(Stage(load_config([*overrides, *small("front", "wrist", size=16)])))
@@ -541,7 +532,7 @@ def test_throughput_and_capacity_count_images() -> None:
     m = result.metrics
     images_s = m["cameras.images_per_s.median"]
     images_ms = m["cameras.images_ms_per_step.median"]
-    assert images_s == pytest.approx(4 * 2 * 1e3 / images_ms, rel=0.5)
+    assert images_s == pytest.approx(4 * 2 * 1e3 / images_ms)  # of one repetition
     assert "env_step.images_per_s.median" not in m
     size = 4 * 2 * 16 * 16 * 3 / 1e6
     assert m["cameras.images_mb"] == pytest.approx(size)

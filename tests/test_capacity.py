@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from compositions import load_config
-from environments import at_double_speed, on_cuda, one_second_episode
+from environments import at_double_speed, on_backend, on_cuda, one_second_episode
 
 import mjstack
 from mjstack.config.schema import Backend
@@ -110,9 +110,7 @@ def test_a_peak_after_a_reset_counts(
 def test_peaks_of_an_environment_outlive_its_episodes(backend: str) -> None:
     """Every world ends in every third step; the loop keeps what it sees before each reset."""
     cfg = load_config(["termination.time_out.params.steps=3", "seed=3"])
-    kind = Backend.native if backend == "native" else Backend.mjwarp
-    device = "cuda:0" if backend == "mjwarp-cuda" else "cpu"
-    env = build_env(cfg, nworld=2, backend=kind, device=device)
+    env = build_env(cfg, nworld=2, **on_backend(backend))
     env.reset(seed=3)
     seen = torch.zeros(2, dtype=torch.int32, device=env.device)
     for _ in range(8):

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 from compositions import load_config, put
-from environments import assert_rows, configure, mask_of, on_shared_sim, returned
+from environments import assert_rows, configure, mask_of, on_shared_sim, returned, zeros
 
 from mjstack import make_env
 from mjstack.config.schema import (
@@ -50,10 +50,6 @@ def env(cfg: Config) -> Env:
     env = on_shared_sim("native", 3, cfg)
     env.reset(seed=0)
     return env
-
-
-def zeros(env: Env, **kwargs: object) -> torch.Tensor:
-    return torch.zeros((env.nworld, env.action_manager.action_dim), **kwargs)  # type: ignore[arg-type]
 
 
 def fails(kind: type[MjstackError], call: Callable[[], object], *words: str) -> str:
@@ -394,19 +390,16 @@ OUT_OF_RANGE: list[tuple[str, type[MjstackError], str]] = [
 def test_parameters_and_settings_out_of_range(
     overrides: str, kind: type[MjstackError], words: str
 ) -> None:
-    choice, *values = (
-        overrides.split()
-        if overrides.startswith(("reset=", "action="))
-        else ("reset=jitter", overrides)
-    )
+    values = overrides.split()
+    choice = "reset=jitter" if "." in values[0] else values.pop(0)
     key = values[-1].partition("=")[0]
     term = key.rpartition(".")[0].removesuffix(".params")
-    found = refused(
+    message = refused(
         put(configure(choice), *values), term if kind is TermError else key, words, kind=kind
     )
     if words == FREE and CROWDED in overrides:
-        assert "20000 trials" in found
-        assert "smaller" in found
+        assert "20000 trials" in message
+        assert "smaller" in message
 
 
 def test_action_that_is_no_action_term(cfg: Config) -> None:

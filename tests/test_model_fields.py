@@ -12,7 +12,7 @@ import pytest
 import torch
 from comparison import assert_worlds_step_alone
 from compositions import load_config
-from environments import CUDA
+from environments import CUDA, on_backend, start_moving
 
 from mjstack.config.schema import Backend
 from mjstack.episodes.stage import Stage
@@ -32,11 +32,7 @@ GetStage = Callable[[str], Stage]
 def simulate(
     model: mujoco.MjModel, backend: str, nworld: int, fields: tuple[str, ...]
 ) -> Simulation:
-    kind = Backend.native if backend == "native" else Backend.mjwarp
-    device = "cuda:0" if backend == "mjwarp-cuda" else "cpu"
-    return make_simulation(
-        model, load_config([]), nworld, backend=kind, device=device, fields=fields
-    )
+    return make_simulation(model, load_config([]), nworld, fields=fields, **on_backend(backend))
 
 
 @pytest.fixture(scope="module")
@@ -86,12 +82,6 @@ def randomise(sim: Simulation, stage: Stage) -> None:
         sim.fields["actuator_biasprm"][k, :, 1] *= gain
 
 
-def start(sim: Simulation, stage: Stage) -> None:
-    """Home, jittered cubes, and a command that moves every joint."""
-    stage.start(sim, stage.cfg.reset)
-    sim.ctrl[:, torch.from_numpy(stage.index.ctrl)] += 0.05
-
-
 @pytest.mark.full
 def test_every_field_has_mujocos_shape_and_values(
     backend: str, make_fields: Make, get_stage: GetStage
@@ -116,7 +106,7 @@ def test_the_models_values_change_nothing(
     steps = 5 if backend == "mjwarp-cuda" else 20
     finals = []
     for sim in (make_sim(backend, N), make_fields(backend, N, FIELD_NAMES)):
-        start(sim, get_stage("so101"))
+        start_moving(sim, get_stage("so101"))
         sim.step(steps)
         finals.append([sim.qpos.clone(), sim.qvel.clone(), sim.geom_xpos.clone()])
     for a, b in zip(*finals, strict=True):
@@ -213,7 +203,7 @@ def test_friction_stops_a_cube_in_one_world_only(
     stage = get_stage("so101")
     _, q, v = cube(stage)
     sim = make_fields(backend)
-    start(sim, stage)
+    start_moving(sim, stage)
     sim.step(50)
     before = sim.qpos.clone()
     sim.fields["geom_friction"][:, :, 0] = torch.tensor([[1.0], [0.02], [1.0]], device=sim.device)
@@ -278,7 +268,7 @@ def test_world_k_of_n_is_world_k_of_one(
     many = make_fields(backend)
     stage = get_stage("so101")
     randomise(many, stage)
-    start(many, stage)
+    start_moving(many, stage)
     assert_worlds_step_alone(many, make_fields(backend, 1), backend)
 
 
@@ -310,7 +300,7 @@ def test_backends_agree(make_fields: Make, get_stage: GetStage, mjwarp: str) -> 
     for backend in ("native", mjwarp):
         sim = make_fields(backend)
         randomise(sim, get_stage("so101"))
-        start(sim, get_stage("so101"))
+        start_moving(sim, get_stage("so101"))
         for _ in range(5):
             sim.step(10, kinematics=True)
         finals.append((sim.qpos.double().cpu(), sim.site_xpos.double().cpu()))

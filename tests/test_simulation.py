@@ -12,6 +12,7 @@ import pytest
 import torch
 from comparison import assert_same_run, assert_worlds_step_alone
 from compositions import load_config, refusal
+from environments import POSES, STATE, on_backend, start_moving
 
 from mjstack.config.schema import Backend
 from mjstack.episodes.stage import Stage
@@ -20,8 +21,6 @@ from mjstack.scene import build_model
 from mjstack.sim import Simulation, SolverLimit, make_simulation
 
 N = 3
-STATE = ("qpos", "qvel", "act", "ctrl")
-POSES = ("xpos", "xquat", "site_xpos", "geom_xpos")
 VIEWS = (*STATE, *POSES, "qfrc_actuator", "sensordata")
 COUNTS = ("contact_count", "constraint_count", "peak_contacts", "peak_constraints", "overflow")
 Make = Callable[..., Simulation]
@@ -55,20 +54,12 @@ def sensing() -> Callable[[str], Simulation]:
 
     def get(backend: str) -> Simulation:
         if backend not in made:
-            kind = Backend.native if backend == "native" else Backend.mjwarp
-            device = "cuda:0" if backend == "mjwarp-cuda" else "cpu"
             model = mujoco.MjModel.from_xml_string(SENSING)
-            made[backend] = make_simulation(model, load_config([]), N, backend=kind, device=device)
+            made[backend] = make_simulation(model, load_config([]), N, **on_backend(backend))
         made[backend].reset()
         return made[backend]
 
     return get
-
-
-def start(sim: Simulation, stage: Stage) -> None:
-    """Home, jittered cubes, and a command that moves every joint."""
-    stage.start(sim, stage.cfg.reset)
-    sim.ctrl[:, torch.from_numpy(stage.index.ctrl)] += 0.05
 
 
 def test_shapes_types_and_device(backend: str, make_sim: Make, get_stage: GetStage) -> None:
@@ -158,7 +149,7 @@ def test_masked_reset(backend: str, make_sim: Make, get_stage: GetStage) -> None
     sim = make_sim(backend, N)
     stage = get_stage("so101")
     fresh = {name: getattr(sim, name).clone() for name in ("qpos", "qvel", "ctrl")}
-    start(sim, stage)
+    start_moving(sim, stage)
     sim.step(10)
     sim.overflow.fill_(1)
     before = {name: getattr(sim, name).clone() for name in (*fresh, *COUNTS)}
@@ -192,7 +183,7 @@ def test_twice_the_same_run(backend: str, make_sim: Make, get_stage: GetStage) -
     finals = []
     for _ in range(2):
         sim = make_sim(backend, N)
-        start(sim, get_stage("so101"))
+        start_moving(sim, get_stage("so101"))
         for _ in range(4):
             sim.step(10)
         finals.append([getattr(sim, name).clone() for name in VIEWS])
@@ -203,7 +194,7 @@ def test_twice_the_same_run(backend: str, make_sim: Make, get_stage: GetStage) -
 
 def test_world_k_of_n_is_world_k_of_one(backend: str, make_sim: Make, get_stage: GetStage) -> None:
     many = make_sim(backend, N)
-    start(many, get_stage("so101"))
+    start_moving(many, get_stage("so101"))
     assert_worlds_step_alone(many, make_sim(backend, 1), backend)
 
 
@@ -212,7 +203,7 @@ def test_forward_writes_every_derived_number(
 ) -> None:
     sim = make_sim(backend, N)
     m = get_stage("so101").model
-    start(sim, get_stage("so101"))
+    start_moving(sim, get_stage("so101"))
     sim.forward()
     derived = (*POSES, "qfrc_actuator")
     expected = {name: getattr(sim, name).clone() for name in derived}
@@ -267,7 +258,7 @@ def test_kinematics_belongs_to_the_last_state(
     backend: str, make_sim: Make, get_stage: GetStage
 ) -> None:
     sim = make_sim(backend, N)
-    start(sim, get_stage("so101"))
+    start_moving(sim, get_stage("so101"))
     sim.step(10)
     stale = {name: getattr(sim, name).clone() for name in POSES}
     sim.kinematics()
@@ -294,7 +285,7 @@ def test_kinematics_changes_no_physics(backend: str, make_sim: Make, get_stage: 
     finals = []
     for kinematics in (False, True):
         sim = make_sim(backend, N)
-        start(sim, get_stage("so101"))
+        start_moving(sim, get_stage("so101"))
         for _ in range(5):
             sim.step(4, kinematics=kinematics)
             sim.step(1, kinematics=kinematics)
@@ -309,7 +300,7 @@ def test_kinematics_changes_no_physics(backend: str, make_sim: Make, get_stage: 
 @pytest.mark.full
 def test_native_kinematics_visits_masked_worlds_only(make_sim: Make, get_stage: GetStage) -> None:
     sim = make_sim("native", N)
-    start(sim, get_stage("so101"))
+    start_moving(sim, get_stage("so101"))
     sim.forward()
     before = {name: getattr(sim, name).clone() for name in POSES}
     sim.qpos[:, 0] += 0.1
@@ -324,7 +315,7 @@ def test_native_kinematics_visits_masked_worlds_only(make_sim: Make, get_stage: 
 def test_forward_agrees_with_mujoco(backend: str, make_sim: Make, get_stage: GetStage) -> None:
     sim = make_sim(backend, N)
     stage = get_stage("so101")
-    start(sim, stage)
+    start_moving(sim, stage)
     sim.step(10)
     sim.forward()
     data = mujoco.MjData(stage.model)
@@ -364,7 +355,7 @@ def test_captured_and_uncaptured_steps_agree(make_sim: Make, get_stage: GetStage
     finals = []
     for overrides in ((), ("graph=off",)):
         sim = make_sim("mjwarp", N, *overrides)
-        start(sim, get_stage("so101"))
+        start_moving(sim, get_stage("so101"))
         sim.step(5)
         sim.step(5)
         finals.append([getattr(sim, name).clone() for name in (*VIEWS, *COUNTS, "step_count")])
@@ -375,7 +366,7 @@ def test_captured_and_uncaptured_steps_agree(make_sim: Make, get_stage: GetStage
 def test_native_does_not_reset_a_diverged_world(make_sim: Make, get_stage: GetStage) -> None:
     """MuJoCo would put it back to qpos0, which looks like a world that never moved."""
     sim = make_sim("native", N)
-    start(sim, get_stage("so101"))
+    start_moving(sim, get_stage("so101"))
     sim.qvel[1, 0] = 1e12  # beyond what MuJoCo calls a good velocity
     sim.step(10)
     assert not sim.qvel[1].abs().max() < 1e6
@@ -435,7 +426,7 @@ def test_native_threads_do_not_matter(get_stage: GetStage, monkeypatch: pytest.M
         monkeypatch.setattr(native, "available_cores", lambda nthread=nthread: nthread)
         sim = native.NativeSimulation(get_stage("so101").model, 5)
         assert sim.nthread == nthread
-        start(sim, get_stage("so101"))
+        start_moving(sim, get_stage("so101"))
         sim.step(20)
         finals.append(sim.qpos.clone())
         sim.close()

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from check_cases import BLUE, RED, limits
-from environments import StubViews, actions, configure, on_shared_sim, returned
+from environments import StubViews, actions, configure, on_shared_sim, returned, zeros
 from stack_checker import lowest_corner
 
 from mjstack.config.schema import Config
@@ -632,7 +632,7 @@ def test_reaching_ends_the_episode_after_ten_steps_in_a_row(backend: str) -> Non
     env = on_shared_sim(backend, 3, cfg)
     env.reset(seed=0)
     q, v = env.index.objects["red"]
-    hold = torch.zeros((3, env.action_manager.action_dim), device=env.device)
+    hold = zeros(env)
     for step in range(1, 17):
         grasp_point = env.sim.site_xpos[:, env.index.grasp_sites].mean(1)
         above = torch.tensor([0.0, 0.0, cfg.task.params["goal_height"]], device=env.device)
