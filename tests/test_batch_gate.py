@@ -16,7 +16,7 @@ import pytest
 import torch
 from check_cases import rules_of
 from compositions import load_config
-from environments import at_double_speed, one_second_episode
+from environments import at_double_speed, one_second_episode, record_of
 
 from mjstack.drivers.open_loop import JointTrajectory
 from mjstack.episodes import batches
@@ -60,12 +60,6 @@ def test_wilson_interval(successes: int, trials: int, low: float, high: float) -
         expected = 1.959964**2 * p * (1.0 - p) / trials
         assert (rate - p) ** 2 == pytest.approx(expected, rel=1e-4, abs=1e-12)
     assert 0.0 <= ends[0] <= rate <= ends[1] <= 1.0
-
-
-def record_of(folder: Path, seed: int) -> EpisodeRecord:
-    record = EpisodeRecord.read(folder, seed)
-    assert record is not None
-    return record
 
 
 def play(run: Run, folder: Path | None) -> GateResult:

@@ -184,6 +184,12 @@ BAD_VALUES = [
         (f"gate.capacity.margin={value}", "gate.capacity.margin=")
         for value in ("0.9", "nan", "inf")
     ),
+    ("gate.success.rate=1.01", "gate.success.rate=1.01: expected a number from 0 to 1"),
+    ("gate.success.rate=nan", "gate.success.rate=nan"),
+    ("gate.success.seeds=0", "gate.success.seeds=0: expected an integer of at least 1"),
+    ("gate.success.cell=0", "gate.success.cell"),
+    ("gate.success.yaw_cell_deg=91", "gate.success.yaw_cell_deg"),
+    ("gate.success.region=[-0.01,0.1]", "gate.success.region"),
     ("gate.capacity.random_steps=0", "gate.capacity.random_steps=0"),
     ("gate.capacity.probe_steps=0", "gate.capacity.probe_steps=0"),
     ("gate.capacity.probe_nworld=-1", "gate.capacity.probe_nworld=-1"),
