@@ -288,13 +288,10 @@ def test_records_that_were_removed(tmp_path: Path) -> None:
     assert (result.metrics["worlds_played"], result.metrics["succeeded"]) == (10, 7)
 
 
-def test_records_of_version_0_1(tmp_path: Path) -> None:
-    """They have other names; a batch that is not in the dataset has not been played."""
+def test_a_batch_that_is_not_in_the_dataset_has_not_been_played(tmp_path: Path) -> None:
     collect(tmp_path, episodes=3)
     (record,) = json.loads((tmp_path / BATCHES).read_text())
-    count = record.pop("episodes")
-    old = record | {"keep": count, "kept": count}
-    (tmp_path / BATCHES).write_text(json.dumps([old, old | {"seed": 1}]))
+    (tmp_path / BATCHES).write_text(json.dumps([record, record | {"seed": 1}]))
     result = collect(tmp_path, episodes=4)
     assert [seed for seed, _ in pairs(tmp_path / "dataset")] == [0] * 3 + [1]
     batches = json.loads((tmp_path / BATCHES).read_text())

@@ -54,8 +54,7 @@ def join(paths: Sequence[Path], path: Path) -> None:
         OSError: The file cannot be written.
     """
     listed = path.with_name(f"{path.name}.txt")
-    lines = [f"file '{os.path.relpath(part, path.parent)}'\n" for part in paths]
-    listed.write_text("".join(lines))
+    listed.write_text("".join(f"file '{os.path.relpath(part, path.parent)}'\n" for part in paths))
     source = ["-f", "concat", "-safe", "0", "-i", str(listed)]
     _ffmpeg([*source, "-c", "copy", "-f", "mp4", str(path)])
     listed.unlink()

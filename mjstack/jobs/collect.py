@@ -156,8 +156,7 @@ class Collection:
         """
         stage = self._stage
         cfg = demonstration_config(stage.cfg, stage.action)
-        channels = demonstration_channels(stage)
-        batches = play_batches(stage, self._batch_plans(), channels, cfg=cfg)
+        batches = play_batches(stage, self._batch_plans(), demonstration_channels(stage), cfg=cfg)
         writer = self.writer if stage.ranks.writes else nullcontext()
         with closing(self._source), writer, closing(batches):
             for batch in batches:

@@ -141,8 +141,7 @@ class EpisodeSource:
         steps = range(len(batch.rows[ACTION]))
         rendered_steps = steps[:: math.gcd(*self._strides.values()) or 1]
         columns = [name for name in batch.rows if name != POSITIONS]
-        world_bytes = sum(batch.rows[name][:, 0].nbytes for name in columns)
-        size = _CHUNK_BYTES // world_bytes
+        size = _CHUNK_BYTES // sum(batch.rows[name][:, 0].nbytes for name in columns)
         if self._cameras:
             size = self._most_rendered // len(rendered_steps)
         size = max(1, size)

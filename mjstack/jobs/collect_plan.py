@@ -6,7 +6,7 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -176,7 +176,7 @@ class BatchRecord:
 
 
 def read_batches(path: Path) -> list[BatchRecord]:
-    """The batches of earlier calls. Those of version 0.1 have ``kept`` for ``episodes``.
+    """The batches of earlier calls.
 
     Raises:
         FolderError: The file cannot be read.
@@ -184,10 +184,8 @@ def read_batches(path: Path) -> list[BatchRecord]:
     if not path.exists():
         return []
     fix = f"Remove {BATCHES}: the expert's success rate is counted anew"
-    names = [item.name for item in fields(BatchRecord)]
     with reading(path, fix):
-        batches = [{"episodes": old.get("kept")} | old for old in json.loads(path.read_text())]
-        return [BatchRecord(**{name: batch[name] for name in names}) for batch in batches]
+        return [BatchRecord(**batch) for batch in json.loads(path.read_text())]
 
 
 def episode_config(cfg: Config) -> dict[str, Any]:
