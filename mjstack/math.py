@@ -179,3 +179,20 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     half = z * math.sqrt(rate * (1.0 - rate) / trials + 0.25 * share / trials) / (1.0 + share)
     # At the ends the exact bounds are 0 and 1; rounding must not miss them.
     return 0.0 if successes == 0 else centre - half, 1.0 if successes == trials else centre + half
+
+
+def mcnemar_p_value(only_a: int, only_b: int) -> float:
+    """Two-sided p-value of McNemar's exact test: how probable it is that pairs of which one side
+    alone won are split so unevenly or more, if either side wins such a pair with probability 1/2.
+
+    Args:
+        only_a: Pairs that the first side alone won.
+        only_b: Pairs that the second side alone won.
+    """
+    pairs = only_a + only_b
+    ways = 1  # binomial coefficient of the pairs; integers are exact
+    tail = 1
+    for won in range(min(only_a, only_b)):
+        ways = ways * (pairs - won) // (won + 1)
+        tail += ways
+    return min(1.0, 2 * tail / 2**pairs)

@@ -227,7 +227,7 @@ BAD = [
     (["gate=batch"], "gates=[...]"),
     (
         ["job=play_schema"],
-        "Did you mean 'play'? Available: collect, export, gates, play, replay, train.",
+        "Did you mean 'play'? Available: collect, compare, export, gates, play, replay, train.",
     ),
     (["nworld=2.5"], "nworld"),
     (["sim.nworlds=3"], "nworld'?"),

@@ -49,12 +49,14 @@ class Job:
         check: Raises a `MjstackError` for what cannot be done here, before anything is written.
             Returns the job ready to run, with the scene and the plan that the check built.
         keys: Top-level keys and groups that its command line may set; None for all.
+        overrides: Whether its check takes the command line's overrides too.
         shows: Whether it can show a world (``view=true``, ``video``).
         live: Whether the live view can show its worlds (``view=web``).
     """
 
-    check: Callable[[Config], "CheckedJob"]
+    check: Callable[..., "CheckedJob"]
     keys: tuple[str, ...] | None = None
+    overrides: bool = False
     shows: bool = False
     live: bool = False
 
@@ -279,7 +281,7 @@ def check_job(cfg: Config, overrides: Sequence[str] = ()) -> CheckedJob:
         raise ConfigError("view", cfg.view, expected, "Leave it out")
     if cfg.video and not job.shows:
         raise ConfigError("video", "true", f"{by}, which shows no world", "Leave it out")
-    return job.check(cfg)
+    return job.check(cfg, overrides) if job.overrides else job.check(cfg)
 
 
 def run_provenance(stage: Stage) -> Provenance:

@@ -48,6 +48,14 @@ class PlayJobCfg(JobCfg):
 
 
 @dataclass(slots=True)
+class CompareJobCfg(JobCfg):
+    """Two policies, drivers or settings, compared on equal starts."""
+
+    against: list[str] = spec(factory=list)
+    """Overrides that make the second side of the command's configuration, which is the first."""
+
+
+@dataclass(slots=True)
 class TrainJobCfg(JobCfg):
     """A policy is trained, and judged from starts that training has not used."""
 
@@ -186,5 +194,6 @@ TRAINER_SCHEMAS = {"ppo": PpoJobCfg}
 JOB_SCHEMAS = {
     "collect": CollectJobCfg,
     "play": PlayJobCfg,
+    "compare": CompareJobCfg,
     "train": CloneJobCfg,
 }

@@ -1,0 +1,205 @@
+"""Job *compare*: two policies, drivers or settings play the episodes of gate *success* from equal
+starts, and McNemar's test says which is better.
+"""
+
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import replace
+from functools import partial
+from itertools import groupby
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from mjstack.config.fingerprint import config_content, differences
+from mjstack.config.load import load_config
+from mjstack.config.schema import Backend, CompareJobCfg, Config
+from mjstack.episodes.batches import BatchPlan, play_batches
+from mjstack.episodes.motion import motion_recorder
+from mjstack.episodes.replay import simulate_alone
+from mjstack.episodes.run import Run
+from mjstack.episodes.stage import Stage, require_episode
+from mjstack.episodes.tally import rate_metrics
+from mjstack.errors import ConfigError, MjstackError
+from mjstack.files import to_csv, write_atomic
+from mjstack.gates.runner import run_guarded
+from mjstack.gates.success import success_config
+from mjstack.jobs.gates import check_machine
+from mjstack.jobs.runner import CheckedJob, Job
+from mjstack.math import mcnemar_p_value
+from mjstack.mdp.starts.starts_file import start_arrays
+from mjstack.report.page import World
+from mjstack.report.record import GateResult, Status
+from mjstack.report.sweep_picture import Plot, save_sweep
+from mjstack.report.table import Table
+
+NAME = "compare"
+TABLE = "compare.csv"
+_SIDES = ("a", "b")
+_PAGE_WORLDS = 8  # worlds on the page that only one side won, of each side
+_LEVEL = 0.05  # of significance
+_ENDS = {"min": "low", "max": "high"}  # of the picture's whiskers, in metrics of a rate
+_ROUNDING = 1e-6  # [m, rad], by which equal starts on two backends may differ
+_PANELS = {"success rate, 95 % interval": "success_rate", "episodes that only this one won": "only"}
+
+Sides = Mapping[str, Stage]
+
+
+def check_compare(cfg: Config, overrides: Sequence[str]) -> CheckedJob:
+    """Raise for sides that cannot be played here or do not start alike, before anything is
+    written. The overrides are the command line's.
+    """
+    against = cast(CompareJobCfg, cfg.job).against
+    if not against:
+        expected = 'what the second side changes, such as ["controller=policy","policy=DIR"]'
+        raise ConfigError("job.against", "[]", expected)
+    changed = {"job.against", *map(_key, against)}
+    unchanged = [override for override in overrides if _key(override) not in changed]
+    sides: dict[str, Stage] = {}
+    facts = []
+    notes = {}
+    for name, side in zip(_SIDES, (cfg, load_config([*unchanged, *against])), strict=True):
+        content = config_content(side)
+        equal = {key: content[key] for key in ("task", "nworld", "seed")}
+        success = {"success.seeds": side.gate.success.seeds}
+        facts.append(equal | {"robot": side.robot.name, "gate": success})
+        if changes := differences(facts[-1], facts[0]):
+            expected = f"the same robot, task, worlds and seeds ({changes})"
+            raise ConfigError("job.against", against, expected)
+        require_episode(side)
+        stage = check_machine(replace(side, gates=["success"]))
+        sides[name] = stage.with_config(success_config(stage.cfg))
+        driver = (sides[name].cfg.controller.name, content.get("policy", ""))
+        notes[name] = " ".join(filter(None, driver))
+    first, second = map(_start_of_first_world, sides.values())
+    if first.keys() != second.keys() or any((first[k] != second[k]).any() for k in first):
+        raise ConfigError("job.against", against, "equal starts, which these keys change")
+    notes["b"] += f", {' '.join(against)}"
+    title = f"task {cfg.task.name}, a against b ({' '.join(against)})"
+    return CheckedJob(stage=sides["a"], title=title, work=partial(_run, sides, notes))
+
+
+def _key(override: str) -> str:
+    return override.lstrip("+~").partition("=")[0]
+
+
+def _start_of_first_world(stage: Stage) -> dict[str, np.ndarray]:
+    """How world 0 of the first seed starts on native MuJoCo, by the arrays of a starts file."""
+    with closing(simulate_alone(stage, Backend.native, "cpu")) as sim:
+        return start_arrays(stage.start(sim, stage.cfg.reset, worlds=[0]))
+
+
+def _run(sides: Sides, notes: Mapping[str, str], run: Run, folder: Path) -> None:
+    """Play both sides and compare them."""
+    for stage in sides.values():
+        stage.progress = run.stage.progress
+    run_guarded(run, NAME, partial(_compare, sides, notes, folder))
+
+
+def _compare(sides: Sides, notes: Mapping[str, str], folder: Path, run: Run) -> list[GateResult]:
+    """The comparison as a result: it passes if it was made."""
+    (failed_a, starts_a), (failed_b, starts_b) = (_play(*side) for side in sides.items())
+    rounding = _ROUNDING if sides["a"].backend[0] != sides["b"].backend[0] else 0.0
+    if not np.abs(starts_a - starts_b).max() <= rounding:
+        raise MjstackError("a and b did not start alike", "Leave what worlds start from unchanged")
+
+    # Episodes that only one side won, and the rules that the other one broke there
+    won = {"a": failed_a == 0, "b": failed_b == 0}
+    only = {"a": won["a"] & ~won["b"], "b": won["b"] & ~won["a"]}
+    rules = run.stage.check.rules
+    rows: list[dict[str, Any]] = []
+    broken: dict[str, dict[str, int]] = {}
+    for name, bits in (("a", failed_b[only["a"]]), ("b", failed_a[only["b"]])):
+        broken[name] = {rule: len(worlds) for rule, worlds in rules.failing(bits).items()}
+        for (seed, world), failed in zip(np.argwhere(only[name]).tolist(), bits, strict=True):
+            row = {"seed": run.cfg.seed + seed, "world": world, "succeeded": name}
+            rows.append(row | {"rules": " ".join(rules.broken(failed))})
+    write_atomic(folder / TABLE, to_csv(rows, ("seed", "world", "succeeded", "rules")))
+    counts = {name: int(mask.sum()) for name, mask in only.items()}
+    if run.page.motion:
+        moving = [*rows[: counts["a"]][:_PAGE_WORLDS], *rows[counts["a"] :][:_PAGE_WORLDS]]
+        run.page.worlds3d[NAME] = _replay(sides, moving)
+
+    # The result
+    episodes = failed_a.size
+    rates = {name: rate_metrics(int(mask.sum()), episodes) for name, mask in won.items()}
+    p_value = mcnemar_p_value(counts["a"], counts["b"])
+    verdict = "no difference is shown"
+    if p_value < _LEVEL:
+        verdict = f"{max(counts, key=lambda name: counts[name])} is better"
+    bars = []
+    for name, rate in rates.items():
+        ends = {f"success_rate_{end}": rate[f"success_rate_{at}95"] for end, at in _ENDS.items()}
+        bars.append({"side": name, "status": "pass", "only": counts[name]} | rate | ends)
+    panels = {title: {"": metric} for title, metric in _PANELS.items()}
+    plot = Plot(title=f"{run.page.title}: {verdict}", over="side", lines=[], panels=panels)
+    run.draw(f"{NAME}.png", save_sweep, plot, bars)
+    table = Table(
+        title="Episodes that only one side won, by the rules that the other one broke",
+        header=["rule", "meaning", "only a", "only b"],
+        rows=[
+            [rule, rules.texts[rule], *(str(broken[name].get(rule, 0)) for name in _SIDES)]
+            for rule in rules
+            if rule in broken["a"] | broken["b"]
+        ],
+    )
+    return [
+        GateResult(
+            name=NAME,
+            status=Status.passed,
+            reason=f"{verdict} (McNemar's exact test, p = {p_value:.3g}): of {episodes} episodes a"
+            f" succeeded in {rates['a']['succeeded']} and b in {rates['b']['succeeded']}, only a in"
+            f" {counts['a']}, only b in {counts['b']}",
+            metrics={
+                "episodes": episodes,
+                "both": int((won["a"] & won["b"]).sum()),
+                **{f"only_{name}": count for name, count in counts.items()},
+                "neither": int((~won["a"] & ~won["b"]).sum()),
+                "p_value": p_value,
+                **{f"{name}.{key}": v for name, rate in rates.items() for key, v in rate.items()},
+                **{f"only_{s}.failed.{r}": n for s in _SIDES for r, n in broken[s].items()},
+            },
+            notes={**notes, "table": TABLE},
+            tables=[table] if table.rows else [],
+        )
+    ]
+
+
+def _play(name: str, stage: Stage) -> tuple[np.ndarray, np.ndarray]:
+    """Play a side: the bits of the rules that each episode broke, shape ``(seeds, nworld)``, and
+    positions at the starts, shape ``(seeds, nworld, nq)``.
+    """
+    cfg = stage.cfg
+    seeds = range(cfg.seed, cfg.seed + cfg.gate.success.seeds)
+    plans = [BatchPlan(seed, range(cfg.nworld)) for seed in seeds]
+    played = []
+    for batch in play_batches(stage, plans, label=f"steps of {name}"):
+        played.append((batch.episode.failed, batch.episode.start))
+        count = f"{int(batch.succeeded.sum())} of {cfg.nworld} worlds succeeded"
+        stage.progress.print_line(f"{name}, seed {batch.plan.seed}: {count}")
+    failed, starts = zip(*played, strict=True)
+    return np.stack(failed), np.stack(starts)
+
+
+def _replay(sides: Sides, rows: Sequence[Mapping[str, Any]]) -> list[World]:
+    """Some worlds in motion, each as a plays it and as b does."""
+    places = sorted((row["seed"], row["world"]) for row in rows)
+    groups = groupby(places, key=lambda place: place[0])
+    plans = [BatchPlan(seed, [world for _, world in group]) for seed, group in groups]
+    moving: dict[tuple[int, int, str], World] = {}
+    for name, stage in sides.items():
+        channels = motion_recorder(stage.cfg.timing.step_dt).channels
+        simulate = partial(simulate_alone, stage, *stage.backend)
+        for batch in play_batches(stage, plans, channels, simulate=simulate):
+            seed = batch.plan.seed
+            motions = batch.rows["qpos"].float().swapaxes(0, 1).cpu().numpy()
+            bits = batch.episode.failed.tolist()
+            for world, qpos, failed in zip(batch.plan.worlds, motions, bits, strict=True):
+                rules = " ".join(stage.check.rules.broken(failed))
+                label = f"{seed}:{world} {name} {rules}".rstrip()
+                moving[seed, world, name] = World(label=label, qpos=qpos, failed=failed > 0)
+    return [moving[key] for key in sorted(moving)]
+
+
+JOB = Job(check_compare, overrides=True)

@@ -1,0 +1,160 @@
+"""job=compare: McNemar's test, known differences of two drivers, and sides that it refuses."""
+
+from __future__ import annotations
+
+import csv
+import math
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from policies import report
+
+import mjstack.jobs.compare as compare
+from mjstack.cli import run
+from mjstack.drivers.driver import Driver
+from mjstack.envs import Env
+from mjstack.episodes.stage import Stage
+from mjstack.math import mcnemar_p_value
+
+TINY = ("job=compare", "task=reach", "sim=native", "nworld=4", "gate.success.seeds=2")
+FAULTS = {"closed_loop": (0, 2), "state_based": (2, 3)}  # worlds in which the driver does nothing
+
+
+@pytest.mark.parametrize(
+    ("only_a", "only_b", "p_value"),
+    [
+        (0, 0, 1.0),
+        (1, 0, 1.0),
+        (3, 3, 1.0),
+        (5, 0, 0.0625),
+        (1, 9, 0.021484375),  # 2 (1 + 10) / 2^10
+        (2, 10, 0.03857421875),  # 2 (1 + 12 + 66) / 2^12
+        (20_000, 0, 0.0),  # smaller than any float
+        (10_000, 10_000, 1.0),
+    ],
+)
+def test_mcnemar_of_known_pairs(only_a: int, only_b: int, p_value: float) -> None:
+    assert mcnemar_p_value(only_a, only_b) == mcnemar_p_value(only_b, only_a) == p_value
+
+
+def test_mcnemar_is_the_exact_binomial() -> None:
+    for pairs in (7, 40, 180):
+        for few in range(pairs // 2):
+            tail = sum(math.comb(pairs, won) for won in range(few + 1))
+            exact = float(Fraction(2 * tail, 2**pairs))
+            assert mcnemar_p_value(few, pairs - few) == exact
+
+
+class Faulty(Driver):
+    """A driver that holds some worlds where they start."""
+
+    def __init__(self, driver: Driver, env: Env, worlds: tuple[int, ...]) -> None:
+        super().__init__(env.nworld, driver.steps, env.device, driver.phases)
+        self.phase, self.error, self.retries = driver.phase, driver.error, driver.retries
+        self._driver = driver
+        self._still = torch.isin(env.world, torch.tensor(worlds))[:, None]
+        self._start = env.sim.ctrl.float().clone()
+
+    def command(self) -> torch.Tensor:
+        return torch.where(self._still, self._start, self._driver.command().float())
+
+
+def test_two_drivers_that_differ_in_known_worlds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = Stage.driver
+
+    def driver(stage: Stage, env: Env) -> Driver:
+        return Faulty(made(stage, env), env, FAULTS[env.cfg.controller.name])
+
+    shown = []
+    replay = compare._replay
+    monkeypatch.setattr(Stage, "driver", driver)
+    monkeypatch.setattr(compare, "_replay", lambda *args: shown.extend(replay(*args)) or shown)
+    sides = ["controller=closed_loop", 'job.against=["controller=state_based"]']
+    assert run([*TINY, *sides, f"hydra.run.dir={tmp_path}/out"]) == 0
+    result = report(tmp_path / "out")["compare"]
+    metrics = result["metrics"]
+    counts = [metrics[name] for name in ("episodes", "both", "only_a", "only_b", "neither")]
+    assert counts == [8, 2, 2, 2, 2]
+    assert metrics["p_value"] == 1.0
+    assert metrics["only_a.failed.REACHED"] == metrics["only_b.failed.REACHED"] == 2
+    assert metrics["a.success_rate"] == metrics["b.success_rate"] == 0.5
+    assert metrics["a.success_rate_low95"] < 0.5 < metrics["a.success_rate_high95"]
+    assert "no difference is shown" in result["reason"]
+    assert result["notes"]["b"] == "state_based, controller=state_based"
+    with (tmp_path / "out/compare.csv").open() as file:
+        rows = [tuple(row.values()) for row in csv.DictReader(file)]
+    assert rows == [
+        *((seed, "3", "a", "REACHED") for seed in "01"),
+        *((seed, "0", "b", "REACHED") for seed in "01"),
+    ]
+    # The page shows each of these worlds as both sides play it.
+    assert [(world.label, world.failed) for world in shown] == [
+        place
+        for seed in "01"
+        for place in (
+            (f"{seed}:0 a REACHED", True),
+            (f"{seed}:0 b", False),
+            (f"{seed}:3 a", False),
+            (f"{seed}:3 b REACHED", True),
+        )
+    ]
+    assert all(world.qpos.shape == shown[0].qpos.shape for world in shown)
+    for name in ("compare.png", "episode.html", "report.html"):
+        assert (tmp_path / "out" / name).stat().st_size > 0, name
+
+
+def test_equal_sides(tmp_path: Path) -> None:
+    settings = [
+        'job.against=["graph=off"]',
+        "web.episode=false",
+        "nworld=2",
+        "gate.success.seeds=1",
+    ]
+    assert run([*TINY, *settings, f"hydra.run.dir={tmp_path}/out"]) == 0
+    metrics = report(tmp_path / "out")["compare"]["metrics"]
+    assert (metrics["both"], metrics["p_value"]) == (2, 1.0)
+    assert (tmp_path / "out/compare.csv").read_text() == "seed,world,succeeded,rules\n"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "problem"),
+    [
+        ([], "job.against=[]: expected what the second side changes"),
+        (["job.against=[policy]"], "override 'policy' cannot be read: expected key=value"),
+        (['job.against=["polcy=x"]'], "'polcy' does not exist. Did you mean 'policy'?"),
+        (
+            ['job.against=["seed=1"]'],
+            "expected the same robot, task, worlds and seeds (seed=1, expected 0)",
+        ),
+        (['job.against=["nworld=8"]'], "(nworld=8, expected 4)"),
+        (['job.against=["robot=rebot"]'], "(robot=rebot, expected so101)"),
+        (['job.against=["gate.success.seeds=3"]'], "(gate.success.seeds=3, expected 2)"),
+        (['job.against=["task.check.distance=0.5"]'], "(task.check.distance=0.5, expected 0.02)"),
+        (
+            ['job.against=["gate.success.region=[0.01,0.01]"]'],
+            "expected equal starts, which",
+        ),
+        (['job.against=["controller=policy","policy=nowhere/last"]'], "nowhere/last"),
+        (['job.against=["graph=off"]', "view=web"], "expected false with job=compare"),
+    ],
+)
+def test_other_sides_are_refused_in_one_line(
+    overrides: list[str], problem: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run([*TINY, *overrides, f"hydra.run.dir={tmp_path}/out"]) == 2
+    text = capsys.readouterr().err
+    assert problem in text
+    assert text.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_starts_that_turn_out_unequal_fail(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compare, "_start_of_first_world", lambda stage: {"start": np.zeros(1)})
+    region = ['job.against=["gate.success.region=[0.01,0.01]"]']
+    assert run([*TINY, *region, f"hydra.run.dir={tmp_path}/out"]) == 1
+    assert "a and b did not start alike" in report(tmp_path / "out")["compare"]["reason"]
