@@ -14,7 +14,7 @@ import pytest
 import torch
 import warp as wp
 from compositions import load_config
-from environments import CUDA, DEVICES
+from environments import CUDA
 from ik_arm import Arm, results, tensors
 from test_robot_models import REPO, upstream
 
@@ -29,11 +29,6 @@ GetStage = Callable[[str], Stage]
 MINK = 300  # targets that mink solves, one after the other
 TOLERANCE = 0.0005  # m, as the driver's
 TABLE = "on and above the table"
-
-
-@pytest.fixture(params=DEVICES)
-def device(request: pytest.FixtureRequest) -> str:
-    return request.param
 
 
 def above_table(stage: Stage, arm: Arm, n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from environments import DEVICES, configure, fused_sim
+from environments import configure, fused_sim
 
 from mjstack.sim.fused import constraints
 from mjstack.sim.mujoco_warp import mjw
@@ -146,7 +146,6 @@ def solved_alike(worlds: Worlds) -> dict[str, np.ndarray]:
     return fused
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(
     ("cone", "condim", "boxes"),
     [
@@ -173,7 +172,6 @@ def test_every_kind_of_row(cone: str, condim: int, boxes: int, device: str) -> N
     assert states >= {0, 1, 2, 3} | ({4} if contact == 7 else set())
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("njmax", [300, 16])
 @pytest.mark.parametrize("condim", [1, 3, 6])
 def test_contact_rows(condim: int, njmax: int, device: str) -> None:
@@ -210,7 +208,6 @@ def test_contact_rows(condim: int, njmax: int, device: str) -> None:
     assert most > 16
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_worlds_without_rows_and_with_too_many(device: str) -> None:
     """No row at all: the smooth acceleration. More rows than there is room for: that world is
     marked as lost by MJWarp, and the others are solved.
@@ -232,7 +229,6 @@ def test_worlds_without_rows_and_with_too_many(device: str) -> None:
     assert np.isfinite(fused["qacc"]).all()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_a_world_that_is_not_finite_is_alone(device: str) -> None:
     worlds = Worlds(every_row("elliptic", 3, 2), device, njmax=128)
     worlds.step(150)
@@ -255,7 +251,6 @@ def test_a_world_that_is_not_finite_is_alone(device: str) -> None:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(("boxes", "slides"), [(0, 1), (5, 1), (5, 2), (5, 3), (8, 0), (9, 6)])
 def test_sizes(boxes: int, slides: int, device: str) -> None:
     """On CUDA a row of the Hessian is a thread's up to 31 degrees of freedom; columns of J are
@@ -282,7 +277,6 @@ def test_sizes_that_do_not_fit() -> None:
     assert "1152 rows need 51,332 bytes of shared memory" in constraints.why_not(worlds.m, worlds.d)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_more_equalities_than_room(device: str) -> None:
     """MJWarp counts them all: such a world is lost, and nothing is read beyond the buffer."""
     body = "<body pos='{0} 0 1'><joint name='j{0}' axis='0 1 0'/><geom size='.1'/></body>"
@@ -295,7 +289,6 @@ def test_more_equalities_than_room(device: str) -> None:
     assert np.isfinite(fused["qacc"]).all()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_limits_are_reported_as_mjwarp_does(device: str) -> None:
     """Of one iteration: later ones end at the rounding of their sums, on either side."""
     model = every_row("elliptic", 3, 2)
@@ -311,8 +304,6 @@ def test_limits_are_reported_as_mjwarp_does(device: str) -> None:
     assert set(bits) >= {int(mjw.OverflowType.ITERATIONS), limits}
 
 
-@pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("robot", ["so101", "rebot"])
 def test_contacts_are_mjwarps_own(robot: str, device: str) -> None:
     """The same kernels, launched here: on the CPU device bit for bit, in the same order."""
     sim = fused_sim(configure(robot=robot), 2, device)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from environments import DEVICES, configure, fused_sim
+from environments import configure, fused_sim
 
 from mjstack.sim.fused import smooth
 from mjstack.sim.mujoco_warp import mjw
@@ -142,7 +142,6 @@ def accelerate(m: mjw.Model, d: mjw.Data) -> None:
     mjw.fwd_acceleration(m, d, factorize=True)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("args", [("robot=so101",), ("robot=rebot",), ("robot=so101", "task=box")])
 def test_robots(args: tuple[str, ...], device: str) -> None:
     """Random commands and thrown objects, every world with masses, gains and places of its own."""
@@ -170,7 +169,6 @@ def test_robots(args: tuple[str, ...], device: str) -> None:
             compare(sim._m, sim._d)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(
     ("boxes", "off"),
     [
@@ -222,7 +220,6 @@ def test_overflow_is_reported() -> None:
     assert d.overflow.numpy().tolist() == [lost, lost | int(bits.NEFC), lost]
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_nan_stays_in_its_world(device: str) -> None:
     model = parts(1)
     with wp.ScopedDevice(device):

@@ -8,18 +8,11 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from environments import DEVICES
 from ik_arm import Arm, results, tensors
 
 from mjstack.config.schema import RobotCfg
 from mjstack.errors import ArgumentError, ConfigError, MjstackError
 from mjstack.kinematics.batched_ik import BatchedIk
-
-
-@pytest.fixture(params=DEVICES)
-def device(request: pytest.FixtureRequest) -> str:
-    return request.param
-
 
 ODD = """
 <mujoco>

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from functools import cache
 from itertools import pairwise
 
-import mujoco
 import numpy as np
 import pytest
+from ik_arm import Arm
 
 from mjstack.drivers.open_loop import JointTrajectory
 from mjstack.episodes.stage import Stage
@@ -51,13 +51,8 @@ def target(stage: Stage, phase: str, xy: np.ndarray) -> np.ndarray:
 
 
 def grasp_point(stage: Stage, command: np.ndarray) -> np.ndarray:
-    """Forward kinematics on the scene's model: the midpoint of the two grasp_point sites."""
-    data = mujoco.MjData(stage.model)
-    joints = [*stage.cfg.robot.arm_joints, *stage.cfg.robot.gripper_joints]
-    for name, value in zip(joints, command, strict=True):
-        data.joint(name).qpos[0] = value
-    mujoco.mj_kinematics(stage.model, data)
-    return np.mean([data.site(name).xpos for name in stage.cfg.robot.grasp_sites], axis=0)
+    """Forward kinematics on the scene's model."""
+    return Arm(stage.model, stage.cfg.robot).grasp_point(command[None])[0]
 
 
 @pytest.fixture

@@ -11,11 +11,11 @@ from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
-import mujoco
 import numpy as np
 import pytest
 import torch
 from compositions import refusal
+from ik_arm import Arm
 
 from mjstack import load_config
 from mjstack.config.fingerprint import config_content
@@ -142,15 +142,6 @@ def test_grasp_sites_are_added_where_the_file_lacks_them(tmp_path: Path) -> None
     np.testing.assert_allclose(site.pos, 0.0)
 
 
-def grasp_point(model: mujoco.MjModel, values: dict[str, float]) -> np.ndarray:
-    """Midpoint of the SCARA's grasp sites [m], by MuJoCo."""
-    data = mujoco.MjData(model)
-    for name, value in values.items():
-        data.joint(name).qpos[0] = value
-    mujoco.mj_kinematics(model, data)
-    return 0.5 * (data.site("left_grasp").xpos + data.site("right_grasp").xpos)
-
-
 def scara_points(n: int) -> np.ndarray:
     """Points over the table of the SCARA [m], shape ``(n, 3)``."""
     return np.random.default_rng(0).uniform([0.33, -0.22, 0.04], [0.49, 0.22, 0.24], (n, 3))
@@ -159,13 +150,14 @@ def scara_points(n: int) -> np.ndarray:
 def test_reach_of_an_arm_with_a_slide_is_mujocos() -> None:
     cfg = scara()
     model = build_model(cfg)
+    arm = Arm(model, cfg.robot)
     reach = PointReach(model, cfg.robot, cfg.robot.gripper_open)
     points = scara_points(30)
-    found, distances = reach.solve(points)
+    solutions, distances = reach.solve(points)
     assert distances.max() < 1e-6
-    for point, q in zip(points, found, strict=True):
-        values = dict(zip(cfg.robot.ik_joints, q, strict=True))
-        assert np.linalg.norm(grasp_point(model, values) - point) < 1e-6
+    commands = arm.at_home(30)
+    commands[:, arm.moved] = solutions
+    assert np.linalg.norm(arm.grasp_point(commands) - points, axis=1).max() < 1e-6
     # Above the slide's range the point is as far away as it is above.
     q, distances = reach.solve(np.array([[0.4, 0.0, 0.28 + 0.1]]))
     assert distances[0] == pytest.approx(0.1, abs=1e-4)
@@ -175,16 +167,13 @@ def test_reach_of_an_arm_with_a_slide_is_mujocos() -> None:
 def test_mink_plans_an_arm_with_a_slide() -> None:
     cfg = scara()
     planner = OpenLoopPlanner(cfg)
-    model = build_model(cfg)
-    names = [*cfg.robot.arm_joints, *cfg.robot.gripper_joints]
+    arm = Arm(build_model(cfg), cfg.robot)
     for point in scara_points(10):
         command, distance = planner.ik.solve(point, np.array([0.02, 0.02]), planner.ik.home)
         assert distance < 0.1 * planner.ik.tolerance
-        values = dict(zip(names, command, strict=True))
-        assert np.linalg.norm(grasp_point(model, values) - point) == pytest.approx(
-            distance, abs=1e-9
-        )
-        assert abs(values["roll"]) < 1e-12
+        miss = np.linalg.norm(arm.grasp_point(command[None])[0] - point)
+        assert miss == pytest.approx(distance, abs=1e-9)
+        assert abs(command[arm.names.index("roll")]) < 1e-12
 
 
 @pytest.mark.full

@@ -193,7 +193,6 @@ def test_same_grasp_point(pair: Pair) -> None:
 # On their own
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
 def test_mesh_free_and_standalone(robot: str, tmp_path: Path) -> None:
     """Nothing but the file itself is needed: it compiles from an empty folder."""
     copy = tmp_path / "robot.xml"
@@ -203,7 +202,6 @@ def test_mesh_free_and_standalone(robot: str, tmp_path: Path) -> None:
     assert (model.geom_type != mujoco.mjtGeom.mjGEOM_MESH).all()
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
 def test_plausible_mass(robot: str) -> None:
     model = built_in(robot)
     low, high = MASS_BOUNDS[robot]
@@ -214,7 +212,6 @@ def test_plausible_mass(robot: str) -> None:
     assert low < model.body_mass.sum() < high
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
 def test_visible_parts_never_touch(robot: str) -> None:
     """Group 2 is for the eye only, group 3 is what collides; no geom is in any other group."""
     model = built_in(robot)

@@ -9,7 +9,6 @@ import pytest
 from mjstack import cli, make_env
 
 
-@pytest.mark.parametrize("robot", ["so101", "rebot"])
 def test_an_environment_steps(robot: str) -> None:
     env = make_env([f"robot={robot}", "sim=native", "reset=randomized"], nworld=2)
     env.reset(seed=0)

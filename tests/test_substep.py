@@ -6,7 +6,7 @@ import mujoco
 import pytest
 import torch
 import warp as wp
-from environments import DEVICES, configure, on_cuda
+from environments import configure, on_cuda
 
 from mjstack.config.schema import Backend
 from mjstack.scene import SceneIndex, build_model
@@ -30,8 +30,6 @@ def worlds(robot: str, device: str, step: str) -> MjwarpSimulation:
     return sim
 
 
-@pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("robot", ["so101", "rebot"])
 @pytest.mark.parametrize("step", ["arranged", "fused"])
 def test_a_step_ends_where_mjwarps_own_does(step: str, robot: str, device: str) -> None:
     """Random commands, cubes thrown about, one between the jaws, for the sensors. Arranged on the
@@ -84,7 +82,6 @@ def test_a_step_ends_where_mjwarps_own_does(step: str, robot: str, device: str) 
 
 @pytest.mark.full
 @on_cuda
-@pytest.mark.parametrize("robot", ["so101", "rebot"])
 def test_branches_count_and_sense_what_one_after_the_other_does(robot: str) -> None:
     """Cubes at rest, red between the jaws: a few decimation from one state, where rounding has no
     time to grow.
