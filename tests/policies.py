@@ -118,7 +118,9 @@ def interrupted(command: Sequence[str], learner: type[Learner], number: int) -> 
         assert run(command) == 130
 
 
-def run_as_torchrun(overrides: Sequence[str], folder: Path) -> list[str]:
+def run_as_torchrun(
+    overrides: Sequence[str], folder: Path, program: Sequence[str] = ("-m", "mjstack")
+) -> list[str]:
     """Run a command in two processes, as torchrun starts them, with Gloo on a CPU, in the folders
     ``0`` and ``1``; returns what each has printed.
     """
@@ -131,7 +133,7 @@ def run_as_torchrun(overrides: Sequence[str], folder: Path) -> list[str]:
         where = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
         (folder / rank).mkdir()
         process = subprocess.Popen(
-            [sys.executable, "-m", "mjstack", *overrides],
+            [sys.executable, *program, *overrides],
             env=os.environ | own | where,
             cwd=folder / rank,
             stdout=subprocess.PIPE,

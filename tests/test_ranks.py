@@ -24,6 +24,7 @@ import torch
 from compositions import load_config
 from dataset_checker import check_dataset
 from environments import one_second_episode
+from policies import run_as_torchrun
 
 import mjstack
 from mjstack.cli import run
@@ -176,14 +177,8 @@ def test_shares_played_apart_join_to_the_whole(finished: Path) -> None:
 
 def test_two_ranks_meet(tmp_path: Path) -> None:
     """What they gather, sum and do in turns; an error of one is an error of both."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = str(free.getsockname()[1])
     (tmp_path / "meeting.py").write_text(MEETING)
-    group = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
-    processes = [start_python(["meeting.py"], tmp_path, RANK=str(n), **group) for n in (0, 1)]
-    texts = [process.communicate(timeout=200)[0] for process in processes]
-    assert [process.returncode for process in processes] == [0, 0], texts
+    texts = run_as_torchrun([], tmp_path, program=[str(tmp_path / "meeting.py")])
     assert "rank 0 prints" in texts[0]
     assert "rank 1 silent" in texts[1]
 
