@@ -130,6 +130,8 @@ class CloneLearner(Learner):
                 usable &= driven[torch.minimum(steps + ahead, self._last)].bool()
         self._training = (usable & ~validates).nonzero()[:, 0]
         self._validation = (usable & validates).nonzero()[:, 0]
+        if not len(self._validation):  # of few episodes the expert may drive no chunk that is one
+            self._validation = self._training
 
     def learn(self, first: int = 0, total: int | None = None) -> None:
         """Make the missing batches; see `Learner`.
