@@ -12,6 +12,8 @@ from compositions import load_config, make_env
 from environments import at_double_speed, on_cuda
 
 from mjstack.drivers.closed_loop import ClosedLoopDriver, make_expert
+from mjstack.drivers.feedback import FeedbackDriver
+from mjstack.drivers.state_based import StateBasedDriver
 from mjstack.drivers.tilt import _keeps, _places
 from mjstack.envs import Env, driven_config
 from mjstack.episodes.stage import Stage
@@ -290,3 +292,24 @@ def test_captured_commands_are_the_eager_ones() -> None:
         play.drop()
         env.close()
     torch.testing.assert_close(commands["require"], commands["off"], rtol=0.0, atol=1e-4)
+
+
+@pytest.mark.parametrize("shape", ["box", "cylinder"])
+@pytest.mark.parametrize("expert", [ClosedLoopDriver, StateBasedDriver])
+def test_jaws_turn_to_an_object_that_has_faces(
+    expert: type[FeedbackDriver], shape: str, drive: Drive, get_stage: GetStage
+) -> None:
+    size = "[0.022,0.022]" if shape == "cylinder" else "[0.022,0.022,0.022]"
+    options = [f"scene.objects.red.shape={shape}", f"scene.objects.red.size={size}"]
+    env, _ = drive(*options, nworld=2)
+    first = env.index.object_qpos[0]
+    env.sim.qpos[1] = env.sim.qpos[0]
+    env.sim.qpos[1, first + 3 : first + 7] = torch.tensor([np.cos(0.3), 0.0, 0.0, np.sin(0.3)])
+    env.sim.forward()
+    controller = expert(env, get_stage("so101").planner.nominal)
+    apart = 0.0
+    for _ in range(60):
+        command = controller.command()
+        apart = max(apart, float((command[0] - command[1]).abs().max()))
+        env.step(command)
+    assert (apart > 0.05) == (shape == "box"), apart

@@ -168,6 +168,7 @@ class ClosedLoopDriver(FeedbackDriver):
         specs = [phase.spec for phase in phases]
         names = [phase.name for phase in phases]
         objects = list(cfg.scene.objects)
+        with_faces = [name for name, thing in cfg.scene.objects.items() if thing.has_faces]
 
         def column(values: Iterable[object]) -> Tensor:
             return torch.tensor(list(values), device=self.phase.device)
@@ -179,7 +180,7 @@ class ClosedLoopDriver(FeedbackDriver):
         self._grasps = column(phase.grasped for phase in phases)
         self._retry_to = column(names.index(s.retry) if s.retry else -1 for s in specs)
         self._turns_jaws = column(
-            s.observe and s.gripper == "open" and s.anchor in objects for s in specs
+            s.observe and s.gripper == "open" and s.anchor in with_faces for s in specs
         )
         self._observes = column(
             [s.observe and name in (s.anchor, s.toward) for name in objects] for s in specs

@@ -130,6 +130,9 @@ class StateBasedDriver(FeedbackDriver):
         beside = self._target[self._roles[:, Role.down], :2].norm(dim=1) * self._pushes
         self._reach = torch.tensor(size, device=device) + beside
 
+        has_faces = [thing.has_faces for thing in cfg.scene.objects.values()]
+        self._has_faces = torch.tensor(has_faces, device=device)
+
         # Heights of targets: over an anchor that may stand anywhere, or over the table
         above = [phase.target.above if phase.target else 0.0 for phase in self._aimed]
         self._above = torch.tensor(above, device=device)
@@ -330,8 +333,8 @@ class StateBasedDriver(FeedbackDriver):
         return torch.where(due.led[:, None], upright, tilt)
 
     def _turn_left(self, state: State, thing: Tensor, pushes: Tensor) -> Tensor:
-        """How far the open jaws have to roll to the nearer face of an object, or those that push
-        one to where they are locked [rad], shape ``(nworld,)``.
+        """How far the open jaws have to roll to the nearer face of an object [rad], shape
+        ``(nworld,)``; where it has no faces or is pushed, to where they are locked.
         """
         if not self._aligns:
             return torch.zeros_like(state.opening)
@@ -355,7 +358,7 @@ class StateBasedDriver(FeedbackDriver):
         beyond = (low - rolls).clamp(min=0.0) + (rolls - high).clamp(min=0.0)
         nearest = ((rolls - STAY * roll).abs() + _BEYOND * beyond).argmin(0, keepdim=True)
         goal = self._cfg.controller.yaw_alignment * rolls.gather(0, nearest)[0]
-        return goal * ~pushes - roll
+        return goal * (self._has_faces[thing] & ~pushes) - roll
 
     def _gap(self, state: State) -> Tensor:
         """Distance of the grasp point from each moved object [m], ``(nworld, objects)``."""

@@ -74,6 +74,11 @@ class ObjectCfg:
         return [radius, radius, self.size[-1]]
 
     @property
+    def has_faces(self) -> bool:
+        """Whether it matters how jaws that grasp it from above are turned."""
+        return self.shape not in ("cylinder", "sphere")
+
+    @property
     def half_height(self) -> float:
         """Height of the centre above what it stands on [m]."""
         return self.half[2]
