@@ -146,8 +146,7 @@ class Ranks:
         """The error behind one that has ended this rank's work: torchrun stops the others where one
         has gone, as a user does.
         """
-        stopped = interrupted() or isinstance(error, KeyboardInterrupt)
-        if not stopped or not self._losses():
+        if not (interrupted() or isinstance(error, KeyboardInterrupt)) or not self._losses():
             return error
         withdraw_interrupt()
         return self._gone(error)
@@ -293,10 +292,8 @@ def launch(args: Sequence[str], count: int) -> int:
                 killed = True
                 if rank == 0 or 1 not in codes:  # else another rank has said so
                     name = failure.signal_name()
-                    process = f"{name}, process {failure.pid}"
-                    print(
-                        f"mjstack: rank {rank} of {count} was killed ({process})", file=sys.stderr
-                    )
+                    text = f"rank {rank} of {count} was killed ({name}, process {failure.pid})"
+                    print(f"mjstack: {text}", file=sys.stderr)
         return 1 if killed else next((code for code in (2, EXIT_CODE) if code in codes), 1)
     finally:
         logging.disable(logging.NOTSET)

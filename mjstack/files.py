@@ -38,16 +38,14 @@ def reading(path: Path, fix: str) -> Iterator[None]:
         MjstackError: Something went wrong inside.
     """
     try:
-        files = path.rglob("*") if path.is_dir() else [path]
-        for file in files:
+        for file in path.rglob("*") if path.is_dir() else [path]:
             if not file.is_dir():
                 check_regular(file)
         yield
     except MjstackError:
         raise
     except Exception as error:
-        text = f"{type(error).__name__}: {first_line(error)}"
-        reason = getattr(error, "strerror", None) or text
+        reason = getattr(error, "strerror", None) or f"{type(error).__name__}: {first_line(error)}"
         raise FolderError(
             f"{path}: cannot be read ({reason}), expected it as written", fix
         ) from error

@@ -45,8 +45,7 @@ def complete(cfg: Config) -> None:
             ``robot.file`` is in none of the folders.
     """
     cfg.view = cfg.view.lower()  # YAML's false and true
-    known = {field.name for field in fields(cfg.gate)}
-    for name in vars(cfg.gate).keys() - known:
+    for name in vars(cfg.gate).keys() - {field.name for field in fields(cfg.gate)}:
         cfg.gate.added[name] = vars(cfg.gate).pop(name)
     for key, kind in _TERMS.items():
         *path, last = key.split(".")

@@ -129,8 +129,7 @@ def _explain(error: Exception, overrides: Sequence[str]) -> MjstackError:
         beside = _beside(key, _keys(o for o in overrides if not o.startswith("~")))
         return MjstackError(f"~{key}: there is none to leave out. {suggest(key, beside)}")
     if key and isinstance(cause, ConfigKeyError | AttributeError):
-        known = _field_names(getattr(cause, "object_type", None))
-        return _unknown_key(key, known, overrides)
+        return _unknown_key(key, _field_names(getattr(cause, "object_type", None)), overrides)
     value = re.match("Value '(.*)' of type", text)
     settings = [f"{key}={value[1]}"] if value else []  # in a file
     settings += [o for o in overrides if o.lstrip("+~").partition("=")[0] == key]

@@ -231,8 +231,7 @@ def image_statistics(images: np.ndarray) -> np.ndarray:
         present = np.flatnonzero(counts)
         mean = np.average(values, weights=counts)
         std = math.sqrt(np.average((values - mean) ** 2, weights=counts))
-        ranks = np.cumsum(counts) / counts.sum()
-        quantiles = np.searchsorted(ranks, list(QUANTILES.values()))
+        quantiles = np.searchsorted(np.cumsum(counts) / counts.sum(), list(QUANTILES.values()))
         statistics.append([present[0], present[-1], mean, std, *quantiles])
     return np.array(statistics).T / 255.0
 

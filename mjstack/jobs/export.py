@@ -41,10 +41,9 @@ def check_export(cfg: Config) -> CheckedJob:
             " files are written for",
             "Play it with controller=policy",
         )
-    title = f"task {cfg.task.name}, policy {stage.assets.policy.folder}"
     return CheckedJob(
         stage=stage,
-        title=title,
+        title=f"task {cfg.task.name}, policy {stage.assets.policy.folder}",
         work=lambda run, folder: run_guarded(
             run, NAME, lambda run: export_policy(run.stage, folder)
         ),

@@ -53,10 +53,9 @@ def check_play(cfg: Config) -> CheckedJob:
     if cfg.video and job.camera is None:  # cameras have been checked with the task
         require_offscreen(stage.model)
     driver = "a policy" if cfg.controller.name == POLICY else "the expert"
-    title = f"task {cfg.task.name}, {cfg.nworld} worlds with {driver}"
     return CheckedJob(
         stage=stage,
-        title=title,
+        title=f"task {cfg.task.name}, {cfg.nworld} worlds with {driver}",
         work=lambda run, folder: run_guarded(run, NAME, play_worlds),
     )
 

@@ -221,8 +221,7 @@ def count_devices(cfg: Config) -> int:
 def _check_share(cfg: Config, size: int) -> None:
     """Raise a `ConfigError` if there are fewer worlds than ranks."""
     if cfg.nworld < size:
-        expected = f"at least {size}, a world for each rank"
-        raise ConfigError("nworld", cfg.nworld, expected)
+        raise ConfigError("nworld", cfg.nworld, f"at least {size}, a world for each rank")
 
 
 def check_ranks(stage: Stage) -> None:

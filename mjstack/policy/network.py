@@ -47,8 +47,7 @@ class ImageEncoder(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """Shape ``(n, features)`` from images of shape ``(n, height, width, 3)``, 0 to 255."""
-        centred = images.permute(0, 3, 1, 2) / 127.5 - 1.0
-        return self.layers(centred)
+        return self.layers(images.permute(0, 3, 1, 2) / 127.5 - 1.0)
 
 
 class PolicyNetwork(nn.Module):

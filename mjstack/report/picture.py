@@ -255,8 +255,7 @@ def save_images(
 ) -> None:
     """Save images, each of shape ``(height, width, 3)``, uint8, in named rows and columns."""
     size = (2.6 * len(columns), 2.6 * len(rows))
-    panels = figure(path, "", len(columns), len(rows), figsize=size, squeeze=False)
-    with panels as (_, axes):
+    with figure(path, "", len(columns), len(rows), figsize=size, squeeze=False) as (_, axes):
         for line, (name, images) in zip(axes, rows.items(), strict=True):
             line[0].set_ylabel(name)
             for axis, image in zip(line, images, strict=True):

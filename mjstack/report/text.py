@@ -36,8 +36,7 @@ def format_percent(rate: float, unit: str = " %") -> str:
     """A rate with as many digits as tell it from 0 and 1, at least two."""
     gap = min(rate, 1.0 - rate)
     digits = 2 if gap <= 0.0 else max(2, math.ceil(-math.log10(100.0 * gap)))
-    text = f"{100.0 * rate:.{digits}f}"
-    return text.rstrip("0").rstrip(".") + unit
+    return f"{100.0 * rate:.{digits}f}".rstrip("0").rstrip(".") + unit
 
 
 def unit_ending(name: str) -> str:

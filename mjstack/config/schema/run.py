@@ -271,9 +271,8 @@ class GateCfg:
 
     def functions(self) -> dict[str, str]:
         """Dotted name of every gate's function, by the gate's name."""
-        gates = vars(self) | self.added
         return {
             name: gate.func if isinstance(gate, GateFuncCfg) else gate["func"]
-            for name, gate in gates.items()
+            for name, gate in (vars(self) | self.added).items()
             if isinstance(gate, GateFuncCfg) or (isinstance(gate, dict) and "func" in gate)
         }
