@@ -265,6 +265,11 @@ BAD = [
     (["gate.batch=[1]"], "gate.batch=[1]: expected keys and values."),
     (["reset@gate.success.reset=null"], "Config group override must be a string"),
     (["nworld=int(a)"], "cannot be read: expected key=value"),
+    (
+        ["job=compare", "job.against=policy=a"],
+        "one of = , : ; # & ! < > ^ ~ ` needs double quotes inside of single ones:"
+        " 'starts=\"run(1).csv\"', or in a list 'job.against=[\"policy=DIR\"]'.",
+    ),
     (["+nworld=4"], "An item is already at 'nworld'."),
     (["~nworld"], "~nworld: expected a term of"),
     (
