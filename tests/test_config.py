@@ -257,6 +257,11 @@ BAD = [
     (["nworld=null"], "nworld=null: expected an integer from 1"),
     (["sim.device=[a]"], "sim.device=[a]: expected text."),
     (["gates={a:1}"], "gates={a:1}: expected a list of names."),
+    (["gates=batch"], "gates=batch: expected a list of names. Write 'gates=[batch]'."),
+    (
+        ["job=compare", 'job.against="policy=a"'],
+        "expected a list of names. Write 'job.against=[\"policy=a\"]'.",
+    ),
     (["job=[gates,play]"], "job=[gates,play]: expected one choice, no list."),
     (["robot={homes:[1]}"], "Did you mean 'robot.home'?"),
     (["nworld=range(1,4)"], "'nworld=range(1,4)': several values are a sweep. Add -m"),
@@ -283,6 +288,11 @@ BAD = [
 @pytest.mark.parametrize(("overrides", "words"), BAD, ids=[" ".join(o) for o, _ in BAD])
 def test_bad_input_is_one_line(overrides: list[str], words: str) -> None:
     refusal(lambda: make_check(load_config(overrides)), words)
+
+
+def test_null_is_no_name_to_put_into_a_list() -> None:
+    message = refusal(lambda: load_config(["gates=null"]))
+    assert message == "gates=null: expected a list of names."
 
 
 REFUSED_BY_THE_CHECK = [

@@ -135,7 +135,12 @@ def _explain(error: Exception, overrides: Sequence[str]) -> MjstackError:
     settings += [o for o in overrides if o.lstrip("+~").partition("=")[0] == key]
     field = find_field(Config, re.sub(r"\[\d+\]$", "", key))
     if settings and field and (error.__cause__ or value):
-        return MjstackError(f"{settings[-1]}: expected {accepted(*field)}.")
+        expected = accepted(*field)
+        given = settings[-1].partition("=")[2]
+        one_name = settings[-1] in overrides and re.match(r"(?!null$)[^\[{]", given)
+        names = expected.startswith("a list of names")
+        cure = f" Write '{key}=[{given}]'." if one_name and names else ""
+        return MjstackError(f"{settings[-1]}: expected {expected}.{cure}")
     return MjstackError(f"{key or ' '.join(overrides) or 'the values'}: {text}.")
 
 
