@@ -64,6 +64,7 @@ BAD: dict[tuple[str, ...], list[tuple[list[str], str]]] = {
         (["job.dataset=outputs"], "job.dataset=outputs: expected null"),
         (["job.rounds=-1"], "job.rounds=-1"),
         (["task=stack", "job.wider=1"], "Or set job.wider=0, in place of 1."),
+        (["reset.cubes.params.xy=0.03"], "reset.cubes.params.xy=0.03: expected"),
         (["job.episodes=1"], "job.episodes=1: expected at least 2"),
         ([*CAMERAS, "job.vision.cameras=[front]"], "trainer=dagger learns from numbers"),
     ],

@@ -42,12 +42,12 @@ def places_objects(term: TermCfg) -> bool:
     return "xy" in term.params and bool(offered(term.func, "places_objects"))
 
 
-def with_region(
-    reset: Mapping[str, TermCfg], change: Callable[[list[float]], list[float]]
-) -> dict[str, TermCfg]:
-    """Reset terms with other regions for the objects' starts: a function of their half-widths."""
+def with_region(reset: Mapping[str, TermCfg], change: Callable[[Any], Any]) -> dict[str, TermCfg]:
+    """Reset terms with other regions for the objects' starts: a function of the configured value,
+    which no term has checked yet.
+    """
     return {
-        name: replace(term, params=term.params | {"xy": change(list(term.params["xy"]))})
+        name: replace(term, params=term.params | {"xy": change(term.params["xy"])})
         if places_objects(term)
         else term
         for name, term in reset.items()

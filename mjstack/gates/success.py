@@ -30,7 +30,7 @@ def success_config(cfg: Config) -> Config:
     reset = dict(cfg.reset if reads_starts_file(cfg.reset) else t.reset)
     region = t.region
     if region is not None:
-        reset = with_region(reset, lambda xy: region)
+        reset = with_region(reset, lambda xy: list(region))
     name = cfg.controller.name if cfg.controller.name in FEEDBACK else CLOSED_LOOP
     return replace(cfg, reset=reset, controller=replace(cfg.controller, name=name))
 

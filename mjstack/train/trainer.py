@@ -1,7 +1,7 @@
 """A trainer, as job=train runs it."""
 
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
@@ -105,8 +105,13 @@ def with_observation(cfg: Config) -> Config:
 def training_config(stage: Stage) -> Config:
     """The configuration of the episodes in which a new policy learns."""
     job = cast(CloneJobCfg, stage.cfg.job)
-    reset = with_region(stage.cfg.reset, lambda xy: [(1.0 + job.wider) * half for half in xy])
-    return with_observation(stage.driven(reset))
+
+    def widen(xy: Any) -> Any:
+        with suppress(TypeError):
+            return [(1.0 + job.wider) * half for half in xy]
+        return xy  # no region; its term says so
+
+    return with_observation(stage.driven(with_region(stage.cfg.reset, widen)))
 
 
 def observed_widths(stage: Stage) -> dict[str, int]:
@@ -121,7 +126,7 @@ def observed_widths(stage: Stage) -> dict[str, int]:
         with renamed_keys(names), one_world(stage, training_config(stage)) as env:
             return env.observation_manager.term_dims[job.group]
     except ConfigError as error:
-        if job.wider == 0.0 or not error.key.startswith("reset."):
+        if job.wider == 0.0 or not (error.key.startswith("reset.") and error.key.endswith(".xy")):
             raise
         raise MjstackError(f"{error}", f"Or set job.wider=0, in place of {job.wider:g}") from error
 
