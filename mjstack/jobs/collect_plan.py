@@ -179,13 +179,17 @@ def read_batches(path: Path) -> list[BatchRecord]:
     """The batches of earlier calls.
 
     Raises:
-        FolderError: The file cannot be read.
+        FolderError: The file cannot be read, or is of version 0.1.
     """
     if not path.exists():
         return []
     fix = f"Remove {BATCHES}: the expert's success rate is counted anew"
     with reading(path, fix):
-        return [BatchRecord(**batch) for batch in json.loads(path.read_text())]
+        batches = json.loads(path.read_text())
+        if any("kept" in batch for batch in batches):
+            reason = f"{path.parent} has a dataset of version 0.1, expected one of this version"
+            raise FolderError(reason, "Set job.folder to another folder")
+        return [BatchRecord(**batch) for batch in batches]
 
 
 def episode_config(cfg: Config) -> dict[str, Any]:
