@@ -40,7 +40,7 @@ _SIDES = ("a", "b")
 _PAGE_WORLDS = 8  # worlds on the page that only one side won, of each side
 _LEVEL = 0.05  # of significance
 _ENDS = {"min": "low", "max": "high"}  # of the picture's whiskers, in metrics of a rate
-_ROUNDING = 1e-6  # [m, rad], by which equal starts on two backends may differ
+_ROUNDING = 1e-6  # [m, rad], by which equal starts on two backends or devices may differ
 _PANELS = {"success rate, 95 % interval": "success_rate", "episodes that only this one won": "only"}
 
 Sides = Mapping[str, Stage]
@@ -100,7 +100,7 @@ def _run(sides: Sides, notes: Mapping[str, str], run: Run, folder: Path) -> None
 def _compare(sides: Sides, notes: Mapping[str, str], folder: Path, run: Run) -> list[GateResult]:
     """The comparison as a result: it passes if it was made."""
     (failed_a, starts_a), (failed_b, starts_b) = (_play(*side) for side in sides.items())
-    rounding = _ROUNDING if sides["a"].backend[0] != sides["b"].backend[0] else 0.0
+    rounding = _ROUNDING if sides["a"].backend != sides["b"].backend else 0.0
     if not np.abs(starts_a - starts_b).max() <= rounding:
         raise MjstackError("a and b did not start alike", "Leave what worlds start from unchanged")
 
