@@ -56,7 +56,7 @@ class EpisodeTally:
     details: list[str] = field(default_factory=list)
 
     def add(self, record: EpisodeRecord) -> None:
-        """Count one seed. Some 150 bytes of a world are kept, without its final positions."""
+        """Count one seed. Of a world 200 to 300 bytes are kept, without its final positions."""
         # Rounded: on CUDA even identical worlds differ in the last digits. Adding 0 makes -0 the
         # same as 0.
         rounded = np.round(record.qpos, 4) + 0.0
