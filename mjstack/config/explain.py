@@ -136,10 +136,10 @@ def _explain(error: Exception, overrides: Sequence[str]) -> MjstackError:
     field = find_field(Config, re.sub(r"\[\d+\]$", "", key))
     if settings and field and (error.__cause__ or value):
         expected = accepted(*field)
-        given = settings[-1].partition("=")[2]
-        one_name = settings[-1] in overrides and re.match(r"(?!null$)[^\[{]", given)
+        value_text = settings[-1].partition("=")[2]
+        one_name = settings[-1] in overrides and re.match(r"(?!null$)[^\[{]", value_text)
         names = expected.startswith("a list of names")
-        cure = f" Write '{key}=[{given}]'." if one_name and names else ""
+        cure = f" Write '{key}=[{value_text}]'." if one_name and names else ""
         return MjstackError(f"{settings[-1]}: expected {expected}.{cure}")
     return MjstackError(f"{key or ' '.join(overrides) or 'the values'}: {text}.")
 
