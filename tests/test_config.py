@@ -355,7 +355,7 @@ def test_every_field_says_what_it_means() -> None:
 def test_the_reference_has_every_group_and_job() -> None:
     hooks = CONFIG_FOLDER.parent / "docs" / "hooks.py"
     text = runpy.run_path(str(hooks))["reference_markdown"]()
-    for key in ("nworld", "gate.batch.seeds", "controller.phases.NAME.gripper", "job.margin"):
+    for key in ("nworld", "gate.batch.seeds", "controller.phases.NAME.gripper", "job.against"):
         assert f"| `{key}` |" in text, key
     assert "| a number above 0 and at most 1 [s] | Duration of one physics step. |" in text
 
