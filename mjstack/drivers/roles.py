@@ -22,7 +22,7 @@ class Role(IntEnum):
 
 
 class ObjectRoles(NamedTuple):
-    """What the phases do with an object.
+    """An object that the phases move, and the phases that do it.
 
     Attributes:
         name: The object.
@@ -37,7 +37,7 @@ class ObjectRoles(NamedTuple):
 
 
 def find_roles(cfg: Config, phases: Sequence[Phase]) -> list[ObjectRoles]:
-    """What the phases do with each object that they move, in their order.
+    """The objects that the phases move, in the order in which they do.
 
     Args:
         cfg: The configuration.

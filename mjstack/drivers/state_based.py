@@ -86,7 +86,7 @@ class StateBasedDriver(FeedbackDriver):
     moves straight up where it is too low. A held object that is off the grasp point is made up
     for. One that no phase lets go of, as in a lift, is kept where the phases bring it last.
 
-    An object that closed jaws push is moved likewise: over the place beside it, down, to the object
+    Closed jaws push an object in the same order: over the place beside it, down, to the object
     and with it to its goal, open, up. Where nothing is moved, as in reach, the grasp point goes to
     the only target of the phases.
 
