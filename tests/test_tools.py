@@ -17,6 +17,7 @@ import soak
 import verdicts
 from compositions import load_config
 from environments import one_second_episode
+from policies import hold_above_red
 from solver_states import FUSED, RANDOM, SCRIPTED, STOCK, Pipeline, Sample, record_states
 
 import mjstack
@@ -107,6 +108,7 @@ CAMERA = ["cameras=top", "scene.cameras.top.size=[32,32]"]
     [
         ("bench_cameras", [*SMALL, *CAMERA, "--draws", "1"], "top 32 x 32"),
         ("bench_ik", [*SMALL, "--nworld", "8", "--iterations", "40"], "1.0000"),
+        ("bench_policy", [*SMALL[:3], "--steps", "3", "--repetitions", "2"], "policy adds"),
         ("bench_physics", [*SMALL, "batch.njmax=200", "--steps", "2"], "bare mujoco_warp.step"),
         ("bench_solver", [*SMALL[:3], "batch.njmax=200", "--states", "40"], "100.000 %"),
     ],
@@ -117,8 +119,16 @@ def test_a_benchmark_prints_its_table(
     expected: str,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
 ) -> None:
     monkeypatch.setenv("COLUMNS", "400")
+    if name == "bench_policy":
+        options = [
+            *options,
+            "controller=policy",
+            f"policy={hold_above_red(tmp_path)}",
+            "task=reach",
+        ]
     short = one_second_episode() if name in ("bench_physics", "bench_solver") else ()
     monkeypatch.setattr(sys, "argv", [name, *options, *short])
     runpy.run_path(str(TOOLS / f"{name}.py"), run_name="__main__")
