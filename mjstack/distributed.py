@@ -223,7 +223,12 @@ def joined() -> Iterator[Ranks]:
             timeout=_WORK,
         )
     except (RuntimeError, ValueError) as error:  # torch's errors of the network are such
-        raise _join_error(error) from error
+        address = ":".join(os.environ.get(name, "?") for name in ("MASTER_ADDR", "MASTER_PORT"))
+        raise MjstackError(
+            f"the {os.environ.get('WORLD_SIZE')} ranks did not meet at {address}"
+            f" ({first_line(error)})",
+            "Start all of them, each with the same address and a port that is free",
+        ) from error
     _current = Ranks(rank, size)
     problem = ""  # of this rank, for the others
     try:
@@ -239,20 +244,6 @@ def joined() -> Iterator[Ranks]:
             _store.set(f"ended/{rank}", problem)
         with suppress(RuntimeError):
             dist.destroy_process_group()
-
-
-def _join_error(error: Exception) -> MjstackError:
-    address = ":".join(os.environ.get(name, "?") for name in ("MASTER_ADDR", "MASTER_PORT"))
-    if "EADDRINUSE" in str(error) or "address already in use" in str(error).lower():
-        return MjstackError(
-            f"MASTER_PORT={os.environ.get('MASTER_PORT')}: is in use on this machine, expected a"
-            " free port, at which ranks meet",
-            "Give another (torchrun --master-port), or none",
-        )
-    return MjstackError(
-        f"the {os.environ.get('WORLD_SIZE')} ranks did not meet at {address} ({first_line(error)})",
-        "Start all of them, each with the same address and port",
-    )
 
 
 def launch(args: Sequence[str], count: int) -> int:

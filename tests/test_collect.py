@@ -564,16 +564,10 @@ def test_damaged_notes_are_one_line(
 ) -> None:
     play_nothing()
     assert collect("nworld=2", "job.episodes=1") == 0
-    (batch,) = json.loads((folder / BATCHES).read_text())
-    batch["kept"] = batch.pop("episodes")
-    for text, says in [
-        ("[{]", f"{BATCHES}: cannot be read (JSONDecodeError: "),
-        (json.dumps([batch]), "has a dataset of version 0.1, expected one of this version"),
-    ]:
-        (folder / BATCHES).write_text(text)
-        capsys.readouterr()
-        assert run([*COMMAND, "nworld=2", "job.episodes=2"]) == 2
-        assert says in capsys.readouterr().err
+    (folder / BATCHES).write_text("[{]")
+    capsys.readouterr()
+    assert run([*COMMAND, "nworld=2", "job.episodes=2"]) == 2
+    assert f"{BATCHES}: cannot be read (JSONDecodeError: " in capsys.readouterr().err
 
 
 @pytest.mark.full
@@ -582,12 +576,9 @@ def test_the_buffer_bounds_the_worlds() -> None:
     stage = Stage(cfg)
     world = 4 * 600 * (6 + 24 + 46 + 6 + 1)  # bytes: state, both groups, action, reward
     with native_env(cfg) as env:
-        for buffer, worlds in ((1.5, 1), (3.5, 3), (7.5, 7), (2**30 / world, 100)):
+        for buffer, worlds in ((0.9, 1), (1.5, 1), (3.5, 3), (7.5, 7), (2**30 / world, 100)):
             cfg.job.buffer_gib = buffer * world / 2**30  # type: ignore[attr-defined]
             assert CollectPlan.of(stage, Path(), env).most == worlds
-        cfg.job.buffer_gib = 0.9 * world / 2**30  # type: ignore[attr-defined]
-        with pytest.raises(ConfigError, match=r"job.buffer_gib"):
-            CollectPlan.of(stage, Path(), env)
 
 
 def test_steps_come_to_the_host_in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:

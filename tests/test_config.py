@@ -204,7 +204,7 @@ def test_a_bad_value_is_one_line(override: str, words: str) -> None:
 
 BAD = [
     (["gate.seeds=3"], "'seeds'"),
-    (["hydra.searchpath=[pkg://mine.conf]"], "expected a folder, such as file://DIR"),
+    (["hydra.searchpath=[pkg://mine.conf]"], "pkg:/mine.conf: there is no such folder"),
     (["job=collect", "job.episode=3"], "Did you mean 'job.episodes'?"),
     (
         ["job.episodes=3"],

@@ -80,14 +80,8 @@ def typed(key: str, node: Any, kind: type) -> Any:
     for name in node:
         if name not in items:
             raise UnknownName(f"{key}: key", str(name), items)
-    # OmegaConf would copy what has no types, to and fro.
-    untyped = {
-        name: node[name]
-        for name in ("params", "terms")
-        if isinstance(node.get(name), dict) and all(isinstance(k, str) for k in node[name])
-    }
     try:
-        typed = OmegaConf.merge(_schema(kind), {k: node[k] for k in node if k not in untyped})
+        typed = OmegaConf.merge(_schema(kind), node)
     except OmegaConfBaseException as error:
         name = re.split(r"[.\[]", str(error.full_key))[0]  # of a list, full_key has the number too
         raise ConfigError(f"{key}.{name}", node[name], accepted(kind, items[name])) from error
@@ -95,8 +89,6 @@ def typed(key: str, node: Any, kind: type) -> Any:
     if missing:
         raise TermError(key, f"'{missing[0]}' is missing: set {key}.{missing[0]}")
     value = OmegaConf.to_object(typed)
-    for name, mapping in untyped.items():
-        setattr(value, name, mapping)
     check_fields(key, value)
     return value
 

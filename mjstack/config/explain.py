@@ -33,12 +33,6 @@ TERM_GROUPS = ("action", "observation", "reset", "termination", "reward")
 
 def check_overrides(overrides: Sequence[str]) -> None:
     """Raise a `MjstackError` for the first override that cannot be used alone."""
-    for override in overrides:
-        if re.match(r"[+~]*hydra([./]job_logging|\.output_subdir)", override):
-            raise MjstackError(
-                f"{override}: expected Hydra's own, because every run has run.log and .hydra. Leave"
-                " it out."
-            )
     for override in own_overrides(overrides):
         parsed = parse(override)
         key = parsed.key_or_group
@@ -113,8 +107,6 @@ def _unknown_choice(path: str, options: Sequence[str] | None) -> MjstackError:
     # Of a list of choices Hydra names none.
     unknown = UnknownName(f"{group}={name}:", name, options or list_choices().get(group, []))
     hint = "" if config_folders() else " A choice of your own needs --config-dir DIR."
-    if group.startswith("hydra/"):
-        hint = " Others are plugins of Hydra, which pip installs, such as hydra-joblib-launcher."
     return MjstackError(f"{unknown}{hint}")
 
 

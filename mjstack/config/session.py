@@ -308,11 +308,6 @@ def list_choices() -> dict[str, list[str]]:
 def _checked_folder(text: str) -> Path:
     """A folder with configuration files, absolute."""
     folder = Path(text.removeprefix(_FILE)).absolute()
-    if text.startswith("pkg://"):
-        raise MjstackError(
-            f"hydra.searchpath: found {text}, expected a folder, such as file://DIR. An installed"
-            f" package registers its folder as an entry point of {ENTRY_POINTS}."
-        )
     if not folder.is_dir():
         raise MjstackError(
             f"configuration folder {folder}: there is no such folder, expected one with YAML files"

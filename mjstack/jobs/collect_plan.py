@@ -49,7 +49,7 @@ class CollectPlan:
         home: The job's folder.
         spec: The dataset's columns and provenance.
         most: Largest number of worlds of a batch: those whose steps fit into the buffers of all
-            ranks.
+            ranks, at least one in each.
     """
 
     home: Path
@@ -61,11 +61,9 @@ class CollectPlan:
         """Plan from an environment of the demonstrations, with any number of worlds.
 
         Raises:
-            ConfigError: The steps of not even one world fit into the buffer, or a column's name is
-                taken.
+            ConfigError: A column's name is taken.
         """
         cfg = stage.cfg
-        gib = cast(CollectJobCfg, cfg.job).buffer_gib
         provenance = run_provenance(stage)
         # They differ between calls that make the same episodes.
         del provenance["date"], provenance["config_sha256"]
@@ -74,10 +72,8 @@ class CollectPlan:
         if spec.videos:
             step += 4 * stage.model.nq
         world = stage.episode_steps * step / 2**30
-        if gib < world:
-            expected = f"at least {world:.2g}, which the steps of one world take"
-            raise ConfigError("job.buffer_gib", gib, expected)
-        return cls(home=home, spec=spec, most=min(cfg.nworld, stage.ranks.size * int(gib / world)))
+        share = max(1, int(cast(CollectJobCfg, cfg.job).buffer_gib / world))
+        return cls(home=home, spec=spec, most=min(cfg.nworld, stage.ranks.size * share))
 
 
 def collect_folder(cfg: Config) -> Path:
@@ -90,8 +86,7 @@ def plan_collection(stage: Stage) -> CollectPlan:
     """Plan the configured dataset.
 
     Raises:
-        MjstackError: Its episodes would not differ, do not fit into the buffer, or have images that
-            cannot be kept or encoded.
+        MjstackError: Its episodes would not differ, or have images that cannot be kept or encoded.
     """
     cfg = stage.cfg
     played = demonstration_config(cfg, stage.action)
@@ -179,17 +174,12 @@ def read_batches(path: Path) -> list[BatchRecord]:
     """The batches of earlier calls.
 
     Raises:
-        FolderError: The file cannot be read, or is of version 0.1.
+        FolderError: The file cannot be read.
     """
     if not path.exists():
         return []
-    fix = f"Remove {BATCHES}: the expert's success rate is counted anew"
-    with reading(path, fix):
-        batches = json.loads(path.read_text())
-        if any("kept" in batch for batch in batches):
-            reason = f"{path.parent} has a dataset of version 0.1, expected one of this version"
-            raise FolderError(reason, "Set job.folder to another folder")
-        return [BatchRecord(**batch) for batch in batches]
+    with reading(path, f"Remove {BATCHES}: the expert's success rate is counted anew"):
+        return [BatchRecord(**batch) for batch in json.loads(path.read_text())]
 
 
 def episode_config(cfg: Config) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError
 from mjstack.gates.runner import run_guarded
 from mjstack.jobs.gates import check_task
-from mjstack.jobs.runner import CheckedJob, Job
+from mjstack.jobs.runner import VIEWS, CheckedJob, Job
 from mjstack.jobs.showing import check_showing
 from mjstack.report.gl import require_offscreen
 from mjstack.report.picture import save_video
@@ -140,4 +140,4 @@ def _save(
         run.print_line(f"video: {path}")
 
 
-JOB = Job(check_play, shows=True, live=True)
+JOB = Job(check_play, views=VIEWS)

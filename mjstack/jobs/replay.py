@@ -24,7 +24,7 @@ from mjstack.files import to_csv, write_atomic, write_npz
 from mjstack.gates.runner import run_guarded
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.replay_plan import ReplayPlan, check_start, plan_replay
-from mjstack.jobs.runner import CheckedJob, Job, run_provenance
+from mjstack.jobs.runner import VIEWS, CheckedJob, Job, run_provenance
 from mjstack.jobs.showing import check_showing
 from mjstack.report.record import GateResult, Status
 from mjstack.report.table import Table
@@ -236,9 +236,5 @@ def _play_failing(
     ]
 
 
-JOB = Job(
-    check_replay,
-    keys=("job", "run", "world", "sim", "view", "video", "web", "devices"),
-    shows=True,
-    live=True,
-)
+_KEYS = ("job", "run", "world", "sim", "view", "video", "web", "devices")
+JOB = Job(check_replay, keys=_KEYS, views=VIEWS)

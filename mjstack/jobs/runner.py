@@ -40,6 +40,8 @@ from mjstack.sim.build import cuda_driver, cuda_uuid
 
 log = logging.getLogger(__name__)
 
+VIEWS = ("false", "true", "web")  # of a job that shows worlds
+
 
 @dataclass(frozen=True, slots=True)
 class Job:
@@ -50,15 +52,13 @@ class Job:
             Returns the job ready to run, with the scene and the plan that the check built.
         keys: Top-level keys and groups that its command line may set; None for all.
         overrides: Whether its check takes the command line's overrides too.
-        shows: Whether it can show a world (``view=true``, ``video``).
-        live: Whether the live view can show its worlds (``view=web``).
+        views: Values of ``view`` that it can show worlds in; ``video`` goes with ``true``.
     """
 
     check: Callable[..., "CheckedJob"]
     keys: tuple[str, ...] | None = None
     overrides: bool = False
-    shows: bool = False
-    live: bool = False
+    views: tuple[str, ...] = ("false",)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -274,12 +274,11 @@ def check_job(cfg: Config, overrides: Sequence[str] = ()) -> CheckedJob:
         if job.keys is not None and re.split(r"[.@/]", key)[0] not in job.keys:
             expected = f"only {', '.join(job.keys[1:])} beside job={cfg.job.name}"
             raise ConfigError(key, value, expected, "Leave it out")
-    by = f"false with job={cfg.job.name}"
-    if cfg.view != "false" and not (job.live if cfg.view == "web" else job.shows):
-        expected = f"web or {by}" if job.live else f"{by}, which shows no world"
+    if cfg.view not in job.views:
+        expected = f"{' or '.join(job.views)} with job={cfg.job.name}"
         raise ConfigError("view", cfg.view, expected, "Leave it out")
-    if cfg.video and not job.shows:
-        raise ConfigError("video", "true", f"{by}, which shows no world", "Leave it out")
+    if cfg.video and "true" not in job.views:
+        raise ConfigError("video", True, f"false with job={cfg.job.name}", "Leave it out")
     return job.check(cfg, overrides) if job.overrides else job.check(cfg)
 
 

@@ -98,7 +98,6 @@ def serve_live_view(stage: Stage, console: Console) -> Iterator[LiveView | None]
     if cfg.view != "web":
         yield None
         return
-    check_address(cfg.web.host, cfg.web.port)  # another program may have come first
     token = secrets.token_urlsafe()
     server = start_server(cfg.web.host, cfg.web.port, token)
     try:

@@ -2,11 +2,10 @@
 
 import math
 import os
-import stat
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -16,7 +15,7 @@ import torch
 from mjstack.config import spec
 from mjstack.config.complete import typed
 from mjstack.config.session import quoted, search_path_args
-from mjstack.errors import ConfigError, FolderError
+from mjstack.errors import ConfigError
 from mjstack.interrupt import interrupted
 from mjstack.jobs.sweep_folder import LOG, SweepJob, add_jobs, lock_file
 from mjstack.process import POLL, Child, stop_all
@@ -60,14 +59,14 @@ class Queueing:
 
         Raises:
             ConfigError: There are not as many GPUs or cores.
-            FolderError: Another user has the folder of the GPUs' locks.
         """
         count = self.jobs
         if gpus := torch.cuda.device_count():
             if (count or 1) > gpus:
                 raise ConfigError("hydra.launcher.jobs", count, f"at most {gpus}, a GPU for each")
             visible = os.environ.get("CUDA_VISIBLE_DEVICES") or ",".join(map(str, range(gpus)))
-            locks = _lock_folder()
+            locks = Path(tempfile.gettempdir()) / f"mjstack-gpus-{os.getuid()}"
+            locks.mkdir(mode=0o700, exist_ok=True)  # this user's, on this machine
             return [
                 Slot(f"GPU {name}", {"CUDA_VISIBLE_DEVICES": name}, lock=locks / name)
                 for name in visible.split(",")[: count or gpus]
@@ -170,8 +169,6 @@ class _Queue:
             for job in jobs
             if queueing.retry and (done := job.result()) and done.status is Status.failed
         }
-        sets = [set(job.overrides) for job in jobs]
-        self._common = set.intersection(*sets) if len(sets) > 1 else set()
         self._print = Console(highlight=False, soft_wrap=True, markup=False).print
 
     def collect(self) -> None:
@@ -225,26 +222,5 @@ class _Queue:
             child = Child(args, log, env=slot.env, cores=slot.cores)
             self.running[slot] = _Running(job, child, logged, locks.pop_all())
         self._waiting.remove(job)
-        text = " ".join(text for text in job.overrides if text not in self._common)
-        self._print(f"job {job.number} on {slot.name}: {text}")
+        self._print(f"job {job.number} on {slot.name}: {' '.join(job.overrides)}")
         return True
-
-
-def _lock_folder() -> Path:
-    """This user's folder with a lock for each GPU, on this machine. Others may not write there:
-    they could hold a lock for ever, or put a link in its place.
-
-    Raises:
-        FolderError: Another user has made it.
-    """
-    folder = Path(tempfile.gettempdir()) / f"mjstack-gpus-{os.getuid()}"
-    with suppress(FileExistsError):
-        folder.mkdir(mode=0o700)
-    facts = folder.lstat()
-    if not stat.S_ISDIR(facts.st_mode) or facts.st_uid != os.getuid():
-        raise FolderError(
-            f"{folder} is another user's or no folder, expected one of yours, for locks of GPUs",
-            "Set TMPDIR to a folder of yours",
-        )
-    folder.chmod(0o700)
-    return folder

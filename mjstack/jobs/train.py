@@ -18,7 +18,7 @@ from mjstack.episodes.rollout import POLICY
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage, require_episode
 from mjstack.errors import ConfigError, FolderError
-from mjstack.files import made_by, reading, to_csv, write_atomic
+from mjstack.files import reading, to_csv, write_atomic
 from mjstack.gates.runner import run_guarded
 from mjstack.gates.success import run_success
 from mjstack.jobs.gates import check_task
@@ -87,8 +87,8 @@ def _check_folder(folder: Path, cfg: Config) -> None:
         changes = differences(json.loads(path.read_text()), training_config(cfg))
     if changes:
         raise FolderError(
-            f"{folder} has a training{made_by(folder)} of another configuration: {changes}. Set"
-            " job.folder to another folder, or these keys back"
+            f"{folder} has a training of another configuration: {changes}. Set job.folder to"
+            " another folder, or these keys back"
         )
 
 
@@ -167,4 +167,4 @@ def _train(trainer: Trainer, folder: Path, run: Run) -> list[GateResult]:
     ]
 
 
-JOB = Job(check_train, live=True)
+JOB = Job(check_train, views=("false", "web"))
