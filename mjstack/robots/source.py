@@ -7,7 +7,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from mjstack.config.schema import ModelCfg, RobotCfg
+from mjstack.config.schema import ModelCfg, RobotCfg, ServoCfg
 from mjstack.errors import ConfigError, MjstackError, UnknownName, first_line
 
 BUILTIN = Path(__file__).parent
@@ -60,6 +60,10 @@ def robot_spec(robot: RobotCfg, model: ModelCfg) -> mujoco.MjSpec:
     if robot.arm_force_limit is not None:
         for name in robot.arm_joints:
             spec.actuator(name).forcerange = [-robot.arm_force_limit, robot.arm_force_limit]
+    for name, servo in robot.servos.items():
+        if name not in robot.joints:
+            raise UnknownName("robot.servos: joint", name, robot.joints)
+        _set_servo(spec, name, servo)
     return spec
 
 
@@ -140,6 +144,25 @@ def _prepare_joint(spec: mujoco.MjSpec, name: str) -> None:
     servo.name = name
     if not servo.ctrlrange[0] < servo.ctrlrange[1]:
         servo.inheritrange = 1.0
+
+
+def _set_servo(spec: mujoco.MjSpec, name: str, servo: ServoCfg) -> None:
+    """Replace the values of a joint and its servo that are given."""
+    actuator = spec.actuator(name)
+    if servo.stiffness is not None:
+        actuator.gainprm[0] = servo.stiffness
+        actuator.biasprm[1] = -servo.stiffness
+    if servo.damping is not None:
+        actuator.biasprm[2] = -servo.damping
+    if servo.effort is not None:
+        actuator.forcerange = [-servo.effort, servo.effort]
+    joint = spec.joint(name)
+    if servo.armature is not None:
+        joint.armature = servo.armature
+    if servo.dry_friction is not None:
+        joint.frictionloss = servo.dry_friction
+    if servo.viscous_friction is not None:
+        joint.damping[0] = servo.viscous_friction  # what follows is for higher powers of velocity
 
 
 def _require(kind: str, name: str, available: Iterable) -> None:

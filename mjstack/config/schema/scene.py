@@ -219,6 +219,24 @@ class PlacementsCfg:
 
 
 @dataclass(slots=True)
+class ServoCfg:
+    """A joint's position servo and friction, for a slide in N and m. null: the file's own."""
+
+    stiffness: float | None = spec(None, unit="N m/rad", gt=0.0)
+    """Torque per position error."""
+    damping: float | None = spec(None, unit="N m s/rad", ge=0.0)
+    """The servo's own torque against velocity."""
+    armature: float | None = spec(None, unit="kg m^2", ge=0.0)
+    """Inertia of rotor and gears, at the joint."""
+    dry_friction: float | None = spec(None, unit="N m", ge=0.0)
+    """Torque that holds against any slow motion."""
+    viscous_friction: float | None = spec(None, unit="N m s/rad", ge=0.0)
+    """The joint's torque against velocity."""
+    effort: float | None = spec(None, unit="N m", gt=0.0)
+    """Largest torque; it replaces ``robot.arm_force_limit``."""
+
+
+@dataclass(slots=True)
 class RobotCfg:
     """An arm with a gripper: names in its MJCF file, and joint targets of its tasks.
 
@@ -259,6 +277,8 @@ class RobotCfg:
     """Joint targets of the gripper around an object."""
     arm_force_limit: float | None = spec(None, unit="N m, N", gt=0.0)
     """Largest force of the arm's servos. null: the file's own."""
+    servos: dict[str, ServoCfg] = spec(factory=dict)
+    """Servos by joint, which the group ``actuator`` chooses; other joints have the file's own."""
 
     locked: dict[str, float] = spec(factory=dict, unit="rad, m")
     """Arm joints that inverse kinematics holds, with their values."""
