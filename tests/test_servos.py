@@ -1,4 +1,4 @@
-"""Servos of the group ``actuator``: published figures in the compiled model, and what is refused."""
+"""Servos of the group ``actuator``: published figures in the compiled model; what is refused."""
 
 from __future__ import annotations
 
