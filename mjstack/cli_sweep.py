@@ -54,13 +54,8 @@ def check_jobs(
     for number, job in enumerate(jobs):
         cfg = compose([*of_hydra, _sweep_dir(folder), *job])
         if cfg.devices is not None:
-            raise ConfigError(
-                "devices",
-                cfg.devices,
-                "null with -m",
-                "Leave it out: with hydra/launcher=gpus each job has one GPU, and"
-                " hydra.launcher.jobs is how many run at once",
-            )
+            fix = "Leave it out: with hydra/launcher=gpus each job has one GPU"
+            raise ConfigError("devices", cfg.devices, "null with -m", fix)
         try:
             check(cfg, job)
         except MjstackError as error:

@@ -238,9 +238,7 @@ def test_the_same_command_again_does_nothing(
     before = contents(demos.dataset / "data")
     assert run(demos.args) == 0
     assert contents(demos.dataset / "data") == before
-    reason = report_of(demos.home)["gates"][0]["reason"]
-    assert "4 episodes, 4 asked for" in reason
-    assert reason.endswith("; they were there already")
+    assert "4 episodes, 4 asked for" in report_of(demos.home)["gates"][0]["reason"]
 
 
 OTHER_EPISODES = "mjstack: outputs/demos/dataset has episodes of another configuration: "

@@ -379,7 +379,7 @@ def test_shares(count: int, size: int) -> None:
 class Others(Ranks):
     """Two ranks, of which the other one tells something else."""
 
-    change: dict[str, str]
+    change: dict[str, dict[str, str]]
 
     def gather(self, value: tuple) -> list:  # type: ignore[override]
         host, facts, gpu = value
@@ -390,8 +390,8 @@ def test_unequal_versions_are_refused() -> None:
     Others.change = {}
     stage = Stage(load_config(["sim=native"]), ranks=Others(0, 2))
     check_ranks(stage)
-    Others.change = {"torch": "1.0"}
-    with pytest.raises(MjstackError, match=r"rank 1 \(.*\) has torch 1\.0 and rank 0 \(.*\) \d"):
+    Others.change = {"versions": {"torch": "1.0"}}
+    with pytest.raises(MjstackError, match=r"rank 1 \(.*\) has versions.torch=1\.0, expected \d"):
         check_ranks(stage)
     Others.change = {}
     stage = stage.with_config(replace(stage.cfg, nworld=1))
@@ -411,12 +411,12 @@ def test_more_devices_than_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
 
     assert count_devices(cfg("1")) == 1
     assert count_devices(cfg("all")) == 1  # on a CPU one process uses all cores
-    with pytest.raises(ConfigError, match=r"devices=9999: expected at most \d+, as this machine"):
+    with pytest.raises(ConfigError, match=r"devices=9999: expected at most \d+, the cores"):
         count_devices(cfg("9999"))
     monkeypatch.setattr("mjstack.jobs.runner.resolve_backend", lambda cfg: ON_CUDA)
     monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
     assert [count_devices(cfg(value)) for value in ("all", "2", "1")] == [2, 2, 1]
-    says = "devices=3: expected at most 2, as this machine has 2 CUDA devices for sim=mjwarp"
+    says = "devices=3: expected at most 2, the CUDA devices that this machine has for sim=mjwarp"
     with pytest.raises(ConfigError, match=says):
         count_devices(cfg("3"))
 

@@ -113,8 +113,7 @@ def carry_start(stage: Stage, sim: Simulation, state: State | None) -> State:
     """
     if state is not None and state.qpos.shape[0] == sim.nworld:
         return state
-    t = stage.cfg.gate.throughput
-    count = min(sim.nworld, t.start_worlds)
+    count = min(sim.nworld, stage.cfg.gate.throughput.start_worlds)
     native = stage.simulation(count, Backend.native, "cpu")
     state = play_to_phase(stage, native)
     native.close()

@@ -65,11 +65,10 @@ def run_solver(run: Run) -> list[GateResult]:
     gate = cast(SolverGateCfg, run.cfg.gate["solver"])
     before = asdict(run.cfg.solver)
     solver = gate.apply(before)
-    changes = {key: value for key, value in asdict(solver).items() if value != before[key]}
+    changes = [f"{key}={value}" for key, value in asdict(solver).items() if value != before[key]]
     result = GateResult(name="solver", status=Status.passed)
     name = "_".join(f"{key}_{value}" for key, value in gate.changes.items())
-    text = ", ".join(f"{key}={value}" for key, value in changes.items())
-    result.notes = {"variant": name or "base", "changes": text or "nothing"}
+    result.notes = {"variant": name or "base", "changes": ", ".join(changes) or "nothing"}
     if gate.changes and not changes:
         result.reason = result.notes["reason"] = "the same as the configured solver"
         return [result]

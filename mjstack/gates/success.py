@@ -57,8 +57,8 @@ def run_success(run: Run) -> list[GateResult]:
     starts = tally.array("start_places")
     retries = tally.array("retries")
     succeeded = tally.array("failed") == 0
-    retried = retries > 0
-    retried_succeeded = int((retried & succeeded).sum())
+    retried = int((retries > 0).sum())
+    retried_succeeded = int(((retries > 0) & succeeded).sum())
     regions = find_regions(
         starts,
         succeeded,
@@ -69,7 +69,7 @@ def run_success(run: Run) -> list[GateResult]:
     )
     metrics = {
         "distinct_starts": len(np.unique(np.round(starts, 6).reshape(len(starts), -1), axis=0)),
-        "retried": int(retried.sum()),
+        "retried": retried,
         "retries": int(retries.sum()),
         "retried_succeeded": retried_succeeded,
         "unreachable": int(tally.array("unreachable").sum()),
@@ -79,8 +79,8 @@ def run_success(run: Run) -> list[GateResult]:
     tally.notes["starts"] = f"starts={cfg.starts}" if reads else _describe_start(cfg)
 
     parts = [f"{tally.summary}, {format_percent(t.rate)} wanted"]
-    if retried.any():
-        parts.append(f"{retried.sum()} retried, {retried_succeeded} of them succeeded")
+    if retried:
+        parts.append(f"{retried} retried, {retried_succeeded} of them succeeded")
     if all(region.succeeded == region.episodes for region in regions):
         there = "had a failure" if regions else "(gate.success.cell_episodes): more seeds have more"
         tally.details.append(f"no region of at least {t.cell_episodes} episodes {there}")

@@ -250,56 +250,46 @@ class Collection:
         did not pass.
         """
         seconds = time.perf_counter() - self._began
-        asked = self._job.episodes
         new = self.committed - self._episodes_before
-        steps = self.writer.frames
         size = sum(path.stat().st_size for path in self.path.rglob("*") if path.is_file()) / 1e6
-        notes = {"dataset": str(self.path), "config_sha256": self._plan.spec.config_sha256}
-        metrics: dict[str, float] = {
-            "episodes": self.committed,
-            "episodes_of_this_call": new,
-            "steps": steps,
-            "megabytes": size,
-        }
-        there = f"{steps:,} steps, {size:.1f} MB"
-        reasons = [problem, f"{self.committed:,} episodes, {asked:,} asked for ({there})"]
-        details: list[str] = []
+        result = GateResult(
+            name=NAME,
+            status=status,
+            seconds=seconds,
+            thresholds={"episodes": self._job.episodes},
+            metrics={
+                "episodes": self.committed,
+                "episodes_of_this_call": new,
+                "steps": self.writer.frames,
+                "megabytes": size,
+            },
+            notes={"dataset": str(self.path), "config_sha256": self._plan.spec.config_sha256},
+            tables=[self._ranges()] if self.committed else [],
+        )
+        asked = f"{self.committed:,} episodes, {self._job.episodes:,} asked for"
+        reasons = [problem, f"{asked} ({self.writer.frames:,} steps, {size:.1f} MB)"]
 
         if self.batches:
-            notes["seeds"] = f"{self.batches[0].seed} to {self.batches[-1].seed}"
-            driver = "expert" if self._stage.phases else "policy"
+            result.notes["seeds"] = f"{self.batches[0].seed} to {self.batches[-1].seed}"
             worlds = sum(batch.worlds for batch in self.batches)
             succeeded = sum(batch.succeeded for batch in self.batches)
-            metrics |= {
-                "worlds_played": worlds,
-                **rate_metrics(succeeded, worlds),
-                "retries": sum(batch.retries for batch in self.batches),
-            }
+            result.metrics |= {"worlds_played": worlds, **rate_metrics(succeeded, worlds)}
+            result.metrics["retries"] = sum(batch.retries for batch in self.batches)
+            driver = "expert" if self._stage.phases else "policy"
             share = f"{succeeded:,} of {worlds:,} worlds ({100.0 * succeeded / worlds:.4g} %)"
             reasons.append(f"the {driver} succeeded in {share}")
             broken = sum((Counter(batch.broken) for batch in self.batches), Counter())
-            details = [f"{text}: {count} of {worlds} worlds" for text, count in broken.items()]
+            result.details = [f"{text}: {n} of {worlds} worlds" for text, n in broken.items()]
 
         # This call
         if new:
-            metrics["episodes_per_s"] = new / seconds
+            result.metrics["episodes_per_s"] = new / seconds
             if self._plan.spec.videos:
-                metrics["drawing_s"] = self._source.drawing
-                metrics["encoding_wait_s"] = self.writer.waited
+                result.metrics["drawing_s"] = self._source.drawing
+                result.metrics["encoding_wait_s"] = self.writer.waited
             reasons.append(f"{new / seconds:.3g} episodes/s in all")
-        elif self.committed >= asked:
-            reasons.append("they were there already")
-        return GateResult(
-            name=NAME,
-            status=status,
-            reason="; ".join(filter(None, reasons)),
-            seconds=seconds,
-            thresholds={"episodes": asked},
-            metrics=metrics,
-            notes=notes,
-            details=details,
-            tables=[self._ranges()] if self.committed else [],
-        )
+        result.reason = "; ".join(filter(None, reasons))
+        return result
 
     def _ranges(self) -> Table:
         """The range of every joint and its target."""

@@ -9,14 +9,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
 
 import mujoco
 import numpy as np
 import torch
 from rich.markup import escape
 
-from mjstack.config.fingerprint import config_content, config_hash
+from mjstack.config.fingerprint import config_content, config_hash, differences
 from mjstack.config.functions import find_object
 from mjstack.config.schema import Backend, Config
 from mjstack.episodes.run import Run
@@ -210,9 +209,8 @@ def count_devices(cfg: Config) -> int:
     all_of_them = there if on_cuda else 1  # one process uses all cores
     count = all_of_them if cfg.devices == "all" else int(cfg.devices)
     if count > there:
-        kind = "CUDA device" if on_cuda else "core"
-        have = f"{there} {kind}{'s' * (there != 1)}"
-        expected = f"at most {there}, as this machine has {have} for sim={backend}"
+        kind = "CUDA devices" if on_cuda else "cores"
+        expected = f"at most {there}, the {kind} that this machine has for sim={backend}"
         raise ConfigError("devices", cfg.devices, expected)
     _check_share(cfg, count)
     return count
@@ -236,22 +234,16 @@ def check_ranks(stage: Stage) -> None:
     _, device = stage.backend
     host = socket.gethostname()
     facts = collect_provenance()
-    equal: dict[str, Any] = {
-        **cast(dict, facts["versions"]),
-        "mjstack's commit": facts["git_commit"],
-        "configuration": config_hash(config_content(cfg))[:12],
-    }
+    equal = {key: facts[key] for key in ("versions", "git_commit")} | config_content(cfg)
     gpu = cuda_uuid(device) if device.startswith("cuda") else ""
     gathered = ranks.gather((host, equal, gpu))
     holders: dict[tuple[str, str], int] = {}
     for rank, (place, values, unit) in enumerate(gathered):
-        for name, value in gathered[0][1].items():
-            if values.get(name) != value:
-                raise MjstackError(
-                    f"rank {rank} ({place}) has {name} {values.get(name)} and rank 0"
-                    f" ({gathered[0][0]}) {value}, expected the same in all ranks",
-                    "Install and start the same everywhere",
-                )
+        if changes := differences(values, gathered[0][1]):
+            raise MjstackError(
+                f"rank {rank} ({place}) has {changes} as in rank 0 ({gathered[0][0]})",
+                "Install and start the same everywhere",
+            )
         if unit and (holder := holders.setdefault((place, unit), rank)) != rank:
             raise MjstackError(
                 f"ranks {holder} and {rank} ({place}) have one GPU, {unit}, expected one each",
