@@ -106,8 +106,8 @@ def _unknown_choice(path: str, options: Sequence[str] | None) -> MjstackError:
     group, _, name = path.rpartition("/")
     # Of a list of choices Hydra names none.
     unknown = UnknownName(f"{group}={name}:", name, options or list_choices().get(group, []))
-    own = config_folders() or group.startswith("hydra/")
-    hint = "" if own else " A choice of your own needs --config-dir DIR."
+    searched = config_folders() or group.startswith("hydra/")
+    hint = "" if searched else " A choice of your own needs --config-dir DIR."
     return MjstackError(f"{unknown}{hint}")
 
 
