@@ -29,6 +29,8 @@ from mjstack.config.fingerprint import config_hash, differences
 from mjstack.config.schema import Backend, Config
 from mjstack.datasets import DatasetSpec, DatasetWriter, Feature
 from mjstack.datasets.part import PartWriter
+from mjstack.datasets.spec import INDICES
+from mjstack.datasets.units import LerobotUnits
 from mjstack.envs import Env, build_env, demonstration_config
 from mjstack.episodes.batches import Batch, BatchPlan
 from mjstack.episodes.recorder import CommandRecorder
@@ -154,6 +156,46 @@ def test_names_of_a_history_and_of_a_strange_term() -> None:
     names = [f"grasp_point_to_red.{end}" for end in ("0.t-1", "1.t-1", "2.t-1", "0")]
     assert list(feature.names[first : first + 4]) == names
     assert feature.units[feature.names.index("count")] == "unknown"
+
+
+def test_lerobot_units_are_those_of_the_real_arm(demos: SimpleNamespace) -> None:
+    """The same episodes in degrees and 0 to 100, in the columns of a follower's recordings."""
+    with contextlib.chdir(demos.cwd):
+        args = [*demos.args, "job.units=lerobot", "job.folder=outputs/degrees"]
+        assert run([arg for arg in args if arg != COMMAND[2]]) == 0
+    dataset = demos.cwd / "outputs" / "degrees" / "dataset"
+    info = json.loads((dataset / "meta" / "info.json").read_text())
+    names = [f"{joint}.pos" for joint in JOINTS]
+    assert info["robot_type"] == "so_follower"
+    assert set(info["features"]) == {"observation.state", "action", *INDICES}
+    assert info["features"]["action"]["names"] == names
+    assert info["mjstack"]["units"]["action"] == ["deg"] * 5 + ["%"]
+    low, high = np.array(Stage(demos.cfg).index.ctrl_range).T
+    units = LerobotUnits(demos.cfg.robot, np.stack([low, high], 1))
+    for number in range(4):
+        si, degrees = steps_of(demos.dataset, number), steps_of(dataset, number)
+        for name in ("observation.state", "action"):
+            wanted = np.rad2deg(si[name] - 0.5 * (low + high))
+            wanted[:, 5] = 100.0 * (si[name][:, 5] - low[5]) / (high[5] - low[5])
+            assert np.allclose(degrees[name], wanted, rtol=0, atol=1e-4)
+            assert np.allclose(units.to_si(degrees[name]), si[name], rtol=0, atol=3e-7)
+
+
+def test_ends_and_middles_of_lerobots_units() -> None:
+    cfg = load_config([])
+    ranges = np.array(Stage(cfg).index.ctrl_range)
+    units = LerobotUnits(cfg.robot, ranges)
+    half = np.rad2deg(0.5 * (ranges[:5, 1] - ranges[:5, 0]))
+    for values, arm, gripper in (
+        (ranges[:, 0], -half, 0.0),
+        (ranges.mean(1), 0.0 * half, 50.0),
+        (ranges[:, 1], half, 100.0),
+    ):
+        given = units.from_si(values)
+        assert np.allclose(given, [*arm, gripper], atol=1e-5)
+        assert given.dtype == np.float32
+    draws = np.random.default_rng(0).uniform(*ranges.T, (10_000, 6)).astype(np.float32)
+    assert np.abs(units.to_si(units.from_si(draws)) - draws).max() <= 2.4e-7  # an ulp of 2 to 4
 
 
 def test_actions_are_what_the_gates_command(demos: SimpleNamespace) -> None:
@@ -581,9 +623,10 @@ def test_the_buffer_bounds_the_worlds() -> None:
 
 def test_steps_come_to_the_host_in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     stage = Stage(load_config(COMMAND))
-    source = EpisodeSource(stage, cast(DatasetSpec, SimpleNamespace(config_sha256="")), Path())
-    plan = BatchPlan(0, range(7))
     rows = {"observation.state": torch.randn(6, 7, 3), "action": torch.randn(5, 7, 1)}
+    spec = SimpleNamespace(config_sha256="", features=rows)
+    source = EpisodeSource(stage, cast(DatasetSpec, spec), Path())
+    plan = BatchPlan(0, range(7))
     results = SimpleNamespace(failed=np.zeros(7, np.int32), retries=np.zeros(7, np.int32))
     batch = Batch(plan, cast(Env, None), cast(Episode, results), rows)
     for size in (1, 2 * (6 * 3 + 5) * 4, 10**6):  # one world, two and all at once

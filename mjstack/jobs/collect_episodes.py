@@ -15,6 +15,7 @@ from mjstack.config.schema import CollectJobCfg
 from mjstack.datasets import DatasetSpec, EpisodeData
 from mjstack.datasets.part import FILE_MB, Part, PartWriter
 from mjstack.datasets.spec import typed_episode
+from mjstack.datasets.units import LEROBOT, LerobotUnits
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.batches import Batch
@@ -72,6 +73,9 @@ class EpisodeSource:
         self._spec = spec
         self._folder = folder
         self.drawing = 0.0
+        self._units: LerobotUnits | None = None
+        if cast(CollectJobCfg, stage.cfg.job).units == LEROBOT:
+            self._units = LerobotUnits(stage.cfg.robot, stage.index.ctrl_range)
         self._most_rendered = 0  # states at once
         self._renderer: StateRenderer | None = None
         self._cameras = with_outputs(stage.cfg.scene.cameras, ["rgb"])
@@ -152,6 +156,8 @@ class EpisodeSource:
             rendered = self._render(batch, worlds, rendered_steps) if self._cameras else {}
             for number, row in enumerate(chunk):
                 arrays = {name: values[number, : len(steps)] for name, values in host.items()}
+                if self._units is not None:
+                    arrays |= {name: self._units.from_si(arrays[name]) for name in (STATE, ACTION)}
                 images = {}
                 for name, stride in self._strides.items():
                     frame = np.array(steps) // stride * stride // rendered_steps.step
@@ -171,8 +177,9 @@ class EpisodeSource:
         task = self._stage.cfg.task
         broken = self._stage.check.rules.describe(int(batch.episode.failed[row]))
         last = np.arange(len(arrays[STATE])) == len(arrays[STATE]) - 1
+        arrays |= {"next.done": last, "next.success": last & (not broken)}
         return EpisodeData(
-            arrays={**arrays, "next.done": last, "next.success": last & (not broken)},
+            arrays={name: arrays[name] for name in self._spec.features},
             images=images,
             task=task.instruction or task.name,
             success=not broken,

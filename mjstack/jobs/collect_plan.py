@@ -6,7 +6,7 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -20,6 +20,7 @@ from mjstack.config.schema import Backend, CollectJobCfg, Config, ObservationTer
 from mjstack.datasets import DatasetSpec, Feature, Video
 from mjstack.datasets.reader import check_same, read_info
 from mjstack.datasets.spec import term_columns
+from mjstack.datasets.units import LEROBOT, LerobotUnits
 from mjstack.datasets.video import check_encoder
 from mjstack.envs import Env, build_env, demonstration_config
 from mjstack.episodes.stage import Stage
@@ -196,6 +197,8 @@ def episode_config(cfg: Config) -> dict[str, Any]:
     config["sim"] = {"backend": backend}
     job = cast(CollectJobCfg, cfg.job)
     config["job"] = {"keep_failures": job.keep_failures}
+    if job.units == LEROBOT:
+        config["job"]["units"] = job.units
     if cfg.scene.cameras:
         config["job"]["codec"] = job.codec
     placed = [term.params for term in cfg.reset.values() if places_objects(term)]
@@ -212,9 +215,12 @@ def make_spec(env: Env, cfg: Config, provenance: Mapping[str, Any]) -> DatasetSp
         ConfigError: An observation group has a name that is taken.
     """
     config = episode_config(cfg)
+    job = cast(CollectJobCfg, cfg.job)
     joints = tuple(cfg.robot.joints)
     units = joint_units(env)
     positions = Feature(dtype="float32", names=tuple(f"{name}.pos" for name in joints), units=units)
+    if job.units == LEROBOT:
+        positions = replace(positions, units=LerobotUnits(cfg.robot, env.index.ctrl_range).units)
     features = {STATE: positions}
     for group in cfg.observation:
         name = f"observation.{group}"
@@ -231,13 +237,14 @@ def make_spec(env: Env, cfg: Config, provenance: Mapping[str, Any]) -> DatasetSp
         "next.done": Feature(dtype="bool", names=("done",), units=("1",)),
         "next.success": Feature(dtype="bool", names=("success",), units=("1",)),
     }
-    codec = cast(CollectJobCfg, cfg.job).codec
+    if job.units == LEROBOT:  # a recording of the real arm has no others
+        features = {STATE: positions, ACTION: positions}
     videos = {
-        f"{IMAGES}.{name}": Video(height=camera.size[0], width=camera.size[1], codec=codec)
+        f"{IMAGES}.{name}": Video(height=camera.size[0], width=camera.size[1], codec=job.codec)
         for name, camera in cfg.scene.cameras.items()
     }
     return DatasetSpec(
-        robot_type=cfg.robot.name,
+        robot_type=(job.units == LEROBOT and cfg.robot.lerobot_type) or cfg.robot.name,
         fps=round(cfg.task.control_hz),
         features=features,
         videos=videos,

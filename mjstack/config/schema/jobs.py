@@ -31,6 +31,9 @@ class CollectJobCfg(JobCfg):
     cameras also memory for images that wait for being encoded."""
     codec: str = spec("h264", choices=("h264", "av1"))
     """Codec of the videos."""
+    units: str = spec("si", choices=("si", "lerobot"))
+    """Joint values: rad and m, or LeRobot's. lerobot also gives the columns and the robot type of a
+    recording of the real arm alone, so that both can be merged."""
 
 
 @dataclass(slots=True)

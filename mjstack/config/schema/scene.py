@@ -247,6 +247,8 @@ class RobotCfg:
     """The robot's name."""
     title: str = ""
     """The name in tables and reports. Empty: ``name``."""
+    lerobot_type: str = ""
+    """Type of the real robot in LeRobot's datasets. Empty: ``name``."""
     file: str | None = None
     """An MJCF file: an absolute path, or one relative to the YAML that names it, or to the working
     folder. null: mjstack's own file of the robot."""

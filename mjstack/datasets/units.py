@@ -1,0 +1,34 @@
+"""Joint values in LeRobot's units, as its SO-101 follower has them after calibration."""
+
+import numpy as np
+
+from mjstack.config.schema import RobotCfg
+
+LEROBOT = "lerobot"  # beside "si"
+
+
+class LerobotUnits:
+    """Degrees from the middle of an arm joint's range, and 0 to 100 over a gripper joint's.
+
+    LeRobot's calibration moves every joint through its range, and takes the middle for zero
+    (``so_follower`` with ``use_degrees``).
+
+    Attributes:
+        units: Unit of each joint's numbers.
+    """
+
+    def __init__(self, robot: RobotCfg, ranges: np.ndarray) -> None:
+        """Take the joints' ranges [rad, m], shape ``(joints, 2)``, the arm's first."""
+        arm = np.arange(len(ranges)) < len(robot.arm_joints)
+        low, high = ranges.astype(np.float64).T
+        self._zero = np.where(arm, 0.5 * (low + high), low)
+        self._scale = np.where(arm, 180.0 / np.pi, 100.0 / (high - low))
+        self.units = tuple("deg" if joint else "%" for joint in arm)
+
+    def from_si(self, values: np.ndarray) -> np.ndarray:
+        """Convert joint values [rad, m], shape ``(…, joints)``; float32, rounded once."""
+        return ((values.astype(np.float64) - self._zero) * self._scale).astype(np.float32)
+
+    def to_si(self, values: np.ndarray) -> np.ndarray:
+        """Convert back to rad and m, shape ``(…, joints)``; float32, rounded once."""
+        return (values.astype(np.float64) / self._scale + self._zero).astype(np.float32)
