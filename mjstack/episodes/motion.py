@@ -1,31 +1,23 @@
 """Worlds of an episode in motion, for the run's 3-D page: recorded on the device, failing ones
-first, each beside its copy on native MuJoCo.
+first.
 """
 
-import logging
-from collections.abc import Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from torch import Tensor
 
-from mjstack.config.schema import Backend
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.recorder import Channels, Read, Recorder
 from mjstack.episodes.stage import Stage
 from mjstack.files import read_npz, reading, write_npz
-from mjstack.interrupt import check_interrupt
 from mjstack.report.page import MOST_WORLDS, Page, World, frame_stride
 from mjstack.report.write import safely_write
 
-log = logging.getLogger(__name__)
-
 _BYTES = 64 * 2**20  # of one recording
-_MARKS = ("label", "failed", "twin")  # of a world, in the file beside its positions
-_TWINS = 8  # failing worlds that native MuJoCo plays too
+_MARKS = ("label", "failed")  # of a world, in the file beside its positions
 
 
 def motion_recorder(step_dt: float) -> Recorder:
@@ -49,8 +41,7 @@ def motion_recorder(step_dt: float) -> Recorder:
 def show_batch(
     stage: Stage, page: Page, path: Path, gate: str, qpos: Tensor, failed: np.ndarray
 ) -> None:
-    """Add a gate's worlds to the page: failing ones, each beside its copy on native MuJoCo where
-    that was not the backend, and then others. A file keeps them for a resumed run.
+    """Add a gate's worlds to the page, failing ones first. A file keeps them for a resumed run.
 
     Args:
         stage: On which the gate has played.
@@ -61,19 +52,13 @@ def show_batch(
         failed: Bits of the task's rules, shape ``(nworld,)``.
     """
     rules = stage.check.rules
-    recorded = qpos.shape[1]
-    failing = np.flatnonzero(failed[:recorded]).tolist()
-    twins = _play_twins(stage, failing[:_TWINS])
-    succeeded = np.flatnonzero(failed[:recorded] == 0).tolist()
-    chosen = [*failing, *succeeded][: MOST_WORLDS - len(twins)]
-    moving: list[World] = []
+    chosen = np.argsort(failed[: qpos.shape[1]] == 0, kind="stable")[:MOST_WORLDS].tolist()
     motions = qpos[:, chosen].float().swapaxes(0, 1).cpu().numpy()
+    moving: list[World] = []
     for world, motion in zip(chosen, motions, strict=True):
-        bits = int(failed[world])
-        label = _label(str(world), rules.broken(bits))
-        moving.append(World(label=label, qpos=motion, failed=bits > 0))
-        if world in twins:
-            moving.append(twins[world])
+        broken = " ".join(rules.broken(int(failed[world])))
+        label = f"{world}: {broken}" if broken else str(world)
+        moving.append(World(label=label, qpos=motion, failed=bool(broken)))
     page.worlds3d[gate] = moving
     arrays: dict[str, Any] = {name: [getattr(world, name) for world in moving] for name in _MARKS}
     arrays["qpos"] = [world.qpos for world in moving]
@@ -92,35 +77,11 @@ def restore_batch(page: Page, path: Path, gate: str) -> None:
             arrays = read_npz(path)
             marks = [arrays[name].tolist() for name in _MARKS]
             page.worlds3d[gate] = [
-                World(label=label, qpos=qpos, failed=failed, twin=twin)
-                for label, failed, twin, qpos in zip(*marks, arrays["qpos"], strict=True)
+                World(label=label, qpos=qpos, failed=failed)
+                for label, failed, qpos in zip(*marks, arrays["qpos"], strict=True)
             ]
 
 
 def motion_path(folder: Path, gate: str) -> Path:
     """The file of a gate's worlds in motion."""
     return folder / f"motion_{gate}.npz"
-
-
-def _play_twins(stage: Stage, worlds: Sequence[int]) -> dict[int, World]:
-    """Some worlds on native MuJoCo, by number; none if that was the backend, or where it fails."""
-    if not worlds or stage.backend[0] is Backend.native:
-        return {}
-    recorder = motion_recorder(stage.cfg.timing.step_dt)
-    try:
-        with closing(stage.simulation(len(worlds), Backend.native, "cpu")) as sim:
-            episode = stage.play(sim, stage.cfg.reset, [recorder], worlds=worlds)
-        positions = recorder.rows["qpos"].float().swapaxes(0, 1).cpu().numpy()
-    except Exception:
-        check_interrupt()
-        log.exception("no copies of failing worlds on native MuJoCo")
-        return {}
-    broken = [stage.check.rules.broken(bits) for bits in episode.failed.tolist()]
-    return {
-        world: World(label=_label(f"{world}, native", rules), qpos=qpos, twin=True)
-        for world, qpos, rules in zip(worlds, positions, broken, strict=True)
-    }
-
-
-def _label(name: str, broken: Sequence[str]) -> str:
-    return f"{name}: {' '.join(broken)}" if broken else name

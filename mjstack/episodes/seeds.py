@@ -205,7 +205,7 @@ def _worlds(tally: EpisodeTally, run: Run) -> Worlds:
         values={name: tally.array(f"value.{name}")[plotted] for name in measured},
     )
     start = tally.array("start_qpos")[plotted]
-    moving = [world for world in run.page.worlds3d.get(tally.gate, []) if not world.twin]
+    moving = run.page.worlds3d.get(tally.gate, [])
     for name, (at, _) in run.stage.index.objects.items():
         xy = slice(at, at + 2)
         ways = [(world.label, world.failed, world.qpos[:, xy]) for world in moving]

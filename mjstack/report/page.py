@@ -53,13 +53,11 @@ class World:
         label: Its text, short.
         qpos: Positions at frames, shape ``(frames, nq)``; NaN where it was not played.
         failed: Whether it failed, which colours its table.
-        twin: Whether it is native MuJoCo's copy of the one before.
     """
 
     label: str
     qpos: np.ndarray
     failed: bool = False
-    twin: bool = False
 
 
 @dataclass(kw_only=True, slots=True)

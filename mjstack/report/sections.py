@@ -69,8 +69,8 @@ def make_sections(report: Report, page: Page) -> list[Section]:
     facts = report.provenance
     episode = page.note
     if page.episode:
-        what = "red tables: failed worlds; blue ones: their copies on native MuJoCo"
-        episode = Marked(f"Play it in 3-D: {page.episode} ({what})", link=page.episode)
+        text = f"Play it in 3-D: {page.episode} (red tables: failed worlds)"
+        episode = Marked(text, link=page.episode)
     head: list[Part] = [
         ", ".join(str(facts[name]) for name in ("date", "device") if name in facts),
         " ".join(report.overrides),

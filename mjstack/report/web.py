@@ -33,7 +33,6 @@ _LOOPBACK = ("127.0.0.1", "::1", "localhost")
 _MESSAGE = 2**16  # bytes, the largest of a browser
 _MARGIN = 0.12  # m between worlds
 _FAILED = np.array([0.86, 0.35, 0.32])
-_TWIN = np.array([0.42, 0.60, 0.86])
 
 
 def lacks_viser() -> str:
@@ -139,7 +138,7 @@ def choose_worlds(parts: Mapping[str, Sequence[World]]) -> list[World]:
     alone = [part[0] for part in parts.values() if len(part) == 1][:MOST_WORLDS]
     batches = [part for part in parts.values() if len(part) > 1]
     share = (MOST_WORLDS - len(alone)) // max(1, len(batches))
-    # An even number, and the others at the end: a copy stands in the same row as its world.
+    # An even number, and the others at the end: worlds of a comparison stand in pairs.
     return [*(world for part in batches for world in part[: share - share % 2]), *alone]
 
 
@@ -159,7 +158,7 @@ def save_episode(
     """
     server = start_server("127.0.0.1", 0)
     try:
-        tints = [_TWIN if world.twin else _FAILED if world.failed else None for world in worlds]
+        tints = [_FAILED if world.failed else None for world in worlds]
         stage = Stage(server, Shapes(model), [world.label for world in worlds], tints)
         qpos = np.stack([_fill(world, worlds) for world in worlds], axis=1)
         stage.update(qpos[0])
@@ -280,7 +279,7 @@ def _fill(world: World, worlds: Sequence[World]) -> np.ndarray:
 
 def _grid(count: int, size: np.ndarray) -> np.ndarray:
     """Places of worlds of a size in x and y [m], shape ``(count, 2)``; an even number of columns,
-    so that a twin stands beside its world.
+    so that the worlds of a comparison stand in pairs.
     """
     columns = math.ceil(math.sqrt(count * size[0] / size[1]))
     columns = min(count, columns + columns % 2)
