@@ -30,7 +30,7 @@ from mjstack.episodes.batches import play_batches
 from mjstack.episodes.stage import Stage
 from mjstack.errors import FolderError
 from mjstack.jobs import collect as job
-from mjstack.jobs import collect_episodes, collect_plan
+from mjstack.jobs import collect_plan
 from mjstack.jobs.collect import Collection
 from mjstack.jobs.collect_plan import BATCHES, CollectPlan
 from mjstack.jobs.runner import run_provenance
@@ -59,7 +59,7 @@ def patch_all(monkeypatch: pytest.MonkeyPatch) -> None:
     """No world is played; a data file has room for four episodes, so that a batch has several;
     what is slow is made once.
     """
-    monkeypatch.setattr(collect_episodes, "FILE_MB", 1)
+    monkeypatch.setattr(lerobot, "DATA_MB", 1)
     monkeypatch.setattr(job, "play_batches", fake_batches(some_fail, noise=True))
     monkeypatch.setattr(collect_plan, "run_provenance", lambda stage: dict(_provenance()))
     monkeypatch.setattr(

@@ -277,7 +277,8 @@ def test_a_full_file_is_committed_and_chunks_follow(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(lerobot, "CHUNK", 2)
-    with DatasetWriter(tmp_path, SPEC, file_mb=1) as writer:
+    monkeypatch.setattr(lerobot, "DATA_MB", 1)
+    with DatasetWriter(tmp_path, SPEC) as writer:
         writer.add([episode(world, frames=8000) for world in range(25)])
         assert 0 < len(writer.committed) < 25
     files = sorted(tmp_path.glob("data/*/*.parquet"))

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from mjstack.datasets.spec import INDICES, DatasetSpec, Video
+from mjstack.datasets.spec import INDICES, DatasetSpec
 from mjstack.errors import MissingExtra
 
 VERSION = "v3.0"
@@ -30,7 +30,8 @@ FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 DATA = f"data/{FILE}.parquet"
 EPISODES = f"meta/episodes/{FILE}.parquet"
 VIDEO = f"videos/{{video_key}}/{FILE}.mp4"
-VIDEO_MB = 200  # size at which a video file is full
+DATA_MB = 100  # size at which a data file is full
+VIDEO_MB = 200  # the same of a video
 INFO = "meta/info.json"
 STATS = "meta/stats.json"
 TASKS = "meta/tasks.parquet"
@@ -76,30 +77,10 @@ def statistics_of(spec: DatasetSpec) -> dict[str, list[int]]:
     return shapes | {name: [3, 1, 1] for name in spec.videos}
 
 
-def _video_feature(video: Video, fps: int) -> dict[str, Any]:
-    """The feature of a video."""
-    return {
-        "dtype": "video",
-        "shape": [video.height, video.width, 3],
-        "names": ["height", "width", "channels"],
-        "info": {
-            "video.height": video.height,
-            "video.width": video.width,
-            "video.codec": video.codec,
-            "video.pix_fmt": "yuv420p",
-            "video.fps": fps,
-            "video.channels": 3,
-            "has_audio": False,
-            "is_depth_map": False,
-        },
-    }
-
-
 def make_info(
     spec: DatasetSpec,
     *,
     provenance: Sequence[Mapping[str, Any]] = (),
-    file_mb: int = 100,
     episodes: int = 0,
     frames: int = 0,
     tasks: int = 0,
@@ -115,7 +96,16 @@ def make_info(
         name: {"dtype": dtype, "shape": [dim], "names": names.get(name)}
         for name, (dtype, dim) in columns_of(spec).items()
     }
-    features |= {name: _video_feature(video, spec.fps) for name, video in spec.videos.items()}
+    for name, video in spec.videos.items():
+        size = {"height": video.height, "width": video.width, "channels": 3}
+        coding = {"codec": video.codec, "pix_fmt": "yuv420p", "fps": spec.fps}
+        features[name] = {
+            "dtype": "video",
+            "shape": list(size.values()),
+            "names": list(size),
+            "info": {f"video.{key}": value for key, value in (size | coding).items()}
+            | {"has_audio": False, "is_depth_map": False},
+        }
     return {
         "codebase_version": VERSION,
         "robot_type": spec.robot_type,
@@ -124,7 +114,7 @@ def make_info(
         "total_frames": frames,
         "total_tasks": tasks,
         "chunks_size": CHUNK,
-        "data_files_size_in_mb": file_mb,
+        "data_files_size_in_mb": DATA_MB,
         "video_files_size_in_mb": VIDEO_MB,  # LeRobot wants a number without videos too
         "data_path": DATA,
         "video_path": VIDEO if spec.videos else None,

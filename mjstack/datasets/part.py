@@ -12,7 +12,6 @@ from mjstack.datasets import lerobot
 from mjstack.datasets.spec import INDICES, DatasetSpec, EpisodeData
 from mjstack.datasets.video import VideoEncoder
 
-FILE_MB = 100  # size of a data file at which the next one begins
 IMAGES_GIB = 1.0  # images that may wait for being encoded
 
 
@@ -74,11 +73,11 @@ class PartWriter:
         most = int(images_gib * 2**30)
         self._videos = VideoEncoder(spec.videos, spec.fps, self.part.videos, most)
 
-    def is_full(self, file_mb: int) -> bool:
-        """Whether one more episode like these would make the data file larger than that [MiB], or a
-        video larger than `lerobot.VIDEO_MB`.
+    def is_full(self) -> bool:
+        """Whether one more episode like these would make the data file larger than
+        `lerobot.DATA_MB`, or a video larger than `lerobot.VIDEO_MB`.
         """
-        data = self._file.tell() / (file_mb * 2**20)
+        data = self._file.tell() / (lerobot.DATA_MB * 2**20)
         share = max(data, self._videos.megabytes() / lerobot.VIDEO_MB)
         return share * (1.0 + 1.0 / len(self.part.rows)) > 1.0
 

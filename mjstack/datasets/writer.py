@@ -14,7 +14,7 @@ from typing import Any, cast
 import numpy as np
 
 from mjstack.datasets import lerobot
-from mjstack.datasets.part import FILE_MB, Part, PartWriter
+from mjstack.datasets.part import Part, PartWriter
 from mjstack.datasets.reader import (
     check_same,
     read_info,
@@ -51,13 +51,12 @@ class DatasetWriter:
         waited: Time for which commits have waited for images to be encoded [s].
     """
 
-    def __init__(self, folder: Path | str, spec: DatasetSpec, *, file_mb: int = FILE_MB) -> None:
+    def __init__(self, folder: Path | str, spec: DatasetSpec) -> None:
         """Open the folder, and begin a dataset in it if there is none.
 
         Args:
             folder: The dataset's own folder.
             spec: Its columns and provenance.
-            file_mb: Size of a data file at which it is committed and the next one begins [MiB].
 
         Raises:
             FolderError: Something else is there, or a dataset of another configuration; another
@@ -69,7 +68,6 @@ class DatasetWriter:
         self.committed: list[tuple[int, int]] = []
         self.frames = 0
         self.waited = 0.0
-        self._file_mb = file_mb
         self._open = True
         self._shards = 0
         self._provenance: list[dict[str, Any]] = []
@@ -122,7 +120,7 @@ class DatasetWriter:
                 start = rows[-1]["dataset_to_index"] if rows else self.frames
                 task = self.number_task(episode.task)
                 self._part.write(episode, task, facts, columns, number, start)
-            if self._part.is_full(self._file_mb):
+            if self._part.is_full():
                 self.flush()
 
     def flush(self, parts: Sequence[Part] = ()) -> None:
@@ -233,7 +231,6 @@ class DatasetWriter:
         info = lerobot.make_info(
             self.spec,
             provenance=self._provenance,
-            file_mb=self._file_mb,
             episodes=len(self.committed),
             frames=self.frames,
             tasks=len(self._tasks),

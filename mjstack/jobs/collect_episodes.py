@@ -13,7 +13,7 @@ import torch
 
 from mjstack.config.schema import CollectJobCfg
 from mjstack.datasets import DatasetSpec, EpisodeData
-from mjstack.datasets.part import FILE_MB, Part, PartWriter
+from mjstack.datasets.part import Part, PartWriter
 from mjstack.datasets.spec import typed_episode
 from mjstack.datasets.units import LEROBOT, LerobotUnits
 from mjstack.drivers.driver import Driver
@@ -120,7 +120,7 @@ class EpisodeSource:
                 first_frame = frame + number * len(data.arrays[STATE])
                 typed = typed_episode(self._spec, data)
                 writer.write(data, task, *typed, episode + number, first_frame)
-                if writer.is_full(FILE_MB):
+                if writer.is_full():
                     files.append(writer.complete())
                     writer = None
                 label = f"episodes of seed {batch.plan.seed}"
