@@ -20,6 +20,7 @@ import mjstack.train.rounds as rounds
 from mjstack.cli import run
 from mjstack.distributed import Ranks
 from mjstack.drivers.driver import Driver
+from mjstack.drivers.policy import QueryImages
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, FolderError
 from mjstack.math import wilson_interval
@@ -181,7 +182,9 @@ def test_the_share_of_the_expert() -> None:
             return self.value
 
     expert, policy = Constant(1.0), Constant(2.0)
-    driver = rounds.MixedDriver(expert, policy, env, beta=0.5, alone=10, spell=25, length=0.5)
+    images = QueryImages(env, {}, [], 25)
+    options = {"beta": 0.5, "alone": 10, "spell": 25, "length": 0.5}
+    driver = rounds.MixedDriver(expert, policy, env, images, **options)  # type: ignore[arg-type]
     assert driver.steps == 75
     seen = []
     for step in range(0, 1000, 25):

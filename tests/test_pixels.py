@@ -20,11 +20,10 @@ from mjstack.drivers.policy import PolicyDriver
 from mjstack.episodes.stage import Stage
 from mjstack.errors import FolderError
 from mjstack.policy import load_policy
-from mjstack.sim import StateRenderer
 from mjstack.train.clone_learner import CloneLearner
 from mjstack.train.clone_network import vision_of
-from mjstack.train.demonstrations import Demonstrations
 from mjstack.train.images import Augmentation, ImagePool
+from mjstack.train.rounds import make_round
 
 CAMERAS = [
     "cameras=[front,wrist]",
@@ -33,15 +32,12 @@ CAMERAS = [
 ]
 SHORT = ["controller.phases.hold.seconds=0.4", "task.episode_steps=70", "task.check.window=10"]
 SMALL = ["task=reach", "sim=mjwarp", "sim.device=cpu", "nworld=4", *CAMERAS, *SHORT]
+TRAIN = ["job=train", "experiment=pixels", *SMALL, "web.episode=false", "gate.success.rate=0.0"]
 TINY = [
-    "job=train",
-    "trainer=pixels",
-    *SMALL,
-    "web.episode=false",
-    *("job.vision.channels=[4,8]", "job.vision.features=8", "job.vision.shift=1"),
-    *("job.vision.pool=40", "job.vision.uses=2", "job.episodes=4"),
-    *("job.hidden=[16]", "job.batches=12", "job.batch_size=16", "job.save_every=6"),
-    "gate.success.rate=0.0",
+    *TRAIN,
+    *("job.rounds=2", "job.vision.channels=[4,8]", "job.vision.features=8", "job.vision.shift=1"),
+    *("job.vision.pool=100", "job.episodes=4", "job.hidden=[16]", "job.batches=6"),
+    *("job.batch_size=16", "job.save_every=6"),
 ]
 
 
@@ -151,54 +147,57 @@ def test_a_strangers_policy_is_refused(
 # Training data
 
 
-def demonstrations(stage: Stage, count: int) -> Demonstrations:
-    """Two episodes of positions that differ in every step."""
-    qpos = torch.from_numpy(stage.model.qpos0).float().repeat(count, 1)
-    qpos[:, 0] = torch.linspace(-1.0, 1.0, count)
-    none = torch.zeros(count, 1)
-    ends = torch.tensor([count // 3, count])
-    return Demonstrations(seen=none, labels=none, ends=ends, widths={}, qpos=qpos)
+def test_the_pool_keeps_an_even_share_in_any_order() -> None:
+    """All steps while they fit; then the same ones, whatever came at once."""
+
+    def images(steps: torch.Tensor) -> torch.Tensor:
+        return (steps % 251).to(torch.uint8)[:, None, None, None].expand(-1, 2, 3, 3)
+
+    def filled(pool: ImagePool, parts: Sequence[int]) -> ImagePool:
+        first = 0
+        for count in parts:
+
+            def read(steps: torch.Tensor, first: int = first) -> dict[str, torch.Tensor]:
+                return {"front": images(first + steps)}
+
+            pool.add(torch.arange(0, count, 5), count, read)
+            first += count
+        rows = pool.rows()
+        assert (pool.steps[rows].diff() > 0).all()
+        assert torch.equal(pool.images[0][rows], images(pool.steps[rows]))
+        return pool
+
+    sizes = {"front": (2, 3)}
+    whole = filled(ImagePool(sizes, 700, "cpu"), [1000, 2000])
+    assert torch.equal(whole.steps[whole.rows()], torch.arange(0, 3000, 5))
+    share = filled(ImagePool(sizes, 100, "cpu"), [1000, 2000])
+    other = filled(ImagePool(sizes, 100, "cpu"), [500, 500, 1500, 500])
+    kept = share.steps[share.rows()]
+    assert torch.equal(other.steps[other.rows()], kept)
+    assert (torch.histc(kept.float(), 10, 0, 3000) - 10).abs().max() <= 2
 
 
-def test_the_pool_has_the_images_of_its_steps() -> None:
-    cfg = load_config([*TINY, "reset=nominal"])
-    stage = Stage(cfg)
-    vision = vision_of(cfg, cast(CloneJobCfg, cfg.job))
-    found = demonstrations(stage, 60)
-    steps = torch.arange(10, 60)
-    settings = VisionCfg(cameras=["front", "wrist"], pool=20, uses=4)
-    every = StateRenderer(stage.model, cfg, 60)
-    assert found.qpos is not None
-    expected = {name: image.clone() for name, image in every.draw(found.qpos).items()}
-
-    def check(pool: ImagePool) -> None:
-        assert set(pool.steps.tolist()) <= set(steps.tolist())
-        for name, images in zip(vision.sizes, pool.images, strict=True):
-            assert torch.equal(images, expected[f"images.{name}"][pool.steps])
-
-    pool = ImagePool(stage, settings, vision, found, steps, 32, 7)
-    pool.fill(-1)
-    assert len(pool.steps) == 24  # three parts of 8
-    check(pool)
-    kept = [pool.steps.clone()]
-    for batch in range(4):
-        pool.advance(batch)
-        check(pool)
-        kept.append(pool.steps.clone())
-        assert ((kept[-1] != kept[-2]).reshape(3, 8).any(1).sum()) == 1
-    assert (kept[-1] != kept[0]).float().mean() > 0.5
-    again = ImagePool(stage, settings, vision, found, steps, 32, 7)
-    again.fill(2)
-    again.advance(3)
-    assert torch.equal(again.steps, kept[-1])
-
-    # All of them fit
-    whole = ImagePool(stage, replace(settings, pool=50), vision, found, steps, 32, 7)
-    whole.fill(-1)
-    assert torch.equal(whole.steps, steps)
-    check(whole)
-    whole.advance(0)
-    assert torch.equal(whole.steps, steps)
+@pytest.mark.parametrize("backend", ["mjwarp", "native"])
+def test_images_of_a_round_come_again(backend: str, tmp_path: Path) -> None:
+    """A round that is read has the images that were rendered when it was played: those at which the
+    policy is queried and whose chunk the expert drove.
+    """
+    args = [*TINY, f"sim={backend}", "looks=randomized", "job.episodes=6"]
+    stage = Stage(load_config(args))
+    job = cast(CloneJobCfg, stage.cfg.job)
+    sizes = vision_of(stage.cfg, job).sizes
+    pools = [ImagePool(sizes, 1000, "cpu") for _ in range(2)]
+    played, read = (make_round(stage, tmp_path, None, 0, pool) for pool in pools)
+    assert played.qpos is not None
+    assert read.qpos is not None
+    assert torch.equal(read.qpos, played.qpos)
+    steps = torch.arange(0, 6 * 70, job.execute)
+    assert torch.equal(read.usable(job), steps)
+    assert torch.equal(pools[1].steps[pools[1].rows()], steps)
+    for camera in range(2):
+        first, second = (pool.images[camera][pool.rows()] for pool in pools)
+        assert torch.equal(first, second)
+        assert first.flatten(1).float().std(1).min() > 5.0
 
 
 def test_augmentation_shifts_and_tints() -> None:
@@ -236,10 +235,32 @@ def test_augmentation_shifts_and_tints() -> None:
 
 @pytest.mark.full
 def test_a_training_goes_on_where_it_was_interrupted(trained: Path, tmp_path: Path) -> None:
+    """In the first round, when it is over, and in the second one, from other images each."""
     command = [*TINY, f"job.folder={tmp_path}"]
-    interrupted(command, CloneLearner, 8)
+    for number in (3, 6, 8):
+        interrupted(command, CloneLearner, number)
     assert run(command) == 0
     assert same(tmp_path / "last", trained / "last")
+
+
+@pytest.mark.full
+def test_a_clone_goes_on_where_it_was_interrupted(tmp_path: Path) -> None:
+    command = [*TINY, "trainer=clone", "job.rounds=0"]
+    interrupted([*command, f"job.folder={tmp_path}/parts"], CloneLearner, 4)
+    for name in ("parts", "whole"):
+        assert run([*command, f"job.folder={tmp_path}/{name}"]) == 0
+    assert same(tmp_path / "parts/last", tmp_path / "whole/last")
+
+
+@pytest.mark.full
+def test_stack_learns_from_pixels_and_goes_on_bit_for_bit(tmp_path: Path) -> None:
+    """Looks differ between episodes. Any rate will do."""
+    sizes = [each for each in TINY if not each.startswith(("task", "controller"))]
+    command = [*sizes, "looks=randomized", "job.length=0.2", "web.episode=false"]
+    interrupted([*command, f"job.folder={tmp_path}/parts"], CloneLearner, 8)
+    for name in ("parts", "whole"):
+        assert run([*command, f"job.folder={tmp_path}/{name}"]) == 0
+    assert same(tmp_path / "parts/last", tmp_path / "whole/last")
 
 
 def success_rate(overrides: Sequence[str], folder: Path) -> float:
@@ -249,12 +270,10 @@ def success_rate(overrides: Sequence[str], folder: Path) -> float:
 
 @pytest.mark.full
 def test_two_cores_train_reach_from_pixels(tmp_path: Path) -> None:
-    """One camera of 32 x 32 pixels: some two minutes, most of them for two cores' learning."""
-    overrides = ["job=train", "trainer=pixels", "task=reach", "sim=mjwarp", "sim.device=cpu"]
-    overrides += ["nworld=64", "cameras=front", "scene.cameras.front.size=[32,32]"]
-    overrides += ["job.vision.cameras=[front]", "job.vision.channels=[16,32,32]"]
-    overrides += ["job.vision.features=64", "job.vision.shift=0", "gate.success.rate=0.7"]
-    assert success_rate(overrides, tmp_path) >= 0.7
+    """One camera of 48 x 48 pixels, from 64 unseen starts: some three minutes."""
+    overrides = ["job=train", "experiment=pixels", "task=reach", "sim=mjwarp", "sim.device=cpu"]
+    overrides += ["nworld=64", "cameras=front", "scene.cameras.front.size=[48,48]"]
+    assert success_rate(overrides, tmp_path) >= 60 / 64
 
 
 @pytest.mark.full

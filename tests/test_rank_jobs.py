@@ -100,9 +100,16 @@ def test_ranks_collect_images(tmp_path: Path) -> None:
 
 def test_ranks_learn_from_pixels(tmp_path: Path) -> None:
     """Each draws images of its own episodes; both have one policy, which the first one writes."""
-    vision = ["channels=[4,8]", "features=8", "pool=40", "uses=2", "shift=1", "cameras=[front]"]
-    sizes = ["episodes=4", "hidden=[16]", "batches=4", "batch_size=16"]
-    args = ["job=train", "trainer=pixels", *CAMERA, "task=reach", "nworld=4", "web.episode=false"]
+    vision = ["channels=[4,8]", "features=8", "pool=40", "shift=1", "cameras=[front]"]
+    sizes = ["rounds=1", "episodes=4", "hidden=[16]", "batches=4", "batch_size=16"]
+    args = [
+        "job=train",
+        "experiment=pixels",
+        *CAMERA,
+        "task=reach",
+        "nworld=4",
+        "web.episode=false",
+    ]
     args += ["controller.phases.hold.seconds=0.4", "task.episode_steps=70", "task.check.window=10"]
     args += [f"job.vision.{key}" for key in vision] + [f"job.{key}" for key in sizes]
     args += ["job.save_every=2", "gate.success.rate=0.0", f"job.folder={tmp_path}/out"]

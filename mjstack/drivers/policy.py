@@ -3,7 +3,7 @@ chunk of actions before it queries the policy again.
 """
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import torch
@@ -20,6 +20,35 @@ from mjstack.sim.cameras import Cameras, with_outputs
 _GRID = 2.0**20  # per unit of an action
 
 
+class QueryImages:
+    """Images of a policy's cameras, rendered where it is queried, whatever their rate is.
+
+    Attributes:
+        images: By name of the camera, each ``(nworld, height, width, 3)``, uint8, as of each
+            world's last query.
+    """
+
+    def __init__(
+        self, env: Env, cameras: Mapping[str, CameraCfg], names: Sequence[str], execute: int
+    ) -> None:
+        """Allocate for the cameras of these names, if any; worlds query every ``execute`` steps."""
+        self._env = env
+        self._execute = execute
+        self.images: dict[str, Tensor] = {}
+        self._cameras: Cameras | None = None
+        if names:
+            self._cameras = env.sim.make_cameras(with_outputs(cameras, ["rgb"], names))
+            self._buffers = self._cameras.allocate()
+            self.images = {name: self._buffers[f"images.{name}"] for name in names}
+
+    def draw(self) -> None:
+        """Render the worlds that query in this step."""
+        due = self._env.episode_step.remainder(self._execute) == 0
+        if self._cameras is not None and (due.is_cuda or bool(due.any())):
+            mask = due if due.is_cuda or not bool(due.all()) else None
+            self._cameras.draw(self._buffers, dict.fromkeys(self.images, mask))
+
+
 class PolicyDriver(Driver):
     """Actions of a policy for every world, for an environment with the policy's action terms.
 
@@ -33,6 +62,9 @@ class PolicyDriver(Driver):
     it, and worlds that do not query it keep their chunk.
 
     The cameras of a policy that sees images are rendered in the worlds that query it.
+
+    Attributes:
+        query_images: These images.
     """
 
     def __init__(
@@ -72,13 +104,9 @@ class PolicyDriver(Driver):
         network = copy.deepcopy(policy.network).to(env.device, dtype)
         self._network = network.requires_grad_(False)
         self._dtype = dtype
-        self._cameras: Cameras | None = None
-        self._images: dict[str, Tensor] = {}
-        names = list(policy.network.vision.sizes)
-        if names:
-            # They are rendered for each query, whatever their rate is.
-            self._cameras = env.sim.make_cameras(with_outputs(cfg.scene.cameras, ["rgb"], names))
-            self._images = self._cameras.allocate()
+        self.query_images = QueryImages(
+            env, cfg.scene.cameras, list(policy.network.vision.sizes), policy.execute
+        )
         self._execute = policy.execute
         shape = (env.nworld, min(policy.execute, network.chunk), network.width)
         self._chunk = torch.zeros(shape, device=env.device)
@@ -106,10 +134,8 @@ class PolicyDriver(Driver):
 
     def _query(self, due: Tensor) -> None:
         """Take the policy's next chunk in the worlds where it is due, shape ``(nworld,)``, bool."""
-        if self._cameras is not None:
-            mask = due if due.is_cuda or not bool(due.all()) else None
-            self._cameras.draw(self._images, dict.fromkeys(self._cameras.cameras, mask))
-        images = [image.to(self._dtype) for image in self._images.values()]
+        self.query_images.draw()
+        images = [image.to(self._dtype) for image in self.query_images.images.values()]
         chunk = self._network(self._observed.to(self._dtype), images)[:, : self._chunk.shape[1]]
         chunk = (torch.round(chunk * _GRID) / _GRID).float()
         torch.where(due[:, None, None], chunk, self._chunk, out=self._chunk)

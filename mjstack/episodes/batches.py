@@ -54,7 +54,8 @@ class Batch:
 
     def finite(self) -> Tensor:
         """Whether all that was recorded of each world is finite, shape ``(nworld,)``, bool."""
-        finite = (rows.isfinite() for rows in self.rows.values())
+        numbers = (rows for rows in self.rows.values() if rows.is_floating_point())
+        finite = (rows.isfinite() for rows in numbers)
         parts = [rows.reshape(*rows.shape[:2], -1).all(2).all(0) for rows in finite]
         return torch.stack(parts).all(0)
 

@@ -1,4 +1,4 @@
-"""Trainers *clone*, *dagger* and *pixels*: a policy learns by regression to answer as the expert
+"""Trainers *clone* and *dagger*: a policy learns by regression to answer as the expert
 does, in the expert's episodes and, with rounds, in states to which the policy itself has led.
 """
 
@@ -10,17 +10,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
-import torch
-
 from mjstack.config.schema import CloneJobCfg
 from mjstack.episodes.rollout import STATE_BASED
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, MjstackError, UnknownName
 from mjstack.math import wilson_interval
-from mjstack.sim.memory import free_memory
 from mjstack.train.clone_learner import CloneLearner
+from mjstack.train.clone_network import vision_of
 from mjstack.train.dataset import check_dataset, read_demonstrations
 from mjstack.train.demonstrations import Demonstrations
+from mjstack.train.images import ImagePool, pool_rows
 from mjstack.train.rounds import make_round, round_file
 from mjstack.train.trainer import (
     FAILED,
@@ -56,9 +55,6 @@ def _check_rounds(stage: Stage, job: CloneJobCfg) -> None:
         expected = "state_based, because trainer=dagger asks the expert in the policy's states"
         fix = "Set trainer=clone, which learns from any expert, or controller=state_based"
         raise ConfigError("controller", name, expected, fix)
-    if job.vision.cameras:
-        expected = "[], because trainer=dagger learns from numbers"
-        raise ConfigError("job.vision.cameras", job.vision.cameras, expected, "Set trainer=pixels")
     if job.dataset is not None:
         expected = "null, because trainer=dagger asks the expert itself"
         raise ConfigError("job.dataset", job.dataset, expected, "Set trainer=clone")
@@ -80,15 +76,9 @@ def _check_vision(stage: Stage, job: CloneJobCfg) -> None:
     if not job.vision.channels:
         raise ConfigError("job.vision.channels", [], "at least one number")
     if job.dataset is not None:
-        expected = "null, because images are drawn from the positions of episodes that are played"
+        expected = "null, because images are rendered in episodes that are played"
         raise ConfigError("job.dataset", job.dataset, expected, "Or set job.vision.cameras=[]")
-    images = 3 * sum(math.prod(cameras[name].size) for name in job.vision.cameras)
-    needed = job.vision.pool * images
-    free = free_memory(torch.device(stage.backend[1]))
-    if needed > free:
-        expected = f"at most {free // images}, as the device has {free / 2**30:.3g} GiB free and so"
-        expected += f" many steps need {needed / 2**30:.3g} GiB"
-        raise ConfigError("job.vision.pool", job.vision.pool, expected, "Or make images smaller")
+    pool_rows(stage, stage.cfg.task.episode_steps)
 
 
 def train_clone(stage: Stage, folder: Path) -> Trained:
@@ -101,8 +91,12 @@ def train_clone(stage: Stage, folder: Path) -> Trained:
         return _trained(job, folder, earlier[1])
 
     # The first episodes give the scale
+    pool = None
+    if sizes := vision_of(stage.cfg, job).sizes:
+        rows = min(stage.ranks.gather(pool_rows(stage, stage.episode_steps)))
+        pool = ImagePool(sizes, earlier[1]["pool"] if earlier else rows, stage.backend[1])
     if job.dataset is None:
-        first = make_round(stage, folder, None, 0)
+        first = make_round(stage, folder, None, 0, pool)
         who = "" if job.rounds == 0 else "round 0: "
         _judge(stage, f"{who}the expert", first)
     else:
@@ -118,7 +112,7 @@ def train_clone(stage: Stage, folder: Path) -> Trained:
 
     # Rounds: in the worlds of the next one the policy of a round shows its success.
     parts = [first]
-    with closing(CloneLearner(stage, first, folder)) as learner:
+    with closing(CloneLearner(stage, first, folder, pool)) as learner:
         if earlier:
             learner.restore(*earlier)
         if not job.rounds:
@@ -126,7 +120,7 @@ def train_clone(stage: Stage, folder: Path) -> Trained:
         for number in range(1, job.rounds + 1):
             learner.process(Demonstrations.join(parts))
             learner.learn((number - 1) * job.batches, number * job.batches)
-            part = make_round(stage, folder, learner.policy, number)
+            part = make_round(stage, folder, learner.policy, number, pool)
             parts.append(part)
             figures = _judge(stage, f"round {number}: the policy alone", part)
             if len(learner.curve) < number:

@@ -1,11 +1,10 @@
-"""The learner of trainers *clone*, *dagger* and *pixels*: fits a network to demonstrations, and
+"""The learner of trainers *clone* and *dagger*: fits a network to demonstrations, and
 goes on where it was stopped.
 """
 
 import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -48,9 +47,10 @@ class CloneLearner(Learner):
         stage: Stage,
         demonstrations: Demonstrations,
         folder: Path,
+        pool: ImagePool | None = None,
     ) -> None:
         """Make the network with the scale of the first demonstrations; the folder gets policies
-        and state.
+        and state, and the pool has the images, if it sees any.
         """
         cfg = with_observation(stage.cfg)
         self._job = job = cast(CloneJobCfg, cfg.job)
@@ -59,6 +59,7 @@ class CloneLearner(Learner):
         ranks = stage.ranks
         device = demonstrations.seen.device
         size = max(1, job.batch_size // ranks.size)
+        self._pool = pool
 
         # The network, its average and its optimizer
         self._network = make_network(cfg, demonstrations, ranks).to(device)
@@ -78,19 +79,7 @@ class CloneLearner(Learner):
         self._noise = torch.zeros((size, self._seen.shape[1]), device=device)
         self._widest = input_noise(cfg, stage.model, demonstrations.widths).to(device)
         self._generator = torch.Generator(device)
-        # Images: a pool for training, and one for validation
-        self._pools: list[ImagePool] = []
-        vision = self._network.vision
-        if vision.sizes:
-            seed = draw_seed(cfg.seed, ranks.rank, 0)
-            stride = -(-len(self._validation) // _VALIDATED_IMAGES)
-            self._validation = self._validation[::stride]
-            whole = replace(job.vision, pool=len(self._validation))
-            self._pools = [
-                ImagePool(stage, settings, vision, demonstrations, steps, size, seed)
-                for settings, steps in ((job.vision, self._training), (whole, self._validation))
-            ]
-            self._augment = Augmentation(job.vision, len(vision.sizes), size, device)
+        self._augment = Augmentation(job.vision, len(job.vision.cameras), size, device)
         seen = cfg.observation[job.group]
         facts = (demonstrations.widths, job.execute, config_content(cfg), cfg.controller.action)
         self.policy = Policy(self._average, job.group, seen, *facts)
@@ -120,16 +109,19 @@ class CloneLearner(Learner):
         self._labels = demonstrations.labels
         episode = demonstrations.episode()
         self._last = demonstrations.ends[episode] - 1  # steps of their episodes
+        # Steps to learn from: those that the pool shows, or all; and their rows in the pool
+        if self._pool is None:
+            rows = steps = demonstrations.usable(self._job)
+        else:
+            rows = self._pool.rows()
+            steps = self._pool.steps[rows]
         share = min(_VALIDATION_SHARE, len(demonstrations.ends))
-        validates = episode % _VALIDATION_SHARE == share - 1
-        # A chunk is the expert's way only where it drove all steps but the last one.
-        usable = torch.ones_like(validates)
-        if (driven := demonstrations.driven) is not None:
-            steps = torch.arange(len(driven), device=driven.device)
-            for ahead in range(self._job.chunk - 1):
-                usable &= driven[torch.minimum(steps + ahead, self._last)].bool()
-        self._training = (usable & ~validates).nonzero()[:, 0]
-        self._validation = (usable & validates).nonzero()[:, 0]
+        validates = episode[steps] % _VALIDATION_SHARE == share - 1
+        self._training = steps[~validates]
+        self._rows = rows[~validates]
+        stride = -(-int(validates.sum()) // _VALIDATED_IMAGES) if self._pool else 1
+        self._validation = steps[validates][:: max(1, stride)]
+        self._validation_rows = rows[validates][:: max(1, stride)]
         if not len(self._validation):  # of few episodes the expert may drive no chunk that is one
             self._validation = self._training
 
@@ -142,8 +134,6 @@ class CloneLearner(Learner):
         """
         self._first = first
         self._total = self._job.batches if total is None else total
-        for pool in self._pools:
-            pool.fill(self.done - 1)
         self._batch = self._fit
         if self._seen.is_cuda and self._ranks.size == 1:
             # Demonstrations and weights stay where they are in memory until the last batch.
@@ -157,8 +147,6 @@ class CloneLearner(Learner):
             super().learn()
         finally:
             torch.set_float32_matmul_precision(precision)
-            for pool in self._pools:
-                pool.close()
 
     def _over(self) -> bool:
         return self.done >= self._total
@@ -174,12 +162,11 @@ class CloneLearner(Learner):
         rate = 0.5 * (1.0 + math.cos(math.pi * share))
         seed = draw_seed(self._cfg.seed, self._ranks.rank, self.done)
         self._generator.manual_seed(seed)
-        count = len(self._steps)
+        count = len(self._training)
         torch.randint(count, self._chosen.shape, generator=self._generator, out=self._chosen)
         self._noise.uniform_(-1.0, 1.0, generator=self._generator)
-        for pool in self._pools[:1]:
+        if self._pool is not None:
             self._augment.draw(self._generator)
-            pool.advance(self.done)
         # The first networks do not count for long.
         share_kept = min(self._job.averaging, (1.0 + self.done) / (10.0 + self.done))
         self._replaced.fill_(1.0 - share_kept)
@@ -190,8 +177,10 @@ class CloneLearner(Learner):
     def _fit(self) -> None:
         """Learn from the drawn steps."""
         weights = list(self._network.parameters())
-        images = self._augment(self._pools[0].images, self._chosen) if self._pools else ()
-        steps = self._steps[self._chosen]
+        steps = self._training[self._chosen]
+        images: Sequence[Tensor] = ()
+        if self._pool is not None:
+            images = self._augment(self._pool.images, self._rows[self._chosen])
         loss = self._loss(self._network, steps, images, self._widest * self._noise)
         # Into memory that is laid out as the weights, which the fused optimizer asks for
         for weight, gradient in zip(weights, torch.autograd.grad(loss, weights), strict=True):
@@ -232,22 +221,16 @@ class CloneLearner(Learner):
             action = network.normalized(self._seen[steps] + noise, images)
         return _LOSSES[self._job.loss](action.float(), target)
 
-    @property
-    def _steps(self) -> Tensor:
-        """Steps that batches are drawn from: those whose images there are, or all of training."""
-        return self._pools[0].steps if self._pools else self._training
-
     @torch.no_grad()
     def _validate(self) -> float:
         """The average network's loss in the episodes that are held out."""
         losses = []
-        pools = self._pools[1:]
-        size = len(self._chosen) if pools else _VALIDATED
-        for first in range(0, len(self._validation), size):
-            rows = slice(first, first + size)
-            images = [image[rows].float() for pool in pools for image in pool.images]
-            part = self._validation[rows]
-            losses.append(self._loss(self._average, part, images) * len(part))
+        stored = self._pool.images if self._pool is not None else ()
+        size = len(self._chosen) if stored else _VALIDATED
+        parts = self._validation.split(size), self._validation_rows.split(size)
+        for steps, rows in zip(*parts, strict=True):
+            images = [image[rows].float() for image in stored]
+            losses.append(self._loss(self._average, steps, images) * len(steps))
         total = torch.stack(losses).sum()
         count = torch.full_like(total, len(self._validation))
         self._ranks.sum_(total, count)
@@ -291,7 +274,9 @@ class CloneLearner(Learner):
 
     @override
     def facts(self) -> dict[str, Any]:
-        return super().facts() | {"made_with": made_with(self._stage), "expert": self._expert}
+        pool = {} if self._pool is None else {"pool": len(self._pool.steps)}
+        made = {"made_with": made_with(self._stage), "expert": self._expert}
+        return super().facts() | made | pool
 
 
 def draw_seed(seed: int, rank: int, batch: int) -> int:

@@ -5,13 +5,17 @@ expert has given.
 import itertools
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from typing import cast
 
 import torch
 from torch import Tensor
 
 from mjstack.config.schema import CloneJobCfg
 from mjstack.episodes.batches import Batch
+from mjstack.episodes.stage import Stage
+from mjstack.train.images import AT_ONCE, ImagePool
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -31,8 +35,8 @@ class Demonstrations:
         broken: How many of these broke a rule of the check, by the rule's name.
         seconds: Time in which they were played or read [s].
         source: Where they come from, in words.
-        qpos: Positions before each step, from which images are drawn, shape ``(steps of all
-            episodes, nq)``, float32; None where there are none.
+        qpos: Positions before each step, from which images can be rendered, shape ``(steps of all
+            episodes, nq)``, in the backend's precision; None where there are no images.
         fields: Model fields of the episodes' worlds by name, each ``(episodes, ...)``.
     """
 
@@ -51,22 +55,34 @@ class Demonstrations:
     fields: Mapping[str, Tensor] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, batch: Batch, worlds: Tensor, job: CloneJobCfg) -> "Demonstrations":
-        """Those of a batch's worlds with these numbers."""
-        rows = {name: batch.select(name, worlds) for name in batch.rows}
-        labels = rows.pop("label")
-        steps = labels.shape[1]
-        before = {name: values[:, :steps].flatten(0, 1) for name, values in rows.items()}
-        fields = batch.env.sim.fields if job.vision.cameras else {}
-        return cls(
-            seen=before["observation"],
-            labels=labels.flatten(0, 1),
+    def of(
+        cls, batch: Batch, worlds: Tensor, job: CloneJobCfg, pool: ImagePool | None
+    ) -> "Demonstrations":
+        """Those of a batch's worlds with these numbers; the pool gets their images."""
+        rows = batch.rows
+        steps = len(rows["label"])
+
+        def before(name: str) -> Tensor:
+            return batch.select(name, worlds)[:, :steps].flatten(0, 1)
+
+        part = cls(
+            seen=before("observation"),
+            labels=before("label"),
             ends=steps * torch.arange(1, len(worlds) + 1, device=worlds.device),
             widths=batch.env.observation_manager.term_dims[job.group],
-            driven=before.get("driven"),
-            qpos=before.get("qpos"),
-            fields={name: fields[name][worlds] for name in fields},
+            driven=before("driven"),
         )
+        if pool is None:
+            return part
+
+        def read(step: Tensor) -> Mapping[str, Tensor]:
+            query = step % steps // job.execute
+            world = worlds[step // steps]
+            return {name: rows[name][query, world] for name in job.vision.cameras}
+
+        pool.add(part.usable(job), len(part.seen), read)
+        fields = {name: values[worlds] for name, values in batch.env.sim.fields.items()}
+        return replace(part, qpos=before("qpos"), fields=fields)
 
     @classmethod
     def join(cls, parts: Sequence["Demonstrations"]) -> "Demonstrations":
@@ -96,3 +112,33 @@ class Demonstrations:
         """The episode that each step belongs to, shape ``(steps,)``, int64."""
         lengths = self.ends.diff(prepend=self.ends.new_zeros(1))
         return torch.arange(len(lengths), device=lengths.device).repeat_interleave(lengths)
+
+    def usable(self, job: CloneJobCfg) -> Tensor:
+        """Steps to learn from, ascending, shape ``(n,)``, int64: the expert drove all steps of the
+        chunk but the last one, and a policy that sees images is queried there.
+        """
+        episode = self.episode()
+        first = torch.cat([self.ends.new_zeros(1), self.ends[:-1]])[episode]
+        last = self.ends[episode] - 1
+        steps = torch.arange(len(last), device=last.device)
+        usable = (steps - first) % (job.execute if job.vision.cameras else 1) == 0
+        if self.driven is not None:
+            for ahead in range(job.chunk - 1):
+                usable &= self.driven[torch.minimum(steps + ahead, last)].bool()
+        return usable.nonzero()[:, 0]
+
+    def render(self, stage: Stage, pool: ImagePool) -> None:
+        """Give the pool the images that it got when these episodes were played."""
+        job = cast(CloneJobCfg, stage.cfg.job)
+        episode = self.episode()
+        names = job.vision.cameras
+        renderer = stage.color_renderer(min(AT_ONCE, len(episode)), list(self.fields), names)
+
+        def read(step: Tensor) -> Mapping[str, Tensor]:
+            assert self.qpos is not None
+            fields = {name: values[episode[step]] for name, values in self.fields.items()}
+            images = renderer.draw(self.qpos[step], fields)
+            return {name: images[f"images.{name}"] for name in names}
+
+        with closing(renderer):
+            pool.add(self.usable(job), len(episode), read)

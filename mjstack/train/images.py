@@ -1,116 +1,103 @@
-"""Images that a policy learns from: drawn from the positions of demonstrations as they are needed,
-on the device.
+"""Images that a policy learns from: those of its own rounds, as they were rendered in them, on the
+device.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import cast
 
 import torch
 from torch import Tensor
 
-from mjstack.config.schema import VisionCfg
+from mjstack.config.schema import CloneJobCfg, VisionCfg
 from mjstack.episodes.stage import Stage
-from mjstack.managers.episode import required_fields
-from mjstack.policy import Vision
-from mjstack.train.demonstrations import Demonstrations
+from mjstack.errors import ConfigError
+from mjstack.sim.memory import free_memory
 
-_FIRST_SEED = 2**40  # from which on nothing else has seeds
-_AT_ONCE = 2048  # states that are drawn at most, where more are needed
+AT_ONCE = 2048  # states that are rendered, or images that are copied, at once
+_GOLDEN = 2654435769  # of 2**32: multiples of it are spread evenly
+_PERIOD = 2**32
+
+ReadImages = Callable[[Tensor], Mapping[str, Tensor]]
+"""Gives images of n steps by camera, each ``(n, height, width, 3)``."""
 
 
 class ImagePool:
-    """Images of some steps of demonstrations, of which the oldest give way to new ones.
+    """Images of all steps while they fit, else of an even share of them.
 
-    The content follows from the seed and the number of the batch alone, so training goes on after
-    any batch. If all steps fit, each is drawn once and stays.
+    A step's number alone decides how long it is kept, so the content depends neither on the order
+    in which steps came nor on how many came at once.
 
     Attributes:
-        steps: The step that each row shows, shape ``(rows,)``, int64.
+        steps: The step that each row shows, counted from the first call of `add` on, shape
+            ``(rows,)``, int64; -1 where there is none yet.
         images: Images of those steps, one for each camera, each ``(rows, height, width, 3)``,
             uint8.
     """
 
     def __init__(
-        self,
-        stage: Stage,
-        settings: VisionCfg,
-        vision: Vision,
-        demonstrations: Demonstrations,
-        steps: Tensor,
-        batch_size: int,
-        seed: int,
+        self, sizes: Mapping[str, Sequence[int]], rows: int, device: torch.device | str
     ) -> None:
-        """Allocate.
-
-        Args:
-            stage: The stage, for its scene and its device.
-            settings: How many images are kept, and how often each is used.
-            vision: The images that the policy sees.
-            demonstrations: The episodes.
-            steps: Those of their steps that are drawn, shape ``(n,)``, int64.
-            batch_size: Steps of a batch.
-            seed: Of the choice of steps.
-
-        Raises:
-            MjstackError: The images do not fit into memory.
-        """
-        assert demonstrations.qpos is not None
-        self._qpos = demonstrations.qpos
-        self._fields = demonstrations.fields
-        self._episode = demonstrations.episode()
-        self._from = steps
-        self._names = list(vision.sizes)
-        device = steps.device
-        self._whole = len(steps) <= settings.pool
-        self._fresh = max(1, batch_size // settings.uses)
-        if self._whole:
-            self._fresh = min(_AT_ONCE, len(steps))
-        rows = len(steps) if self._whole else -(-settings.pool // self._fresh) * self._fresh
-        self._count = -(-rows // self._fresh)
-        fields = required_fields(stage.cfg.reset)
-        self._renderer = stage.color_renderer(self._fresh, fields, self._names)
-        self._generator = torch.Generator(device)
-        self._seed = _FIRST_SEED + seed
-        self.steps = torch.zeros(rows, dtype=torch.int64, device=device)
+        """Allocate rows for images of these heights and widths."""
+        self._names = list(sizes)
+        self._before = 0  # steps of earlier calls
+        self.steps = torch.full((rows,), -1, dtype=torch.int64, device=device)
         self.images = [
-            torch.zeros((rows, *vision.sizes[name], 3), dtype=torch.uint8, device=device)
-            for name in self._names
+            torch.zeros((rows, *size, 3), dtype=torch.uint8, device=device)
+            for size in sizes.values()
         ]
 
-    def fill(self, batch: int) -> None:
-        """Draw what the pool has after a batch of this number."""
-        if self._whole:
-            for first in range(0, len(self.steps), self._fresh):
-                self._draw(first, self._from[first : first + self._fresh])
-        else:
-            for number in range(batch - self._count + 1, batch + 1):
-                self._draw_part(number)
+    def add(self, steps: Tensor, count: int, read: ReadImages) -> None:
+        """Keep images of some of the next ``count`` steps.
 
-    def advance(self, batch: int) -> None:
-        """Draw new images for a batch in the place of the oldest."""
-        if not self._whole:
-            self._draw_part(batch)
+        Args:
+            steps: Those that have images, counted from 0 on, shape ``(n,)``, int64.
+            count: How many steps there are, with images or not.
+            read: Gives images of some of these, shape ``(m,)``.
+        """
+        rows = len(self.steps)
+        candidates = torch.cat([self.steps, self._before + steps])
+        order = torch.where(candidates < 0, _PERIOD, candidates * _GOLDEN % _PERIOD)
+        stays = torch.zeros_like(order, dtype=torch.bool)
+        stays[order.topk(rows, largest=False).indices] = True
+        free = (~stays[:rows]).nonzero()[:, 0].split(AT_ONCE)
+        chosen = steps[stays[rows:]].split(AT_ONCE)
+        for into, part in zip(free, chosen, strict=True):
+            self.steps[into] = self._before + part
+            values = read(part)
+            for name, images in zip(self._names, self.images, strict=True):
+                images[into] = values[name]
+        self._before += count
 
-    def _draw_part(self, number: int) -> None:
-        """Draw the part of the pool that has this number."""
-        self._generator.manual_seed(self._seed + number + self._count)
-        device = self.steps.device
-        size = (self._fresh,)
-        chosen = torch.randint(len(self._from), size, generator=self._generator, device=device)
-        self._draw(number % self._count * self._fresh, self._from[chosen])
+    def rows(self) -> Tensor:
+        """Rows that show a step, in the order of these, shape ``(n,)``, int64."""
+        order = self.steps.argsort()
+        return order[self.steps[order] >= 0]
 
-    def _draw(self, first: int, steps: Tensor) -> None:
-        """Draw steps into the rows from ``first`` on."""
-        rows = slice(first, first + len(steps))
-        self.steps[rows] = steps
-        episodes = self._episode[steps]
-        fields = {name: values[episodes] for name, values in self._fields.items()}
-        rendered = self._renderer.draw(self._qpos[steps], fields)
-        for name, images in zip(self._names, self.images, strict=True):
-            images[rows] = rendered[f"images.{name}"]
 
-    def close(self) -> None:
-        """Give the worlds for drawing back."""
-        self._renderer.close()
+def pool_rows(stage: Stage, steps: int) -> int:
+    """Number of rows of the pool of a training: job.vision.pool, or as many as half of the free
+    memory has place for, and no more than there will be images.
+
+    Args:
+        stage: The stage.
+        steps: Control steps of a whole episode.
+
+    Raises:
+        ConfigError: They, or the images of one batch of worlds, do not fit into memory.
+    """
+    job = cast(CloneJobCfg, stage.cfg.job)
+    answers = math.ceil(math.ceil(job.length * steps) / job.execute)
+    cameras = stage.cfg.scene.cameras
+    size = 3 * sum(math.prod(cameras[name].size) for name in job.vision.cameras)
+    free = free_memory(torch.device(stage.backend[1]))
+    most = free // size - answers * min(stage.cfg.nworld, job.episodes)  # beside those of a batch
+    rows = most // 2 if job.vision.pool is None else job.vision.pool
+    if not 1 <= rows <= most:
+        expected = f"at most {max(0, most)}, for which the device has memory ({free / 2**30:.3g}"
+        expected += f" GiB are free; a step takes {size / 2**20:.3g} MiB), beside one of nworld"
+        raise ConfigError("job.vision.pool", job.vision.pool, expected, "Or make images smaller")
+    return min(rows, answers * job.episodes * (job.rounds + 1))
 
 
 class Augmentation:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mjstack.config.schema import CloneJobCfg
 from mjstack.drivers.driver import Driver
-from mjstack.drivers.policy import PolicyDriver
+from mjstack.drivers.policy import PolicyDriver, QueryImages
 from mjstack.envs import Env
 from mjstack.episodes.batches import BatchPlan, play_batches
 from mjstack.episodes.recorder import Channels, Read, start_and_every_step
@@ -23,9 +23,12 @@ from mjstack.managers.view import random_uniform
 from mjstack.policy import Policy
 from mjstack.policy.checkpoint import write_state
 from mjstack.train.demonstrations import Demonstrations
+from mjstack.train.images import ImagePool
 from mjstack.train.trainer import earlier_state, made_with, training_config
 
-_TENSORS = ("seen", "labels", "ends", "driven")  # of `Demonstrations`, in the file of a round
+# Of `Demonstrations`, in the file of a round
+_TENSORS = ("seen", "labels", "ends", "driven", "qpos")
+_FIELD = "field."  # before the name of a model field
 _FACTS = ("widths", "played", "judged", "succeeded", "broken", "seconds", "source")
 
 
@@ -36,13 +39,15 @@ class MixedDriver(Driver):
     Attributes:
         label: The expert's joint targets of the last step, shape ``(nworld, nu)``.
         driven: Where the expert drives this step, shape ``(nworld,)``, int8.
+        query_images: The policy's images.
     """
 
     def __init__(
         self,
         expert: Driver,
-        policy: Driver | None,
+        policy: PolicyDriver | None,
         env: Env,
+        images: QueryImages,
         *,
         beta: float,
         alone: int,
@@ -55,6 +60,7 @@ class MixedDriver(Driver):
             expert: Answers in every state.
             policy: None where the expert drives alone.
             env: The environment.
+            images: Those of the policy, or of one that would see them.
             beta: Share of the time in which the expert drives.
             alone: Number of worlds, the first ones, in which the policy drives alone.
             spell: Control steps for which one of them drives before it is drawn anew.
@@ -70,6 +76,7 @@ class MixedDriver(Driver):
         self._policy = policy
         self._beta = beta
         self._spell = spell
+        self.query_images = images
         self.label = torch.zeros((env.nworld, len(env.index.ctrl)), device=env.device)
         self.driven = torch.ones(env.nworld, dtype=torch.int8, device=env.device)
         self._alone = env.world < alone
@@ -78,6 +85,7 @@ class MixedDriver(Driver):
         """Joint targets of the next step, shape ``(nworld, nu)``."""
         self.label.copy_(self._expert.command())
         if self._policy is None:
+            self.query_images.draw()
             return self.label
         action = self._policy.command()
         spell = torch.div(self._env.episode_step, self._spell, rounding_mode="floor")
@@ -88,8 +96,8 @@ class MixedDriver(Driver):
 
 
 def _channels(job: CloneJobCfg) -> Sequence[Channels]:
-    """What is recorded of an episode: observations before each step, positions too where images are
-    rendered from them, the labels, and who drove.
+    """What is recorded of an episode: observations before each step, labels, and who drove; for a
+    policy that sees images also positions, and the images of the steps in which it is queried.
     """
 
     def read_before(env: Env, driver: Driver) -> Read:
@@ -97,13 +105,21 @@ def _channels(job: CloneJobCfg) -> Sequence[Channels]:
         if not job.vision.cameras:
             return lambda: {"observation": observations}
         qpos = env.sim.qpos
-        return lambda: {"observation": observations, "qpos": qpos.float()}
+        return lambda: {"observation": observations, "qpos": qpos}
 
     def read_answer(env: Env, driver: Driver) -> Read:
         mixed = cast(MixedDriver, driver)
         return lambda: {"label": mixed.label, "driven": mixed.driven}
 
-    return [Channels(read_before, start_and_every_step), Channels(read_answer)]
+    def read_images(env: Env, driver: Driver) -> Read:
+        images = cast(MixedDriver, driver).query_images.images
+        return lambda: images
+
+    return [
+        Channels(read_before, start_and_every_step),
+        Channels(read_answer),
+        Channels(read_images, lambda steps: range(1, steps + 1, job.execute)),
+    ]
 
 
 def round_file(number: int, rank: int) -> str:
@@ -111,7 +127,13 @@ def round_file(number: int, rank: int) -> str:
     return f"round-{number}-{rank}.safetensors"
 
 
-def make_round(stage: Stage, folder: Path, policy: Policy | None, number: int) -> Demonstrations:
+def make_round(
+    stage: Stage,
+    folder: Path,
+    policy: Policy | None,
+    number: int,
+    pool: ImagePool | None = None,
+) -> Demonstrations:
     """Play a round, or read it where an earlier call has played it in every rank. Each rank keeps
     its own part.
 
@@ -120,29 +142,39 @@ def make_round(stage: Stage, folder: Path, policy: Policy | None, number: int) -
         folder: That of the training, in which rounds are kept.
         policy: The policy so far; None: the expert drives alone.
         number: Of the round; 0 is the expert's.
+        pool: Gets the round's images, which no file has.
 
     Raises:
         FolderError: It was played on another kind of device or in another number of ranks.
     """
     job = cast(CloneJobCfg, stage.cfg.job)
     if not job.rounds:
-        return _play_round(stage, policy, number)
+        return _play_round(stage, policy, number, pool)
     ranks = stage.ranks
     name = round_file(number, ranks.rank)
-    if ranks.any(not (folder / name).exists()):
-        played = _play_round(stage, policy, number)
-        tensors = {key: getattr(played, key) for key in _TENSORS}
+    plays = ranks.any(not (folder / name).exists())
+    if plays:
+        played = _play_round(stage, policy, number, pool)
+        tensors = {key: part for key in _TENSORS if (part := getattr(played, key)) is not None}
+        tensors |= {f"{_FIELD}{key}": values for key, values in played.fields.items()}
         facts = {fact: getattr(played, fact) for fact in _FACTS}
         write_state(folder / name, tensors, facts | {"made_with": made_with(stage)})
     state = earlier_state(stage, folder, name)
     assert state is not None
     tensors, facts = state
     del facts["made_with"]
-    values: dict[str, Any] = {key: tensors[key].to(stage.backend[1]) for key in _TENSORS}
-    return Demonstrations(**values, **facts)
+    values: dict[str, Any] = {key: part.to(stage.backend[1]) for key, part in tensors.items()}
+    names = [key for key in values if key.startswith(_FIELD)]
+    fields = {key.removeprefix(_FIELD): values.pop(key) for key in names}
+    episodes = Demonstrations(**values, **facts, fields=fields)
+    if pool is not None and not plays:
+        episodes.render(stage, pool)
+    return episodes
 
 
-def _play_round(stage: Stage, policy: Policy | None, number: int) -> Demonstrations:
+def _play_round(
+    stage: Stage, policy: Policy | None, number: int, pool: ImagePool | None
+) -> Demonstrations:
     """Play a round, each rank in its worlds. Episodes that are not finite are left out; without
     rounds those that the task's check does not accept, too.
     """
@@ -158,12 +190,21 @@ def _play_round(stage: Stage, policy: Policy | None, number: int) -> Demonstrati
     first = cfg.seed + number * batches
 
     def drive(plan: BatchPlan, env: Env) -> Driver:
-        learner = PolicyDriver(env, policy) if policy else None
+        cameras = cfg.scene.cameras
+        learner = PolicyDriver(env, policy, cameras) if policy else None
+        names = () if learner else job.vision.cameras
+        images = QueryImages(env, cameras, names, job.execute)
         # Whole answers: the policy takes over where it is queried.
         spell = job.execute * max(1, round(job.spell / env.cfg.timing.step_dt / job.execute))
-        expert = stage.driver(env)
         return MixedDriver(
-            expert, learner, env, beta=beta, alone=alone, spell=spell, length=job.length
+            stage.driver(env),
+            learner,
+            env,
+            learner.query_images if learner else images,
+            beta=beta,
+            alone=alone,
+            spell=spell,
+            length=job.length,
         )
 
     parts = []
@@ -184,7 +225,7 @@ def _play_round(stage: Stage, policy: Policy | None, number: int) -> Demonstrati
         failing = stage.check.rules.failing(batch.episode.failed[judged.cpu().numpy()])
         parts.append(
             replace(
-                Demonstrations.of(batch, usable.nonzero()[:, 0], job),
+                Demonstrations.of(batch, usable.nonzero()[:, 0], job, pool),
                 played=int(counted.sum()),
                 judged=int(judged.sum()),
                 succeeded=int((judged & batch.succeeded).sum()),

@@ -92,11 +92,9 @@ class VisionCfg:
     """Largest shift of an image in training, up, down and to the sides."""
     color: float = spec(0.2, ge=0.0, le=1.0)
     """Largest change of brightness and of each colour in training, as a share."""
-    pool: int = spec(131072, unit="steps", ge=1)
-    """Steps whose images are kept on the device. Batches are drawn from these."""
-    uses: int = spec(4, unit="batches", ge=1)
-    """How often an image is in a batch, on average, before another one is drawn in its place. If
-    all steps fit into the pool, each is drawn once."""
+    pool: int | None = spec(None, unit="steps", ge=1)
+    """Steps whose images are kept on the device, of all rounds; null: as many as half of its free
+    memory has place for."""
 
 
 @dataclass(slots=True)
