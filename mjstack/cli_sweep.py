@@ -52,7 +52,7 @@ def check_jobs(
     placed: list[SweepJob] = []
     numbers: dict[Path, int] = {}
     for number, job in enumerate(jobs):
-        cfg = compose([*of_hydra, _sweep_dir(folder), *job])
+        cfg = compose([*of_hydra, f"hydra.sweep.dir={quoted(folder)}", *job])
         if cfg.devices is not None:
             fix = "Leave it out: with hydra/launcher=gpus each job has one GPU"
             raise ConfigError("devices", cfg.devices, "null with -m", fix)
@@ -88,10 +88,6 @@ def _launcher(master: DictConfig) -> str:
     return str(OmegaConf.select(master, "hydra.launcher._target_"))
 
 
-def _sweep_dir(folder: Path) -> str:
-    return f"hydra.sweep.dir={quoted(folder)}"
-
-
 @contextmanager
 def claim_sweep(master: DictConfig, jobs: Sequence["SweepJob"]) -> Iterator[Path]:
     """A sweep's folder, with the list of its jobs: a new one by the hour, or one in which the same
@@ -110,7 +106,7 @@ def claim_sweep(master: DictConfig, jobs: Sequence["SweepJob"]) -> Iterator[Path
     key = "hydra.sweep.dir"
     with claim_folder(folder, marker=marker, numbered=hourly, shared=queued, key=key) as claimed:
         master.hydra.sweep.dir = str(claimed)
-        master.hydra.overrides.hydra.append(_sweep_dir(claimed))  # of its jobs
+        master.hydra.overrides.hydra.append(f"hydra.sweep.dir={quoted(claimed)}")  # of its jobs
         names = (os.path.relpath(job.folder, folder) for job in jobs)
         paths = (Path(os.path.normpath(claimed / name)) for name in names)
         moved = [replace(job, folder=path) for job, path in zip(jobs, paths, strict=True)]

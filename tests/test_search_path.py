@@ -184,7 +184,7 @@ def test_a_bad_folder_is_refused(lean: Path, refused: Callable[..., str]) -> Non
     assert missing.startswith("mjstack: task=lean: 'lean' does not exist. Available: ")
     assert missing.endswith(" A choice of your own needs --config-dir DIR.")
     assert "no such folder" in refused("--config-dir", "nowhere")
-    assert "expected a list" in refused("hydra.searchpath=3")
+    assert "no such folder" in refused("hydra.searchpath=3")
     shutil.copy(lean / "task" / "lean.yaml", lean / "task" / "box.yaml")
     assert "task/box.yaml is mjstack's own" in refused("--config-dir", str(lean))
 

@@ -106,9 +106,9 @@ def _unknown_choice(path: str, options: Sequence[str] | None) -> MjstackError:
     group, _, name = path.rpartition("/")
     # Of a list of choices Hydra names none.
     unknown = UnknownName(f"{group}={name}:", name, options or list_choices().get(group, []))
-    searched = config_folders() or group.startswith("hydra/")
-    hint = "" if searched else " A choice of your own needs --config-dir DIR."
-    return MjstackError(f"{unknown}{hint}")
+    if config_folders() or group.startswith("hydra/"):
+        return unknown
+    return MjstackError(f"{unknown} A choice of your own needs --config-dir DIR.")
 
 
 def _explain(error: Exception, overrides: Sequence[str]) -> MjstackError:

@@ -108,11 +108,7 @@ def extended_search_path(
     remaining = [o for o in overrides if not o.lstrip("+").startswith("hydra.searchpath=")]
     for override in [override for override in overrides if override not in remaining]:
         value = parse(override).value()
-        if not isinstance(value, list):
-            raise MjstackError(
-                f"{override}: expected a list, such as 'hydra.searchpath=[file://DIR]'."
-            )
-        entries += map(str, value)
+        entries += map(str, value if isinstance(value, list) else [value])
     with search_path(entries):
         yield [*remaining, *_policy_choices(remaining)]
 

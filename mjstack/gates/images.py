@@ -101,8 +101,7 @@ def compare_images(
         a, b = (images[f"images.{name}"][camera.worst].astype(int) for images in (native, mjwarp))
         difference = np.minimum(np.abs(a - b) * _AMPLIFIED, 255)
         rows[f"{name}, state {camera.worst}"] = [a, b, difference]
-    columns = ["native MuJoCo", "MJWarp", f"difference x {_AMPLIFIED}"]
-    draw(PICTURE, save_images, rows, columns)
+    draw(PICTURE, save_images, rows, ["native MuJoCo", "MJWarp", f"difference x {_AMPLIFIED}"])
     result.thresholds |= {
         "images.same_thing": limits.image_same,
         "images.iou": limits.image_iou,
@@ -154,10 +153,10 @@ def _report(stage: Stage, result: GateResult, agreements: dict[str, Agreement]) 
             f"depths differ by {camera.depth:.2g} m": camera.depth <= limits.image_depth,
         }
         problems += [f"camera {name}: {text}" for text, passes in verdicts.items() if not passes]
-    things = dict.fromkeys(thing for camera in agreements.values() for thing in camera.iou)
     ious = [camera.iou for camera in agreements.values()]
     rows = [
-        [thing, *(f"{iou[thing]:.4f}" if thing in iou else "-" for iou in ious)] for thing in things
+        [thing, *(f"{iou[thing]:.4f}" if thing in iou else "-" for iou in ious)]
+        for thing in dict.fromkeys(thing for iou in ious for thing in iou)
     ]
     title = "Images of both backends: intersection over union of each thing"
     result.tables.append(Table(header=["thing", *agreements], rows=rows, title=title))

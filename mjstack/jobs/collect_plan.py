@@ -13,7 +13,6 @@ from typing import Any, cast
 import mujoco
 import torch
 
-from mjstack.config.check import places_objects
 from mjstack.config.fingerprint import WITHOUT_EFFECT, config_content, config_hash, differences
 from mjstack.config.functions import offered
 from mjstack.config.schema import Backend, CollectJobCfg, Config, ObservationTermCfg
@@ -27,7 +26,7 @@ from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, FolderError
 from mjstack.files import lock_folder, reading
 from mjstack.jobs.runner import run_provenance
-from mjstack.mdp.starts.placement import GAP, SCHEMA, may_meet
+from mjstack.mdp.starts.placement import SCHEMA
 from mjstack.sim import resolve_backend
 
 NAME = "collect"
@@ -201,10 +200,7 @@ def episode_config(cfg: Config) -> dict[str, Any]:
         config["job"]["units"] = job.units
     if cfg.scene.cameras:
         config["job"]["codec"] = job.codec
-    placed = [term.params for term in cfg.reset.values() if places_objects(term)]
-    if any(may_meet(cfg.scene, params["xy"], params.get("gap", GAP)) for params in placed):
-        config["starts_schema"] = SCHEMA  # the others are drawn as ever
-    return config
+    return config | {"starts_schema": SCHEMA}
 
 
 def make_spec(env: Env, cfg: Config, provenance: Mapping[str, Any]) -> DatasetSpec:

@@ -123,7 +123,7 @@ def _compare(sides: Sides, notes: Mapping[str, str], folder: Path, run: Run) -> 
     p_value = mcnemar_p_value(counts["a"], counts["b"])
     verdict = "no difference is shown"
     if p_value < _LEVEL:
-        verdict = f"{max(counts, key=lambda name: counts[name])} is better"
+        verdict = f"{'a' if counts['a'] > counts['b'] else 'b'} is better"
     bars = []
     for name, rate in rates.items():
         ends = {f"success_rate_{end}": rate[f"success_rate_{at}95"] for end, at in _ENDS.items()}

@@ -10,13 +10,12 @@ import numpy as np
 
 from mjstack.config.schema import Backend, Config, SimCfg
 from mjstack.envs import driven_config
-from mjstack.episodes.earlier_run import EarlierRun, archived_starts, copy_names
+from mjstack.episodes.earlier_run import EarlierRun, archived_starts
 from mjstack.episodes.record import STEMS, EpisodeRecord
 from mjstack.episodes.replay import simulate_alone
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, DeviceError, FolderError
 from mjstack.gates.success import success_config
-from mjstack.mdp.starts.placement import SCHEMA
 from mjstack.sim import resolve_backend, resolve_device
 
 # [m, rad], and of quaternions: backends differ by rounding, another start by more
@@ -155,14 +154,8 @@ def check_start(plan: ReplayPlan) -> None:
             off = float(np.abs(start - recorded).max()) if same else math.inf
         if off <= _SAME_START:
             return
-    copies = ", ".join(copy_names(plan.run.cfg).values())
-    provenance = plan.run.provenance
-    fix = f"Use mjstack at {provenance.get('git_commit')}"
-    if copies:
-        fix = f"Put back what it started from, as {copies}"
-    elif (schema := provenance.get("starts_schema", 1)) != SCHEMA:
-        fix = f"Random starts are drawn otherwise now (schema {SCHEMA}, not {schema}). {fix}"
     raise FolderError(
         f"run={plan.run.folder}: world {plan.world} of seed {plan.seed} would start up to {off:.3g}"
-        f" (m, rad) from where it did, expected its own start. {fix}."
+        " (m, rad) from where it did, expected its own start",
+        f"Use mjstack at {plan.run.provenance.get('git_commit')}",
     )

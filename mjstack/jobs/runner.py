@@ -139,7 +139,7 @@ class CheckedJob:
     def _do(self, report: Report, page: Page, console: Console) -> None:
         """Do the work, and draw what it has left."""
         folder = report.folder
-        where = f"{escape(self.title)} -> {escape(str(folder))}"
+        where = escape(f"{self.title} -> {folder}")
         console.print(f"[bold]{escape(self.stage.cfg.robot.title)}[/], {where}")
         report.provenance = run_provenance(self.stage)
         if self.earlier:

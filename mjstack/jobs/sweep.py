@@ -16,6 +16,7 @@ from mjstack.config import spec
 from mjstack.config.complete import typed
 from mjstack.config.session import quoted, search_path_args
 from mjstack.errors import ConfigError
+from mjstack.files import move_aside
 from mjstack.interrupt import interrupted
 from mjstack.jobs.sweep_folder import LOG, SweepJob, add_jobs, lock_file
 from mjstack.process import POLL, Child, stop_all
@@ -130,8 +131,12 @@ def run_jobs(
         FolderError: The folder has the jobs of another sweep.
         KeyboardInterrupt: The command was interrupted; so were its jobs.
     """
-    queue = _Queue(jobs, queueing or Queueing())
+    queueing = queueing or Queueing()
+    queue = _Queue(jobs, queueing)
     add_jobs(folder, jobs)
+    for job in jobs if queueing.retry else ():
+        if (done := job.result()) is not None and done.status is Status.failed:
+            move_aside(job.folder)
     try:
         while len(queue.reports) < len(jobs):
             count = len(queue.reports)
@@ -164,11 +169,6 @@ class _Queue:
         self._slots = queueing.slots()
         self._limit = math.inf if queueing.minutes is None else 60.0 * queueing.minutes
         self._elsewhere: set[int] = set()  # printed that another command runs them
-        self._failed = {  # and are repeated
-            job.number
-            for job in jobs
-            if queueing.retry and (done := job.result()) and done.status is Status.failed
-        }
         self._print = Console(highlight=False, soft_wrap=True, markup=False).print
 
     def collect(self) -> None:
@@ -189,7 +189,7 @@ class _Queue:
     def begin(self) -> None:
         """Start waiting jobs as long as there are slots, and take results that are there."""
         for job in list(self._waiting):
-            if job.number not in self._failed and (done := job.result()) is not None:
+            if (done := job.result()) is not None:
                 self._print(f"job {job.number}: {done.status}, done before")
                 self.reports[job.number] = done
                 self._waiting.remove(job)
@@ -200,23 +200,21 @@ class _Queue:
 
     def _start(self, job: SweepJob, slot: Slot) -> bool:
         """Start a job, unless another command has it; return whether the slot could be had."""
-        anew = job.number in self._failed
         with ExitStack() as locks:
             if (log := lock_file(job.folder / LOG)) is None:
                 if job.number not in self._elsewhere:
                     self._elsewhere.add(job.number)
                     self._print(f"job {job.number}: another command is running it")
-                self._failed.discard(job.number)
                 return True
             locks.enter_context(log)
-            if not anew and job.result() is not None:  # just ended elsewhere
+            if job.result() is not None:  # just ended elsewhere
                 return True
             if slot.lock is not None:
                 if (gpu := lock_file(slot.lock)) is None:  # another sweep's
                     self._slots.append(self._slots.pop(self._slots.index(slot)))
                     return False
                 locks.enter_context(gpu)
-            key = "resume" if job.set_aside(anew=anew) else "hydra.run.dir"
+            key = "resume" if job.set_aside() else "hydra.run.dir"
             args = [*job.overrides, f"{key}={quoted(job.folder)}", *search_path_args()]
             logged = log.tell()
             child = Child(args, log, env=slot.env, cores=slot.cores)

@@ -35,13 +35,12 @@ class SweepJob:
         report = self.report()
         return report if report is not None and report.status in _ENDED else None
 
-    def set_aside(self, *, anew: bool = False) -> bool:
+    def set_aside(self) -> bool:
         """Make room for a run: move what an earlier one has left into a folder beside this one,
-        unless the job goes on with it and shall not begin anew. Return whether the job goes on
-        where ``resume`` says so.
+        unless the job goes on with it. Return whether the job goes on where ``resume`` says so.
         """
         earlier = self.report()  # without one, the run refuses other files
-        if earlier is not None and (anew or not earlier.resumes):
+        if earlier is not None and not earlier.resumes:
             move_aside(self.folder)
             return False
         return earlier is not None and earlier.resumes == "gates"

@@ -27,12 +27,10 @@ from mjstack.jobs.showing import check_showing
 from mjstack.report.picture import save_curves
 from mjstack.report.record import GateResult, Status
 from mjstack.report.table import Table
-from mjstack.report.text import label
 from mjstack.train.trainer import FAILED, LAST, Trainer, whole_starts
 
 NAME = "train"
 CONFIG = "training.json"  # the configuration of the training in the folder
-_TIMES = ("expert_s", "training_s")  # metrics of a training: parts of its time
 _ENDS = ("low", "high")  # of an interval
 # Keys of the job; changing one of these changes no training.
 _WITHOUT_EFFECT = ("folder", "test_seed", "iterations", "minutes", "max_minutes")
@@ -99,13 +97,7 @@ def _run(trainer: Trainer, run: Run, folder: Path) -> None:
         write_atomic(folder / CONFIG, json.dumps(training_config(run.cfg), indent=1) + "\n")
     run_guarded(run, NAME, partial(_train, trainer, folder), "worlds")
     if run.artifacts.results[NAME].status is Status.passed:
-        judged = run.on(judged_stage(run.stage, folder / LAST))
-        run_guarded(judged, "success", run_success)
-        trained = run.artifacts.results[NAME]
-        times = {name: trained.metrics[name] for name in _TIMES if name in trained.metrics}
-        times["judgement_s"] = judged.artifacts.results["success"].seconds
-        rows = [[label(name), f"{seconds:.1f} s"] for name, seconds in times.items()]
-        trained.tables.append(Table(title="Time", header=["part", "time"], rows=rows))
+        run_guarded(run.on(judged_stage(run.stage, folder / LAST)), "success", run_success)
 
 
 def judged_stage(stage: Stage, policy: Path) -> Stage:
