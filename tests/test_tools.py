@@ -108,7 +108,7 @@ CAMERA = ["cameras=top", "scene.cameras.top.size=[32,32]"]
     [
         ("bench_cameras", [*SMALL, *CAMERA, "--draws", "1"], "top 32 x 32"),
         ("bench_ik", [*SMALL, "--nworld", "8", "--iterations", "40"], "1.0000"),
-        ("bench_policy", [*SMALL[:3], "--steps", "3", "--repetitions", "2"], "policy adds"),
+        ("bench_policy", [*SMALL[:3], "--steps", "5", "--repetitions", "2"], "policy adds"),
         ("bench_physics", [*SMALL, "batch.njmax=200", "--steps", "2"], "bare mujoco_warp.step"),
         ("bench_solver", [*SMALL[:3], "batch.njmax=200", "--states", "40"], "100.000 %"),
     ],

@@ -27,17 +27,17 @@ from mjstack.sim.graph import StepGraph
 
 
 class Recorded(Driver):
-    """Plays recorded actions, shape ``(steps, nworld, action_dim)``."""
+    """Plays recorded actions, shape ``(steps, nworld, action_dim)``, from number `next` on."""
 
     def __init__(self, actions: torch.Tensor) -> None:
         super().__init__(actions.shape[1], len(actions), actions.device)
         self._actions = actions
-        self._next = torch.zeros(1, dtype=torch.int64, device=actions.device)
+        self.next = torch.zeros(1, dtype=torch.int64, device=actions.device)
 
     def command(self) -> torch.Tensor:
         """The next step's actions."""
-        out = self._actions.index_select(0, self._next)[0]
-        self._next.add_(1).remainder_(self.steps)
+        out = self._actions.index_select(0, self.next)[0]
+        self.next.add_(1).remainder_(self.steps)
         return out
 
 
@@ -71,17 +71,20 @@ def _times(
     for step in range(args.steps):
         actions[step] = policy.command()
         env.step(actions[step])
-    drivers = (policy, Recorded(actions))
+    recorded = Recorded(actions)
+    drivers = (policy, recorded)
     graphs = [env.captured(partial(_step, env, driver), "a step") for driver in drivers]
     times: list[list[float]] = [[], []]
     for repetition in range(args.repetitions + 1):
         for which in (0, 1) if repetition % 2 else (1, 0):
             env.reset(seed=env.cfg.seed)
+            recorded.next.zero_()
             for _ in range(3):  # eager, captured, replayed
                 graphs[which]()
-            seconds = timed(env.sim, partial(_repeat, graphs[which], args.steps))
+            work = partial(_repeat, graphs[which], args.steps - 3)
+            seconds = timed(env.sim, work)
             if repetition:  # the first one warms up
-                times[which].append(1e3 * seconds / args.steps)
+                times[which].append(1e3 * seconds / (args.steps - 3))
         advance("repetitions", repetition, args.repetitions)
     for graph in graphs:
         graph.drop()
@@ -100,6 +103,6 @@ def _step(env: Env, driver: Driver) -> None:
 
 if __name__ == "__main__":
     parser = make_parser(__doc__)
-    parser.add_argument("--steps", type=count, default=200, help="in a repetition")
+    parser.add_argument("--steps", type=count, default=600, help="in a repetition")
     parser.add_argument("--repetitions", type=count, default=10)
     run(parser, measure)
