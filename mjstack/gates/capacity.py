@@ -5,7 +5,7 @@ they be?
 import math
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial, reduce
 
 import numpy as np
@@ -38,6 +38,7 @@ class _Group:
     sizes: BatchSizes  # in force
     advice: BatchSizes  # recommended
     lost: str  # physics that was lost with room to spare; nothing may be sized from it then
+    problems: list[str] = field(default_factory=list)  # at the recommended sizes
 
 
 @each_rank
@@ -58,7 +59,7 @@ def run_capacity(run: Run) -> list[GateResult]:
     # task's is kept for the gates that follow. Planning processes load during random actions.
     planned = cfg.controller.name not in FEEDBACK
     with run.stage.planner.processes(nworld) if planned else nullcontext():
-        env, broken_env = _measure(
+        env = _measure(
             run,
             result,
             "environments (random actions, randomised starts)",
@@ -66,7 +67,7 @@ def run_capacity(run: Run) -> list[GateResult]:
             random_actions=partial(play_random, run),
             randomized=partial(run.stage.play_task, t.reset),
         )
-        task, broken_task = _measure(
+        task = _measure(
             run,
             result,
             "driven task",
@@ -83,7 +84,7 @@ def run_capacity(run: Run) -> list[GateResult]:
         # do for both.
         remarks = result.details if key in configured_sizes(cfg.batch) else problems
         remarks.append(f"environments: {text}")
-    problems += broken_env + broken_task
+    problems += env.problems + task.problems
     if nworld < cfg.nworld:
         result.details.append(
             f"from {nworld} worlds: more of them meet rarer peaks, above all under random actions"
@@ -128,10 +129,8 @@ def _measure(
     title: str,
     configured: BatchSizes,
     **plays: Callable[..., Workload],
-) -> tuple[_Group, list[str]]:
-    """Play some workloads, recommend sizes for them, and try those on MJWarp; the problems that
-    there were at these sizes.
-    """
+) -> _Group:
+    """Play some workloads, recommend sizes for them, and try those on MJWarp."""
     cfg = run.cfg
     margin = cfg.gate.capacity.margin
     runs = {}
@@ -155,11 +154,11 @@ def _measure(
         lost="; ".join(load.loss for load in runs.values() if load.sizes and load.loss),
     )
     exact = not run.stage.backend[1].startswith("cuda")
-    broken: list[str] = []
     for workload, load in reversed(runs.items()):
         if load.sizes is not None and not group.lost:
-            broken += _compare(workload, load, plays[workload](advice), result, exact=exact)
-    return group, broken
+            again = plays[workload](advice)
+            group.problems += _compare(workload, load, again, result, exact=exact)
+    return group
 
 
 def _compare(

@@ -103,8 +103,7 @@ def _measure(stage: Stage, variant: Stage, gate: SolverGateCfg, result: GateResu
         times: dict[HeldPhysics, list[float]] = {base: [], physics: []}
         for repetition in range(gate.repetitions):
             for side in list(times)[:: 1 if repetition % 2 else -1]:
-                seconds = side.play(steps)
-                times[side].append(1e3 * seconds / (steps * decimation))
+                times[side].append(1e3 * side.play(steps) / (steps * decimation))
                 if problem := describe_lost(side.lost):
                     raise MjstackError(f"no time: {problem} (of {sim.nworld}).")
             stage.progress.advance("repetitions", repetition + 1, gate.repetitions)

@@ -53,10 +53,9 @@ def check_collect(cfg: Config) -> CheckedJob:
     plan = plan_collection(stage)
     if stage.ranks.writes:  # it may have begun there when the others come
         check_folder(plan.home / DATASET, plan.spec)
-    count = cast(CollectJobCfg, cfg.job).episodes
     return CheckedJob(
         stage=stage,
-        title=f"task {cfg.task.name}, {count:,} demonstrations",
+        title=f"task {cfg.task.name}, {cast(CollectJobCfg, cfg.job).episodes:,} demonstrations",
         work=partial(run_collect, plan),
         folder=plan.home,
         resumes=NAME,

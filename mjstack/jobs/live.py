@@ -179,12 +179,11 @@ class LiveView(Observer):
             if plot.visible != (names == list(lines.get(title, ()))):
                 plot.visible = not plot.visible
         for name, image in self._render(world).items():
-            if image.dtype != torch.uint8:
-                continue
-            pixels = image.cpu().numpy()
-            if name not in self._images:
-                self._images[name] = self._server.gui.add_image(pixels, label=name)
-            self._images[name].image = pixels
+            if image.dtype == torch.uint8:
+                pixels = image.cpu().numpy()
+                if name not in self._images:
+                    self._images[name] = self._server.gui.add_image(pixels, label=name)
+                self._images[name].image = pixels
         title = f"{self._part}, step {step:,}, {env.nworld:,} worlds"
         lines_shown = [title, f"world {world}: {terms}", *problem]
         self._status.value = "\n".join(line[: 2 * _TEXT] for line in lines_shown)
@@ -201,22 +200,18 @@ class LiveView(Observer):
         ends = env.termination_manager
         words = [f"step {int(env.episode_step[world])} of its episode"]
         if self.driver.phases:
-            phase = int(self.driver.phase[world])
-            words.append(f"phase {self.driver.phases[phase].name}")
+            words.append(f"phase {self.driver.phases[int(self.driver.phase[world])].name}")
         lines: dict[str, dict[str, float]] = {}
         if rewards.names:
             values = rewards.values[world].tolist()
             lines["reward"] = {"sum": sum(values), **dict(zip(rewards.names, values, strict=True))}
-            words += [
-                f"reward {sum(values):.4g}",
-                f"success {'yes' if env.success[world] else 'no'}",
-            ]
+            words.append(f"reward {sum(values):.4g}")
+            words.append(f"success {'yes' if env.success[world] else 'no'}")
         if ends.names:
             flags = zip(ends.names, ends.values[world].tolist(), strict=True)
             words.append(f"ends: {', '.join(name for name, flag in flags if flag) or 'no'}")
-        top = env.cfg.scene.table_top
         heights = {
-            name: 1e3 * (float(env.sim.qpos[world, at + 2]) - top)
+            name: 1e3 * (float(env.sim.qpos[world, at + 2]) - env.cfg.scene.table_top)
             for name, (at, _) in env.index.objects.items()
         }
         if heights:
@@ -241,9 +236,8 @@ class LiveView(Observer):
                 rgb = (round(255 * part) for part in self.env.cfg.scene.objects[name].color[:3])
                 color = f"rgb({', '.join(map(str, rgb))})"
             series.append({"label": name, "stroke": color, "width": 2})
-        scales = {"x": {"time": False}}
         self._plots[key] = self._server.gui.add_uplot(
-            data, tuple(series), title=title, scales=scales, height=200
+            data, tuple(series), title=title, scales={"x": {"time": False}}, height=200
         )
 
     def _render(self, world: int) -> dict[str, torch.Tensor]:

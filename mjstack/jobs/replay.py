@@ -103,9 +103,8 @@ def _replay(
     qpos = trace.arrays["qpos"]
     status, reason, metrics = run.judge_one(episode)
     agrees, comparison = _compare(plan, number, episode, qpos[-1], changes, run)
-    label = f"{plan.world}, {backend}"
     title = f"world {plan.world} of seed {plan.seed}, replayed ({backend})" if first else ""
-    run.show_world(f"replay_{backend}", label, qpos, status, title)
+    run.show_world(f"replay_{backend}", f"{plan.world}, {backend}", qpos, status, title)
     lines += [_first_sign(monitor, episode) for monitor in monitors]
     for line in lines:
         run.print_line(f"  {line}")
@@ -134,8 +133,7 @@ def _first_sign(monitor: FailureMonitor, episode: Episode) -> str:
         phases = monitor.driver.phases
         phase = phases[int(monitor.phase[0])].name if phases else ""
         text = f"{describe_sign(sign, phase)}, seen in step {int(monitor.step[0])}"
-    retries = int(episode.retries[0])
-    return f"first sign of failure: {text}; grasps tried again: {retries}"
+    return f"first sign of failure: {text}; grasps tried again: {int(episode.retries[0])}"
 
 
 def _compare(
@@ -228,7 +226,6 @@ def _play_failing(
                 "worlds": len(played),
                 "fail_again": again,
                 "by_the_same_rules": same,
-                "episodes_of_that_run": plan.episodes,
             },
             notes={"backend": f"{backend} on {device}", "table": TABLE},
             tables=[Table.of(columns, table_rows, f"Failing worlds (all of them: {TABLE})")],

@@ -31,7 +31,6 @@ class ReplayPlan:
         run: The earlier run.
         gate: Whose worlds they are, ``batch`` or ``success``.
         failing: Whether they are all failing ones.
-        episodes: Episodes of the gate's finished seeds, where they are all failing ones.
         bits: Bits of the rules that each world broke, by seed and world.
         record: The results of the first seed.
         where: Backend and device, each played once; the first is the earlier run's unless ``sim``
@@ -42,7 +41,6 @@ class ReplayPlan:
     run: EarlierRun
     gate: str
     failing: bool
-    episodes: int
     bits: dict[int, dict[int, int]]
     record: EpisodeRecord
     where: list[tuple[Backend, str]]
@@ -82,7 +80,6 @@ def plan_replay(cfg: Config) -> ReplayPlan:
     last = first + run.cfg.gate[gate].seeds - 1
     seed = int(heads[0]) if heads else first
     bits: dict[int, dict[int, int]] = {}
-    episodes = 0
     expected = ""
     if gate not in played_gates:
         noun = "failing worlds" if failing else "a world"
@@ -115,7 +112,6 @@ def plan_replay(cfg: Config) -> ReplayPlan:
         run=run,
         gate=gate,
         failing=failing,
-        episodes=episodes,
         bits=bits,
         record=record,
         where=where,

@@ -181,10 +181,9 @@ class _Queue:
                 stop_all([child])
             if (code := child.poll()) is not None:
                 del self.running[slot]
-                number = running.job.number
-                self.reports[number] = running.conclude(code)
-                status = self.reports[number].status
-                self._print(f"job {number}: {status} ({seconds:.0f} s, {slot.name})")
+                report = self.reports[running.job.number] = running.conclude(code)
+                line = f"{report.status} ({seconds:.0f} s, {slot.name})"
+                self._print(f"job {running.job.number}: {line}")
 
     def begin(self) -> None:
         """Start waiting jobs as long as there are slots, and take results that are there."""
