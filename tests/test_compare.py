@@ -130,7 +130,6 @@ def test_equal_sides(tmp_path: Path) -> None:
             ['job.against=["seed=1"]'],
             "expected the same robot, task, worlds and seeds (seed=1, expected 0)",
         ),
-        (['job.against=["nworld=8"]'], "(nworld=8, expected 4)"),
         (['job.against=["robot=rebot"]'], "(robot=rebot, expected so101)"),
         (['job.against=["gate.success.seeds=3"]'], "(gate.success.seeds=3, expected 2)"),
         (['job.against=["task.check.distance=0.5"]'], "(task.check.distance=0.5, expected 0.02)"),

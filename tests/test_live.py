@@ -62,10 +62,7 @@ def refusal_of(*overrides: str) -> str:
         ("8-12", 10, [8, 9]),
         ("0-999999999", 4096, list(range(64))),
         ("10", 10, []),
-        ("", 10, []),
-        ("-1", 10, []),
         ("3-", 10, []),
-        ("all", 10, []),
         ("9" * 5000, 10, []),
     ],
 )
@@ -422,7 +419,6 @@ def test_texts_are_plain_and_short(
     [
         (["view=web", "web.host=203.0.113.1"], "web.host=203.0.113.1: expected an address of this"),
         (["view=web", "web.host=::1"], "web.host=::1: expected an address of this machine"),
-        (["view=web", "web.port=0"], "web.port=0: expected an integer from 1 to 65535"),
         (["view=web", "gates=[capacity]"], "expected a gate that shows worlds: baseline"),
         (["view=web", "job=collect"], "expected false with job=collect"),
         (["view=true", "job=train", "trainer=clone"], "expected false or web with job=train"),

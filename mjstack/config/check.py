@@ -211,7 +211,7 @@ def _phases(cfg: Config) -> Checks:
     phases = controller.phases
     names = list(phases)
     known = [*cfg.scene.objects, *cfg.scene.places]
-    observed = set(cfg.scene.places)
+    observed: set[str | None] = {*cfg.scene.places, None}
     grasped = False
     for number, (name, phase) in enumerate(phases.items()):
         key = f"controller.phases.{name}"
@@ -219,14 +219,10 @@ def _phases(cfg: Config) -> Checks:
         yield f"{key}.anchor", wrong, "an object or a place, as the phase is the first"
         _require(f"{key}.grasps: object", [phase.grasps], cfg.scene.objects)
         _require(f"{key}.retry: phase", [phase.retry], phases)
-        for role in ("anchor", "toward"):
-            source = getattr(phase, role)
-            if source is None:
-                continue
+        for role, source in (("anchor", phase.anchor), ("toward", phase.toward)):
             _require(f"{key}.{role}: object or place", [source], known)
-            expected = "true here or in a phase before, because controller=closed_loop does not"
-            expected += f" know yet where {source} is"
             wrong = closed_loop and not phase.observe and source not in observed
+            expected = f"true here or before, as closed_loop does not know yet where {source} is"
             yield f"{key}.observe", wrong, expected
             observed.add(source)
         wrong = phase.level == "on_top" and not grasped

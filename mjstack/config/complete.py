@@ -4,9 +4,9 @@ import re
 from dataclasses import fields
 from functools import cache, reduce
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from mjstack.config.fields import accepted, check_fields
@@ -34,6 +34,9 @@ _TERMS = {
     "observation": ObservationGroupCfg,
     "job.observation": ObservationGroupCfg,
 }
+
+
+_schema = cache(OmegaConf.structured)  # made once: terms are many
 
 
 def complete(cfg: Config) -> None:
@@ -91,12 +94,6 @@ def typed(key: str, node: Any, kind: type) -> Any:
     value = OmegaConf.to_object(typed)
     check_fields(key, value)
     return value
-
-
-@cache
-def _schema(kind: type) -> DictConfig:
-    """A dataclass as OmegaConf has it, made once: terms are many."""
-    return cast(DictConfig, OmegaConf.structured(kind))
 
 
 def _complete_robot(robot: RobotCfg) -> None:

@@ -30,6 +30,7 @@ MOST_SEEDS = 1 << 32  # seeds are 32-bit
 _SPEC = "mjstack"  # key of a field's metadata
 _NOUNS = {int: "an integer", float: "a number", bool: "true or false", str: "text"}
 _PLURALS = {int: "integers", float: "numbers", str: "names"}
+_hints = cache(get_type_hints)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -196,11 +197,6 @@ def _own_docs(cls: type) -> dict[str, str]:
         if isinstance(node, ast.AnnAssign) and isinstance(after, ast.Expr):
             docs[ast.unparse(node.target)] = " ".join(ast.literal_eval(after.value).split())
     return docs
-
-
-@cache
-def _hints(owner: type) -> dict[str, Any]:
-    return get_type_hints(owner)
 
 
 def _kind(hint: Any) -> tuple[Any, list[Any]]:

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import torch
 
+from mjstack.config.fingerprint import differences
 from mjstack.config.schema import OUTPUTS, Backend, Config
 from mjstack.episodes.stage import Stage
 from mjstack.errors import FolderError, MjstackError
@@ -225,26 +226,20 @@ def load_images(cfg: Config) -> tuple[np.ndarray, Images]:
         images: Images = read_npz(path)
         about = json.loads(str(images.pop("about")))
         qpos = images.pop("qpos")
-        for key, value in _about(cfg).items():
-            if about.get(key) != value:
-                raise FolderError(
-                    f"{path} was drawn with {key}={about.get(key)}, expected {value}",
-                    "Give the robot, the scene and the cameras of that run",
-                )
+        if changes := differences(about, _about(cfg)):
+            fix = "Give the robot, the scene and the cameras of that run"
+            raise FolderError(f"{path} was drawn with {changes}", fix)
     return qpos, images
 
 
 def _about(cfg: Config) -> dict[str, object]:
-    """The part of the configuration on which images depend, by key."""
-    scene = cfg.scene
+    """The part of the configuration on which images depend."""
+    cameras = {
+        name: {key: asdict(camera)[key] for key in ("size", "fovy", "pose")}
+        for name, camera in cfg.scene.cameras.items()
+    }
     return {
-        "robot.name": cfg.robot.name,
-        "model.source": cfg.model.source,
-        "scene.name": scene.name,
-        "cameras": list(scene.cameras),
-        **{
-            f"scene.cameras.{name}.{key}": asdict(camera)[key]
-            for name, camera in scene.cameras.items()
-            for key in ("size", "fovy", "pose")
-        },
+        "robot": {"name": cfg.robot.name},
+        "model": {"source": cfg.model.source},
+        "scene": {"name": cfg.scene.name, "cameras": cameras},
     }

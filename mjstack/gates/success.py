@@ -75,9 +75,7 @@ def run_success(run: Run) -> list[GateResult]:
         "unreachable": int(tally.array("unreachable").sum()),
         "episode_s": tally.seconds,
     }
-    reads = reads_starts_file(cfg.reset)
-    tally.notes["starts"] = f"starts={cfg.starts}" if reads else _describe_start(cfg)
-
+    tally.notes["starts"] = _describe_start(cfg)
     parts = [f"{tally.summary}, {format_percent(t.rate)} wanted"]
     if retried:
         parts.append(f"{retried} retried, {retried_succeeded} of them succeeded")
@@ -121,6 +119,8 @@ class _StartsWriter(Observer):
 
 def _describe_start(cfg: Config) -> str:
     """How worlds start, in a few words."""
+    if reads_starts_file(cfg.reset):
+        return f"starts={cfg.starts}"
     regions = [term.params["xy"] for term in cfg.reset.values() if places_objects(term)]
     where = "".join(f", objects within {x:g} x {y:g} m of their places" for x, y in regions)
     return f"gate.success.reset ({', '.join(cfg.reset)}{where})"

@@ -101,11 +101,8 @@ def _on_driven_worlds(
 ) -> dict[str, Measurement]:
     """Measurements *physics* and *episode*, on the same worlds."""
     t = run.cfg.gate.throughput
-    measured: dict[str, Measurement] = {
-        name: Measurement(name=name, missing=lacks_episode(run.cfg))
-        for name in ("physics", "episode")
-        if name in t.measurements
-    }
+    chosen: list[str] = [name for name in ("physics", "episode") if name in t.measurements]
+    measured = {name: Measurement(name=name, missing=lacks_episode(run.cfg)) for name in chosen}
     if "physics" in measured and not run.stage.phases:
         measured["physics"].missing = "it starts as a phase begins, and a policy has none"
     names = [name for name, part in measured.items() if not part.missing]

@@ -256,9 +256,7 @@ def check_job(cfg: Config, overrides: Sequence[str] = ()) -> CheckedJob:
     """Raise for what this machine cannot do, before anything is written. The overrides are those of
     the command line without Hydra's own.
     """
-    job = find_object("job.func", cfg.job.func)
-    if not isinstance(job, Job):
-        raise ConfigError("job.func", cfg.job.func, "a mjstack.jobs.Job")
+    job: Job = find_object("job.func", cfg.job.func)
     for override in overrides:
         key, _, value = override.lstrip("+~").partition("=")
         if key in ("job.name", "job.func"):  # reports and replays go by them
