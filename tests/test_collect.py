@@ -599,10 +599,16 @@ def test_damaged_notes_are_one_line(
 ) -> None:
     play_nothing()
     assert collect("nworld=2", "job.episodes=1") == 0
-    (folder / BATCHES).write_text("[{]")
-    capsys.readouterr()
-    assert run([*COMMAND, "nworld=2", "job.episodes=2"]) == 2
-    assert f"{BATCHES}: cannot be read (JSONDecodeError: " in capsys.readouterr().err
+    (batch,) = json.loads((folder / BATCHES).read_text())
+    batch["kept"] = batch.pop("episodes")
+    for text, says in [
+        ("[{]", f"{BATCHES}: cannot be read (JSONDecodeError: "),
+        (json.dumps([batch]), "has a dataset of version 0.1, expected one of this version"),
+    ]:
+        (folder / BATCHES).write_text(text)
+        capsys.readouterr()
+        assert run([*COMMAND, "nworld=2", "job.episodes=2"]) == 2
+        assert says in capsys.readouterr().err
 
 
 @pytest.mark.full

@@ -7,12 +7,14 @@ import math
 from fractions import Fraction
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from policies import report
 
 import mjstack.jobs.compare as compare
 from mjstack.cli import run
+from mjstack.config.schema import Backend
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.stage import Stage
@@ -149,3 +151,26 @@ def test_other_sides_are_refused_in_one_line(
     assert problem in text
     assert text.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_starts_that_turn_out_unequal_fail(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compare, "_start_of_first_world", lambda stage: {"start": np.zeros(1)})
+    region = ['job.against=["gate.success.region=[0.01,0.01]"]']
+    assert run([*TINY, *region, f"hydra.run.dir={tmp_path}/out"]) == 1
+    assert "a and b did not start alike" in report(tmp_path / "out")["compare"]["reason"]
+
+
+@pytest.mark.parametrize(("device", "code"), [("cpu", 1), ("cuda:0", 0)])
+def test_starts_may_differ_by_rounding_on_another_device(
+    device: str, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def backend(stage: Stage) -> tuple[Backend, str]:
+        return Backend.native, device if stage.cfg.graph == "off" else "cpu"
+
+    def play(name: str, stage: Stage) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros((2, 4), np.int32), np.full((2, 4, 13), 1e-7 * (name == "b"))
+
+    monkeypatch.setattr(Stage, "backend", property(backend))
+    monkeypatch.setattr(compare, "_play", play)
+    overrides = ['job.against=["graph=off"]', "web.episode=false"]
+    assert run([*TINY, *overrides, f"hydra.run.dir={tmp_path}/out"]) == code

@@ -179,7 +179,11 @@ def read_batches(path: Path) -> list[BatchRecord]:
     if not path.exists():
         return []
     with reading(path, f"Remove {BATCHES}: the expert's success rate is counted anew"):
-        return [BatchRecord(**batch) for batch in json.loads(path.read_text())]
+        batches = json.loads(path.read_text())
+        if any("kept" in batch for batch in batches):
+            reason = f"{path.parent} has a dataset of version 0.1, expected one of this version"
+            raise FolderError(reason, "Set job.folder to another folder")
+        return [BatchRecord(**batch) for batch in batches]
 
 
 def episode_config(cfg: Config) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from mjstack.episodes.replay import simulate_alone
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage, require_episode
 from mjstack.episodes.tally import rate_metrics
-from mjstack.errors import ConfigError
+from mjstack.errors import ConfigError, MjstackError
 from mjstack.files import to_csv, write_atomic
 from mjstack.gates.runner import run_guarded
 from mjstack.gates.success import success_config
@@ -40,6 +40,7 @@ _SIDES = ("a", "b")
 _PAGE_WORLDS = 8  # worlds on the page that only one side won, of each side
 _LEVEL = 0.05  # of significance
 _ENDS = {"min": "low", "max": "high"}  # of the picture's whiskers, in metrics of a rate
+_ROUNDING = 1e-6  # [m, rad], by which equal starts on two backends or devices may differ
 _PANELS = {"success rate, 95 % interval": "success_rate", "episodes that only this one won": "only"}
 
 Sides = Mapping[str, Stage]
@@ -98,7 +99,10 @@ def _run(sides: Sides, notes: Mapping[str, str], run: Run, folder: Path) -> None
 
 def _compare(sides: Sides, notes: Mapping[str, str], folder: Path, run: Run) -> list[GateResult]:
     """The comparison as a result: it passes if it was made."""
-    failed_a, failed_b = (_play(*side) for side in sides.items())
+    (failed_a, starts_a), (failed_b, starts_b) = (_play(*side) for side in sides.items())
+    rounding = _ROUNDING if sides["a"].backend != sides["b"].backend else 0.0
+    if not np.abs(starts_a - starts_b).max() <= rounding:
+        raise MjstackError("a and b did not start alike", "Leave what worlds start from unchanged")
 
     # Episodes that only one side won, and the rules that the other one broke there
     won = {"a": failed_a == 0, "b": failed_b == 0}
@@ -162,17 +166,20 @@ def _compare(sides: Sides, notes: Mapping[str, str], folder: Path, run: Run) -> 
     ]
 
 
-def _play(name: str, stage: Stage) -> np.ndarray:
-    """Play a side: the bits of the rules that each episode broke, shape ``(seeds, nworld)``."""
+def _play(name: str, stage: Stage) -> tuple[np.ndarray, np.ndarray]:
+    """Play a side: the bits of the rules that each episode broke, shape ``(seeds, nworld)``, and
+    positions at the starts, shape ``(seeds, nworld, nq)``.
+    """
     cfg = stage.cfg
     seeds = range(cfg.seed, cfg.seed + cfg.gate.success.seeds)
     plans = [BatchPlan(seed, range(cfg.nworld)) for seed in seeds]
-    failed = []
+    played = []
     for batch in play_batches(stage, plans, label=f"steps of {name}"):
-        failed.append(batch.episode.failed)
+        played.append((batch.episode.failed, batch.episode.start))
         count = f"{int(batch.succeeded.sum())} of {cfg.nworld} worlds succeeded"
         stage.progress.print_line(f"{name}, seed {batch.plan.seed}: {count}")
-    return np.stack(failed)
+    failed, starts = zip(*played, strict=True)
+    return np.stack(failed), np.stack(starts)
 
 
 def _replay(sides: Sides, rows: Sequence[Mapping[str, Any]]) -> list[World]:
