@@ -87,7 +87,7 @@ PATHS: dict[str, dict[str, str] | None] = {
     },
     "tasks/box_terms.py": {"ToSlot": "__call__"},
     "tasks/progress.py": {"Progress": "__call__"},
-    "tasks/reach.py": {"ReachSuccess": "__init__", "ReachCheck": "placed trace"},
+    "tasks/reach.py": {"ReachCheck": "placed trace"},
     "drivers/open_loop.py": {"JointTrajectory": "command"},
     "drivers/driver.py": {"OpenLoopDriver": "command"},
     "drivers/closed_loop.py": {

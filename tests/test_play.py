@@ -96,7 +96,8 @@ def test_a_task_without_a_check_is_shown_unjudged(saved: list[np.ndarray], tmp_p
     cfg = configure("task=reach")
     policy = write_policy(tmp_path / "policy", cfg)
     out = tmp_path / "out"
-    args = [*REACH, "task.check=null", f"policy={policy}", "nworld=1", f"hydra.run.dir={out}"]
+    args = [*REACH, "task.check=null", "task.success=null", f"policy={policy}", "nworld=1"]
+    args.append(f"hydra.run.dir={out}")
     assert run(args) == 0
     assert result(out)["reason"] == "not judged: the task has no check"
     assert len(saved) == 1

@@ -26,7 +26,7 @@ from mjstack.mdp import reward as reward_terms
 from mjstack.mdp import termination as termination_terms
 from mjstack.mdp.geometry import source_xy
 from mjstack.tasks.check import make_check
-from mjstack.tasks.reach import ReachSuccess
+from mjstack.tasks.placed import HeldSuccess
 from mjstack.tasks.stack import StackSuccess
 
 CUBES = ("red", "blue")
@@ -589,36 +589,23 @@ def test_stack_success_is_rules_four_to_six(
             assert_success(rec, [world], want[None])
 
 
-# Success of the reach task
+# Success
 
 
-def test_reach_success_counts_steps_in_a_row() -> None:
+def test_success_counts_steps_in_a_row() -> None:
     n = 4
-    steps = 80
-    near = np.random.default_rng(0).random((steps, n)) < 0.85
-    red = slice(3, 10)
-    index = SimpleNamespace(grasp_sites=[0, 2], object_columns=lambda name: (red, red), fixed={})
-    env = SimpleNamespace(nworld=n, device=torch.device("cpu"), index=index, sim=StubViews())
-    term = ReachSuccess(env, object="red", height=0.06, distance=0.02, steps=5)
+    near = torch.from_numpy(np.random.default_rng(0).random((80, n)) < 0.85)
+    now = iter(near)
+    env = SimpleNamespace(nworld=n, device=torch.device("cpu"))
+    term = HeldSuccess(env, lambda: next(now), 5)
     run = np.zeros(n, dtype=int)
     seen = []
-    for step in range(steps):
+    for step, holds in enumerate(near.numpy()):
         if step == 40:
             term.reset(torch.tensor([True, False, False, True]))
             run[[0, 3]] = 0
-        rng = np.random.default_rng(step)
-        direction = rng.normal(size=(n, 3))
-        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-        goal = rng.normal(size=(n, 3))
-        grasp_point = goal + direction * np.where(near[step], 0.0199, 0.0201)[:, None]
-        spread = rng.normal(size=(n, 3))
-        sites = np.stack((grasp_point + spread, goal, grasp_point - spread), axis=1)
-        env.sim.site_xpos = torch.from_numpy(sites)
-        env.sim.qpos = torch.zeros((n, 10), dtype=torch.float64)
-        env.sim.qpos[:, 3:6] = torch.from_numpy(goal - [0.0, 0.0, 0.06])
-        run = np.where(near[step], run + 1, 0)
-        got = term(env)
-        seen.append(got.tolist())
+        run = np.where(holds, run + 1, 0)
+        seen.append(term(env).tolist())
         assert seen[-1] == (run >= 5).tolist(), step
     assert 0.2 < np.mean(seen) < 0.8
 

@@ -328,7 +328,8 @@ def test_broken_episode_does_not_verify_the_task(
 
 @pytest.mark.full
 def test_a_task_without_a_check_is_not_asked_for_batch(new_run: Callable[..., Run]) -> None:
-    result = measure(new_run, "task=reach", "task.check=null", "sim=native", "nworld=1", *FEW)
+    overrides = ["task=reach", "task.check=null", "task.success=null", "sim=native", "nworld=1"]
+    result = measure(new_run, *overrides, *FEW)
     assert result.status is Status.passed
     assert "episode: not measured: task reach has no check" in result.reason
     assert "verified" not in result.reason

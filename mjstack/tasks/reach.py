@@ -7,12 +7,10 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from mjstack.config.fields import Count, Positive, spec
-from mjstack.managers.view import EnvView
+from mjstack.config.fields import spec
 from mjstack.mdp.observation import grasp_point_to_object
 from mjstack.tasks.check import EpisodeCheck, Rule
 from mjstack.tasks.parts import InWindow
-from mjstack.tasks.placed import HeldSuccess
 from mjstack.tasks.view import Step
 
 
@@ -47,35 +45,10 @@ class ReachCheck(EpisodeCheck):
 
     @override
     def trace(self, step: Step) -> dict[str, Tensor]:
-        return {"distance_m": distance_to(step.view.env, self.t.object, self.t.height)}
+        t = self.t
+        offset = grasp_point_to_object(step.view.env, object=t.object, height=t.height)
+        return {"distance_m": torch.linalg.vector_norm(offset, dim=1)}
 
     def headline(self, values: Mapping[str, float]) -> str:
         """How near it is."""
         return f"{1e3 * values['distance_m']:.1f} mm from the point"
-
-
-def distance_to(env: EnvView, object: str, height: float) -> Tensor:
-    """Distance of the grasp point from a point above an object [m], shape ``(nworld,)``."""
-    offset = grasp_point_to_object(env, object=object, height=height)
-    return torch.linalg.vector_norm(offset, dim=1)
-
-
-class ReachSuccess(HeldSuccess):
-    """Achieved while the grasp point has been near the point for some steps in a row."""
-
-    def __init__(
-        self, env: EnvView, *, object: str, height: float, distance: Positive, steps: Count
-    ) -> None:
-        """Take the thresholds.
-
-        Args:
-            env: The environment.
-            object: The cube.
-            height: How far above its centre the point is [m].
-            distance: Largest distance that counts as near [m].
-            steps: How many steps in a row.
-
-        Raises:
-            MjstackError: There is no such object.
-        """
-        super().__init__(env, lambda: distance_to(env, object, height) <= distance, steps)
