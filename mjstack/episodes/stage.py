@@ -5,6 +5,7 @@ them. All that a trainer or a benchmark needs of a run.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -17,7 +18,6 @@ from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.drivers.policy import PolicyDriver
 from mjstack.envs import Env, driven_config
 from mjstack.envs.buffers import Advance, Workload, measured_sizes, play_workload
-from mjstack.episodes.assets import Assets
 from mjstack.episodes.rollout import (
     CLOSED_LOOP,
     PHASELESS,
@@ -32,7 +32,8 @@ from mjstack.episodes.rollout import (
 from mjstack.errors import ConfigError
 from mjstack.managers.episode import required_fields
 from mjstack.mdp.geometry import source_xy
-from mjstack.scene import SceneIndex
+from mjstack.policy import Policy, load_policy
+from mjstack.scene import SceneIndex, build_model
 from mjstack.scene.phases import Phase
 from mjstack.sim import (
     BatchSizes,
@@ -60,6 +61,49 @@ class Progress:
 
     print_line: TextHook = lambda line: None
     advance: Advance = lambda what, done, total: None
+
+
+@dataclass(eq=False)
+class Assets:
+    """Scene, plan and policy, each built once when it is first needed.
+
+    Attributes:
+        cfg: The configuration of scene, robot and phases.
+    """
+
+    cfg: Config
+
+    @cached_property
+    def model(self) -> mujoco.MjModel:
+        """The scene for physics."""
+        return build_model(self.cfg)
+
+    @cached_property
+    def visual_model(self) -> mujoco.MjModel:
+        """The same scene with everything that only pictures need."""
+        return build_model(self.cfg, visuals=True)
+
+    @cached_property
+    def index(self) -> SceneIndex:
+        """Addresses in the model."""
+        return SceneIndex(self.model, self.cfg.robot, self.cfg.scene)
+
+    @cached_property
+    def planner(self) -> OpenLoopPlanner:
+        """The planner, its nominal plan made."""
+        return OpenLoopPlanner(self.cfg)
+
+    @cached_property
+    def policy(self) -> Policy:
+        """The policy of ``controller=policy``.
+
+        Raises:
+            MjstackError: There is none, or it cannot be read.
+        """
+        if self.cfg.policy is None:
+            expected = "the folder of a trained policy, which controller=policy plays"
+            raise ConfigError("policy", None, expected)
+        return load_policy(Path(self.cfg.policy))
 
 
 @dataclass(eq=False)

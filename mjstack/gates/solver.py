@@ -14,9 +14,8 @@ from mjstack.bench.timing import describe_lost, steps_that_fit
 from mjstack.config.complete import typed
 from mjstack.config.fields import spec
 from mjstack.config.schema import GateFuncCfg, SolverCfg
-from mjstack.episodes.assets import Assets
 from mjstack.episodes.run import Run, needs_episode
-from mjstack.episodes.stage import Stage
+from mjstack.episodes.stage import Assets, Stage
 from mjstack.errors import MjstackError
 from mjstack.managers.view import offers
 from mjstack.report.record import GateResult, Status
