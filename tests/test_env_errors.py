@@ -168,7 +168,6 @@ def test_seed_of_some_worlds(env: Env) -> None:
 def test_step_before_reset(cfg: Config) -> None:
     env = on_shared_sim("native", 3, cfg)
     fails(ArgumentError, lambda: env.step(zeros(env)), "before reset()", "env.reset()")
-    fails(ArgumentError, lambda: env.reset(mask=mask_of(env, 1)), "mask", "env.reset()")
     env.reset()
     env.step(zeros(env))
 
