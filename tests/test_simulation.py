@@ -179,19 +179,6 @@ def test_reset_world_goes_on_as_a_fresh_one(backend: str, make_sim: Make) -> Non
     assert not torch.equal(sim.qpos[0], expected[0])
 
 
-def test_twice_the_same_run(backend: str, make_sim: Make, get_stage: GetStage) -> None:
-    finals = []
-    for _ in range(2):
-        sim = make_sim(backend, N)
-        start_moving(sim, get_stage("so101"))
-        for _ in range(4):
-            sim.step(10)
-        finals.append([getattr(sim, name).clone() for name in VIEWS])
-    for a, b in zip(*finals, strict=True):
-        assert_same_run(a, b, backend)
-    assert not torch.equal(finals[0][0][0], finals[0][0][1])
-
-
 def test_world_k_of_n_is_world_k_of_one(backend: str, make_sim: Make, get_stage: GetStage) -> None:
     many = make_sim(backend, N)
     start_moving(many, get_stage("so101"))

@@ -26,7 +26,6 @@ from mjstack.mdp import reward as reward_terms
 from mjstack.mdp import termination as termination_terms
 from mjstack.mdp.geometry import source_xy
 from mjstack.tasks.check import make_check
-from mjstack.tasks.placed import HeldSuccess
 from mjstack.tasks.stack import StackSuccess
 
 CUBES = ("red", "blue")
@@ -590,24 +589,6 @@ def test_stack_success_is_rules_four_to_six(
 
 
 # Success
-
-
-def test_success_counts_steps_in_a_row() -> None:
-    n = 4
-    near = torch.from_numpy(np.random.default_rng(0).random((80, n)) < 0.85)
-    now = iter(near)
-    env = SimpleNamespace(nworld=n, device=torch.device("cpu"))
-    term = HeldSuccess(env, lambda: next(now), 5)
-    run = np.zeros(n, dtype=int)
-    seen = []
-    for step, holds in enumerate(near.numpy()):
-        if step == 40:
-            term.reset(torch.tensor([True, False, False, True]))
-            run[[0, 3]] = 0
-        run = np.where(holds, run + 1, 0)
-        seen.append(term(env).tolist())
-        assert seen[-1] == (run >= 5).tolist(), step
-    assert 0.2 < np.mean(seen) < 0.8
 
 
 def test_reaching_ends_the_episode_after_ten_steps_in_a_row(backend: str) -> None:
