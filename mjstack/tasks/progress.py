@@ -1,7 +1,5 @@
 """Reward in stages for tasks in which objects are carried to their goals."""
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -73,11 +71,7 @@ class Progress:
         # opening.
         constant = self._view.constant
         self._ranges = constant(scale, scale, scale, height, max(open_fraction, 1e-6))
-        self._most = constant(*[math.inf] * 3, 1.0, 1.0)
-        self._start = constant(1.0, 1.0, 1.0, 0.0, 0.0)
-        self._sign = constant(-1.0, -1.0, -1.0, 1.0, 1.0)
         self._number = constant(0.0, 2.0, 3.0, 1.0, 4.0)
-        self._least = constant(*[0.0] * 5)
 
     def __call__(self, env: EnvView) -> Tensor:
         """The reward, shape ``(nworld,)``."""
@@ -102,11 +96,10 @@ class Progress:
 
         # How far it has got in each: the last one that it has got to is worth most
         opening = step.narrowest.expand_as(low)
-        done = torch.stack((away, across, above.abs(), low, opening), dim=-1).div_(self._ranges)
-        done.clamp_(self._least, self._most)
-        done[..., :3].tanh_()
-        worth = torch.addcmul(self._start, done, self._sign).add_(self._number)
-        value = worth.mul_(reached).amax(-1).div_(len(STAGES))
+        done = torch.stack((away, across, above.abs(), low, opening), dim=-1) / self._ranges
+        near = 1.0 - torch.tanh(done[..., :3])
+        worth = torch.cat((near, done[..., 3:].clamp(0.0, 1.0)), dim=-1) + self._number
+        value = (worth * reached).amax(-1) / len(STAGES)
         if len(goals) == 1:
             return value[:, 0]
 

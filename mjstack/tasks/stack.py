@@ -154,8 +154,6 @@ class StackSuccess(HeldSuccess):
         # Where the oldest step is, in every world.
         self._slot = torch.zeros(1, dtype=torch.int64, device=env.device)
         self._pose = view.zeros(*ring, 7)
-        self._apart = view.zeros(*ring, 3)
-        self._product = view.zeros(*ring, 4)
         self._energy = view.zeros(*ring)  # squared speed
         self._far = view.zeros(*ring)  # squared distance to later steps
         self._turned = view.zeros(*ring)  # 1 - |cosine of half the angle| to them
@@ -174,10 +172,10 @@ class StackSuccess(HeldSuccess):
             ring.index_fill_(1, self._slot, 0.0)
 
         # The newest step against the others
-        torch.sub(self._pose[..., :3], step.pos[:, None], out=self._apart).square_()
-        torch.maximum(self._far, self._apart.sum(-1), out=self._far)
-        torch.mul(self._pose[..., 3:], step.quat[:, None], out=self._product)
-        torch.maximum(self._turned, 1.0 - self._product.sum(-1).abs(), out=self._turned)
+        apart = (self._pose[..., :3] - step.pos[:, None]).square().sum(-1)
+        torch.maximum(self._far, apart, out=self._far)
+        cosine = (self._pose[..., 3:] * step.quat[:, None]).sum(-1).abs()
+        torch.maximum(self._turned, 1.0 - cosine, out=self._turned)
         return stands
 
     def __call__(self, env: EnvView) -> Tensor:
