@@ -139,10 +139,10 @@ def check_types(info: Any, *, written_here: bool = True) -> None:
     """
     empty = lerobot.make_info(DatasetSpec(robot_type="", fps=1, features={}, config_sha256=""))
     used = empty if written_here else {name: empty[name] for name in _USED}
-    for block, model in (
-        (info, used),
-        *([(info["mjstack"], empty["mjstack"])] if written_here else []),
-    ):
+    blocks = [(info, used)]
+    if written_here:
+        blocks.append((info["mjstack"], empty["mjstack"]))
+    for block, model in blocks:
         for name, value in model.items():
             kinds = {"video_path": str | None, "fps": int | float}.get(name, type(value))
             if not isinstance(block[name], kinds) or isinstance(block[name], bool):
