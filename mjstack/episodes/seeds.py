@@ -24,7 +24,7 @@ from mjstack.episodes.rollout import Observer
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
 from mjstack.episodes.tally import EpisodeTally
-from mjstack.errors import FolderError, first_line, name_worlds
+from mjstack.errors import first_line, name_worlds
 from mjstack.files import write_npz
 from mjstack.interrupt import check_interrupt
 from mjstack.report.page import Map, Worlds
@@ -72,7 +72,8 @@ def play_seeds(
             "backend": sim.description,
             "sizes": str(sim.sizes or "native MuJoCo has no fixed buffers"),
         }
-        player = _Player(run, tally, signs, observers)
+        motion = motion_path(folder, gate) if folder is not None and run.page.motion else None
+        player = _Player(run, tally, signs, observers, motion)
         try:
             player.play(range(cfg.seed, cfg.seed + count), sim)
         finally:
@@ -87,18 +88,15 @@ def play_seeds(
 
 @dataclass
 class _Player:
-    """Plays seeds into a tally; the other attributes are arguments of `play_seeds`."""
+    """Plays seeds into a tally; ``path`` is the file of worlds in motion, None if there is none,
+    and the other attributes are arguments of `play_seeds`.
+    """
 
     run: Run
     tally: EpisodeTally
     signs: bool
     observers: Callable[[int], Sequence[Observer]]
-
-    @property
-    def _motion_path(self) -> Path | None:
-        """The file of worlds in motion, if they are shown."""
-        folder = self.run.folder
-        return folder and motion_path(folder, self.tally.gate) if self.run.page.motion else None
+    path: Path | None
 
     def play(self, seeds: range, sim: Simulation) -> None:
         """Play or read back seed after seed, and count them."""
@@ -110,12 +108,14 @@ class _Player:
                 tally.first = tally.first or batch.episode
                 part = _record(run.stage, batch, self._monitor)
                 record = EpisodeRecord.join(run.stage.ranks.gather(part))
-                self._write(record)
-                if self._motion is not None and self._motion_path is not None:
+                # Before the next one can break or be stopped. A full disk takes no result back.
+                if tally.path is not None:
+                    path = tally.path.with_name(record_name(tally.gate, record.seed))
+                    if problem := safely_write(path, write_npz, record.arrays(), stops=False):
+                        tally.details.append(problem)
+                if self._motion is not None and self.path is not None:
                     qpos = self._motion.rows["qpos"]
-                    show_batch(
-                        run.stage, run.page, self._motion_path, tally.gate, qpos, record.failed
-                    )
+                    show_batch(run.stage, run.page, self.path, tally.gate, qpos, record.failed)
                 self._count(record)
         except Exception as error:
             check_interrupt()
@@ -136,14 +136,14 @@ class _Player:
                 yield BatchPlan(seed, run.stage.worlds)
                 continue
             self.tally.again.append(seed)
-            if self._motion_path is not None and seed == run.cfg.seed:
-                restore_batch(run.page, self._motion_path, self.tally.gate)
+            if self.path is not None and seed == run.cfg.seed:
+                restore_batch(run.page, self.path, self.tally.gate)
             self._count(record)
 
     def _observe(self, plan: BatchPlan) -> list[Observer]:
         """The observers of a seed."""
         cfg = self.run.cfg
-        in_motion = self._motion_path is not None and plan.seed == cfg.seed
+        in_motion = self.path is not None and plan.seed == cfg.seed
         self._monitor = FailureMonitor() if self.signs else None
         self._motion = motion_recorder(cfg.timing.step_dt) if in_motion else None
         watchers = [self._monitor, *self.observers(plan.seed), self._motion]
@@ -162,27 +162,10 @@ class _Player:
 
     def _read(self, seed: int) -> EpisodeRecord | None:
         """The results of a seed that an earlier call of the run has left."""
-        cfg = self.run.cfg
         folder = self.run.folder
-        if cfg.resume is None or folder is None:
+        if self.run.cfg.resume is None or folder is None:
             return None
-        record = EpisodeRecord.read(folder, seed, self.tally.gate)
-        if record is not None and len(record.failed) != cfg.nworld:
-            raise FolderError(
-                f"resume={folder}: has {len(record.failed)} worlds of seed {seed}, expected"
-                f" {cfg.nworld}. Name another folder."
-            )
-        return record
-
-    def _write(self, record: EpisodeRecord) -> None:
-        """Write the seed's record, before the next one can break or be stopped. A full disk takes
-        no result back.
-        """
-        tally = self.tally
-        if tally.path is not None:
-            path = tally.path.with_name(record_name(tally.gate, record.seed))
-            if problem := safely_write(path, write_npz, record.arrays(), stops=False):
-                tally.details.append(problem)
+        return EpisodeRecord.read(folder, seed, self.tally.gate)
 
 
 def _worlds(tally: EpisodeTally, run: Run) -> Worlds:

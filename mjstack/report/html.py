@@ -75,7 +75,7 @@ def _section(section: Section) -> str:
 
 def _row(part: Part) -> str:
     """The class of a row that parts of a kind share; empty for a part that stands alone."""
-    return {Table: "side", Path: "pictures"}.get(Path if isinstance(part, Path) else type(part), "")
+    return "side" if isinstance(part, Table) else "pictures" if isinstance(part, Path) else ""
 
 
 def _part(part: Part) -> str:

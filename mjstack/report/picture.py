@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
-from PIL import Image, features
+from PIL import Image
 
-from mjstack.errors import MissingExtra, MjstackError
+from mjstack.errors import MissingExtra
 from mjstack.interrupt import check_interrupt
 from mjstack.report.gl import open_renderer
 from mjstack.report.page import frame_stride
@@ -162,11 +162,8 @@ def require_video(ending: str = ".mp4") -> Callable[[Path, Frames, int, float], 
 
     Raises:
         MissingExtra: The mp4 writer is not installed.
-        MjstackError: Pillow was built without WebP.
     """
     if ending in _LOOPS:
-        if ending == ".webp" and not features.check("webp"):
-            raise MjstackError("Pillow here writes no WebP", "Use job.format=gif or job.format=mp4")
         return partial(_write_loop, options=_LOOPS[ending])
     if find_spec("imageio_ffmpeg") is None:
         raise MissingExtra("video=true", "imageio-ffmpeg", "video")
