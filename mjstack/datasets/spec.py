@@ -94,33 +94,33 @@ class DatasetSpec:
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.fps, int) or self.fps < 1:
-            raise ArgumentError("fps", self.fps, "a whole number of frames per second, at least 1")
+        def require(holds: bool, label: str, value: object, expected: str) -> None:
+            if not holds:
+                raise ArgumentError(label, value, expected)
+
+        whole = isinstance(self.fps, int) and self.fps > 0
+        require(whole, "fps", self.fps, "a whole number of frames per second, at least 1")
         for name, feature in self.features.items():
             label = f"features['{name}']"
-            if "/" in name or name in INDICES:
-                raise ArgumentError(
-                    label, name, f"a name without / other than {', '.join(INDICES)}"
-                )
-            if feature.dtype not in DTYPES:
-                raise ArgumentError(f"{label}.dtype", feature.dtype, f"one of {', '.join(DTYPES)}")
-            if not len(feature.names) == len(set(feature.names)) == len(feature.units) > 0:
-                raise ArgumentError(
-                    f"{label}.names", list(feature.names), "names, each once, and a unit for each"
-                )
+            usable = "/" not in name and name not in INDICES
+            require(usable, label, name, f"a name without / other than {', '.join(INDICES)}")
+            known = feature.dtype in DTYPES
+            require(known, f"{label}.dtype", feature.dtype, f"one of {', '.join(DTYPES)}")
+            names = list(feature.names)
+            unique = len(names) == len(set(names)) == len(feature.units) > 0
+            require(unique, f"{label}.names", names, "names, each once, and a unit for each")
         for name, video in self.videos.items():
             label = f"videos['{name}']"
-            if "/" in name or name in self.features or name in INDICES:
-                raise ArgumentError(label, name, "a name without / that no feature has")
-            if video.codec not in CODECS:
-                raise ArgumentError(f"{label}.codec", video.codec, f"one of {', '.join(CODECS)}")
-            if min(video.height, video.width) < 2 or video.height % 2 or video.width % 2:
-                size = f"{video.height}x{video.width}"
-                expected = "even numbers of pixels, because a video halves the resolution of colour"
-                raise ArgumentError(label, size, expected)
+            usable = "/" not in name and name not in {*self.features, *INDICES}
+            require(usable, label, name, "a name without / that no feature has")
+            known = video.codec in CODECS
+            require(known, f"{label}.codec", video.codec, f"one of {', '.join(CODECS)}")
+            even = min(video.height, video.width) > 1 and not (video.height % 2 or video.width % 2)
+            expected = "even numbers of pixels, because a video halves the resolution of colour"
+            require(even, label, f"{video.height}x{video.width}", expected)
         for name, dtype in self.values.items():
-            if dtype not in VALUE_DTYPES:
-                raise ArgumentError(f"values['{name}']", dtype, f"one of {', '.join(VALUE_DTYPES)}")
+            known = dtype in VALUE_DTYPES
+            require(known, f"values['{name}']", dtype, f"one of {', '.join(VALUE_DTYPES)}")
 
 
 @dataclass(eq=False, kw_only=True, slots=True)
@@ -176,8 +176,9 @@ def typed_episode(
             or not finite.
     """
 
-    def misfit(name: str, problem: str, expected: object, fix: str) -> FolderError:
+    def misfit(name: str, problem: str, expected: object) -> FolderError:
         where = f"episode of seed {episode.seed}, world {episode.world}"
+        fix = "Correct the episode, or change the DatasetSpec"
         return FolderError(f"{where}: {name} {problem}, expected {expected}", fix)
 
     for noun, names, expected in (
@@ -186,10 +187,7 @@ def typed_episode(
         ("video", episode.images, spec.videos),
     ):
         if names.keys() != expected.keys():
-            problem = f"names are {', '.join(names) or 'missing'}"
-            raise misfit(
-                noun, problem, ", ".join(expected), "Give these, or change the DatasetSpec"
-            )
+            raise misfit(noun, f"names are {', '.join(names) or 'missing'}", ", ".join(expected))
 
     # Values of the row
     values = {name: getattr(episode, name) for name in OWN_VALUES} | dict(episode.values)
@@ -197,8 +195,7 @@ def typed_episode(
     for name, dtype in {**OWN_VALUES, **spec.values}.items():
         kinds, convert = VALUE_DTYPES[dtype]
         if not isinstance(values[name], kinds):
-            fix = "Convert it, or change the DatasetSpec"
-            raise misfit(name, f"is {values[name]!r}", dtype, fix)
+            raise misfit(name, f"is {values[name]!r}", dtype)
         row[name] = convert(values[name])
 
     # Frames
@@ -209,22 +206,20 @@ def typed_episode(
         rows = array[:, None] if array.ndim == feature.dim == 1 else array
         if rows.shape != (frames, feature.dim) or not frames:
             shape = f"({frames or 'frames'}, {feature.dim})"
-            raise misfit(name, f"has shape {array.shape}", shape, f"Give every frame's {name}")
+            raise misfit(name, f"has shape {array.shape}", shape)
         if not np.can_cast(rows.dtype, feature.dtype, "same_kind"):
-            fix = "Convert it, or change the feature"
-            raise misfit(name, f"is {rows.dtype}", feature.dtype, fix)
+            raise misfit(name, f"is {rows.dtype}", feature.dtype)
         with np.errstate(over="ignore"):
             typed[name] = np.ascontiguousarray(rows, dtype=feature.dtype)
         infinite = np.flatnonzero(~np.isfinite(typed[name]).all(axis=1))
         if len(infinite):
             problem = f"is not finite in {len(infinite)} of {frames} frames (first: {infinite[0]})"
-            raise misfit(name, problem, f"finite {feature.dtype}", "Leave the episode out")
+            raise misfit(name, problem, f"finite {feature.dtype}")
 
     # Images
     for name, video in spec.videos.items():
         images = episode.images[name]
         size = (frames, video.height, video.width, 3)
         if images.shape != size or images.dtype != np.uint8:
-            problem = f"is {images.dtype} of shape {images.shape}"
-            raise misfit(name, problem, f"uint8 of {size}", "Give an image for every frame")
+            raise misfit(name, f"is {images.dtype} of shape {images.shape}", f"uint8 of {size}")
     return row, typed
