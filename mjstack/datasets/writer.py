@@ -176,12 +176,12 @@ class DatasetWriter:
         for path in uncommitted(self.folder, self._shards):
             path.unlink()
         # Where the last writer and this one differ, such as in a version, both are on record.
-        while self._provenance and self._provenance[-1]["from_episode"] == len(self.committed):
-            del self._provenance[-1]
+        count = len(self.committed)
+        self._provenance = [p for p in self._provenance if p["from_episode"] < count]
         now = json.loads(json.dumps(dict(self.spec.provenance)))
-        last = self._provenance[-1] if self._provenance else {"from_episode": 0}
+        *_, last = [{"from_episode": 0}, *self._provenance]
         if last != {"from_episode": last["from_episode"], **now}:
-            self._provenance.append({"from_episode": len(self.committed), **now})
+            self._provenance.append({"from_episode": count, **now})
         self._write_totals()
 
     def _commit(self, parts: Sequence[Part]) -> None:

@@ -123,17 +123,19 @@ def _take_limited(metrics: dict[str, float], thresholds: dict[str, float]) -> It
     row per state and group, in which each stands beside its limit.
     """
     cells: dict[str, dict[str, str]] = {}
-    quantities = {name: name.partition(".")[2] for name in metrics}
-    limited = {n: q for n, q in quantities.items() if "." in q and q in thresholds}
-    for name, quantity in limited.items():
-        group, _, column = quantity.rpartition(".")
+    limits = set()
+    for name in list(metrics):
+        state, _, quantity = name.partition(".")
+        group, dot, column = quantity.rpartition(".")
+        if not dot or quantity not in thresholds:
+            continue
+        limits.add(quantity)
         limit = float(thresholds[quantity])
         value = float(metrics.pop(name))
         grade = "good" if value <= 0.5 * limit else "near" if value <= limit else "bad"
-        state = name.removesuffix(f".{quantity}")
-        row = cells.setdefault(", ".join(label(part) for part in (state, group) if part), {})
+        row = cells.setdefault(f"{label(state)}, {label(group)}", {})
         row[column] = Marked(f"{format_value(value)} / {format_value(limit)}", grade=grade)
-    for quantity in {*limited.values()}:
+    for quantity in limits:
         del thresholds[quantity]
     columns = list(dict.fromkeys(column for row in cells.values() for column in row))
     rows = [[name, *(row.get(column, "") for column in columns)] for name, row in cells.items()]
@@ -158,10 +160,9 @@ def _take_matrices(metrics: dict[str, float]) -> Iterator[Table]:
             continue
         body = []
         for name in names:
-            values = {column: metrics.pop(f"{name}.{column}") for column in columns}
             cells = [
-                with_unit(column if unit_ending(column) else name, value)
-                for column, value in values.items()
+                with_unit(column if unit_ending(column) else name, metrics.pop(f"{name}.{column}"))
+                for column in columns
             ]
             body.append([label(name), *cells])
         yield Table(title="Figures", header=["", *map(label, columns)], rows=body)
@@ -214,9 +215,8 @@ def _episode_parts(worlds: Worlds, thresholds: Mapping[str, float]) -> Iterator[
         rows.append([outcome, worlds.rules.get(outcome, ""), f"{len(names):,}", bar, listed])
     header = ["outcome", "meaning", "episodes", "share", "which"]
     yield Table(title="Outcomes", header=header, rows=rows)
-    limits = {name: _limits_of(name, thresholds) for name in worlds.values}
     histograms = [
-        histogram(name, values, failed, [thresholds[limit] for limit in limits[name]])
+        histogram(name, values, failed, [thresholds[end] for end in _limits_of(name, thresholds)])
         for name, values in worlds.values.items()
     ]
     if any(histograms):
