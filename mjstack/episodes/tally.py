@@ -182,17 +182,9 @@ class EpisodeTally:
         return name_worlds(self.names(episodes), self.episodes, limit, self.noun)
 
     def tables(self) -> list[Table]:
-        """Tables of the report: ranks, seeds, and first signs of failure."""
+        """Tables of the report: seeds, and first signs of failure."""
         tables = []
         last = self.records[-1]
-        if last.ranks:
-            firsts = [*last.ranks, len(last.failed)]
-            rows = [
-                [f"{first:,} to {end - 1:,}", where]
-                for (first, where), end in zip(last.ranks.items(), firsts[1:], strict=True)
-            ]
-            title = f"Which rank played which world (seed {last.seed})"
-            tables.append(Table(title=title, header=["worlds", "where"], rows=rows))
         if self.several:
             header = ["seed", "episodes", "succeeded", "rate", "95 % interval"]
             counts = [(r.seed, len(r.failed), int(r.succeeded.sum())) for r in self.records]
