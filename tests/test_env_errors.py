@@ -320,7 +320,6 @@ OUT_OF_RANGE: list[tuple[str, type[MjstackError], str]] = [
         TermError,
         "'elbow' does not exist. Did you mean 'elbow_f",
     ),
-    ("action.arm.params.joints=[shoulder_pan,shoulder_pan]", ConfigError, ""),
     ("action.arm.params.mode=absolut", ConfigError, "=absolut: expected one of relative, absolute"),
     ("action.arm.params.scale=0.0", ConfigError, "=0.0: expected a number above 0"),
     (
