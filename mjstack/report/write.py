@@ -54,7 +54,7 @@ def read_report(folder: Path, overrides: Sequence[str] = ()) -> Report | None:
         report.status = Status(data["status"])
         report.resumes = str(data["resumes"])
         report.provenance = dict(data.get("provenance", {}))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+    except Exception:  # it may hold anything
         return None
     return report
 
@@ -75,11 +75,10 @@ def safely_write(
     try:
         write(begun, *args)
         begun.replace(path)
-    except (Exception, KeyboardInterrupt) as error:
-        begun.unlink(missing_ok=True)
-        if isinstance(error, KeyboardInterrupt):
-            raise
+    except Exception as error:
         log.exception("%s was not written", path.name)
         reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
         return f"{path.name} was not written: {reason}"
+    finally:
+        begun.unlink(missing_ok=True)
     return ""
