@@ -276,6 +276,7 @@ DAMAGED: dict[str, tuple[Callable[[Path], object], str]] = {
         "cannot be read (JSONDecodeError",
     ),
     "another format": (change("format", value=7), "has format 7, expected 5, which mjstack"),
+    "version 0.1": (change("format", value=4), "has format 4 of version 0.1, expected 5"),
     "another network": (change("network", "hidden", value=[16]), "cannot be read"),
     "no number": (change("action", "execute", value=0), "cannot be read"),
     "a key less": (edit(lambda d: d["config"]["robot"].pop("home")), "cannot be read (KeyError"),

@@ -338,7 +338,7 @@ def test_copies_of_layouts(tmp_path: Path) -> None:
     """Each file once, byte for byte."""
     folder = tmp_path / "run"
     folder.mkdir()
-    own = tmp_path / "own"
+    own = tmp_path / "own.csv"  # of version 0.1: its ending stays, by which it is refused
     own.write_bytes(b"own")
     (tmp_path / "a.npz").write_bytes(b"any")
     cfg = load_config(["reset=starts_file", f"starts={tmp_path}/a.npz"])
@@ -352,10 +352,10 @@ def test_copies_of_layouts(tmp_path: Path) -> None:
     found = archive_starts(cfg, folder)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == {
         f"{STEM}.npz": b"any",
-        f"{STEM}_2.npz": b"own",
+        f"{STEM}_2.csv": b"own",
     }
     read = [term.params["path"] for term in found.reset.values()]
-    assert read == [str(folder / f"{STEM}{end}") for end in (".npz", "_2.npz", "_2.npz")]
+    assert read == [str(folder / f"{STEM}{end}") for end in (".npz", "_2.csv", "_2.csv")]
     assert found.reset["again"].params["pose"] == "home"
     assert cfg.reset["starts"].params["path"] == f"{tmp_path}/a.npz"  # as saved and shown
 

@@ -272,7 +272,7 @@ def test_a_file_with_too_few_rows_is_refused(rows: int, tmp_path: Path) -> None:
 
 
 def test_no_starts_file_at_all(tmp_path: Path) -> None:
-    """Damaged, of another format, without numbers, or missing."""
+    """Damaged, of another format, without numbers, missing, or of version 0.1."""
     path = tmp_path / "worlds.npz"
     cfg = from_file(path)
     missing = "it cannot be read (No such file or directory). Name a file: starts=worlds.npz"
@@ -284,6 +284,11 @@ def test_no_starts_file_at_all(tmp_path: Path) -> None:
         assert "it cannot be read (damaged, or of another format)" in refusal_of(cfg)
     np.savez(path)
     assert ": expected arrays red_xy, " in refusal_of(cfg)
+    cfg = from_file(tmp_path / "starts_seed0.csv")
+    assert refusal_of(cfg).endswith(
+        "expected an npz file; CSV is of version 0.1 and is not read any more. Make a new one with"
+        " write_starts or numpy.savez."
+    )
 
 
 def test_a_file_that_the_term_alone_names_is_called_by_its_key(tmp_path: Path) -> None:

@@ -156,4 +156,8 @@ def copy_names(cfg: Config) -> dict[str, str]:
         reset = cfg.gate.success.reset
     files = [term.params.get("path") for term in reset.values() if reads_starts_file({"": term})]
     paths = dict.fromkeys(path for path in files if path is not None)
-    return {path: f"{STEM}{f'_{n}' if n > 1 else ''}.npz" for n, path in enumerate(paths, 1)}
+    # With its ending, by which a term knows a file of version 0.1
+    return {
+        path: f"{STEM}{f'_{n}' if n > 1 else ''}{Path(path).suffix}"
+        for n, path in enumerate(paths, 1)
+    }

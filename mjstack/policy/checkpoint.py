@@ -206,9 +206,10 @@ def load_policy(folder: Path) -> Policy:
     with reading(path, _NAME_ANOTHER):
         facts = json.loads(read_inside(path))
         if facts["format"] != FORMAT:
+            of = " of version 0.1" if facts["format"] in (3, 4) else ""
             raise FolderError(
-                f"policy={folder}: has format {facts['format']}, expected {FORMAT}, which mjstack"
-                f" {mjstack.__version__} reads",
+                f"policy={folder}: has format {facts['format']}{of}, expected {FORMAT}, which"
+                f" mjstack {mjstack.__version__} reads",
                 "Use the mjstack that wrote it, or train it again",
             )
         policy = _from_facts(facts, path)

@@ -60,6 +60,9 @@ class StartsTable:
         self._path = path
         self._error = ConfigError if key == "starts" else ParameterError
         self._key = key
+        if Path(path).suffix == ".csv":
+            expected = "an npz file; CSV is of version 0.1 and is not read any more"
+            raise self.wrong(expected, "Make a new one with write_starts or numpy.savez")
         try:
             arrays = {name: np.atleast_1d(array) for name, array in read_npz(Path(path)).items()}
         except Exception as error:  # a file can be anything
