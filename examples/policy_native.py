@@ -19,7 +19,18 @@ def play(folder: str, steps: int) -> list[np.ndarray]:
     robot, execute = facts["robot"], facts["action"]["execute"]
     objects = {name: o["shape"] for name, o in facts["objects"].items() if not o["fixed"]}
     data.qpos[robot["qpos"]] = data.ctrl[robot["ctrl"]] = robot["home"]
+    option = mujoco.MjvOption()
+    option.sitegroup[:] = 0
+    model.vis.quality.offsamples = 0
+    cameras = facts["observation"].get("images", {}).items()
+    renderers = {name: mujoco.Renderer(model, *size) for name, size in cameras}
     past, targets = {}, []
+
+    def image(name: str) -> np.ndarray:
+        renderers[name].update_scene(data, name, option)
+        for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+            renderers[name].scene.flags[flag] = 0
+        return renderers[name].render()[None]
 
     def positions() -> np.ndarray:
         return np.array([data.body(name).xpos for name in objects])
@@ -41,14 +52,15 @@ def play(folder: str, steps: int) -> list[np.ndarray]:
         "goals": lambda: [place["xy"] for place in facts["places"].values()],
     }
     for step in range(steps):
-        mujoco.mj_kinematics(model, data)
+        mujoco.mj_fwdPosition(model, data)
         for name, term in facts["observation"]["terms"].items():
             value = np.ravel(terms[term["func"].split(".")[-1]](**term["params"]))
             value = np.clip(value, *(term["clip"] or (-np.inf, np.inf))) * term["scale"]
             past[name] = [*past.get(name, [value] * term["history"])[1:], value]
         if step % execute == 0:
             seen = np.concatenate([value for values in past.values() for value in values])
-            (chunk,) = session.run(None, {"observation": np.float32([seen])})[0]
+            images = {f"images.{name}": image(name) for name in renderers}
+            (chunk,) = session.run(None, {"observation": np.float32([seen]), **images})[0]
         targets.append(chunk[min(step % execute, len(chunk) - 1)])
         if step >= facts["timing"]["command_delay"]:
             data.ctrl[robot["ctrl"]] = targets[-1 - facts["timing"]["command_delay"]]

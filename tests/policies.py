@@ -26,12 +26,18 @@ from mjstack.envs import build_env
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
 from mjstack.interrupt import handle_interrupts
-from mjstack.policy import Policy, PolicyNetwork, load_policy, save_policy
+from mjstack.policy import Policy, PolicyNetwork, Vision, load_policy, save_policy
 from mjstack.train.learner import Learner
 
 
 def make_policy(
-    cfg: Config, *, group: str = "policy", chunk: int = 6, execute: int = 4, seed: int = 0
+    cfg: Config,
+    *,
+    group: str = "policy",
+    chunk: int = 6,
+    execute: int = 4,
+    seed: int = 0,
+    vision: Vision | None = None,
 ) -> Policy:
     """A policy around the robot's start that moves every joint by up to some 0.05 rad. If the
     configuration has a policy decide below the control rate, its action terms are those of the
@@ -44,7 +50,7 @@ def make_policy(
     env.close()
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        network = PolicyNetwork(sum(widths.values()), width, chunk, [16, 16])
+        network = PolicyNetwork(sum(widths.values()), width, chunk, [16, 16], vision)
     if targets:
         start = torch.tensor(cfg.robot.start, dtype=torch.float32)
         network.set_scale("action", start, torch.full_like(start, 0.05))

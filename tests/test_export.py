@@ -16,7 +16,7 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
-from environments import configure
+from environments import configure, has_gl
 from policies import make_policy, write_policy
 
 import mjstack
@@ -29,7 +29,7 @@ from mjstack.episodes.rollout import NOMINAL
 from mjstack.episodes.stage import Stage
 from mjstack.jobs import play as play_job
 from mjstack.jobs.export import check_export, export_facts
-from mjstack.policy import load_policy, save_policy
+from mjstack.policy import Vision, load_policy, save_policy
 from mjstack.policy.onnx import to_onnx
 
 SEEN = ("observation=state", "+observation.policy.terms.joint_vel.history=2")
@@ -115,7 +115,7 @@ def test_the_example_imports_no_mjstack() -> None:
     names = {a.name for node in ast.walk(tree) if isinstance(node, ast.Import) for a in node.names}
     assert names <= {"json", "sys", "mujoco", "numpy", "onnxruntime"}
     assert not any(isinstance(node, ast.ImportFrom) for node in ast.walk(tree))
-    assert len(EXAMPLE.read_text().splitlines()) <= 60
+    assert len(EXAMPLE.read_text().splitlines()) <= 72
 
 
 def drivers_targets(policy: Path, cfg: Config, steps: int) -> np.ndarray:
@@ -147,6 +147,45 @@ def test_the_example_drives_as_the_driver_does(task: str, exported: Path, tmp_pa
     wanted = drivers_targets(policy, cfg, 40)
     np.testing.assert_allclose(play(str(out), 40), wanted, rtol=0.0, atol=2e-5)
     assert wanted.std(0).max() > 1e-3  # it moves
+
+
+@pytest.fixture(scope="module")
+def sees(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
+    """A policy of task reach with two cameras, and overrides with them."""
+    folder = tmp_path_factory.mktemp("sees") / "policy"
+    args = ["task=reach", "sim=native", "nworld=1", "cameras=[front,wrist]", "observation=pixels"]
+    args += ["scene.cameras.front.size=[16,24]", "scene.cameras.wrist.size=[13,13]"]
+    args += ["+observation.policy.noise=false"]
+    sizes = {"front": (16, 24), "wrist": (13, 13)}
+    vision = Vision(sizes=sizes, channels=[4, 8], features=8)
+    policy = make_policy(load_config(args), vision=vision)
+    for encoder in policy.network.encoders:  # so that the answer depends on the images
+        encoder.layers[-2].weight.data *= 20.0
+    save_policy(folder, policy)
+    return folder, args
+
+
+def test_onnxruntime_sees_as_torch_does(sees: tuple[Path, list[str]]) -> None:
+    network = load_policy(sees[0]).network
+    sizes = network.vision.sizes
+    shown = [torch.randint(0, 256, (5, *size, 3), dtype=torch.uint8) for size in sizes.values()]
+    joints = torch.randn(5, 6)
+    session = onnxruntime.InferenceSession(to_onnx(network, {}))
+    inputs = {f"images.{name}": image.numpy() for name, image in zip(sizes, shown, strict=True)}
+    (found,) = session.run(["action"], {"observation": joints.numpy(), **inputs})
+    wanted = network(joints, [image.float() for image in shown]).numpy()
+    np.testing.assert_allclose(found, wanted, rtol=0.0, atol=2e-6)
+    assert wanted.std(0).max() > 1e-3
+
+
+@pytest.mark.skipif(not has_gl(), reason="MuJoCo does not draw offscreen here")
+def test_the_example_sees_as_the_driver_does(sees: tuple[Path, list[str]], tmp_path: Path) -> None:
+    policy, args = sees
+    assert export(policy, tmp_path / "out", *args) == 0
+    play = runpy.run_path(str(EXAMPLE))["play"]
+    wanted = drivers_targets(policy, load_config(args), 30)
+    np.testing.assert_allclose(play(str(tmp_path / "out"), 30), wanted, rtol=0.0, atol=2e-5)
+    assert wanted.std(0).max() > 1e-3
 
 
 def test_actions_of_a_policys_own_are_described(tmp_path: Path) -> None:

@@ -113,13 +113,6 @@ def test_other_cameras_are_refused(trained: Path, capsys: pytest.CaptureFixture[
     env.close()
 
 
-def test_a_policy_that_sees_images_is_not_exported(
-    trained: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(["job=export", *SMALL, f"policy={trained}/last"]) == 2
-    assert "sees images, expected one that sees numbers alone" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(
     ("change", "says"),
     [

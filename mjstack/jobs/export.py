@@ -35,12 +35,6 @@ def check_export(cfg: Config) -> CheckedJob:
     require_onnx()
     stage = Stage(replace(cfg, controller=replace(cfg.controller, name=DRIVER)))
     check_task(stage)
-    if stage.assets.policy.network.vision.sizes:
-        raise FolderError(
-            f"policy={cfg.policy}: sees images, expected one that sees numbers alone, which ONNX"
-            " files are written for",
-            "Play it with controller=policy",
-        )
     return CheckedJob(
         stage=stage,
         title=f"task {cfg.task.name}, policy {stage.assets.policy.folder}",
