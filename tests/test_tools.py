@@ -110,6 +110,18 @@ CAMERA = ["cameras=top", "scene.cameras.top.size=[32,32]"]
         ("bench_ik", [*SMALL, "--nworld", "8", "--iterations", "40"], "1.0000"),
         ("bench_policy", [*SMALL[:3], "--steps", "5", "--repetitions", "2"], "policy adds"),
         ("bench_physics", [*SMALL, "batch.njmax=200", "--steps", "2"], "bare mujoco_warp.step"),
+        (
+            "profile_pixels",
+            [
+                "experiment=pixels",
+                "task=reach",
+                *SMALL[:3],
+                *CAMERA,
+                "job.episodes=4",
+                "--batches=2",
+            ],
+            "aten::convolution_backward",
+        ),
         ("bench_solver", [*SMALL[:3], "batch.njmax=200", "--states", "40"], "100.000 %"),
     ],
 )

@@ -123,15 +123,18 @@ class Augmentation:
         """
         out = []
         for images, moves, tints in zip(pool, self._moves, self._tints, strict=True):
-            moves = (moves - self._shift)[..., None]
+            height, width = images.shape[1:3]
             y, x = (
-                (torch.arange(size, device=rows.device) + moves[:, axis]).clamp(0, size - 1)
-                for axis, size in enumerate(images.shape[1:3])
+                (torch.arange(size, device=rows.device) + move[:, None]).clamp(0, size - 1)
+                for size, move in zip((height, width), (moves - self._shift).T, strict=True)
             )
-            picked = images[rows[:, None, None], y[:, :, None], x[:, None, :]].float()
+            # Pixels are gathered as bytes
+            pixels = (rows[:, None, None] * height + y[:, :, None]) * width + x[:, None, :]
+            picked = images.view(-1, 3).index_select(0, pixels.flatten()).float()
+            picked = picked.view(*pixels.shape, 3)
             # Of all colours, and of each
             change = 0.5 * self._color * (tints[..., :1] + tints[..., 1:])
             gain = 1.0 + change[:, None, None, 0]
             offset = 127.5 * change[:, None, None, 1]
-            out.append((picked * gain + offset).clamp(0.0, 255.0))
+            out.append(picked.mul_(gain).add_(offset).clamp_(0.0, 255.0))
         return out
