@@ -157,7 +157,7 @@ def test_the_pool_keeps_an_even_share_in_any_order() -> None:
             first += count
         rows = pool.rows()
         assert (pool.steps[rows].diff() > 0).all()
-        assert torch.equal(pool.images[0][rows], images(pool.steps[rows]))
+        assert torch.equal(pool.images["front"][rows], images(pool.steps[rows]))
         return pool
 
     sizes = {"front": (2, 3)}
@@ -187,7 +187,7 @@ def test_images_of_a_round_come_again(backend: str, tmp_path: Path) -> None:
     steps = torch.arange(0, 6 * 70, job.execute)
     assert torch.equal(read.usable(job), steps)
     assert torch.equal(pools[1].steps[pools[1].rows()], steps)
-    for camera in range(2):
+    for camera in sizes:
         first, second = (pool.images[camera][pool.rows()] for pool in pools)
         assert torch.equal(first, second)
         assert first.flatten(1).float().std(1).min() > 5.0

@@ -24,7 +24,7 @@ class Vision:
         features: Numbers that the perceptron gets from each image.
     """
 
-    sizes: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    sizes: Mapping[str, Sequence[int]] = field(default_factory=dict)
     channels: Sequence[int] = ()
     features: int = 0
 
@@ -32,7 +32,7 @@ class Vision:
 class ImageEncoder(nn.Module):
     """Convolutions that turn images into some numbers each."""
 
-    def __init__(self, size: tuple[int, int], channels: Sequence[int], features: int) -> None:
+    def __init__(self, size: Sequence[int], channels: Sequence[int], features: int) -> None:
         """Make the layers for images of a size, height and width."""
         super().__init__()
         layers: list[nn.Module] = []

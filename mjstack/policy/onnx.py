@@ -12,7 +12,6 @@ from mjstack.errors import MissingExtra
 from mjstack.policy.network import FARTHEST, PolicyNetwork
 
 INPUT = "observation"
-IMAGES = "images."  # before the name of a camera
 OUTPUT = "action"
 _OPSET = 17
 _IR = 8  # runtimes since 2022 read these two
@@ -60,10 +59,8 @@ def to_onnx(network: PolicyNetwork, facts: Mapping[str, Any]) -> bytes:
             if isinstance(layer, nn.Linear):
                 value = add("Gemm", [value], layer.weight, layer.bias, transB=1)
             elif isinstance(layer, nn.Conv2d):
-                pads = [*layer.padding, *layer.padding]
-                value = add(
-                    "Conv", [value], layer.weight, layer.bias, strides=layer.stride, pads=pads
-                )
+                options = {"strides": layer.stride, "pads": [*layer.padding, *layer.padding]}
+                value = add("Conv", [value], layer.weight, layer.bias, **options)
             elif isinstance(layer, nn.ELU):
                 value = add("Elu", [value], alpha=layer.alpha)
             elif isinstance(layer, nn.Flatten):
@@ -79,17 +76,15 @@ def to_onnx(network: PolicyNetwork, facts: Mapping[str, Any]) -> bytes:
     kind = onnx.TensorProto.FLOAT
     inputs = [helper.make_tensor_value_info(INPUT, kind, ["n", len(network.observation_mean)])]
     for (name, size), encoder in zip(network.vision.sizes.items(), network.encoders, strict=True):
-        pixels = helper.make_tensor_value_info(
-            IMAGES + name, onnx.TensorProto.UINT8, ["n", *size, 3]
-        )
-        inputs.append(pixels)
-        value = add("Cast", [IMAGES + name], to=kind)
-        value = add("Transpose", [value], perm=[0, 3, 1, 2])
+        key = f"images.{name}"
+        shape = ["n", *size, 3]
+        inputs.append(helper.make_tensor_value_info(key, onnx.TensorProto.UINT8, shape))
+        value = add("Transpose", [add("Cast", [key], to=kind)], perm=[0, 3, 1, 2])
         value = add("Sub", [add("Div", [value], 127.5)], 1.0)
         parts.append(add_layers(value, encoder.get_submodule("layers")))
     value = add_layers(add("Concat", parts, axis=1), network.layers)
-    shape = torch.tensor([-1, network.chunk, network.width])
-    value = add("Mul", [add("Reshape", [value], shape)], network.action_std)
+    chunk = torch.tensor([-1, network.chunk, network.width])
+    value = add("Mul", [add("Reshape", [value], chunk)], network.action_std)
     value = add("Add", [value], network.action_mean)
     add("Min", [add("Max", [value], network.action_low)], network.action_high)
     nodes[-1].output[0] = OUTPUT

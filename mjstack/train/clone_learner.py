@@ -26,7 +26,7 @@ from mjstack.train.trainer import made_with, with_observation
 _LOSSES = {"absolute": nn.functional.l1_loss, "squared": nn.functional.mse_loss}
 _VALIDATION_SHARE = 20  # of so many episodes one is for validation
 _VALIDATED = 65536  # steps at once
-_VALIDATED_IMAGES = 4096  # steps, at most
+_MILLION = 1_000_003  # a prime: no other batch or rank of a training has its seed
 
 
 class CloneLearner(Learner):
@@ -119,9 +119,8 @@ class CloneLearner(Learner):
         validates = episode[steps] % _VALIDATION_SHARE == share - 1
         self._training = steps[~validates]
         self._rows = rows[~validates]
-        stride = -(-int(validates.sum()) // _VALIDATED_IMAGES) if self._pool else 1
-        self._validation = steps[validates][:: max(1, stride)]
-        self._validation_rows = rows[validates][:: max(1, stride)]
+        self._validation = steps[validates]
+        self._validation_rows = rows[validates]
         if not len(self._validation):  # of few episodes the expert may drive no chunk that is one
             self._validation = self._training
 
@@ -160,8 +159,7 @@ class CloneLearner(Learner):
         """
         share = (self.done - self._first) / (self._total - self._first)
         rate = 0.5 * (1.0 + math.cos(math.pi * share))
-        seed = draw_seed(self._cfg.seed, self._ranks.rank, self.done)
-        self._generator.manual_seed(seed)
+        self._generator.manual_seed(_MILLION * (self._cfg.seed + self._ranks.rank) + self.done)
         count = len(self._training)
         torch.randint(count, self._chosen.shape, generator=self._generator, out=self._chosen)
         self._noise.uniform_(-1.0, 1.0, generator=self._generator)
@@ -180,7 +178,7 @@ class CloneLearner(Learner):
         steps = self._training[self._chosen]
         images: Sequence[Tensor] = ()
         if self._pool is not None:
-            images = self._augment(self._pool.images, self._rows[self._chosen])
+            images = self._augment(self._pool.images.values(), self._rows[self._chosen])
         loss = self._loss(self._network, steps, images, self._widest * self._noise)
         # Into memory that is laid out as the weights, which the fused optimizer asks for
         for weight, gradient in zip(weights, torch.autograd.grad(loss, weights), strict=True):
@@ -225,7 +223,7 @@ class CloneLearner(Learner):
     def _validate(self) -> float:
         """The average network's loss in the episodes that are held out."""
         losses = []
-        stored = self._pool.images if self._pool is not None else ()
+        stored = [] if self._pool is None else self._pool.images.values()
         size = len(self._chosen) if stored else _VALIDATED
         parts = self._validation.split(size), self._validation_rows.split(size)
         for steps, rows in zip(*parts, strict=True):
@@ -277,8 +275,3 @@ class CloneLearner(Learner):
         pool = {} if self._pool is None else {"pool": len(self._pool.steps)}
         made = {"made_with": made_with(self._stage), "expert": self._expert}
         return super().facts() | made | pool
-
-
-def draw_seed(seed: int, rank: int, batch: int) -> int:
-    """Seed of what a rank draws for a batch: no other batch or rank of the training has it."""
-    return 1_000_003 * (seed + rank) + batch

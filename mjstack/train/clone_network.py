@@ -54,12 +54,8 @@ def input_noise(cfg: Config, model: mujoco.MjModel, widths: Mapping[str, int]) -
 
 def vision_of(cfg: Config, job: CloneJobCfg) -> Vision:
     """The images that a policy of the job sees."""
-    vision = job.vision
-    if not vision.cameras:
-        return Vision()
-    images = {name: cfg.scene.cameras[name].size for name in vision.cameras}
-    sizes = {name: (height, width) for name, (height, width) in images.items()}
-    return Vision(sizes=sizes, channels=vision.channels, features=vision.features)
+    sizes = {name: cfg.scene.cameras[name].size for name in job.vision.cameras}
+    return Vision(sizes=sizes, channels=job.vision.channels, features=job.vision.features)
 
 
 def _moments(values: Tensor, ranks: Ranks) -> tuple[Tensor, Tensor]:

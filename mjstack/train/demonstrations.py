@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
-from typing import cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -16,6 +16,9 @@ from mjstack.config.schema import CloneJobCfg
 from mjstack.episodes.batches import Batch
 from mjstack.episodes.stage import Stage
 from mjstack.train.images import AT_ONCE, ImagePool
+
+_ROWS = ("seen", "labels", "driven", "qpos")
+_SUMS = ("played", "judged", "succeeded", "seconds")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -87,22 +90,19 @@ class Demonstrations:
     @classmethod
     def join(cls, parts: Sequence["Demonstrations"]) -> "Demonstrations":
         """The episodes of all parts, in their order."""
+
+        def joined(name: str) -> Any:
+            values = [getattr(part, name) for part in parts]
+            return None if values[0] is None else torch.cat(values)
+
         first = [0, *itertools.accumulate(len(part.seen) for part in parts)]
-        states = [part.qpos for part in parts if part.qpos is not None]
-        driven = [part.driven for part in parts if part.driven is not None]
         return cls(
-            seen=torch.cat([part.seen for part in parts]),
-            labels=torch.cat([part.labels for part in parts]),
+            **{name: joined(name) for name in _ROWS},
             ends=torch.cat([part.ends + at for part, at in zip(parts, first, strict=False)]),
             widths=parts[0].widths,
-            driven=torch.cat(driven) if driven else None,
-            played=sum(part.played for part in parts),
-            judged=sum(part.judged for part in parts),
-            succeeded=sum(part.succeeded for part in parts),
+            **{name: sum(getattr(part, name) for part in parts) for name in _SUMS},
             broken=sum((Counter(part.broken) for part in parts), Counter()),
-            seconds=sum(part.seconds for part in parts),
             source=parts[0].source,
-            qpos=torch.cat(states) if states else None,
             fields={
                 name: torch.cat([part.fields[name] for part in parts]) for name in parts[0].fields
             },

@@ -3,7 +3,7 @@ device.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import cast
 
 import torch
@@ -31,21 +31,19 @@ class ImagePool:
     Attributes:
         steps: The step that each row shows, counted from the first call of `add` on, shape
             ``(rows,)``, int64; -1 where there is none yet.
-        images: Images of those steps, one for each camera, each ``(rows, height, width, 3)``,
-            uint8.
+        images: Images of those steps by camera, each ``(rows, height, width, 3)``, uint8.
     """
 
     def __init__(
         self, sizes: Mapping[str, Sequence[int]], rows: int, device: torch.device | str
     ) -> None:
         """Allocate rows for images of these heights and widths."""
-        self._names = list(sizes)
         self._before = 0  # steps of earlier calls
         self.steps = torch.full((rows,), -1, dtype=torch.int64, device=device)
-        self.images = [
-            torch.zeros((rows, *size, 3), dtype=torch.uint8, device=device)
-            for size in sizes.values()
-        ]
+        self.images = {
+            name: torch.zeros((rows, *size, 3), dtype=torch.uint8, device=device)
+            for name, size in sizes.items()
+        }
 
     def add(self, steps: Tensor, count: int, read: ReadImages) -> None:
         """Keep images of some of the next ``count`` steps.
@@ -64,9 +62,8 @@ class ImagePool:
         chosen = steps[stays[rows:]].split(AT_ONCE)
         for into, part in zip(free, chosen, strict=True):
             self.steps[into] = self._before + part
-            values = read(part)
-            for name, images in zip(self._names, self.images, strict=True):
-                images[into] = values[name]
+            for name, images in read(part).items():
+                self.images[name][into] = images
         self._before += count
 
     def rows(self) -> Tensor:
@@ -77,11 +74,7 @@ class ImagePool:
 
 def pool_rows(stage: Stage, steps: int) -> int:
     """Number of rows of the pool of a training: job.vision.pool, or as many as half of the free
-    memory has place for, and no more than there will be images.
-
-    Args:
-        stage: The stage.
-        steps: Control steps of a whole episode.
+    memory has place for, and no more than there will be images in episodes of so many steps.
 
     Raises:
         ConfigError: They, or the images of one batch of worlds, do not fit into memory.
@@ -117,7 +110,7 @@ class Augmentation:
         self._moves.random_(0, 2 * self._shift + 1, generator=generator)
         self._tints.uniform_(-1.0, 1.0, generator=generator)
 
-    def __call__(self, pool: Sequence[Tensor], rows: Tensor) -> list[Tensor]:
+    def __call__(self, pool: Iterable[Tensor], rows: Tensor) -> list[Tensor]:
         """Augmented images of some rows of a pool, each ``(n, height, width, 3)``, float32, 0 to
         255. What a shift leaves open repeats the border.
         """

@@ -5,7 +5,7 @@ answers in the states to which that leads are recorded.
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -26,10 +26,7 @@ from mjstack.train.demonstrations import Demonstrations
 from mjstack.train.images import ImagePool
 from mjstack.train.trainer import earlier_state, made_with, training_config
 
-# Of `Demonstrations`, in the file of a round
-_TENSORS = ("seen", "labels", "ends", "driven", "qpos")
-_FIELD = "field."  # before the name of a model field
-_FACTS = ("widths", "played", "judged", "succeeded", "broken", "seconds", "source")
+_FIELD = "field."  # before the name of a model field, in the file of a round
 
 
 class MixedDriver(Driver):
@@ -155,18 +152,18 @@ def make_round(
     plays = ranks.any(not (folder / name).exists())
     if plays:
         played = _play_round(stage, policy, number, pool)
-        tensors = {key: part for key in _TENSORS if (part := getattr(played, key)) is not None}
-        tensors |= {f"{_FIELD}{key}": values for key, values in played.fields.items()}
-        facts = {fact: getattr(played, fact) for fact in _FACTS}
+        facts = {part.name: getattr(played, part.name) for part in fields(played)}
+        facts |= {f"{_FIELD}{key}": values for key, values in facts.pop("fields").items()}
+        tensors = {key: facts.pop(key) for key in [*facts] if isinstance(facts[key], Tensor)}
         write_state(folder / name, tensors, facts | {"made_with": made_with(stage)})
     state = earlier_state(stage, folder, name)
     assert state is not None
     tensors, facts = state
     del facts["made_with"]
-    values: dict[str, Any] = {key: part.to(stage.backend[1]) for key, part in tensors.items()}
+    values = {key: part.to(stage.backend[1]) for key, part in tensors.items()}
     names = [key for key in values if key.startswith(_FIELD)]
-    fields = {key.removeprefix(_FIELD): values.pop(key) for key in names}
-    episodes = Demonstrations(**values, **facts, fields=fields)
+    looks = {key.removeprefix(_FIELD): values.pop(key) for key in names}
+    episodes = Demonstrations(**facts | values, fields=looks)
     if pool is not None and not plays:
         episodes.render(stage, pool)
     return episodes
@@ -192,20 +189,17 @@ def _play_round(
     def drive(plan: BatchPlan, env: Env) -> Driver:
         cameras = cfg.scene.cameras
         learner = PolicyDriver(env, policy, cameras) if policy else None
-        names = () if learner else job.vision.cameras
-        images = QueryImages(env, cameras, names, job.execute)
+        names = job.vision.cameras
+        images = learner.query_images if learner else QueryImages(env, cameras, names, job.execute)
         # Whole answers: the policy takes over where it is queried.
         spell = job.execute * max(1, round(job.spell / env.cfg.timing.step_dt / job.execute))
-        return MixedDriver(
-            stage.driver(env),
-            learner,
-            env,
-            learner.query_images if learner else images,
-            beta=beta,
-            alone=alone,
-            spell=spell,
-            length=job.length,
-        )
+        shares: dict[str, Any] = {
+            "beta": beta,
+            "alone": alone,
+            "spell": spell,
+            "length": job.length,
+        }
+        return MixedDriver(stage.driver(env), learner, env, images, **shares)
 
     parts = []
     for batch in play_batches(
