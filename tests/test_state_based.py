@@ -12,6 +12,7 @@ from compositions import load_config
 from doc_blocks import ROOT, write_files
 
 from mjstack import load_config as load_from
+from mjstack.cli import run
 from mjstack.config.schema import Config
 from mjstack.drivers.roles import ObjectRoles, Role, find_roles
 from mjstack.drivers.state_based import StateBasedDriver
@@ -163,6 +164,15 @@ def test_a_push_goes_on_from_wherever_the_arm_is(folder: Callable[[str], Path]) 
 
 def find(cfg: Config) -> list[ObjectRoles]:
     return find_roles(cfg, build_phases(cfg))
+
+
+def test_late_commands_are_refused_before_anything_runs(tmp_path: Path) -> None:
+    late = ["timing.command_delay=1", "sim=native", "nworld=2", f"hydra.run.dir={tmp_path}/out"]
+    for overrides in ([EXPERT, "gates=[success]"], ["job=train", f"job.folder={tmp_path}/out"]):
+        assert run([*overrides, *late]) == 2
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(ConfigError, match=r"timing.command_delay=1: expected 0 .* trainer=clone"):
+        find(load_config([EXPERT, *late[:1]]))
 
 
 @pytest.mark.parametrize(

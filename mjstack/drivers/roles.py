@@ -8,6 +8,8 @@ from mjstack.config.schema import Config
 from mjstack.errors import ConfigError
 from mjstack.scene.phases import Phase, source_names
 
+_OTHER = "Set controller=closed_loop, or trainer=clone to train a policy"
+
 
 class Role(IntEnum):
     """The part of a phase in bringing an object to its goal."""
@@ -44,8 +46,12 @@ def find_roles(cfg: Config, phases: Sequence[Phase]) -> list[ObjectRoles]:
         phases: Its phases.
 
     Raises:
-        ConfigError: They do nothing that a state tells.
+        ConfigError: They do nothing that a state tells, or commands are late: a state does not
+            have those that are still to come.
     """
+    if delay := cfg.timing.command_delay:
+        expected = f"0 with controller={cfg.controller.name}, which does not command ahead"
+        raise ConfigError("timing.command_delay", delay, expected, _OTHER)
     names = source_names(cfg.scene)
     moves = [k for k, phase in enumerate(phases) if phase.target is not None]
     moved: dict[str, ObjectRoles] = {}
@@ -103,8 +109,7 @@ def _find_release(phases: Sequence[Phase], place: int) -> tuple[int, int]:
 
 def _refusal(cfg: Config, why: str) -> ConfigError:
     expected = f"another controller, because the phases of task {cfg.task.name} {why}"
-    fix = "Set controller=closed_loop, or trainer=clone to train a policy"
-    return ConfigError("controller", cfg.controller.name, expected, fix)
+    return ConfigError("controller", cfg.controller.name, expected, _OTHER)
 
 
 def follows_anchor(phase: Phase, things: Sequence[str]) -> bool:
