@@ -8,7 +8,7 @@ from mjstack.config.schema import Config
 from mjstack.errors import ConfigError
 from mjstack.scene.phases import Phase, source_names
 
-_OTHER = "Set controller=closed_loop, or trainer=clone to train a policy"
+_FIX = "Set controller=closed_loop, or trainer=clone to train a policy"
 
 
 class Role(IntEnum):
@@ -51,7 +51,7 @@ def find_roles(cfg: Config, phases: Sequence[Phase]) -> list[ObjectRoles]:
     """
     if delay := cfg.timing.command_delay:
         expected = f"0 with controller={cfg.controller.name}, which does not command ahead"
-        raise ConfigError("timing.command_delay", delay, expected, _OTHER)
+        raise ConfigError("timing.command_delay", delay, expected, _FIX)
     names = source_names(cfg.scene)
     moves = [k for k, phase in enumerate(phases) if phase.target is not None]
     moved: dict[str, ObjectRoles] = {}
@@ -109,7 +109,7 @@ def _find_release(phases: Sequence[Phase], place: int) -> tuple[int, int]:
 
 def _refusal(cfg: Config, why: str) -> ConfigError:
     expected = f"another controller, because the phases of task {cfg.task.name} {why}"
-    return ConfigError("controller", cfg.controller.name, expected, _OTHER)
+    return ConfigError("controller", cfg.controller.name, expected, _FIX)
 
 
 def follows_anchor(phase: Phase, things: Sequence[str]) -> bool:
