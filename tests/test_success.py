@@ -7,7 +7,6 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,7 +22,7 @@ from mjstack.cli import run
 from mjstack.config.schema import Config
 from mjstack.episodes.failures import FailureMonitor, Sign
 from mjstack.episodes.record import FAILING
-from mjstack.episodes.regions import find_regions, radial_yaw_deg, regions_table
+from mjstack.episodes.regions import describe_region, find_regions, radial_yaw_deg, regions_table
 from mjstack.episodes.rollout import Hook
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Progress, Stage
@@ -417,29 +416,31 @@ def test_worst_regions_of_made_up_episodes() -> None:
     succeeded = ~(corner & (rng.random(n) < 0.9)) & ~(turned & (rng.random(n) < 0.5))
     cells = {"cell": 0.02, "yaw_cell_deg": 15.0, "episodes": 20, "objects": ("red", "blue")}
     regions = find_regions(places, succeeded, **cells)
-    assert [region.rate for region in regions] == sorted(region.rate for region in regions)
-    assert all(region.episodes >= 20 for region in regions)
-    assert not any(region.object == "red" and region.x_min_m == 0.4 for region in regions)
+    assert [region["rate"] for region in regions] == sorted(region["rate"] for region in regions)
+    assert all(region["episodes"] >= 20 for region in regions)
+    assert not any(region["object"] == "red" and region.get("x_min_m") == 0.4 for region in regions)
     worst = regions[0]
-    assert (worst.object, worst.x_min_m, worst.y_min_m) == ("red", 0.34, -0.14)
-    assert worst.where.startswith("red: x 0.340 to 0.360 m, y -0.140 to -0.120 m")
-    angles = [region for region in regions if region.object == "blue" and region.x_min_m is None]
-    assert (angles[0].yaw_min_deg, angles[0].yaw_max_deg) == (30.0, 45.0)
-    assert angles[0].where == "blue: turned 30 to 45 deg"
+    assert (worst["object"], worst["x_min_m"], worst["y_min_m"]) == ("red", 0.34, -0.14)
+    text = describe_region(worst)
+    assert text.startswith("red: x 0.340 to 0.360 m, y -0.140 to -0.120 m")
+    angles = [r for r in regions if r["object"] == "blue" and "x_min_m" not in r]
+    assert (angles[0]["yaw_min_deg"], angles[0]["yaw_max_deg"]) == (30.0, 45.0)
+    assert describe_region(angles[0]) == "blue: turned 30 to 45 deg"
     assert len(angles) == 6
-    assert sum(region.episodes for region in angles) == n
-    assert sum(region.succeeded for region in angles) == succeeded.sum()
-    placed = [region for region in regions if region.object == "red" and region.yaw_min_deg is None]
+    assert sum(region["episodes"] for region in angles) == n
+    assert sum(region["succeeded"] for region in angles) == succeeded.sum()
+    placed = [r for r in regions if r["object"] == "red" and "yaw_min_deg" not in r]
     assert len(placed) == 6
-    whole = next(region for region in placed if (region.x_min_m, region.y_min_m) == (0.34, -0.14))
-    assert (whole.episodes, whole.succeeded) == (int(corner.sum()), int((corner & succeeded).sum()))
-    assert (whole.rate_low95, whole.rate_high95) == wilson_interval(whole.succeeded, whole.episodes)
-    assert len(set(regions)) == len(regions)
+    whole = next(r for r in placed if (r["x_min_m"], r["y_min_m"]) == (0.34, -0.14))
+    counts = (int(corner.sum()), int((corner & succeeded).sum()))
+    assert (whole["episodes"], whole["succeeded"]) == counts
+    assert (whole["rate_low95"], whole["rate_high95"]) == wilson_interval(*reversed(counts))
+    assert len({str(region) for region in regions}) == len(regions)
     # A region without a failure has no place among the worst
-    flawless = replace(worst, object="blue", succeeded=worst.episodes)
+    flawless = worst | {"object": "blue", "succeeded": worst["episodes"]}
     (table,) = regions_table(load_config(["gate.success.worst_regions=2"]), [worst, flawless])
     assert table.title == "Worst regions of at least 20 episodes (1 of 1 with a failure)"
-    assert [row[0] for row in table.rows] == [worst.where]
+    assert [row[0] for row in table.rows] == [text]
 
 
 @pytest.mark.full

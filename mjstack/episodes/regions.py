@@ -4,8 +4,8 @@ as a table and a file.
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,46 +17,13 @@ from mjstack.math import wilson_interval
 from mjstack.report.table import Table
 from mjstack.report.write import safely_write
 
+Region = dict[str, Any]
+"""Episodes whose object started in one cell, by column of the file: the ``object``; the bounds that
+the cell has, of x and y of its centre [m] and of its direction [deg], as of `radial_yaw_deg`; how
+many ``episodes``, and how many ``succeeded``, their ``rate`` and its 95 % interval."""
+
+_BOUNDS = (*("x_min_m", "x_max_m", "y_min_m", "y_max_m"), "yaw_min_deg", "yaw_max_deg")
 _EDGE = 1e-9  # cells: a place this close below a cell's edge is on it
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Region:
-    """Episodes whose object started in one cell. A bound that a cell does not have is None.
-
-    Attributes:
-        object: Its name.
-        x_min_m: Least x of its centre [m], and so on.
-        yaw_min_deg: Least angle [deg] from the direction base to object to a face's normal, of 0 to
-            90, and so on.
-        episodes: How many.
-        succeeded: How many of them succeeded.
-        rate: Their share, and its 95 % interval.
-    """
-
-    object: str
-    x_min_m: float | None = None
-    x_max_m: float | None = None
-    y_min_m: float | None = None
-    y_max_m: float | None = None
-    yaw_min_deg: float | None = None
-    yaw_max_deg: float | None = None
-    episodes: int
-    succeeded: int
-    rate: float
-    rate_low95: float
-    rate_high95: float
-
-    @property
-    def where(self) -> str:
-        """The cell in words."""
-        parts = []
-        if self.x_min_m is not None:
-            parts.append(f"x {self.x_min_m:.3f} to {self.x_max_m:.3f} m")
-            parts.append(f"y {self.y_min_m:.3f} to {self.y_max_m:.3f} m")
-        if self.yaw_min_deg is not None:
-            parts.append(f"turned {self.yaw_min_deg:g} to {self.yaw_max_deg:g} deg")
-        return f"{self.object}: {', '.join(parts)}"
 
 
 def radial_yaw_deg(places: np.ndarray) -> np.ndarray:
@@ -91,56 +58,52 @@ def find_regions(
         episodes: Least number of episodes.
         objects: Names of the objects.
     """
-    out = []
+    out: list[Region] = []
+    widths = np.array([cell, cell, yaw_cell_deg])
+    ends = np.array([math.inf, math.inf, 90.0])
     for number, name in enumerate(objects):
-        x, y = np.floor(places[:, number, :2] / cell + _EDGE).T
-        yaw = np.floor(radial_yaw_deg(places[:, number]) / yaw_cell_deg + _EDGE)
-        yaw[yaw * yaw_cell_deg >= 90.0] = 0.0  # on the edge of 90, which is 0
-        # Each axis: the cell of every episode, the width and the unit of a cell, and the last edge.
-        axes = {
-            "x": (x, cell, "m", math.inf),
-            "y": (y, cell, "m", math.inf),
-            "yaw": (yaw, yaw_cell_deg, "deg", 90.0),
-        }
-        for chosen in (("x", "y"), ("yaw",), ("x", "y", "yaw")):
-            keys = np.stack([axes[axis][0] for axis in chosen], axis=1)
-            cells, which = np.unique(keys, axis=0, return_inverse=True)
-            for row, key in enumerate(cells.tolist()):
+        yaw = radial_yaw_deg(places[:, number])
+        keys = np.floor(np.column_stack((places[:, number, :2], yaw)) / widths + _EDGE)
+        keys[keys[:, 2] * yaw_cell_deg >= 90.0, 2] = 0.0  # on the edge of 90, which is 0
+        for axes in ([0, 1], [2], [0, 1, 2]):
+            cells, which = np.unique(keys[:, axes], axis=0, return_inverse=True)
+            for row, key in enumerate(cells):
                 outcomes = succeeded[which.ravel() == row]
                 n = len(outcomes)
                 if n < episodes:
                     continue
                 k = int(outcomes.sum())
-                bounds = {}
-                for axis, at in zip(chosen, key, strict=True):
-                    _, width, unit, last = axes[axis]
-                    bounds[f"{axis}_min_{unit}"] = round(at * width, 9)
-                    bounds[f"{axis}_max_{unit}"] = min(round((at + 1.0) * width, 9), last)
+                edges = (key * widths[axes], np.minimum((key + 1.0) * widths[axes], ends[axes]))
+                names = [_BOUNDS[2 * axis + end] for axis in axes for end in (0, 1)]
+                bounds = zip(names, np.column_stack(edges).round(9).ravel().tolist(), strict=True)
                 low, high = wilson_interval(k, n)
+                interval = {"rate": k / n, "rate_low95": low, "rate_high95": high}
                 out.append(
-                    Region(
-                        object=name,
-                        **bounds,
-                        episodes=n,
-                        succeeded=k,
-                        rate=k / n,
-                        rate_low95=low,
-                        rate_high95=high,
-                    )
+                    {"object": name, **dict(bounds), "episodes": n, "succeeded": k, **interval}
                 )
-    return sorted(out, key=lambda region: (region.rate, region.rate_high95))
+    return sorted(out, key=lambda region: (region["rate"], region["rate_high95"]))
+
+
+def describe_region(region: Region) -> str:
+    """The cell in words."""
+    texts = {
+        "x_min_m": "x {x_min_m:.3f} to {x_max_m:.3f} m, y {y_min_m:.3f} to {y_max_m:.3f} m",
+        "yaw_min_deg": "turned {yaw_min_deg:g} to {yaw_max_deg:g} deg",
+    }
+    parts = [text.format(**region) for name, text in texts.items() if name in region]
+    return f"{region['object']}: {', '.join(parts)}"
 
 
 def regions_table(cfg: Config, regions: list[Region]) -> list[Table]:
     """The regions with the lowest rates; no table where none has a failure."""
     t = cfg.gate.success
-    failing = [r for r in regions if r.succeeded < r.episodes]
+    failing = [r for r in regions if r["succeeded"] < r["episodes"]]
     if not failing:
         return []
-    rows = [
-        [r.where, str(r.episodes), str(r.succeeded), *rate_cells(r.succeeded, r.episodes)]
-        for r in failing[: t.worst_regions]
-    ]
+    rows = []
+    for region in failing[: t.worst_regions]:
+        n, k = region["episodes"], region["succeeded"]
+        rows.append([describe_region(region), str(n), str(k), *rate_cells(k, n)])
     title = (
         f"Worst regions of at least {t.cell_episodes} episodes ({len(rows)} of {len(failing)} with"
         " a failure)"
@@ -151,5 +114,4 @@ def regions_table(cfg: Config, regions: list[Region]) -> list[Table]:
 
 def save_regions(folder: Path, regions: list[Region]) -> str:
     """Write the table of regions; return why it was not written, empty if it was."""
-    rows = to_csv([asdict(region) for region in regions], [f.name for f in fields(Region)])
-    return safely_write(folder / REGIONS, write_atomic, rows)
+    return safely_write(folder / REGIONS, write_atomic, to_csv(regions, ("object", *_BOUNDS)))

@@ -79,7 +79,7 @@ def run_success(run: Run) -> list[GateResult]:
     parts = [f"{tally.summary}, {format_percent(t.rate)} wanted"]
     if retried:
         parts.append(f"{retried} retried, {retried_succeeded} of them succeeded")
-    if all(region.succeeded == region.episodes for region in regions):
+    if all(region["succeeded"] == region["episodes"] for region in regions):
         there = "had a failure" if regions else "(gate.success.cell_episodes): more seeds have more"
         tally.details.append(f"no region of at least {t.cell_episodes} episodes {there}")
     if run.folder is not None and (problem := save_regions(run.folder, regions)):
