@@ -30,7 +30,7 @@ from mjstack.cli import run
 from mjstack.config.check import validate
 from mjstack.config.load import load_saved
 from mjstack.config.schema import Backend, TermCfg
-from mjstack.episodes.earlier_run import STEM, archive_starts, copy_names
+from mjstack.episodes.earlier_run import COPY, archive_starts, played_starts
 from mjstack.episodes.record import EpisodeRecord, record_name
 from mjstack.episodes.replay import simulate_alone
 from mjstack.episodes.rollout import snapshot
@@ -334,37 +334,28 @@ def test_what_the_start_does_not_show_is_found_at_the_end(from_file: Path, tmp_p
 
 
 @pytest.mark.full
-def test_copies_of_layouts(tmp_path: Path) -> None:
-    """Each file once, byte for byte."""
+def test_the_copy_of_a_starts_file(tmp_path: Path) -> None:
+    """Byte for byte, for all terms that read it."""
     folder = tmp_path / "run"
     folder.mkdir()
-    own = tmp_path / "own.csv"  # of version 0.1: its ending stays, by which it is refused
-    own.write_bytes(b"own")
-    (tmp_path / "a.npz").write_bytes(b"any")
-    cfg = load_config(["reset=starts_file", f"starts={tmp_path}/a.npz"])
-    cfg.reset["own"] = TermCfg(
-        func="mjstack.mdp.starts.starts_file.FromStartsFile", params={"path": str(own)}
-    )
-    cfg.reset["again"] = TermCfg(
-        func="mjstack.mdp.starts.starts_file.FromStartsFile",
-        params={"path": str(own), "pose": "home"},
-    )
+    own = tmp_path / "a.npz"
+    own.write_bytes(b"any")
+    cfg = load_config(["reset=starts_file", f"starts={own}"])
+    func = "mjstack.mdp.starts.starts_file.FromStartsFile"
+    cfg.reset["again"] = TermCfg(func=func, params={"path": str(own), "pose": "home"})
     found = archive_starts(cfg, folder)
-    assert {path.name: path.read_bytes() for path in folder.iterdir()} == {
-        f"{STEM}.npz": b"any",
-        f"{STEM}_2.csv": b"own",
-    }
+    assert [path.read_bytes() for path in folder.iterdir()] == [b"any"]
     read = [term.params["path"] for term in found.reset.values()]
-    assert read == [str(folder / f"{STEM}{end}") for end in (".npz", "_2.csv", "_2.csv")]
+    assert read == [str(folder / COPY)] * 2
     assert found.reset["again"].params["pose"] == "home"
-    assert cfg.reset["starts"].params["path"] == f"{tmp_path}/a.npz"  # as saved and shown
+    assert cfg.reset["starts"].params["path"] == str(own)  # as saved and shown
 
     plain = load_config(["gates=[batch]"])
     assert archive_starts(plain, folder) == plain
     plain.gate.success.reset = dict(cfg.reset)
-    assert not copy_names(plain)  # of a gate that does not run
+    assert played_starts(plain) is None  # of a gate that does not run
     plain.gates = ["success"]
-    assert list(copy_names(plain)) == [f"{tmp_path}/a.npz", str(own)]
+    assert played_starts(plain) == str(own)
 
 
 @pytest.mark.full

@@ -1,4 +1,4 @@
-"""The folder of an earlier run: its configuration, report, records, and copies of starts files."""
+"""The folder of an earlier run: its configuration, report and records, and its starts file."""
 
 import json
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ from mjstack.errors import FolderError, MjstackError
 from mjstack.files import reading, write_atomic
 
 REPORT = "report.json"
-STEM = "starts_played"
+COPY = "starts_played.npz"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -106,42 +106,45 @@ class EarlierRun:
 
 
 def archive_starts(cfg: Config, folder: Path) -> Config:
-    """Copy every starts file that worlds start from, byte for byte, for the run and its replays.
+    """Copy the starts file that worlds start from, byte for byte, for the run and its replays.
 
     Args:
         cfg: The run's configuration.
         folder: The run's folder.
 
     Returns:
-        The configuration with the copies as its terms' files.
+        The configuration with the copy as the file of its terms.
 
     Raises:
-        OSError: A file cannot be read, or a copy cannot be written.
+        OSError: The file cannot be read, or the copy cannot be written.
     """
-    for path, name in copy_names(cfg).items():
-        write_atomic(folder / name, Path(path).read_bytes())
+    if path := played_starts(cfg):
+        write_atomic(folder / COPY, Path(path).read_bytes())
     return archived_starts(cfg, folder)
 
 
 def archived_starts(cfg: Config, folder: Path) -> Config:
-    """A run's configuration, with the copies in its folder as its terms' files.
+    """A run's configuration, with the copy in its folder as the file of its terms.
 
     Raises:
-        FolderError: A copy is missing.
+        FolderError: The copy is missing.
     """
-    copies = {path: folder.resolve() / name for path, name in copy_names(cfg).items()}
-    for path, copy in copies.items():
-        if not copy.is_file():
-            raise FolderError(
-                f"run={folder}: has no {copy.name}, expected a copy of the starts file that it"
-                f" started from, {path}. Put one there, unchanged."
-            )
+    path = played_starts(cfg)
+    if path is None:
+        return cfg
+    copy = folder.resolve() / COPY
+    if not copy.is_file():
+        raise FolderError(
+            f"run={folder}: has no {COPY}, expected a copy of the starts file that it started from,"
+            f" {path}. Put one there, unchanged."
+        )
 
     def swap(reset: Mapping[str, TermCfg]) -> dict[str, TermCfg]:
+        params = {"path": str(copy)}
         return {
-            key: term
-            if (copy := copies.get(term.params.get("path", ""))) is None
-            else replace(term, params=term.params | {"path": str(copy)})
+            key: replace(term, params=term.params | params)
+            if term.params.get("path") == path
+            else term
             for key, term in reset.items()
         }
 
@@ -149,15 +152,10 @@ def archived_starts(cfg: Config, folder: Path) -> Config:
     return replace(cfg, reset=swap(cfg.reset), gate=replace(cfg.gate, success=success))
 
 
-def copy_names(cfg: Config) -> dict[str, str]:
-    """The name of the copy of each file that worlds of a gate start from; empty if none does."""
+def played_starts(cfg: Config) -> str | None:
+    """The file that worlds of a gate start from; None if they start from none."""
     reset = cfg.reset
     if "success" in cfg.gates and not reads_starts_file(reset):
         reset = cfg.gate.success.reset
-    files = [term.params.get("path") for term in reset.values() if reads_starts_file({"": term})]
-    paths = dict.fromkeys(path for path in files if path is not None)
-    # With its ending, by which a term knows a file of version 0.1
-    return {
-        path: f"{STEM}{f'_{n}' if n > 1 else ''}{Path(path).suffix}"
-        for n, path in enumerate(paths, 1)
-    }
+    paths = (term.params.get("path") for term in reset.values() if reads_starts_file({"": term}))
+    return next(filter(None, paths), None)
