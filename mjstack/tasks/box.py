@@ -377,11 +377,5 @@ class BoxSuccess(HeldSuccess):
             MjstackError: The task has another check.
         """
         check = BoxCheck(env.cfg)
-        view = check.view(env)
         let_go = released(*check.objects, open_fraction=check.t.open_fraction)
-
-        def done() -> Tensor:
-            step = view.step()
-            return (check.resting(step) & let_go(step)).all(1)
-
-        super().__init__(env, done, check.settle_steps)
+        super().__init__(env, check.view(env), [check.resting, let_go], check.settle_steps)

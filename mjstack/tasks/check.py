@@ -203,10 +203,7 @@ class EpisodeCheck(ABC):
         name = node.pop("func", None)
         if not issubclass(check_class(cfg) or object, type(self)):
             expected = f"{type(self).__module__}.{type(self).__name__}, whose rules a term needs"
-            if cfg.task.success:
-                expected += f", such as task.success ({cfg.task.success.func})"
-            key = "task.check.func" if name else "task.check"
-            raise ConfigError(key, name or "null", expected)
+            raise ConfigError("task.check.func", name or "null", expected)
         self.cfg = cfg
         self.t: Any = typed("task.check", node, self.Thresholds)
         self.key = f"{type(self).__module__}.{type(self).__qualname__} {self.t}"

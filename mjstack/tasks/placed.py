@@ -1,8 +1,8 @@
-"""Success of a step: a condition has held for some steps; for any task that has a check, that every
+"""Success of a step: conditions have held for some steps; for any task that has a check, that every
 object is where it belongs.
 """
 
-from collections.abc import Callable
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -11,26 +11,33 @@ from mjstack.config.fields import Count, Fraction
 from mjstack.managers.view import EnvView
 from mjstack.tasks.check import make_check
 from mjstack.tasks.parts import Condition, released
+from mjstack.tasks.view import TaskView
 
 
 class HeldSuccess:
-    """Achieved while a condition has held for some steps in a row."""
+    """Achieved while conditions have held for some steps in a row."""
 
-    def __init__(self, env: EnvView, condition: Callable[[], Tensor], steps: int) -> None:
+    def __init__(
+        self, env: EnvView, view: TaskView, conditions: Sequence[Condition], steps: int
+    ) -> None:
         """Allocate the streaks.
 
         Args:
             env: The environment.
-            condition: Whether it holds now, shape ``(nworld,)``, bool.
+            view: Of the task's objects.
+            conditions: All have to hold, each shape ``(nworld, n)``, bool.
             steps: How many steps in a row.
         """
-        self._condition = condition
+        self._view = view
+        self._conditions = conditions
         self._steps = steps
         self._length = torch.zeros(env.nworld, dtype=torch.int32, device=env.device)
 
     def __call__(self, env: EnvView) -> Tensor:
         """Process a step; shape ``(nworld,)``, bool."""
-        self._length.add_(1).mul_(self._condition())
+        step = self._view.step()
+        holds = torch.cat([condition(step) for condition in self._conditions], dim=1)
+        self._length.add_(1).mul_(holds.all(1))
         return self._length >= self._steps
 
     def reset(self, mask: Tensor) -> None:
@@ -58,13 +65,7 @@ class Placed(HeldSuccess):
             MjstackError: The task has no check, or the number is out of range.
         """
         check = make_check(env.cfg)
-        view = check.view(env)
         conditions: list[Condition] = [check.placed]
         if open_fraction is not None:
             conditions.append(released(*check.objects, open_fraction=open_fraction))
-
-        def holds() -> Tensor:
-            step = view.step()
-            return torch.cat([condition(step) for condition in conditions], dim=1).all(1)
-
-        super().__init__(env, holds, steps)
+        super().__init__(env, check.view(env), conditions, steps)

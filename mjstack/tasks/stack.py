@@ -148,7 +148,7 @@ class StackSuccess(HeldSuccess):
         """
         check = StackCheck(env.cfg)
         view = check.view(env)
-        super().__init__(env, lambda: self._stands(view.step()), check.t.window)
+        super().__init__(env, view, [self._stands], check.t.window)
         self._check = check
         ring = (check.t.window, len(view.objects))
         # Where the oldest step is, in every world.
@@ -163,7 +163,7 @@ class StackSuccess(HeldSuccess):
         written anew before the streak can reach the window.
         """
         self._slot.add_(1).remainder_(self._steps)
-        stands = self._check.placed(step).all(1) & self._check.released(step)[:, 0]
+        stands = self._check.placed(step).all(1, keepdim=True) & self._check.released(step)
         if not stands.is_cuda and not bool(stands.any()):
             return stands  # no window that holds this step can pass: its slot is never judged
         self._pose.index_copy_(1, self._slot, step.pose[:, None])
