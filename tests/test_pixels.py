@@ -263,7 +263,7 @@ def success_rate(overrides: Sequence[str], folder: Path) -> float:
 
 @pytest.mark.full
 def test_two_cores_train_reach_from_pixels(tmp_path: Path) -> None:
-    """One camera of 48 x 48 pixels, from 64 unseen starts: some three minutes."""
+    """One camera of 48 x 48 pixels, from 64 unseen starts: some two minutes."""
     overrides = ["job=train", "experiment=pixels", "task=reach", "sim=mjwarp", "sim.device=cpu"]
     overrides += ["nworld=64", "cameras=front", "scene.cameras.front.size=[48,48]"]
     assert success_rate(overrides, tmp_path) >= 60 / 64

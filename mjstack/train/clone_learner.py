@@ -26,7 +26,6 @@ from mjstack.train.trainer import made_with, with_observation
 _LOSSES = {"absolute": nn.functional.l1_loss, "squared": nn.functional.mse_loss}
 _VALIDATION_SHARE = 20  # of so many episodes one is for validation
 _VALIDATED = 65536  # steps at once
-_MILLION = 1_000_003  # a prime: no other batch or rank of a training has its seed
 
 
 class CloneLearner(Learner):
@@ -159,7 +158,7 @@ class CloneLearner(Learner):
         """
         share = (self.done - self._first) / (self._total - self._first)
         rate = 0.5 * (1.0 + math.cos(math.pi * share))
-        self._generator.manual_seed(_MILLION * (self._cfg.seed + self._ranks.rank) + self.done)
+        self._generator.manual_seed(draw_seed(self._cfg.seed, self._ranks.rank, self.done))
         count = len(self._training)
         torch.randint(count, self._chosen.shape, generator=self._generator, out=self._chosen)
         self._noise.uniform_(-1.0, 1.0, generator=self._generator)
@@ -275,3 +274,8 @@ class CloneLearner(Learner):
         pool = {} if self._pool is None else {"pool": len(self._pool.steps)}
         made = {"made_with": made_with(self._stage), "expert": self._expert}
         return super().facts() | made | pool
+
+
+def draw_seed(seed: int, rank: int, batch: int) -> int:
+    """Seed of what a rank draws for a batch: no other batch or rank of the training has it."""
+    return 1_000_003 * (seed + rank) + batch
