@@ -94,33 +94,33 @@ class DatasetSpec:
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        def require(holds: bool, label: str, value: object, expected: str) -> None:
-            if not holds:
-                raise ArgumentError(label, value, expected)
-
-        whole = isinstance(self.fps, int) and self.fps > 0
-        require(whole, "fps", self.fps, "a whole number of frames per second, at least 1")
+        if not isinstance(self.fps, int) or self.fps < 1:
+            raise ArgumentError("fps", self.fps, "a whole number of frames per second, at least 1")
         for name, feature in self.features.items():
             label = f"features['{name}']"
-            usable = "/" not in name and name not in INDICES
-            require(usable, label, name, f"a name without / other than {', '.join(INDICES)}")
-            known = feature.dtype in DTYPES
-            require(known, f"{label}.dtype", feature.dtype, f"one of {', '.join(DTYPES)}")
-            names = list(feature.names)
-            unique = len(names) == len(set(names)) == len(feature.units) > 0
-            require(unique, f"{label}.names", names, "names, each once, and a unit for each")
+            if "/" in name or name in INDICES:
+                raise ArgumentError(
+                    label, name, f"a name without / other than {', '.join(INDICES)}"
+                )
+            if feature.dtype not in DTYPES:
+                raise ArgumentError(f"{label}.dtype", feature.dtype, f"one of {', '.join(DTYPES)}")
+            if not len(feature.names) == len(set(feature.names)) == len(feature.units) > 0:
+                raise ArgumentError(
+                    f"{label}.names", list(feature.names), "names, each once, and a unit for each"
+                )
         for name, video in self.videos.items():
             label = f"videos['{name}']"
-            usable = "/" not in name and name not in {*self.features, *INDICES}
-            require(usable, label, name, "a name without / that no feature has")
-            known = video.codec in CODECS
-            require(known, f"{label}.codec", video.codec, f"one of {', '.join(CODECS)}")
-            even = min(video.height, video.width) > 1 and not (video.height % 2 or video.width % 2)
-            expected = "even numbers of pixels, because a video halves the resolution of colour"
-            require(even, label, f"{video.height}x{video.width}", expected)
+            if "/" in name or name in self.features or name in INDICES:
+                raise ArgumentError(label, name, "a name without / that no feature has")
+            if video.codec not in CODECS:
+                raise ArgumentError(f"{label}.codec", video.codec, f"one of {', '.join(CODECS)}")
+            if min(video.height, video.width) < 2 or video.height % 2 or video.width % 2:
+                size = f"{video.height}x{video.width}"
+                expected = "even numbers of pixels, because a video halves the resolution of colour"
+                raise ArgumentError(label, size, expected)
         for name, dtype in self.values.items():
-            known = dtype in VALUE_DTYPES
-            require(known, f"values['{name}']", dtype, f"one of {', '.join(VALUE_DTYPES)}")
+            if dtype not in VALUE_DTYPES:
+                raise ArgumentError(f"values['{name}']", dtype, f"one of {', '.join(VALUE_DTYPES)}")
 
 
 @dataclass(eq=False, kw_only=True, slots=True)
