@@ -3,7 +3,6 @@ first.
 """
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -17,7 +16,7 @@ from mjstack.report.page import MOST_WORLDS, Page, World, frame_stride
 from mjstack.report.write import safely_write
 
 _BYTES = 64 * 2**20  # of one recording
-_MARKS = ("label", "failed")  # of a world, in the file beside its positions
+_PARTS = ("label", "failed", "qpos")  # of a world, in the file
 
 
 def motion_recorder(step_dt: float) -> Recorder:
@@ -60,8 +59,7 @@ def show_batch(
         label = f"{world}: {broken}" if broken else str(world)
         moving.append(World(label=label, qpos=motion, failed=bool(broken)))
     page.worlds3d[gate] = moving
-    arrays: dict[str, Any] = {name: [getattr(world, name) for world in moving] for name in _MARKS}
-    arrays["qpos"] = [world.qpos for world in moving]
+    arrays = {name: [getattr(world, name) for world in moving] for name in _PARTS}
     if problem := safely_write(path, write_npz, arrays, stops=False):
         stage.progress.print_line(problem)
 
@@ -75,13 +73,7 @@ def restore_batch(page: Page, path: Path, gate: str) -> None:
     if path.exists():
         with reading(path, "Remove it"):
             arrays = read_npz(path)
-            marks = [arrays[name].tolist() for name in _MARKS]
             page.worlds3d[gate] = [
-                World(label=label, qpos=qpos, failed=failed)
-                for label, failed, qpos in zip(*marks, arrays["qpos"], strict=True)
+                World(label=str(label), failed=bool(failed), qpos=qpos)
+                for label, failed, qpos in zip(*(arrays[name] for name in _PARTS), strict=True)
             ]
-
-
-def motion_path(folder: Path, gate: str) -> Path:
-    """The file of a gate's worlds in motion."""
-    return folder / f"motion_{gate}.npz"

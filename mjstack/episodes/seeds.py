@@ -12,7 +12,7 @@ import numpy as np
 
 from mjstack.episodes.batches import Batch, BatchPlan, play_batches
 from mjstack.episodes.failures import FailureMonitor
-from mjstack.episodes.motion import motion_path, motion_recorder, restore_batch, show_batch
+from mjstack.episodes.motion import motion_recorder, restore_batch, show_batch
 from mjstack.episodes.record import (
     FAILING,
     SUCCESS_FAILING,
@@ -72,7 +72,7 @@ def play_seeds(
             "backend": sim.description,
             "sizes": str(sim.sizes or "native MuJoCo has no fixed buffers"),
         }
-        motion = motion_path(folder, gate) if folder is not None and run.page.motion else None
+        motion = folder / f"motion_{gate}.npz" if folder is not None and run.page.motion else None
         player = _Player(run, tally, signs, observers, motion)
         try:
             player.play(range(cfg.seed, cfg.seed + count), sim)
