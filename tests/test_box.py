@@ -341,7 +341,6 @@ def test_lowest_point_of_a_turned_geom(kind: str) -> None:
         ("scene.box.wall=-0.006", ["scene.box.wall=-0.006", "above 0"]),
         ("scene.box.friction=[1,0.005]", ["scene.box.friction", "3 numbers"]),
         ("scene.places.red_slot.xy=[0.46,0.26]", ["red_slot.xy", "a place in the box"]),
-        ("scene.objects.blue.xy=[0.35,0.0]", ["scene.objects.blue.xy", "beside the box"]),
         ("scene.random_xy=[0.1]", ["scene.random_xy", "2 numbers"]),
         ("scene.random_xy=[0.1,-0.1]", ["scene.random_xy", "at least 0"]),
         ("task.check.places=[red_slot]", ["task.check.places", "each object"]),

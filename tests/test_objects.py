@@ -179,6 +179,110 @@ def test_lowest_point_of_any_shape(shape: str, size: list[float]) -> None:
         assert float(lowest) == pytest.approx(expected, abs=1e-6)
 
 
+LYING = [math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0]
+FIXTURES = f"""
+  objects:
+    roll: {{shape: cylinder, size: [0.015, 0.04], mass: 0.1, xy: [0.0, -0.1], quat: {LYING}}}
+    left: {{size: [0.03, 0.004, 0.02], xy: [0.0, 0.118], yaw: 0.4, fixed: true}}
+    right: {{size: [0.03, 0.004, 0.02], xy: [0.0, 0.120], fixed: true}}
+    rack:
+      fixed: true
+      xy: [0.05, 0.0]
+      yaw: 0.5
+      parts:
+        post: {{size: [0.005, 0.02, 0.03], pos: [-0.02, 0.0, 0.03]}}
+        shelf: {{size: [0.03, 0.03, 0.004], pos: [0.0, 0.0, 0.064]}}
+    ball: {{shape: sphere, size: [0.01], mass: 0.01, pos: [0.05, 0.0, 0.078]}}
+  places:
+    goal: {{xy: [0.0, -0.2]}}
+  frame: table
+"""
+
+
+@pytest.mark.parametrize("robot", ["so101", "rebot"])
+def test_things_lie_lean_touch_and_stand_on_each_other(
+    folder: Callable[[str], Path], robot: str
+) -> None:
+    """One set of positions for both robots: each counts from the middle of its table."""
+    conf = folder(FIXTURES)
+    path = conf / "scene" / "mine.yaml"
+    text = path.read_text()
+    for key, value in (("center", "[0.35, -0.04, 0.012]"), ("half", "[0.16, 0.26, 0.012]")):
+        text = text.replace(value, f"${{robot.placements.stack.table_{key}}}")
+    path.write_text(text)
+    env = build(conf, f"robot={robot}", "reset=randomized", nworld=16)
+    scene = env.cfg.scene
+    middle = [*scene.table_center[:2], scene.table_top]
+    model = env.sim.model
+    assert scene.objects["rack"].xy == [middle[0] + 0.05, middle[1]]
+    post = model.geom("rack_post")
+    turn = [math.cos(0.5), math.sin(0.5)]
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    expected = np.add(middle, [0.05 - 0.02 * turn[0], -0.02 * turn[1], 0.03])
+    np.testing.assert_allclose(data.geom_xpos[post.id], expected, atol=1e-12)
+    np.testing.assert_allclose(pose_w(env, "left")[0, 3:], [math.cos(0.2), 0, 0, math.sin(0.2)])
+    for name, height in (("roll", 0.015), ("ball", 0.078)):
+        pose = pose_w(env, name).double().numpy()
+        np.testing.assert_allclose(pose[:, 2], middle[2] + height, atol=1e-9)
+        assert np.ptp(pose[:, 0]) > 0.005
+    axis = np.stack([mujoco_axis(quat) for quat in pose_w(env, "roll")[:, 3:].numpy()])
+    np.testing.assert_allclose(axis[:, 2], 0.0, atol=1e-6)
+    assert np.ptp(np.arctan2(axis[:, 1], axis[:, 0])) > 1.0
+    assert float(above_table(env, "roll").abs().max()) < 1e-6
+    for _ in range(10):
+        env.step(torch.zeros((16, env.action_manager.action_dim)))
+    assert float(above_table(env, "ball").min()) > 0.06
+    env.close()
+
+
+def mujoco_axis(quat: np.ndarray) -> np.ndarray:
+    """The z axis of a body."""
+    axis = np.empty(3)
+    mujoco.mju_rotVecQuat(axis, np.array([0.0, 0.0, 1.0]), quat.astype(float))
+    return axis
+
+
+def test_a_fixture_from_a_file_and_an_object_from_the_command_line(tmp_path: Path) -> None:
+    (tmp_path / "rack.xml").write_text(
+        "<mujoco><worldbody><body name='rack'><geom name='slab' type='box' size='.02 .03 .01'"
+        " pos='0 0 .01'/><body pos='0 0 .05'><geom type='sphere' size='.01'/></body></body>"
+        "</worldbody></mujoco>"
+    )
+    rack = f"+scene.objects.rack={{fixed: true, xy: [0.4, -0.04], file: {tmp_path}/rack.xml}}"
+    can = ["shape=cylinder", "size=[0.02,0.03]", "mass=0.1", "xy=[0.27,-0.04]"]
+    options = [rack, *(f"+scene.objects.can.{part}" for part in can)]
+    env = make_env([*options, "sim=native", "reset=randomized"], nworld=8)
+    env.reset(seed=0)
+    assert list(env.cfg.scene.objects) == ["red", "blue", "rack", "can"]
+    assert list(env.index.objects) == ["red", "blue", "can"]
+    assert env.sim.model.geom("rack_slab").type[0] == mujoco.mjtGeom.mjGEOM_BOX
+    env.close()
+    bad = ["scene.objects.can.shapes=box", "scene.objects.can=5"]
+    refusal(lambda: load_config([f"+{bad[0]}"]), "Did you mean 'scene.objects.can.shape'?")
+    refusal(lambda: load_config([f"+{bad[1]}"]), "scene.objects.can=5: expected keys and values")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["scene.objects.red.xy=[0.33,0.02]"], "position clear of blue, into which it reaches 4.0"),
+        (["task=box", "scene.objects.blue.xy=[0.35,0.0]"], "blue.xy=[0.35, 0.0]: expected a"),
+        (
+            ["+scene.objects.a={xy: [0.3, 0], size: [0.01, 0.01, 0.01], mass: 1, parts: {p: {}}}"],
+            "scene.objects.a.fixed=false: expected true, because it has parts",
+        ),
+    ],
+)
+def test_what_moves_starts_clear_of_the_rest(overrides: list[str], message: str) -> None:
+    refusal(lambda: make_env([*overrides, "sim=native"], nworld=1), message)
+
+
+def test_corners_may_pass_where_circles_meet() -> None:
+    """Diagonal neighbours: closer than their circles, not touching."""
+    make_env(["scene.objects.red.xy=[0.33,0.01]", "sim=native", "reset=nominal"], nworld=1).close()
+
+
 @pytest.mark.full
 @pytest.mark.parametrize("objects", [PUCK, SHAPES], ids=["one", "many"])
 def test_random_starts_keep_apart_and_come_back_from_a_file(

@@ -70,6 +70,26 @@ def test_cubes_start_on_the_table_and_touch_nothing_else(robot: str, reset: str)
     assert gap > (0.01 if reset in ("randomized", "wide") else 0.0)
 
 
+@pytest.mark.parametrize(
+    ("task", "expected"),
+    [
+        ("stack", {"so101": "2e448a27d1bd7d85", "rebot": "fa4b4cf089f5e3bf"}),
+        ("box", {"so101": "55d57d43ec54005c", "rebot": "4f9d2b3947257f9f"}),
+        ("reach", {"so101": "2e448a27d1bd7d85", "rebot": "fa4b4cf089f5e3bf"}),
+    ],
+)
+def test_random_starts_are_those_of_commit_28ea565(
+    robot: str, task: str, expected: dict[str, str]
+) -> None:
+    """Bit for bit, before fixed things of any shape and pose were in the way."""
+    overrides = [f"task={task}", f"robot={robot}", "sim=native", "reset=randomized"]
+    env = mjstack.make_env(overrides, nworld=64)
+    env.reset(seed=0)
+    xy = env.sim.qpos[:, [a + i for a in env.index.object_qpos for i in (0, 1)]]
+    assert hashlib.sha256(xy.numpy().tobytes()).hexdigest()[:16] == expected[robot]
+    env.close()
+
+
 @pytest.mark.full
 def test_home_jitter_and_noise_stay_within_their_widths(robot: str) -> None:
     nominal = start_of(configure("reset=nominal", robot=robot))

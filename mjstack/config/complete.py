@@ -11,11 +11,14 @@ from omegaconf.errors import OmegaConfBaseException
 
 from mjstack.config.fields import accepted, check_fields
 from mjstack.config.schema import (
+    SHAPES,
     Config,
+    ObjectCfg,
     ObservationGroupCfg,
     ObservationTermCfg,
     RewardTermCfg,
     RobotCfg,
+    SceneCfg,
     TermCfg,
     TerminationTermCfg,
 )
@@ -56,6 +59,7 @@ def complete(cfg: Config) -> None:
         if hasattr(parent, last):  # not every job has observations
             setattr(parent, last, _typed_all(key, getattr(parent, last), kind))
     _complete_robot(cfg.robot)
+    _complete_scene(cfg.scene)
     for camera in cfg.scene.cameras.values():
         camera.pose = camera.pose or cfg.robot.wrist_camera
     _choose_phases(cfg)
@@ -97,21 +101,72 @@ def typed(key: str, node: Any, kind: type) -> Any:
 
 
 def _complete_robot(robot: RobotCfg) -> None:
-    """Fill in what a robot's YAML left out, and find its file: relative to the ``robot`` group of a
-    search path, or to the working folder.
-    """
+    """Fill in what a robot's YAML left out, and find its file."""
     robot.title = robot.title or robot.name
     robot.start = robot.start or list(robot.home)
     robot.ik_joints = robot.ik_joints or [n for n in robot.arm_joints if n not in robot.locked]
-    if robot.file is None:
-        return
-    tried = [*(folder / "robot" / robot.file for folder in config_folders()), Path(robot.file)]
-    paths = list(dict.fromkeys(path.resolve() for path in tried))
-    file = next((path for path in paths if path.is_file()), None)
+    robot.file = _find_file("robot.file", robot.file, "robot")
+
+
+def _complete_scene(scene: SceneCfg) -> None:
+    """Find the files of fixed objects, and turn all positions into the world's."""
+    check_fields("scene", scene)
+    origin = [0.0, 0.0, 0.0]
+    if scene.frame == "table":
+        origin = [*scene.table_center[:2], scene.table_top]
+    scene.frame = "world"
+
+    def in_world(at: list[float]) -> list[float]:
+        return [a + b for a, b in zip(at, origin, strict=False)]
+
+    for name, thing in scene.objects.items():
+        key = f"scene.objects.{name}"
+        thing.file = _find_file(f"{key}.file", thing.file, "scene", "task")
+        if thing.parts or thing.file:
+            thing.shape = "box"
+            thing.size = _half_sizes(thing)
+        if thing.pos is not None:
+            thing.pos = in_world(thing.pos)
+            thing.xy = thing.pos[:2]
+        elif len(thing.xy) == 2:
+            thing.xy = in_world(thing.xy)
+        else:
+            expected = f"a list of 2 numbers [m], or {key}.pos with 3"
+            raise ConfigError(f"{key}.xy", thing.xy, expected)
+    for place in scene.places.values():
+        place.xy = in_world(place.xy)
+    if scene.box is not None:
+        scene.box.center = in_world(scene.box.center)
+
+
+def _half_sizes(thing: ObjectCfg) -> list[float]:
+    """Half sizes of the box around an object's origin that holds its parts [m]; of a file, which is
+    not read yet, next to nothing.
+    """
+    sizes = [1e-4] * 3
+    for part in thing.parts.values():
+        if len(part.size) != SHAPES[part.shape][0]:
+            continue  # what is wrong is told later
+        for axis, unit in enumerate(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))):
+            sizes[axis] = max(sizes[axis], abs(part.pos[axis]) + part.reach(unit))
+    return sizes
+
+
+def _find_file(key: str, file: str | None, *groups: str) -> str | None:
+    """An MJCF file, absolute; relative to some groups of a search path, or to the working
+    folder.
+    """
     if file is None:
+        return None
+    folders = [folder / group for folder in config_folders() for group in groups]
+    paths = list(
+        dict.fromkeys(path.resolve() for path in (*(f / file for f in folders), Path(file)))
+    )
+    match = next((path for path in paths if path.is_file()), None)
+    if match is None:
         expected = f"an MJCF file; there is no {' and no '.join(map(str, paths))}"
-        raise ConfigError("robot.file", robot.file, expected)
-    robot.file = str(file)
+        raise ConfigError(key, file, expected)
+    return str(match)
 
 
 def _choose_phases(cfg: Config) -> None:

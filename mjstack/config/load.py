@@ -175,10 +175,12 @@ def load_saved(path: Path) -> Config:
         try:
             cfg = to_config(merged)
         except ConfigError as error:
-            if error.key != "robot.file":
+            if not error.key.endswith(".file"):
                 raise
             raise MjstackError(f"{error} {add_folder(path)}") from error
-        check_beside(cfg.robot.file)
+        check_beside("robot.file", cfg.robot.file)
+        for name, thing in cfg.scene.objects.items():
+            check_beside(f"scene.objects.{name}.file", thing.file)
     return cfg
 
 

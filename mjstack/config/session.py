@@ -8,6 +8,7 @@ beside an added one is importable, so that its YAML can name functions by module
 import copy
 import functools
 import os
+import re
 import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -52,6 +53,12 @@ _REPLAYED = {
     "reset.": "reset term",
     "task.check.": "check",
 }
+
+# An override that adds an entry to a mapping by names, of which the schema knows the type
+_ENTRY = re.compile(
+    r"\++((?:scene\.(?:objects|places|cameras)|controller\.phases|robot\.placements)\.\w+"
+    r"(?:\.parts\.\w+)?)[.=]"
+)
 
 _added: ContextVar[tuple[Path, ...]] = ContextVar("search path", default=())
 
@@ -211,8 +218,8 @@ def in_search_path(dotted: str, saved: Path) -> bool:
     )
 
 
-def check_beside(file: str | None) -> None:
-    """Check that a robot's file, if a saved run names one, lies beside a folder of the search path.
+def check_beside(key: str, file: str | None) -> None:
+    """Check that an MJCF file, if a saved run names one, lies beside a folder of the search path.
 
     Raises:
         MjstackError: It lies elsewhere.
@@ -220,7 +227,7 @@ def check_beside(file: str | None) -> None:
     folders = [folder.parent for folder in config_folders()]
     if file is not None and not any(map(Path(file).is_relative_to, folders)):
         raise MjstackError(
-            f"robot.file={file}: expected a file beside a folder of the search path. If you trust"
+            f"{key}={file}: expected a file beside a folder of the search path. If you trust"
             f" it, add {shlex.join(search_path_args([Path(file).parent]))}."
         )
 
@@ -275,10 +282,29 @@ def _once(load: Callable[..., DictConfig]) -> Callable[..., DictConfig]:
     def load_once(*, overrides: list[str], run_mode: RunMode, **options: Any) -> DictConfig:
         key = (*overrides, run_mode)
         if key not in composed:
-            composed[key] = load(overrides=overrides, run_mode=run_mode, **options)
+            typed = _add_entries(overrides)
+            composed[key] = load(overrides=typed, run_mode=run_mode, **options)
         return composed[key]
 
     return load_once
+
+
+def _add_entries(overrides: Sequence[str]) -> list[str]:
+    """Let the next composition end with an empty entry of the right type for each object, place,
+    phase or camera that a ``+`` adds: OmegaConf would take none from a command line.
+
+    Returns:
+        The overrides, which set such an entry's values over its defaults.
+    """
+    entries = DictConfig({})
+    out = []
+    for text in overrides:
+        entry = _ENTRY.match(text)
+        if entry:
+            OmegaConf.update(entries, entry[1], {}, force_add=True)
+        out.append(f"++{text.lstrip('+')}" if entry else text)
+    ConfigStore.instance().store("added_entries", entries, package="_global_", provider="mjstack")
+    return out
 
 
 def compose_raw(overrides: Sequence[str]) -> DictConfig:

@@ -33,6 +33,7 @@ from mjstack.report.web import (
     stop_server,
 )
 from mjstack.report.write import safely_write
+from mjstack.scene.index import geom_corners
 from mjstack.sim import Simulation
 
 
@@ -66,7 +67,11 @@ def draw_episode(
     positions = np.stack([qpos[:, a : a + 3] for a in stage.index.object_qpos], axis=1)
     title = f"{cfg.robot.title}, {cfg.task.name}: {world}"
     draw("scene.png", save_scene, model, qpos[-1])
-    draw("trajectories.png", save_trajectories, positions, objects, title)
+    bodies = [stage.index.bodies[name] for name in stage.index.fixed]
+    geoms = np.flatnonzero(np.isin(model.body_rootid[model.geom_bodyid], bodies))
+    fixed = geom_corners(model, geoms)
+    places = {name: (place.xy, place.random_xy) for name, place in cfg.scene.places.items()}
+    draw("trajectories.png", save_trajectories, positions, objects, fixed, places, title)
     if cfg.video:
         path = folder / "episode.mp4"
         problem = safely_write(path, save_video, model, qpos[None], cfg.timing.step_dt)

@@ -13,7 +13,7 @@ from mjstack.config.fields import Count, NotNegative
 from mjstack.config.functions import offered
 from mjstack.errors import ParameterError
 from mjstack.managers.view import EnvView, offers, random_uniform, rows_of, uses_fields, zero_rows
-from mjstack.math import quat_from_yaw
+from mjstack.math import quat_from_yaw, quat_mul
 from mjstack.mdp.geometry import Pose, robot, write_robot
 from mjstack.mdp.starts.placement import GAP, Placement, may_meet
 from mjstack.mdp.starts.randomization import Elements, Randomized, bounds
@@ -272,5 +272,7 @@ def _write_objects(
     now = poses.read(env.sim.qpos)[at].unflatten(1, (-1, 7))
     # In float64, so that the rounded cosine and sine are the same on every backend
     turned = quat_from_yaw(yaw.double()).to(offset.dtype)
+    if any(thing.turned != [1.0, 0.0, 0.0, 0.0] for thing in env.cfg.scene.free.values()):
+        turned = quat_mul(turned, now[..., 3:])
     value = torch.cat((now[..., :2] + offset, now[..., 2:3], turned), dim=-1).flatten(1)
     poses.write_masked(env.sim.qpos, mask, value, at)

@@ -22,6 +22,8 @@ from mjstack.report.page import frame_stride
 if TYPE_CHECKING:
     from matplotlib.patches import Rectangle
 
+_FACES = [[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]]
+"""Corners of a box in the order of their signs, by its faces."""
 Draw = Callable[[np.ndarray], Iterable[np.ndarray]]
 Frames = Callable[[Sequence[int]], Iterator[Image.Image]]
 
@@ -223,12 +225,30 @@ def save_trajectories(
     path: Path,
     positions: np.ndarray,
     objects: Mapping[str, tuple[Sequence[float], Sequence[float]]],
+    fixed: np.ndarray,
+    places: Mapping[str, tuple[Sequence[float], Sequence[float]]],
     title: str,
 ) -> None:
-    """Plot the objects' way: positions [m], shape ``(steps, objects, 3)``, and the half sizes [m]
-    and the colour of each object by name.
+    """Plot the objects' way among what does not move.
+
+    Args:
+        path: The file.
+        positions: Of the objects [m], shape ``(steps, objects, 3)``.
+        objects: Half sizes [m] and colour of each object by name.
+        fixed: Corners of the boxes that hold fixed things [m], shape ``(n, 8, 3)``, in the order of
+            their signs.
+        places: Position and half-widths of the region [m] of each place by name.
+        title: The picture's.
     """
     with figure(path, title, 3, figsize=(13, 4)) as (_, (side, above, height)):
+        for axes, row in ((side, 2), (above, 0)):
+            for box in 1e3 * fixed:
+                for face in box[_FACES][..., [1, row]]:
+                    axes.fill(*face.T, color="0.75", zorder=0)
+        for name, ((x, y), (wide, deep)) in places.items():
+            above.plot(1e3 * y, 1e3 * x, "x", color="0.3")
+            above.annotate(name, (1e3 * y, 1e3 * x), color="0.3")
+            above.add_patch(outline((1e3 * y, 1e3 * x), (1e3 * deep, 1e3 * wide), linestyle=":"))
         for number, (name, (half, color)) in enumerate(objects.items()):
             mm = 1e3 * positions[:, number]
             for axes, row in ((side, 2), (above, 0)):

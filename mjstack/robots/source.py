@@ -35,11 +35,7 @@ def robot_spec(robot: RobotCfg, model: ModelCfg) -> mujoco.MjSpec:
     """
     menagerie = model.source == "menagerie"
     path = _menagerie_path(robot) if menagerie else _file_path(robot)
-    try:
-        spec = mujoco.MjSpec.from_file(str(path))
-    except (ValueError, FileNotFoundError) as error:
-        fix = _MENAGERIE_FIX if menagerie else "Correct the file (robot.file)."
-        raise MjstackError(f"{path} cannot be read: {first_line(error)}. {fix}") from error
+    spec = read_mjcf(path, _MENAGERIE_FIX if menagerie else "Correct the file (robot.file).")
     if menagerie and robot.replace_collision:
         _replace_collision(spec, robot)
     for name in robot.jaw_bodies:
@@ -65,6 +61,22 @@ def robot_spec(robot: RobotCfg, model: ModelCfg) -> mujoco.MjSpec:
             raise UnknownName("robot.servos: joint", name, robot.joints)
         _set_servo(spec, name, servo)
     return spec
+
+
+def read_mjcf(path: str | Path, fix: str) -> mujoco.MjSpec:
+    """Load an MJCF file.
+
+    Args:
+        path: The file.
+        fix: What to do where it cannot be read.
+
+    Raises:
+        MjstackError: It cannot.
+    """
+    try:
+        return mujoco.MjSpec.from_file(str(path))
+    except (ValueError, FileNotFoundError) as error:
+        raise MjstackError(f"{path} cannot be read: {first_line(error)}. {fix}") from error
 
 
 def _file_path(robot: RobotCfg) -> Path:

@@ -10,11 +10,12 @@ import mujoco
 import numpy as np
 
 from mjstack.config.schema import BoxCfg, CameraCfg, Config, ObjectCfg, SceneCfg
-from mjstack.errors import MjstackError, UnknownName
-from mjstack.robots import robot_spec
+from mjstack.errors import ConfigError, MjstackError, UnknownName
+from mjstack.robots import read_mjcf, robot_spec
 
 TABLE = "table"
 WORLD = "world"  # MuJoCo's name of the body that never moves
+_TOUCH = 1e-5  # m: objects closer together by less only touch
 _NETFORCE = 3  # the contact sensor's reduction to one force and torque, in the world frame
 
 
@@ -78,7 +79,7 @@ def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> m
     if scene.box is not None:
         _add_box(spec, scene.box, scene.table_top)
     for name, thing in scene.objects.items():
-        _add_object(world, name, thing, scene.table_top)
+        _add_object(spec, name, thing, scene.table_top)
 
     # Sensors
     pairs = [(jaw, name) for name in scene.objects for jaw in jaw_bodies]
@@ -115,7 +116,9 @@ def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> m
         spec.visual.quality.shadowsize = 1024  # without a GPU, MuJoCo's 4096 doubles the time
     else:
         spec.compiler.discardvisual = True
-    return spec.compile()
+    model = spec.compile()
+    _require_clear(model, scene)
+    return model
 
 
 def force_sensor(first: str, second: str) -> str:
@@ -131,18 +134,50 @@ def _add_geom(body: mujoco.MjsBody, name: str, shape: str, **values: Any) -> muj
     return body.add_geom(name=name, type=kind, condim=3, **values)
 
 
-def _add_object(world: mujoco.MjsBody, name: str, thing: ObjectCfg, top: float) -> None:
-    """Add an object that stands on a surface at height top [m]. Its body, joint and geom have its
-    name.
+def _add_object(spec: mujoco.MjSpec, name: str, thing: ObjectCfg, top: float) -> None:
+    """Add an object where it stands on a surface at height top [m], or is. Its body, joint and geom
+    have its name; geoms of parts and what comes from a file begin with it.
     """
-    body = world.add_body(name=name, pos=[*thing.xy, top + thing.half_height])
+    height = top + thing.half_height if thing.pos is None else thing.pos[2]
+    body = spec.worldbody.add_body(name=name, pos=[*thing.xy, height], quat=thing.turned)
     if not thing.fixed:
         body.add_freejoint(name=name)
-    size = [*thing.size, 0.0, 0.0][:3]
-    surface = {"friction": thing.friction, "rgba": thing.color}
-    geom = _add_geom(body, name, thing.shape, size=size, mass=thing.mass, **surface)
-    if thing.shape == "capsule":  # MuJoCo's stands along z; this one lies along x
-        geom.quat = [math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0]
+    surface: dict[str, Any] = {"friction": thing.friction, "rgba": thing.color}
+    if thing.mass is not None:
+        surface["mass"] = thing.mass / max(1, len(thing.pieces))
+    for suffix, piece in thing.pieces.items():
+        size = [*piece.size, 0.0, 0.0][:3]
+        geom = _add_geom(body, name + suffix, piece.shape, size=size, pos=piece.pos, **surface)
+        geom.quat = piece.turned
+        if piece.shape == "capsule":  # MuJoCo's stands along z; this one lies along x
+            mujoco.mju_mulQuat(geom.quat, piece.turned, [math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0])
+    if thing.file is not None:
+        key = f"scene.objects.{name}.file"
+        child = read_mjcf(thing.file, f"Correct the file ({key})")
+        if child.joints:
+            raise ConfigError(key, thing.file, "a file without joints, because it is fixed")
+        spec.attach(child, frame=body.add_frame(), prefix=f"{name}_")
+
+
+def _require_clear(model: mujoco.MjModel, scene: SceneCfg) -> None:
+    """Raise a `ConfigError` for the first object that moves and starts inside of something else of
+    the scene, by their shapes.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    root = model.body_rootid[model.geom_bodyid]
+    geoms = {name: np.flatnonzero(root == model.body(name).id) for name in scene.objects}
+    walls = [model.geom(geom).name.startswith("box_") for geom in range(model.ngeom)]
+    geoms["the box"] = np.flatnonzero(walls)
+    for name, thing in scene.free.items():
+        for obstacle in [label for label in geoms if label != name]:
+            pairs = itertools.product(geoms[name], geoms[obstacle])
+            gaps = [mujoco.mj_geomDistance(model, data, *pair, 1.0, None) for pair in pairs]
+            if min(gaps, default=0.0) < -_TOUCH:
+                key = f"scene.objects.{name}.{'xy' if thing.pos is None else 'pos'}"
+                depth = f"into which it reaches {-1e3 * min(gaps):.1f} mm"
+                expected = f"a position clear of {obstacle}, {depth}"
+                raise ConfigError(key, thing.pos or thing.xy, expected)
 
 
 def _add_camera(spec: mujoco.MjSpec, name: str, camera: CameraCfg, scene: SceneCfg) -> None:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, product
 
 import mujoco
 import numpy as np
@@ -247,6 +247,19 @@ def turn_sign(model: mujoco.MjModel, robot: RobotCfg) -> float:
         expected = f"0, because joint {robot.arm_joints[0]} does not turn about the vertical"
         raise ConfigError("robot.approach_gain", robot.approach_gain, expected)
     return math.copysign(1.0, up)
+
+
+def geom_corners(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray:
+    """Corners of the boxes that hold some geoms, in the model's own state [m], shape ``(n, 8, 3)``,
+    in the order of their signs.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    signs = np.array(list(product((-1.0, 1.0), repeat=3)))
+    middle, half = model.geom_aabb[geoms].reshape(-1, 2, 3).swapaxes(0, 1)
+    corners = middle[:, None] + signs * half[:, None]
+    turned = corners @ data.geom_xmat[geoms].reshape(-1, 3, 3).swapaxes(1, 2)
+    return data.geom_xpos[geoms][:, None] + turned
 
 
 def lowest_height(

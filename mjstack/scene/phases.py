@@ -68,6 +68,9 @@ def build_phases(cfg: Config) -> list[Phase]:
     scene = cfg.scene
     sources = source_names(scene)
     bottom = dict.fromkeys(sources, 0.0)  # above the table, when a phase begins
+    for name, thing in scene.objects.items():
+        if thing.pos is not None:
+            bottom[name] = thing.pos[2] - thing.half_height - scene.table_top
     phases: list[Phase] = []
     start = 0
     load = ""  # the object that was grasped last
@@ -79,8 +82,8 @@ def build_phases(cfg: Config) -> list[Phase]:
             in_hand = False
         target = None
         if spec.anchor is not None:
-            thing = scene.objects.get(spec.anchor)
-            half = thing.half_height if thing is not None else 0.0
+            known = spec.anchor in scene.objects
+            half = scene.objects[spec.anchor].half_height if known else 0.0
             centre = bottom[spec.anchor] + half
             up = 0.0 if spec.level == "table" else centre
             rest = 0.0

@@ -1,7 +1,10 @@
 """The robot and the scene: table, objects, places and perhaps a box."""
 
+import itertools
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from omegaconf import MISSING
 
@@ -9,12 +12,17 @@ from mjstack.config.fields import spec
 
 OUTPUTS = ("rgb", "depth", "segmentation")
 _ROUND = (2, "radius and half length")
+_SQUARE = 0.004  # m: jaws take a box whose sides differ by no more across any of them
 SHAPES = {  # and the sizes of each
     "box": (3, "half sizes"),
     "cylinder": _ROUND,
     "sphere": (1, "the radius"),
     "capsule": _ROUND,
 }
+
+
+def _dot(a: Iterable[float], b: Iterable[float]) -> float:
+    return sum(x * y for x, y in zip(a, b, strict=True))
 
 
 def _friction() -> list[float]:
@@ -44,24 +52,47 @@ class BoxCfg:
     """Contact parameters of the walls."""
 
 
+class Grasp(NamedTuple):
+    """How jaws take an object from above.
+
+    Attributes:
+        axis: Number of the body axis whose heading tells how they are turned.
+        turn: From that heading to the way that they close [rad].
+        period: After which turn the object looks the same to them [rad]; 0: after any.
+        width: Size of the object between them [m].
+    """
+
+    axis: int
+    turn: float
+    period: float
+    width: float
+
+
 @dataclass(slots=True)
-class ObjectCfg:
-    """An object that stands on the table at the start."""
+class ShapeCfg:
+    """A shape, its size, and how it is turned."""
 
     shape: str = spec("box", choices=tuple(SHAPES))
-    """box, cylinder (upright), sphere, or capsule (lying along its own x axis)."""
-    size: list[float] = spec(unit="m", ge=1e-4, le=10.0)
+    """box, cylinder (its length along its z axis), sphere, or capsule (along its x axis)."""
+    size: list[float] = spec(factory=list, unit="m", ge=1e-4, le=10.0)
     """Half sizes of a box; radius of a sphere; radius and half length of the others."""
-    mass: float = spec(unit="kg", ge=1e-5, le=1000.0)
-    """Mass."""
-    friction: list[float] = spec(factory=_friction, length=3, gt=0.0)
-    """Sliding, torsional and rolling coefficient."""
-    color: list[float] = spec(factory=lambda: [0.6, 0.6, 0.6, 1.0], length=4, ge=0.0, le=1.0)
-    """Red, green, blue and alpha, 0 to 1."""
-    xy: list[float] = spec(unit="m", length=2)
-    """Nominal position of its centre."""
-    fixed: bool = False
-    """Whether it is fixed to the world."""
+    yaw: float = spec(0.0, unit="rad")
+    """Turn about the vertical."""
+    quat: list[float] | None = spec(None, length=4)
+    """Orientation (w, x, y, z), in place of ``yaw``. [0.707, 0.707, 0, 0] lays a cylinder down."""
+
+    @property
+    def turned(self) -> list[float]:
+        """Orientation, a unit quaternion."""
+        if self.quat is None:
+            return [math.cos(0.5 * self.yaw), 0.0, 0.0, math.sin(0.5 * self.yaw)]
+        length = math.hypot(*self.quat)
+        return [part / length for part in self.quat]
+
+    @property
+    def upright(self) -> bool:
+        """Whether its z axis points up."""
+        return self.quat is None or not any(self.quat[1:3])
 
     @property
     def half(self) -> list[float]:
@@ -74,28 +105,112 @@ class ObjectCfg:
         return [radius, radius, self.size[-1]]
 
     @property
-    def has_faces(self) -> bool:
-        """Whether it matters how jaws that grasp it from above are turned."""
-        return self.shape not in ("cylinder", "sphere")
-
-    @property
     def half_height(self) -> float:
         """Height of the centre above what it stands on [m]."""
-        return self.half[2]
+        return self.half[2] if self.upright else self.reach((0.0, 0.0, 1.0))
 
     @property
     def footprint(self) -> float:
         """Radius of the disc that it covers at any yaw [m]."""
+        if not self.upright:  # around a box that holds it, turned about its own axes alone
+            signs = itertools.product((-1.0, 1.0), repeat=3)
+            corners = [[s * h for s, h in zip(sign, self.half, strict=True)] for sign in signs]
+            rows = self.axes[:2]
+            return max(math.hypot(*(_dot(row, at) for row in rows)) for at in corners)
         if self.shape == "box":
             return math.hypot(1.0, self.size[1] / self.size[0]) * self.size[0]
         return sum(self.size) if self.shape == "capsule" else self.size[0]
+
+    @property
+    def axes(self) -> list[list[float]]:
+        """Rotation matrix: its columns are its own axes."""
+        w, x, y, z = self.turned
+        return [
+            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+            [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+        ]
+
+    def reach(self, direction: Sequence[float]) -> float:
+        """How far it reaches from its centre in a direction, a unit vector [m]."""
+        x, y, z = (abs(_dot(direction, axis)) for axis in zip(*self.axes, strict=True))
+        if self.shape == "box":
+            return _dot((x, y, z), self.size)
+        radius = self.size[0]
+        if self.shape == "cylinder":
+            return radius * math.hypot(x, y) + self.size[1] * z
+        return radius + (self.size[1] * x if self.shape == "capsule" else 0.0)
+
+
+@dataclass(slots=True)
+class PartCfg(ShapeCfg):
+    """A part of a fixed object."""
+
+    pos: list[float] = spec(factory=lambda: [0.0, 0.0, 0.0], unit="m", length=3)
+    """Its centre in the object's frame, whose origin stands on the table."""
+
+
+@dataclass(slots=True)
+class ObjectCfg(ShapeCfg):
+    """An object that stands on the table at the start, or is fixed to the world."""
+
+    mass: float | None = spec(None, unit="kg", ge=1e-5, le=1000.0)
+    """Mass; a fixed object needs none."""
+    friction: list[float] = spec(factory=_friction, length=3, gt=0.0)
+    """Sliding, torsional and rolling coefficient."""
+    color: list[float] = spec(factory=lambda: [0.6, 0.6, 0.6, 1.0], length=4, ge=0.0, le=1.0)
+    """Red, green, blue and alpha, 0 to 1."""
+    xy: list[float] = spec(factory=list, unit="m")
+    """Nominal position of its centre, standing on the table."""
+    pos: list[float] | None = spec(None, unit="m", length=3)
+    """Nominal position of its centre, in place of ``xy``: also over the table."""
+    fixed: bool = False
+    """Whether it is fixed to the world. Fixed objects may touch and overlap each other."""
+    parts: dict[str, PartCfg] = field(default_factory=dict)
+    """Shapes of a fixed object that has several, by name, in place of ``shape`` and ``size``."""
+    file: str | None = None
+    """A fixed object's MJCF file, in place of them: relative to the YAML, or to the working
+    folder."""
+
+    @property
+    def pieces(self) -> dict[str, PartCfg]:
+        """Its shapes in its own frame, by the names of their geoms but for the object's."""
+        if self.parts or self.file:
+            return {f"_{name}": part for name, part in self.parts.items()}
+        return {"": PartCfg(shape=self.shape, size=self.size)}
+
+    @property
+    def half_height(self) -> float:
+        """Height of the centre above what it stands on [m]; 0 of one made of parts."""
+        return 0.0 if self.parts or self.file else super(ObjectCfg, self).half_height
+
+    @property
+    def grasp(self) -> Grasp:
+        """How jaws take it from above; of a box whose sides differ, across the shorter one."""
+        up = [abs(part) for part in self.axes[2]]
+        vertical = up.index(max(up))
+        if self.shape == "box":
+            first, second = (k for k in range(3) if k != vertical)
+            widths = [2.0 * self.half[k] for k in (first, second)]
+            if abs(widths[0] - widths[1]) <= _SQUARE:
+                return Grasp(first, 0.0, 0.5 * math.pi, max(widths))
+            axis = second if widths[1] < widths[0] else first
+            return Grasp(axis, 0.0, math.pi, min(widths))
+        length = {"cylinder": 2, "capsule": 0}.get(self.shape, vertical)
+        lies = length != vertical
+        return Grasp(length, 0.5 * math.pi, math.pi * lies, 2.0 * self.size[0])
+
+    @property
+    def has_faces(self) -> bool:
+        """Whether it matters how jaws that grasp it from above are turned."""
+        return self.grasp.period > 0.0
 
     @property
     def radius(self) -> float:
         """Radius of the sphere around its centre that holds it [m]."""
         if self.shape == "capsule":
             return sum(self.size)
-        return math.hypot(*(half / self.size[0] for half in self.size)) * self.size[0]
+        return math.hypot(*(half / self.size[0] for half in self.half)) * self.size[0]
 
 
 @dataclass(slots=True)
@@ -151,6 +266,9 @@ class SceneCfg:
     """Centre of the table, a box."""
     table_half: list[float] = spec(unit="m", length=3, gt=0.0)
     """Half sizes of the table."""
+    frame: str = spec("world", choices=("world", "table"))
+    """Where positions of objects and places count from: the arm's base, or the middle of the
+    table's top. Loading turns them into the world's."""
     table_friction: list[float] = spec(factory=_friction, length=3, gt=0.0)
     """Sliding, torsional and rolling coefficient of the table."""
     random_xy: list[float] = spec(factory=lambda: [0.03, 0.03], unit="m", length=2, ge=0.0)

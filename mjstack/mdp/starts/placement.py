@@ -5,6 +5,7 @@ fixed.
 import itertools
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -25,6 +26,7 @@ _SHARE = 2_000  # of them at a time
 _FIRST = 3  # candidates that are tried first
 # [m] between an object and the arm at its start, noise included: it is the arm that moves away
 _ARM_ROOM = 0.001
+_UNDER = 1e-5  # m: a box is under an object if its top is this much higher at most
 
 
 def may_meet(scene: SceneCfg, region: Sequence[float], gap: float = GAP) -> bool:
@@ -42,8 +44,9 @@ class Placement:
     """Tests positions of all free objects in a region around their nominal ones.
 
     Shapes are rounded up: an object of any yaw is a disc, of half a box's diagonal. A geom of the
-    arm, wherever noise puts it, or of what is fixed to the world, such as a wall of the box, is the
-    box along the axes that holds it. So what passes is free, and some free positions are not used.
+    arm, wherever noise puts it, is the box along the world's axes that holds it. One that is fixed
+    to the world, such as a wall, is the box along its own axes if it is upright, or a disc. So what
+    passes is free, and some free positions are not used. Nothing under an object is in its way.
     """
 
     def __init__(
@@ -80,7 +83,7 @@ class Placement:
         # Floor, the only plane in a scene, and table are left out.
         ground = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
         ground[model.geom("table").id] = True
-        fixed = world_boxes(data, np.flatnonzero(collides & bolted & ~ground))
+        fixed = _fixed_boxes(data, np.flatnonzero(collides & bolted & ~ground))
 
         rectangles = []
         top = scene.table_top
@@ -88,7 +91,10 @@ class Placement:
             around = np.concatenate(
                 [_around(thing, top, arm, min(gap, _ARM_ROOM)), _around(thing, top, fixed, gap)]
             )
-            away = np.abs(around[:, :2] - thing.xy) - around[:, 2:4] - region
+            cos, sin = around[:, 5:].T
+            turn = np.stack((cos, sin, -sin, cos), axis=1).reshape(-1, 2, 2)
+            away = np.abs(((around[:, :2] - thing.xy)[:, None] * turn).sum(2)) - around[:, 2:4]
+            away -= (np.abs(turn) * region).sum(2)
             near = np.linalg.norm(np.maximum(away, 0.0), axis=1) < around[:, 4]
             rectangles.append(torch.from_numpy(around[near]))
         half = torch.tensor(scene.table_half[:2]).double()
@@ -144,7 +150,10 @@ class Placement:
         free = ((places - center).abs() <= room[:, None]).all(-1)
         for number, around in enumerate(rectangles):
             if around.shape[0]:
-                off = (places[:, number, :, None, :] - around[:, :2]).abs() - around[:, 2:4]
+                x, y = (places[:, number, :, None, :] - around[:, :2]).unbind(-1)
+                cos, sin = around[:, 5:].unbind(-1)
+                off = torch.stack((cos * x + sin * y, cos * y - sin * x), dim=-1)
+                off = off.abs() - around[:, 2:4]
                 distance = off.clamp_min(0.0).square().sum(-1)
                 free[:, number] &= (distance >= around[:, 4].square()).all(-1)
         # The free candidates of each object first; the k-th of all objects are tried together
@@ -169,29 +178,52 @@ def _trials(size: int) -> Tensor:
     return uniform(0, 0, world, zero, None, size)
 
 
-def _around(
-    thing: ObjectCfg, top: float, boxes: tuple[np.ndarray, np.ndarray], clear: float
-) -> np.ndarray:
-    """Distance that boxes ask of an object on the table: of its centre from a rectangle.
+class _Boxes(NamedTuple):
+    """Upright boxes: centres and half sizes, shape ``(n, 3)`` each; radius around them, and cosine
+    and sine of their yaw, shape ``(n, 3)``.
+    """
+
+    centers: np.ndarray
+    halves: np.ndarray
+    turned: np.ndarray
+
+
+def _around(thing: ObjectCfg, top: float, boxes: _Boxes, clear: float) -> np.ndarray:
+    """Distance that boxes ask of an object: of its centre from a rectangle.
 
     Returns:
-        Centre and half sizes of the rectangle in x and y, and the distance [m], shape ``(m, 5)``,
-        of the boxes that are low enough to matter.
+        Centre and half sizes of the rectangle in x and y, the distance [m], and cosine and sine of
+        its yaw, shape ``(m, 7)``, of the boxes that are low enough to matter.
     """
-    centers, halves = boxes
+    centers, halves, turned = boxes
     half = thing.half_height
-    above = np.maximum(np.abs(centers[:, 2] - (top + half)) - halves[:, 2] - half, 0.0)
-    matters = (above < clear) | (above == 0.0)
-    distance = thing.footprint + np.sqrt(np.maximum(clear**2 - above**2, 0.0))
-    return np.column_stack((centers[:, :2], halves[:, :2], distance))[matters]
+    center = top + half if thing.pos is None else thing.pos[2]
+    above = np.maximum(np.abs(centers[:, 2] - center) - halves[:, 2] - half, 0.0)
+    under = centers[:, 2] + halves[:, 2] - (center - half) < _UNDER
+    matters = ((above < clear) | (above == 0.0)) & ~under
+    distance = thing.footprint + np.sqrt(np.maximum(clear**2 - above**2, 0.0)) + turned[:, 0]
+    columns = (centers[:, :2], halves[:, :2], distance, turned[:, 1:])
+    return np.column_stack(columns)[matters]
 
 
-def _arm_boxes(
-    cfg: Config, data: mujoco.MjData, geoms: np.ndarray, noise: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Centres and half sizes of boxes that hold the arm's colliding geoms, wherever noise puts
-    them, shape ``(n, 3)`` each.
-    """
+def _fixed_boxes(data: mujoco.MjData, geoms: np.ndarray) -> _Boxes:
+    """What holds geoms that are fixed to the world."""
+    model = data.model
+    centers, halves = world_boxes(data, geoms)
+    turned = np.tile([0.0, 1.0, 0.0], (len(geoms), 1))
+    axes = data.geom_xmat[geoms].reshape(-1, 3, 3)
+    upright = np.abs(axes[:, 2, 2]) > 1.0 - 1e-9
+    halves[upright] = model.geom_aabb[geoms[upright], 3:]
+    turned[upright, 1:] = axes[upright, :2, 0]
+    discs = (mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_SPHERE)
+    disc = upright & np.isin(model.geom_type[geoms], discs)
+    turned[disc, 0] = halves[disc, 0]
+    halves[disc, :2] = 0.0
+    return _Boxes(centers, halves, turned)
+
+
+def _arm_boxes(cfg: Config, data: mujoco.MjData, geoms: np.ndarray, noise: float) -> _Boxes:
+    """Boxes that hold the arm's colliding geoms, wherever noise puts them."""
     model = data.model
     joints = [model.joint(name).id for name in cfg.robot.arm_joints]
     dofs = model.jnt_dofadr[joints]
@@ -208,7 +240,7 @@ def _arm_boxes(
         # the longest lever.
         lever = np.linalg.norm(data.xanchor[joints][None] - corners[:, None], axis=2).max()
         halves[k] += moved + 0.5 * (noise * len(joints)) ** 2 * lever
-    return centers, halves
+    return _Boxes(centers, halves, np.tile([0.0, 1.0, 0.0], (len(geoms), 1)))
 
 
 def world_boxes(

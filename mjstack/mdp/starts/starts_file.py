@@ -13,6 +13,7 @@ from torch import Tensor
 from mjstack.errors import ArgumentError, ConfigError, ParameterError, suggest
 from mjstack.files import read_npz, write_npz
 from mjstack.managers.view import EnvView, offers, uses_fields
+from mjstack.math import quat_mul
 from mjstack.mdp.geometry import Pose, place_xy, pose_w, robot, write_robot
 from mjstack.mdp.observation import joint_pos
 from mjstack.mdp.reset import ActuatorGains, ObjectFriction, ObjectMass
@@ -22,6 +23,7 @@ from mjstack.mdp.starts.reach import out_of_reach
 from mjstack.scene.index import joint_limits
 
 _FLAT = 1e-5  # [m], and of a quaternion: how far off upright an object on the table may be
+_TOUCH = 1e-5  # [m] into each other: things that only touch
 _OVER = 1e-6  # [m] how far an object may reach over the edge of the table
 # What a file may have of the model, and which parameter has its ends
 _RANDOMIZED: dict[Any, str] = {
@@ -237,8 +239,10 @@ def start_arrays(env: EnvView) -> dict[str, np.ndarray]:
     out: dict[str, Tensor] = {}
     for name, (address, _) in env.index.objects.items():
         pose = pose_w(env, name)
-        nominal = pose.new_tensor([env.sim.model.qpos0[address + 2], 0.0, 0.0])
-        off = (pose[:, [2, 4, 5]] - nominal).abs().amax(1)
+        nominal = pose.new_tensor(env.sim.model.qpos0[address + 2 : address + 7])
+        back = nominal[1:] * nominal.new_tensor([1.0, -1.0, -1.0, -1.0])
+        tilt = quat_mul(pose[:, 3:], back.expand(len(pose), 4))[:, 1:3]
+        off = torch.cat((pose[:, 2:3] - nominal[0], tilt), dim=1).abs().amax(1)
         if off.max() > _FLAT:
             problem = f"{name} of world {int(off.argmax())} off the table"
             raise ArgumentError("env", problem, "objects that stand flat on it")
@@ -286,8 +290,13 @@ def _check_worlds(
         for (name, (address, _)), start in zip(index.objects.items(), objects, strict=True):
             data.qpos[address : address + 2] = start[:2]
             data.qpos[address + 3 : address + 7] = start[2:]
-            if max(abs(start[3]), abs(start[4]), abs(np.linalg.norm(start[2:]) - 1.0)) > _FLAT:
+            back = model.qpos0[address + 3 : address + 7] * [1.0, -1.0, -1.0, -1.0]
+            turn = np.empty(4)
+            mujoco.mju_mulQuat(turn, start[2:], back)
+            if max(abs(turn[1]), abs(turn[2]), abs(np.linalg.norm(start[2:]) - 1.0)) > _FLAT:
                 expected = f"w, 0, 0, z of length 1, a rotation about z, it is {start[2:]}"
+                if env.cfg.scene.objects[name].turned != [1.0, 0.0, 0.0, 0.0]:
+                    expected = f"its nominal orientation, turned about z, it is {start[2:]}"
                 raise table.wrong(expected, "Correct it", world, [f"{name}_quat"])
         mujoco.mj_kinematics(model, data)
         for name in index.objects:
@@ -298,8 +307,9 @@ def _check_worlds(
                 expected = f"all of {name} above the table, {1e3 * beyond:.1f} mm are not"
                 raise table.wrong(expected, "Move it", world, [f"{name}_xy"])
         mujoco.mj_collision(model, data)
-        for pair in data.contact.geom[: data.ncon].tolist():
-            if ground in pair or not owner.keys() & set(pair):
+        depths = data.contact.dist[: data.ncon]
+        for pair, depth in zip(data.contact.geom[: data.ncon].tolist(), depths, strict=True):
+            if depth > -_TOUCH or ground in pair or not owner.keys() & set(pair):
                 continue
             names = [
                 owner.get(g) or model.geom(g).name or model.body(model.geom_bodyid[g]).name
