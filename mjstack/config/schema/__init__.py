@@ -6,6 +6,7 @@ here.
 """
 
 from mjstack.config.schema.jobs import *
+from mjstack.config.schema.robot import *
 from mjstack.config.schema.root import Config as Config
 from mjstack.config.schema.run import *
 from mjstack.config.schema.scene import *

@@ -5,6 +5,7 @@ from typing import Any
 
 from mjstack.config.fields import MOST_SEEDS, MOST_WORLDS, spec
 from mjstack.config.schema.jobs import JobCfg
+from mjstack.config.schema.robot import ModelCfg, RobotCfg
 from mjstack.config.schema.run import (
     BatchCfg,
     GateCfg,
@@ -14,7 +15,7 @@ from mjstack.config.schema.run import (
     TimingCfg,
     WebCfg,
 )
-from mjstack.config.schema.scene import ModelCfg, RobotCfg, SceneCfg
+from mjstack.config.schema.scene import SceneCfg
 from mjstack.config.schema.task import ControllerCfg, TaskCfg
 
 

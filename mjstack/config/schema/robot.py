@@ -1,0 +1,150 @@
+"""The robot: names in its MJCF file, servos, and where each scene's objects stand for it."""
+
+from dataclasses import dataclass, field
+
+from omegaconf import MISSING
+
+from mjstack.config.fields import spec
+from mjstack.config.schema.scene import CameraPoseCfg
+
+
+@dataclass(slots=True)
+class ModelCfg:
+    """Source of the robot's MJCF file."""
+
+    source: str = spec(choices=("builtin", "menagerie"))
+    """``builtin``: ``robot.file``, or mjstack's own file of the robot. ``menagerie``: MuJoCo
+    Menagerie's."""
+
+
+@dataclass(slots=True)
+class PlacementsCfg:
+    """Where a scene's objects stand for one robot, and the buffer sizes its contacts need."""
+
+    table_center: list[float] = spec(unit="m", length=3)
+    """Centre of the table."""
+    table_half: list[float] = spec(unit="m", length=3, gt=0.0)
+    """Half sizes of the table."""
+    objects: dict[str, list[float]] = spec(factory=dict, unit="m", length=2)
+    """Nominal x and y of each object."""
+    places: dict[str, list[float]] = spec(factory=dict, unit="m", length=2)
+    """x and y of each place."""
+    random_xy: list[float] = spec(unit="m", length=2, ge=0.0)
+    """How far ``reset=randomized`` moves each object, plus or minus."""
+    box_center: list[float] | None = spec(None, unit="m", length=2)
+    """Centre of the box."""
+    grasp_offset: float = spec(0.0, unit="m")
+    """How far above an object's centre it is held."""
+    home: list[float] | None = spec(None, unit="rad, m")
+    """Joint values at which this scene's task begins, where ``robot.home`` would collide."""
+    nconmax: int = spec(128, ge=1)
+    """Contacts per world while a driver does the task."""
+    njmax: int = spec(300, ge=1)
+    """Constraint rows per world while a driver does the task."""
+    env_nconmax: int = spec(128, ge=1)
+    """Contacts per world under random actions."""
+    env_njmax: int = spec(768, ge=1)
+    """Constraint rows per world under random actions."""
+
+
+@dataclass(slots=True)
+class ServoCfg:
+    """A joint's position servo and friction, for a slide in N and m. null: the file's own."""
+
+    stiffness: float | None = spec(None, unit="N m/rad", gt=0.0)
+    """Torque per position error."""
+    damping: float | None = spec(None, unit="N m s/rad", ge=0.0)
+    """The servo's own torque against velocity."""
+    armature: float | None = spec(None, unit="kg m^2", ge=0.0)
+    """Inertia of rotor and gears, at the joint."""
+    dry_friction: float | None = spec(None, unit="N m", ge=0.0)
+    """Torque that holds against any slow motion."""
+    viscous_friction: float | None = spec(None, unit="N m s/rad", ge=0.0)
+    """The joint's torque against velocity."""
+    effort: float | None = spec(None, unit="N m", gt=0.0)
+    """Largest torque; it replaces ``robot.arm_force_limit``."""
+
+
+@dataclass(slots=True)
+class RobotCfg:
+    """An arm with a gripper: names in its MJCF file, and joint targets of its tasks.
+
+    Every joint named here has a position servo, and a range. Joint values are rad, or m for slides.
+    """
+
+    name: str = MISSING
+    """The robot's name."""
+    title: str = ""
+    """The name in tables and reports. Empty: ``name``."""
+    lerobot_type: str = ""
+    """Type of the real robot in LeRobot's datasets. Empty: ``name``."""
+    file: str | None = None
+    """An MJCF file: an absolute path, or one relative to the YAML that names it, or to the working
+    folder. null: mjstack's own file of the robot."""
+    menagerie_name: str = ""
+    """The robot's folder in MuJoCo Menagerie, for ``model=menagerie``."""
+    menagerie_file: str = ""
+    """Its file there."""
+    replace_collision: bool = False
+    """Whether ``model=menagerie`` gets the collision geoms of mjstack's own file."""
+
+    arm_joints: list[str] = spec()
+    """Joints of the arm, from the base on."""
+    gripper_joints: list[str] = MISSING
+    """Joints of the gripper."""
+    jaw_bodies: list[str] = MISSING
+    """Bodies that touch a grasped object. A sensor measures the force of each on each object."""
+    grasp_sites: list[str] = spec(length=2)
+    """Two sites, one on each jaw. Their midpoint is the grasp point."""
+    grasp_parts: dict[str, list[str]] = field(default_factory=dict)
+    """Where a grasp site goes that the file lacks: the mean of these geoms or bodies of one jaw."""
+    home: list[float] = spec(unit="rad, m")
+    """Joint values at which a driven episode begins."""
+    start: list[float] = spec(factory=list, unit="rad, m")
+    """Joint values at which environments begin, clear of the table. Empty: ``home``."""
+    gripper_open: list[float] = spec(unit="rad, m")
+    """Joint targets of the open gripper."""
+    gripper_closed: list[float] = spec(unit="rad, m")
+    """Joint targets of the gripper around an object."""
+    arm_force_limit: float | None = spec(None, unit="N m, N", gt=0.0)
+    """Largest force of the arm's servos. null: the file's own."""
+    servos: dict[str, ServoCfg] = spec(factory=dict)
+    """Servos by joint, which the group ``actuator`` chooses; other joints have the file's own."""
+
+    locked: dict[str, float] = spec(factory=dict, unit="rad, m")
+    """Arm joints that inverse kinematics holds, with their values."""
+    ik_joints: list[str] = field(default_factory=list)
+    """Arm joints for inverse kinematics, each moves both grasp sites. Empty: all not locked."""
+    approach_body: str = ""
+    """Body with the approach axis: the last that carries both jaws. Empty: the body of the last arm
+    joint."""
+    approach_axis: list[float] = spec(factory=lambda: [0.0, 0.0, -1.0], length=3)
+    """Direction from the wrist towards the grasped object, in that body's frame."""
+    roll_joint: str | None = None
+    """Arm joint that turns the gripper about the approach axis. null: there is none, and no yaw
+    alignment."""
+    posture_gain: float = spec(0.0, ge=0.0, le=1.0)
+    """Closed loop: share per iteration of the way to the nominal joint values, in the null
+    space."""
+    approach_gain: float = spec(0.0, unit="rad", ge=0.0, le=1.0)
+    """Closed loop: turn per iteration of the approach axis towards the desired one."""
+    yaw_alignment: float = spec(0.0, ge=0.0, le=1.0)
+    """Closed loop: how far the jaws turn to an object's nearest face."""
+    approach_height: float = spec(0.1, unit="m", gt=0.0)
+    """Height above an object at which a grasp begins."""
+    finger_room: float = spec(0.01, unit="m", ge=0.0)
+    """Free room around an object for the open jaws."""
+    wrist_camera: CameraPoseCfg | None = None
+    """Pose of a camera on the gripper. null: there is none."""
+    placements: dict[str, PlacementsCfg] = field(default_factory=dict)
+    """Where the objects of each scene stand for this robot."""
+
+    @property
+    def joints(self) -> list[str]:
+        """The arm's joints and then the gripper's, in the order of all joint values."""
+        return [*self.arm_joints, *self.gripper_joints]
+
+    @property
+    def grips(self) -> dict[str, list[float]]:
+        """Joint targets of the gripper by the word for it in a phase."""
+        return {"open": self.gripper_open, "closed": self.gripper_closed}
