@@ -25,7 +25,7 @@ from mjstack.adapters.rsl_rl import RslRlVecEnv
 from mjstack.errors import ArgumentError, MjstackError, UnknownName
 
 FRAMES = 5  # of an episode: short, so that several end in a test
-SUCCESS = ("task.success.params.distance=10.0",)  # wherever the grasp point is
+SUCCESS = ("task.check.distance=10.0",)  # wherever the grasp point is
 Make = Callable[..., mjstack.Env]
 
 

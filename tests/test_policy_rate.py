@@ -64,7 +64,7 @@ def test_held_steps_are_observed_for_a_history_alone(
     ("ends", "last", "success"),
     [
         (["task.episode_steps=7"], 7, 0.0),
-        (["task.success.params.distance=10.0", "task.success.params.steps=3"], 3, 1.0),
+        (["task.check.distance=10.0", "task.success.params.steps=3"], 3, 1.0),
     ],
     ids=["time out", "success"],
 )
