@@ -122,7 +122,7 @@ def by_mink(
         anywhere = arm.grasp_point(arm.anywhere(3000, 25))
         anywhere = anywhere[anywhere[:, 2] > top][:MINK]
         assert len(anywhere) == MINK
-        mink = GraspIk(arm.robot, stage.cfg.model, tolerance=TOLERANCE, iterations=60)
+        mink = GraspIk(arm.robot, stage.cfg.model, tolerance=TOLERANCE)
         gripper = np.array(arm.robot.gripper_open)
         made = {}
         for where, targets in ((TABLE, workspace(robot)[1][:MINK]), ("anywhere", anywhere)):

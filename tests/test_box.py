@@ -146,7 +146,7 @@ def test_sensors_tell_supports_from_jaws(robot: str) -> None:
 
 def test_home_is_the_first_approach_and_clear_of_everything(robot: str) -> None:
     cfg = configured(robot)
-    first = _planner(robot).plan_world(0, nominal_xy(cfg.scene))[0][0]
+    first = _planner(robot).plan(nominal_xy(cfg.scene)[None]).knots[0, 0]
     np.testing.assert_allclose(cfg.robot.home, first, atol=2e-6)
     assert cfg.robot.start == cfg.robot.home == cfg.robot.placements["box"].home
     model = build_model(cfg)

@@ -160,11 +160,56 @@ def test_unreachable_target_names_world_phase_and_distance(stage: Stage) -> None
     assert "\n" not in str(caught.value)
 
 
+def test_the_first_unreachable_world_is_named(stage: Stage) -> None:
+    """Not the one that fails first in the episode; by its number, where there are some."""
+    xy = np.stack([nominal(stage)] * 6)
+    xy[3, 1] = xy[[4, 5], 0] = [1.5, 0.0]
+    for names, expected in ((None, 3), ([0, 2, 4, 6, 8, 10], 6)):
+        with pytest.raises(Unreachable) as caught:
+            stage.planner.plan(xy, names=names)
+        assert (caught.value.world, caught.value.phase) == (expected, "above_blue")
+
+
+def test_a_world_that_is_nowhere_is_unreachable(stage: Stage) -> None:
+    xy = np.stack([nominal(stage)] * 2)
+    xy[1, 0, 0] = np.nan
+    with pytest.raises(Unreachable, match="world 1, phase above_red"):
+        stage.planner.plan(xy)
+
+
 def test_plan_does_not_depend_on_the_other_worlds(stage: Stage) -> None:
-    a, b, _ = layouts(stage)
-    alone = stage.planner.plan(b[None])
-    among = stage.planner.plan(np.stack([a, b, b]))
-    for step in range(0, 600, 7):
-        assert (among.command(step)[1] == alone.command(step)[0]).all()
-        assert (among.command(step)[2] == alone.command(step)[0]).all()
-    assert not (among.command(300)[0] == alone.command(300)[0]).all()
+    """To the last bit, wherever a world stands in the batch, the nominal one included."""
+    xy = nominal(stage) + np.random.default_rng(7).uniform(-0.02, 0.02, (40, 2, 2))
+    xy[[3, 17]] = nominal(stage)
+    xy[20, 0] = nominal(stage)[0]  # its first phases are the nominal ones
+    xy[23] = xy[8]
+    planner = stage.planner
+    among = planner.plan(xy)
+    order = np.random.default_rng(8).permutation(40)
+    assert among.knots[order].numpy().tobytes() == planner.plan(xy[order]).knots.numpy().tobytes()
+    for world in (0, 3, 8, 20, 23, 39):
+        alone = planner.plan(xy[[world]])
+        assert alone.knots.numpy().tobytes() == among.knots[[world]].numpy().tobytes()
+        assert alone.waypoint_error[0] == among.waypoint_error[world]
+        for step in range(0, 600, 37):
+            assert (alone.command(step)[0] == among.command(step)[world]).all()
+    assert len(np.unique(among.knots.numpy().round(4), axis=0)) == 38
+
+
+def test_plans_are_those_that_mink_makes(stage: Stage) -> None:
+    """mink, from the nominal plan too, comes to the same joints, on one branch of solutions."""
+    xy = nominal(stage) + np.random.default_rng(9).uniform(-0.02, 0.02, (4, 2, 2))
+    planner = stage.planner
+    (seed,) = planner.plan(nominal(stage)[None]).knots.numpy()
+    arm = Arm(stage.model, stage.cfg.robot)
+    n_arm = len(stage.cfg.robot.arm_joints)
+    for knots in planner.plan(xy).knots.numpy():
+        points = arm.grasp_point(knots)
+        solved = [
+            planner.ik.solve(point, knot[n_arm:], start)
+            for point, knot, start in zip(points, knots, seed, strict=True)
+        ]
+        commands, distances = (np.array(part) for part in zip(*solved, strict=True))
+        assert distances.max() <= planner.ik.tolerance
+        assert np.abs(knots - commands).max() <= 0.04
+        assert np.abs(knots - commands).mean() <= 0.002

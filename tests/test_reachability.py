@@ -56,7 +56,7 @@ def grasp_point(ik: GraspIk, cfg: Config, q: np.ndarray, gripper: list[float]) -
 def test_solutions_are_where_mujoco_says(get_stage: GetStage, robot: str, grip: str) -> None:
     cfg = get_stage(robot).cfg
     gripper = cfg.robot.gripper_open if grip == "open" else cfg.robot.gripper_closed
-    ik = GraspIk(cfg.robot, cfg.model, tolerance=5e-4, iterations=60)
+    ik = GraspIk(cfg.robot, cfg.model, tolerance=5e-4)
     points = points_over(cfg, 20)
     found, distances = PointReach(get_stage(robot).model, cfg.robot, gripper).solve(points)
     assert distances.max() < 5e-4
@@ -197,7 +197,7 @@ def test_finger_room_is_what_the_open_jaws_need(get_stage: GetStage, robot: str)
     index = get_stage(robot).index
     scene = cfg.scene
     distance = 2.0 * math.sqrt(2.0) * scene.objects["red"].half_height + cfg.robot.finger_room
-    ik = GraspIk(cfg.robot, cfg.model, tolerance=5e-4, iterations=60)
+    ik = GraspIk(cfg.robot, cfg.model, tolerance=5e-4)
     z = scene.table_top + scene.objects["red"].half_height
 
     def touched(

@@ -1,16 +1,7 @@
 """Planning before the episode: targets of the grasp point and joint trajectories of every world."""
 
-import os
-import signal
-import sys
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from multiprocessing import active_children, get_context, parent_process
-from threading import Thread
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -18,25 +9,19 @@ import torch
 from torch import Tensor
 
 from mjstack.config.schema import Config
-from mjstack.errors import MjstackError, Unreachable
+from mjstack.errors import Unreachable
 from mjstack.interrupt import check_interrupt
 from mjstack.kinematics.mink_ik import GraspIk
-from mjstack.process import available_cores
 from mjstack.scene.phases import build_phases, nominal_xy, target_xy
 
-# Distinct worlds: some 6 s of planning; a process needs 3 s before its first plan.
-PARALLEL_FROM = 512
-WORLDS_PER_PROCESS = 128  # distinct worlds that pay for one process more
-_POLL = 0.2  # s, between two looks at whether the command was interrupted
-_CHUNK = 8  # worlds, 0.1 s of planning: messages cost little beside it
+# Of batched inverse kinematics: enough for a start far from the nominal one.
+_ITERATIONS = 40
+# Its spare joints end where mink's posture task leaves them: near home.
+_POSTURE_GAIN = 0.3
 
-# Variables of a planning process, each 1: no threads, and no imports from the working folder.
-_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "PYTHONSAFEPATH")
-
-# Commands at the knots (n, nu), and the largest distance [m] from a target.
-Plan = tuple[np.ndarray, float]
-
-_planner: "OpenLoopPlanner"  # of a process that plans for another one
+# Joint positions to start from, shape (nworld, nu), and targets [m], shape (nworld, 3), to the
+# solutions and the distances that are left [m], shape (nworld,).
+_Solve = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -91,11 +76,12 @@ class JointTrajectory:
 
 
 class OpenLoopPlanner:
-    """Plans joint trajectories for objects and places at given positions, with mink.
+    """Plans joint trajectories for objects and places at given positions: the nominal one with
+    mink, and all others from there with batched inverse kinematics on the CPU.
 
     Attributes:
         phases: The phases.
-        ik: Inverse kinematics of the robot alone.
+        ik: mink's inverse kinematics of the robot alone.
         nominal: Commands at the end of each phase of the nominal plan, shape ``(phases, nu)``.
     """
 
@@ -107,151 +93,159 @@ class OpenLoopPlanner:
         """
         self._cfg = cfg
         self.phases = build_phases(cfg)
-        self.ik = GraspIk(
-            cfg.robot,
-            cfg.model,
-            tolerance=cfg.controller.ik_tolerance,
-            iterations=cfg.controller.ik_iterations,
-        )
+        self.ik = GraspIk(cfg.robot, cfg.model, tolerance=cfg.controller.ik_tolerance)
         self._nodes = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, cfg.controller.knots))
         self._weights, self._numbers = self._step_weights()
-        self._seed: np.ndarray | None = None
         self._last: tuple[np.ndarray, JointTrajectory] | None = None
-        self._pool: ProcessPoolExecutor | None = None
-        self._seed = self.plan_world(0, nominal_xy(cfg.scene))[0]
-        self.nominal = self._seed[len(self._nodes) - 1 :: len(self._nodes)]
+        self._xy = nominal_xy(cfg.scene)
+        (first,), _ = self._solve_knots(self._xy[None], [0], self._solve_nominal)
+        self.nominal = first[len(self._nodes) - 1 :: len(self._nodes)]
+        # Once more from there: mink stops when the target is near, and spare joints have farther
+        # to go.
+        plan = self._solve_knots(self._xy[None], [0], self._solve_nominal, first)
+        (self._knots,), (self._error,) = plan
 
-    def plan(
-        self,
-        sources_xy: np.ndarray,
-        progress: Callable[[int], None] = lambda done: None,
-        names: Sequence[int] | None = None,
-    ) -> JointTrajectory:
-        """Plan one trajectory per world; worlds that start alike share the work.
+    def plan(self, sources_xy: np.ndarray, names: Sequence[int] | None = None) -> JointTrajectory:
+        """Plan one trajectory per world, which does not depend on the other worlds.
 
         Args:
             sources_xy: Position of each object and place at the start [m], shape ``(nworld,
                 sources, 2)``; see `source_names`.
-            progress: Called with the number of worlds done.
             names: Numbers of the worlds, for the error; from 0 on if None.
 
         Raises:
             Unreachable: A target is out of reach; names the world (the first one), the phase and
                 the distance.
-            MjstackError: A process that helps has ended.
         """
         if self._last is not None and np.array_equal(self._last[0], sources_xy):
             return self._last[1]  # the gates of one run play the same batch
-        nworld = sources_xy.shape[0]
-        flat = sources_xy.reshape(nworld, -1)
-        _, first, kind = np.unique(flat, axis=0, return_index=True, return_inverse=True)
-        twin = first[kind.reshape(-1)]
-        worlds = sorted(first.tolist())
-        done = np.cumsum(np.bincount(twin)[worlds]).tolist()
-        plans: dict[int, Plan] = {}
-        try:
-            with self.processes(len(worlds)):
-                batch = zip(worlds, done, self._plans(worlds, sources_xy), strict=True)
-                for world, count, plan in batch:
-                    plans[world] = plan
-                    progress(count)
-        except Unreachable as unreachable:
-            if names is not None:
-                unreachable.world = names[unreachable.world]
-            raise
-        parts = zip(*(plans[world] for world in twin), strict=True)
-        knots, error = (np.array(part) for part in parts)
+        nworld = len(sources_xy)
+        knots = np.tile(self._knots, (nworld, 1, 1))
+        error = np.full(nworld, self._error)
+        displaced = np.flatnonzero((sources_xy != self._xy).any(axis=(1, 2)))
+        if displaced.size:
+            worlds = displaced if names is None else np.array(names)[displaced]
+            solve = self._batched_solve(len(displaced))
+            plans = self._solve_knots(sources_xy[displaced], worlds.tolist(), solve, self._knots)
+            knots[displaced], error[displaced] = plans
         trajectory = JointTrajectory(torch.from_numpy(knots), self._weights, self._numbers, error)
         if nworld > 1:
             self._last = (sources_xy.copy(), trajectory)
         return trajectory
 
-    def _plans(self, worlds: Sequence[int], sources_xy: np.ndarray) -> Iterator[Plan]:
-        """The plan of each world, in their order."""
-        if self._pool is not None:
-            return plan_in_parallel(self._pool, worlds, sources_xy)
-        return (self.plan_world(world, sources_xy[world]) for world in worlds)
-
-    @contextmanager
-    def processes(self, worlds: int) -> Iterator[None]:
-        """Keep processes for every `plan` inside, if so many distinct worlds pay for them. They
-        load beside whatever comes before the first plan.
-        """
-        count = min(available_cores(), worlds // WORLDS_PER_PROCESS)
-        if self._pool is not None or worlds < PARALLEL_FROM or count < 2:
-            yield
-            return
-        with _start_processes(self._cfg, count) as self._pool:
-            try:
-                yield
-            finally:
-                self._pool = None
-
     def path_error(self) -> float:
         """Largest distance [m] of the grasp point from its straight path at any step of the nominal
         plan.
         """
-        nominal = nominal_xy(self._cfg.scene)
-        trajectory = self.plan(nominal[None])
-        targets = self._targets(nominal)
+        trajectory = self.plan(self._xy[None])
+        (ends,) = self._targets(self._xy[None])
         worst = 0.0
         for step, (number, s) in enumerate(self._progress()):
-            start, end = targets[number]
+            start, end = ends[number : number + 2]
             at = self.ik.grasp_point(trajectory.command(step)[0].numpy())
             worst = max(worst, float(np.linalg.norm(at - (start + s * (end - start))[:3])))
         return worst
 
-    def plan_world(self, world: int, xy: np.ndarray) -> Plan:
-        """Plan one world, starting from the nominal plan, so that its neighbours do not matter.
+    def _solve_nominal(self, q: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Solve one world with mink."""
+        command, distance = self.ik.solve(target[0], q[0, len(self._cfg.robot.arm_joints) :], q[0])
+        return command[None], np.array([distance])
+
+    def _batched_solve(self, nworld: int) -> _Solve:
+        """Batched inverse kinematics of so many worlds."""
+        # Loads Warp, which the nominal plan alone does not need.
+        from mjstack.kinematics.batched_ik import BatchedIk
+
+        robot = self._cfg.robot
+        ik = BatchedIk(
+            self.ik.model,
+            robot,
+            nworld,
+            "cpu",
+            iterations=_ITERATIONS,
+            posture_gain=_POSTURE_GAIN,
+        )
+        moved = [robot.joints.index(name) for name in robot.ik_joints]
+
+        def solve(q: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            rounded, distance = ik.solve(torch.from_numpy(q), torch.from_numpy(target))
+            solution = q.copy()  # the other joints exactly, not in float32
+            solution[:, moved] = rounded.numpy()[:, moved]
+            return solution, distance.numpy()
+
+        return solve
+
+    def _solve_knots(
+        self,
+        xy: np.ndarray,
+        worlds: Sequence[int],
+        solve: _Solve,
+        seed: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Commands at the knots, shape ``(nworld, n, nu)``, and the largest distance from a target
+        at any [m], shape ``(nworld,)``.
 
         Args:
-            world: Its number, for the error.
-            xy: Position of each object and place at the start [m], shape ``(sources, 2)``.
-
-        Returns:
-            Commands at the knots, shape ``(n, nu)``, and the largest distance [m] from a target at
-            any.
+            xy: Position of each object and place at the start [m], shape ``(nworld, sources, 2)``.
+            worlds: Numbers of the worlds, for the error.
+            solve: Inverse kinematics of these worlds.
+            seed: Commands at which the solutions of every world start, shape ``(n, nu)``. Without
+                it each one starts at the one before, the first one at home.
 
         Raises:
             Unreachable: A target is out of reach.
         """
         n = len(self._nodes)
-        knots = np.empty((len(self.phases) * n, len(self._cfg.robot.home)))
-        worst = 0.0
-        command = self.ik.home
-        for i, (phase, (start, end)) in enumerate(zip(self.phases, self._targets(xy), strict=True)):
-            still = bool((start == end).all())
+        ends = self._targets(xy)
+        knots = np.tile(self.ik.home, (len(xy), len(self.phases) * n, 1))
+        distances = np.zeros(knots.shape[:2])
+        for i in range(len(self.phases)):
+            start, end = ends[:, i : i + 2].swapaxes(0, 1)
+            still = (start == end).all(axis=1)
             for j, s in enumerate(self._nodes):
                 k = i * n + j
-                repeated = (still and j > 0) or (j == 0 and i > 0)
-                if not repeated:
-                    guess = command if self._seed is None else self._seed[k]
-                    way = start + s * (end - start)
-                    command, distance = self.ik.solve(way[:3], way[3:], guess)
-                    if not distance <= self.ik.tolerance:
-                        facts = (phase.spec.anchor, way[:3].tolist(), distance, self.ik.tolerance)
-                        raise Unreachable(world, phase.name, *facts)
-                    worst = max(worst, distance)
-                knots[k] = command
-        return knots, worst
+                repeated = still if j > 0 else np.full(len(xy), i > 0)
+                knots[repeated, k] = knots[repeated, k - 1]
+                if repeated.all():
+                    continue
+                check_interrupt()
+                way = start + s * (end - start)
+                guess = knots[:, k - 1].copy() if seed is None else np.tile(seed[k], (len(xy), 1))
+                guess[:, len(self._cfg.robot.arm_joints) :] = way[:, 3:]
+                command, distance = solve(guess, way[:, :3])
+                knots[~repeated, k] = command[~repeated]
+                distances[~repeated, k] = distance[~repeated]
+        failed = np.argwhere(~(distances <= self.ik.tolerance))
+        if failed.size:
+            row, k = failed[0]
+            phase = self.phases[k // n]
+            start, end = ends[row, k // n : k // n + 2, :3]
+            way = start + self._nodes[k % n] * (end - start)
+            facts = (way.tolist(), float(distances[row, k]), self.ik.tolerance)
+            raise Unreachable(worlds[row], phase.name, phase.spec.anchor, *facts)
+        return knots, distances.max(axis=1)
 
-    def _targets(self, xy: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Start and end of each phase: the grasp point [m] and then the gripper's command."""
+    def _targets(self, xy: np.ndarray) -> np.ndarray:
+        """Where each phase ends, after where the first one starts: the grasp point [m] and then the
+        gripper's command, shape ``(nworld, phases + 1, 3 + n_gripper)``.
+        """
         robot = self._cfg.robot
         where = xy.copy()  # of each object after the phases so far
         in_hand = -1
-        out: list[tuple[np.ndarray, np.ndarray]] = []
-        for phase in self.phases:
+        ends = np.empty((len(xy), len(self.phases) + 1, 3 + len(robot.gripper_joints)))
+        for i, phase in enumerate(self.phases):
             if in_hand >= 0 and phase.carried < 0:  # let go where the last target was
-                where[in_hand] = out[-1][1][:2]
+                where[:, in_hand] = ends[:, i, :2]
             in_hand = phase.carried
-            target = phase.target
-            point = out[-1][1][:3] if target is None else [*target_xy(target, where), target.z]
-            end = np.array([*point, *robot.grips[phase.spec.gripper]])
-            # The first phase's target stands from the first step; only the gripper moves from home.
-            home = np.array([*point, *robot.home[len(robot.arm_joints) :]])
-            out.append((out[-1][1] if out else home, end))
-        return out
+            ends[:, i + 1] = ends[:, i]
+            if phase.target is not None:
+                ends[:, i + 1, :2] = target_xy(phase.target, where)
+                ends[:, i + 1, 2] = phase.target.z
+            ends[:, i + 1, 3:] = robot.grips[phase.spec.gripper]
+        # The first phase's target stands from the first step; only the gripper moves from home.
+        ends[:, 0, :3] = ends[:, 1, :3]
+        ends[:, 0, 3:] = robot.home[len(robot.arm_joints) :]
+        return ends
 
     def _progress(self) -> Iterator[tuple[int, float]]:
         """Number of the phase, and the smoothstep parameter at the end, of every step."""
@@ -273,91 +267,6 @@ class OpenLoopPlanner:
         share = bary / np.where(hit, 1.0, gap)
         rows = np.where(hit.any(1, keepdims=True), hit, share / share.sum(1, keepdims=True))
         return torch.from_numpy(rows), torch.from_numpy(phase * n + np.arange(n))
-
-
-def plan_in_parallel(
-    pool: ProcessPoolExecutor, worlds: Sequence[int], sources_xy: np.ndarray
-) -> Iterator[Plan]:
-    """Plan worlds, their numbers ascending, in processes; ``sources_xy`` as of
-    `OpenLoopPlanner.plan`.
-
-    Raises:
-        Unreachable: A target is out of reach; of several such worlds it names the first, as one
-            process would.
-        MjstackError: A process has ended by itself.
-    """
-    jobs: list[Future[list[Plan]]] = []
-    try:
-        with _as_programs():
-            chunks = [worlds[first : first + _CHUNK] for first in range(0, len(worlds), _CHUNK)]
-            jobs += [pool.submit(_plan, chunk, sources_xy[list(chunk)]) for chunk in chunks]
-        for job in jobs:
-            while not wait([job], _POLL).done:
-                check_interrupt()
-            yield from job.result()
-    except BrokenProcessPool:
-        raise MjstackError(
-            "a planning process was killed or ended before every world was planned",
-            "Run again with more free memory, or on one core (taskset -c 0), which starts no"
-            " processes",
-        ) from None
-    finally:
-        for job in jobs:  # after an error the rest is not wanted
-            job.cancel()
-
-
-@contextmanager
-def _start_processes(cfg: Config, count: int) -> Iterator[ProcessPoolExecutor]:
-    """Processes that plan, which are gone when this has ended in any way."""
-    before = active_children()
-    # Processes are not forks: this one may hold a CUDA context and threads.
-    with _as_programs():
-        pool = ProcessPoolExecutor(count, get_context("spawn"), _start_process, (cfg,))
-        for _ in range(count):  # a process starts where a job finds none idle
-            pool.submit(int)
-    try:
-        yield pool
-    finally:
-        for process in set(active_children()).difference(before):
-            process.kill()  # it may still be loading
-        pool.shutdown(cancel_futures=True)
-
-
-@contextmanager
-def _as_programs() -> Iterator[None]:
-    """Processes that start in here do not import the main module again, which need not bear it,
-    leave Ctrl-C to this process, and use one core each.
-    """
-    main = sys.modules["__main__"]
-    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    sys.modules["__main__"] = ModuleType("__main__")
-    limits = {name: "1" for name in _VARIABLES if name not in os.environ}
-    os.environ.update(limits)
-    try:
-        yield
-    finally:
-        for name in limits:
-            del os.environ[name]
-        sys.modules["__main__"] = main
-        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
-
-
-def _start_process(cfg: Config) -> None:
-    """Make the planner of a process, which ends when the one that started it does."""
-    global _planner
-    Thread(target=_end_with_parent, daemon=True).start()
-    _planner = OpenLoopPlanner(cfg)
-
-
-def _end_with_parent() -> None:
-    parent = parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
-
-
-def _plan(worlds: Sequence[int], xy: np.ndarray) -> list[Plan]:
-    return [_planner.plan_world(world, row) for world, row in zip(worlds, xy, strict=True)]
 
 
 def smoothstep(u: Any) -> Any:

@@ -243,11 +243,8 @@ class Stage:
 
             return StateBasedDriver(env, self.planner.nominal)
         sim = env.sim
-        trajectory = self.planner.plan(
-            source_xy(env).double().cpu().numpy(),
-            lambda done: self.progress.advance("planning", done, sim.nworld),
-            names=env.world.tolist(),
-        )
+        sources = source_xy(env).double().cpu().numpy()
+        trajectory = self.planner.plan(sources, names=env.world.tolist())
         return OpenLoopDriver(trajectory.to(sim.device, sim.ctrl.dtype), self.planner.phases)
 
     def play(

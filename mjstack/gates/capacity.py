@@ -4,7 +4,6 @@ they be?
 
 import math
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import partial, reduce
 
@@ -19,7 +18,6 @@ from mjstack.envs.buffers import (
     random_actions,
     recommend_sizes,
 )
-from mjstack.episodes.rollout import FEEDBACK
 from mjstack.episodes.run import Run, each_rank, needs_episode
 from mjstack.errors import Unreachable, name_worlds
 from mjstack.report.record import GateResult, Status
@@ -56,24 +54,22 @@ def run_capacity(run: Run) -> list[GateResult]:
     result = GateResult(name="capacity", status=Status.passed, metrics={"worlds": nworld})
 
     # Environments first: each start is planned once, for both of its runs, and the plan of the
-    # task's is kept for the gates that follow. Planning processes load during random actions.
-    planned = cfg.controller.name not in FEEDBACK
-    with run.stage.planner.processes(nworld) if planned else nullcontext():
-        env = _measure(
-            run,
-            result,
-            "environments (random actions, randomised starts)",
-            resolve_env_sizes(cfg),
-            random_actions=partial(play_random, run),
-            randomized=partial(run.stage.play_task, t.reset),
-        )
-        task = _measure(
-            run,
-            result,
-            "driven task",
-            resolve_sizes(cfg),
-            task=partial(run.stage.play_task, cfg.reset),
-        )
+    # task's is kept for the gates that follow.
+    env = _measure(
+        run,
+        result,
+        "environments (random actions, randomised starts)",
+        resolve_env_sizes(cfg),
+        random_actions=partial(play_random, run),
+        randomized=partial(run.stage.play_task, t.reset),
+    )
+    task = _measure(
+        run,
+        result,
+        "driven task",
+        resolve_sizes(cfg),
+        task=partial(run.stage.play_task, cfg.reset),
+    )
 
     # Problems. Motion that lost physics sizes nothing that follows.
     groups = {"task": task, "env": env}

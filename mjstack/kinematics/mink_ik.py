@@ -12,6 +12,7 @@ from mjstack.robots import robot_spec
 from mjstack.scene.index import locked_home
 
 _POSTURE_COST = 1e-3  # pulls the redundant joints home; moves the grasp point by micrometres
+_ITERATIONS = 60  # at most, per solve
 _CONVERGED = 0.1  # share of the tolerance: Newton's method squares the error, so that is enough
 _MAX_STEP = 0.3  # [rad, m] per iteration: a far target is approached on one branch of solutions
 
@@ -43,22 +44,18 @@ class GraspPointTask(mink.Task):
 class GraspIk:
     """Arm positions that bring the grasp point to a target at a given gripper opening."""
 
-    def __init__(
-        self, robot: RobotCfg, model: ModelCfg, *, tolerance: float, iterations: int
-    ) -> None:
+    def __init__(self, robot: RobotCfg, model: ModelCfg, *, tolerance: float) -> None:
         """Compile the robot without a scene.
 
         Args:
             robot: The robot's profile.
             model: Where its description comes from.
             tolerance: Distance that counts as reached [m].
-            iterations: Most mink steps per solve.
         """
         spec = robot_spec(robot, model)
         spec.compiler.discardvisual = True
         self.model = spec.compile()
         self.tolerance = tolerance
-        self._iterations = iterations
         joints = [self.model.joint(name).id for name in robot.joints]
         for key in ("home", "gripper_open", "gripper_closed"):
             values = getattr(robot, key)
@@ -102,7 +99,7 @@ class GraspIk:
         configuration.update(self._to_qpos(q))
         nearest = configuration.q[self._qpos].copy()
         distance = math.inf
-        for _ in range(self._iterations):
+        for _ in range(_ITERATIONS):
             try:
                 step = mink.solve_ik(
                     configuration,

@@ -122,8 +122,6 @@ class ControllerCfg:
     """Inverse-kinematics solutions per phase of a plan."""
     ik_tolerance: float = spec(unit="m", gt=0.0)
     """Largest distance of the grasp point from a target."""
-    ik_iterations: int = spec(ge=1, le=10_000)
-    """Iterations per solution of a plan."""
     step_iterations: int = spec(ge=1, le=1000)
     """Iterations of batched inverse kinematics per control step of closed_loop and
     state_based."""
