@@ -98,10 +98,10 @@ def test_two_drivers_that_differ_in_known_worlds(
         place
         for seed in "01"
         for place in (
-            (f"{seed}:0 a REACHED", True),
+            (f"{seed}:0 a grasp point not above red", True),
             (f"{seed}:0 b", False),
             (f"{seed}:3 a", False),
-            (f"{seed}:3 b REACHED", True),
+            (f"{seed}:3 b grasp point not above red", True),
         )
     ]
     assert all(world.qpos.shape == shown[0].qpos.shape for world in shown)

@@ -248,7 +248,9 @@ def test_failing_worlds_come_first(failing: Path) -> None:
     lost = int(gate["metrics"]["episodes"] - gate["metrics"]["succeeded"])
     assert 0 < lost < 6
     labels = labels_of(failing / "episode.html")
-    assert [label.endswith(": STACKED") for label in labels[:-1]] == [w < lost for w in range(6)]
+    assert [label.endswith(": not stacked") for label in labels[:-1]] == [
+        w < lost for w in range(6)
+    ]
     assert labels[-1] == "baseline, native"
     report = (failing / "report.html").read_text()
     assert "href='episode.html'" in report

@@ -55,9 +55,9 @@ def show_batch(
     motions = qpos[:, chosen].float().swapaxes(0, 1).cpu().numpy()
     moving: list[World] = []
     for world, motion in zip(chosen, motions, strict=True):
-        broken = " ".join(rules.broken(int(failed[world])))
-        label = f"{world}: {broken}" if broken else str(world)
-        moving.append(World(label=label, qpos=motion, failed=bool(broken)))
+        problem = rules.describe(int(failed[world]))
+        label = f"{world}: {problem}" if problem else str(world)
+        moving.append(World(label=label, qpos=motion, failed=bool(problem)))
     page.worlds3d[gate] = moving
     arrays = {name: [getattr(world, name) for world in moving] for name in _PARTS}
     if problem := safely_write(path, write_npz, arrays, stops=False):

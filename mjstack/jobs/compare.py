@@ -196,8 +196,8 @@ def _replay(sides: Sides, rows: Sequence[Mapping[str, Any]]) -> list[World]:
             motions = batch.rows["qpos"].float().swapaxes(0, 1).cpu().numpy()
             bits = batch.episode.failed.tolist()
             for world, qpos, failed in zip(batch.plan.worlds, motions, bits, strict=True):
-                rules = " ".join(stage.check.rules.broken(failed))
-                label = f"{seed}:{world} {name} {rules}".rstrip()
+                problem = stage.check.rules.describe(failed)
+                label = f"{seed}:{world} {name} {problem}".rstrip()
                 moving[seed, world, name] = World(label=label, qpos=qpos, failed=failed > 0)
     return [moving[key] for key in sorted(moving)]
 

@@ -84,7 +84,7 @@ def table_map(
             marks.append(f"<path class={css} d='M{line}'>{_tip(text)}</path>")
     for row in sorted(rows, key=lambda row: bool(broken[row])):  # failed ones on top
         rules = " ".join(broken[row])
-        tip = _tip(f"{names[row]}: {rules}" if rules else names[row])
+        tip = _tip(f"{names[row]}: broke {rules}" if rules else names[row])
         for x, y in place(plan.xy[row : row + 1, :2]):
             if rules:
                 corner = f"{x - 4:.1f} {y - 4:.1f}"
