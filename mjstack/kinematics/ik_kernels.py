@@ -21,8 +21,8 @@ NAN = wp.constant(float("nan"))
 
 @wp.struct
 class Chain:
-    """The moving links from the world to the two sites. All have the world's axes where the joints
-    are at 0.
+    """The moving links from the world to the two sites. Parts that do not move are folded
+    into the links' frames.
 
     Links up to ``trunk`` carry both sites, from there to ``fork`` only the first one, from there to
     ``end`` only the second. Inverse kinematics keeps a joint within ``low`` and ``high``, which are
@@ -30,8 +30,8 @@ class Chain:
     link before them, the axis from the trunk's.
     """
 
-    offset: wp.array[wp.vec3]  # of the joint at position 0 from the joint before
-    axis: wp.array[wp.vec3]  # of unit length
+    frame: wp.array[wp.transform]  # the joint's frame at position 0, seen from the link before
+    axis: wp.array[wp.vec3]  # of unit length, in that frame
     kind: wp.array[int]  # HINGE or SLIDE
     column: wp.array[int]  # of the joint positions
     low: wp.array[float]
@@ -58,13 +58,11 @@ class Shape:
 
 
 @wp.func
-def turn(
-    pose: wp.transform, offset: wp.vec3, axis: wp.vec3, kind: int, value: float
-) -> wp.transform:
-    """Pose of a link, from that of the link before it."""
-    motion = wp.transform(offset + value * axis, wp.quat_identity())
+def turn(pose: wp.transform, axis: wp.vec3, kind: int, value: float) -> wp.transform:
+    """A joint's frame after it has moved."""
+    motion = wp.transform(value * axis, wp.quat_identity())
     if kind == HINGE:
-        motion = wp.transform(offset, wp.quat_from_axis_angle(axis, value))
+        motion = wp.transform(wp.vec3(), wp.quat_from_axis_angle(axis, value))
     return wp.transform_multiply(pose, motion)
 
 
@@ -75,8 +73,8 @@ def follow(
     """Pose after links ``first`` to ``last`` (exclusive), from a pose."""
     pose = start
     for i in range(first, last):
-        value = q[w, chain.column[i]]
-        pose = turn(pose, chain.offset[i], chain.axis[i], chain.kind[i], value)
+        frame = wp.transform_multiply(pose, chain.frame[i])
+        pose = turn(frame, chain.axis[i], chain.kind[i], q[w, chain.column[i]])
     return pose
 
 
@@ -220,10 +218,10 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
             axes = Rows()
             link = wp.transform(wp.vec3(), wp.quat_identity())
             for i in range(END):
-                anchors[i] = wp.transform_point(link, chain.offset[i])
-                axes[i] = wp.transform_vector(link, chain.axis[i])
-                kind = wp.static(shape.kinds[i])
-                link = turn(link, chain.offset[i], chain.axis[i], kind, q[i])
+                pose = wp.transform_multiply(link, chain.frame[i])
+                anchors[i] = wp.transform_get_translation(pose)
+                axes[i] = wp.transform_vector(pose, chain.axis[i])
+                link = turn(pose, chain.axis[i], wp.static(shape.kinds[i]), q[i])
             first = wp.transform_point(link, first_site)
             second = wp.transform_point(link, second_site)
             midpoint = wp.lerp(first, second, 0.5)
