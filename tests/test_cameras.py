@@ -27,7 +27,7 @@ from mjstack.distributed import Ranks
 from mjstack.envs import Env, build_env, driven_config
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
-from mjstack.errors import ConfigError, FolderError
+from mjstack.errors import ArgumentError, ConfigError, FolderError
 from mjstack.gates import images as gate_images
 from mjstack.gates.capacity import run_capacity
 from mjstack.gates.images import agree, compare_images
@@ -408,6 +408,8 @@ def test_states_are_drawn_later_as_they_were(make: Make, backend: str) -> None:
         for name, image in drawn.items():
             assert (image == env.images[name][worlds]).float().mean() > 0.999, name
     assert renderer.labels == env.cameras.labels
+    with pytest.raises(ArgumentError, match="qpos: found 6 states, expected at most 5"):
+        renderer.draw(env.sim.qpos.repeat(2, 1))
     renderer.close()
 
 

@@ -307,6 +307,23 @@ def test_the_whole_job_is_checked_before_its_folder_exists(
     refusal(lambda: check_machine(load_config(["gates=[baseline]", *overrides])), words)
 
 
+def test_a_swapped_function_does_not_inherit_parameters() -> None:
+    reach = "reward.reach.func=mjstack.mdp.reward.reach"
+    swap = "reward.reach.func=mjstack.mdp.reward.action_rate"
+    task = "task=reach"
+    assert load_config([task, reach]).reward["reach"].params
+    assert load_config([task, swap, "reward.reach.weight=3.0"]).reward["reach"].params == {}
+    values = ["+reward.reach.params.mine=2", "reward.reach.params={scale: 1}"]
+    term = load_config([task, swap, *values]).reward["reach"]
+    assert term.params == {"mine": 2, "scale": 1}
+    whole = "{func: mjstack.mdp.reward.action_rate, params: {mine: 3}}"
+    assert load_config([task, f"+reward.reach={whole}"]).reward["reach"].params == {"mine": 3}
+    home = "gate.success.reset.joint_noise.func=mjstack.mdp.reset.home"
+    assert load_config([home]).gate.success.reset["joint_noise"].params == {}
+    check = load_config(["task.check.func=mine.Check", "task.check.window=7"]).task.check
+    assert check == {"func": "mine.Check", "window": 7}
+
+
 @pytest.mark.full
 def test_every_field_says_what_it_means() -> None:
     keys = list(list_keys(load_config()))

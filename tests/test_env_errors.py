@@ -148,6 +148,7 @@ def test_seed_of_some_worlds(env: Env) -> None:
 def test_step_before_reset(cfg: Config) -> None:
     env = on_shared_sim("native", 3, cfg)
     fails(ArgumentError, lambda: env.step(zeros(env)), "before reset()", "env.reset()")
+    fails(ArgumentError, lambda: env.reset(mask=mask_of(env, 1)), "mask", "env.reset()")
     env.reset()
     env.step(zeros(env))
 
@@ -320,6 +321,7 @@ OUT_OF_RANGE: list[tuple[str, type[MjstackError], str]] = [
         TermError,
         "'elbow' does not exist. Did you mean 'elbow_f",
     ),
+    ("action.arm.params.joints=[shoulder_pan,shoulder_pan]", ConfigError, ""),
     ("action.arm.params.mode=absolut", ConfigError, "=absolut: expected one of relative, absolute"),
     ("action.arm.params.scale=0.0", ConfigError, "=0.0: expected a number above 0"),
     (

@@ -195,5 +195,6 @@ def test_a_closed_environment_and_a_missing_field_say_so() -> None:
     with pytest.raises(MjstackError, match="uses_fields"):
         env.sim.fields["body_mass"]
     env.close()
-    with pytest.raises(mjstack.MjstackError, match="close"):
-        env.step(zeros(env))
+    for call in (lambda: env.step(zeros(env)), env.reset):
+        with pytest.raises(mjstack.MjstackError, match="close"):
+            call()

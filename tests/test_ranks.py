@@ -35,7 +35,7 @@ from mjstack.episodes.batches import BatchPlan, play_batches
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.seeds import _record as record_of
 from mjstack.episodes.stage import Stage
-from mjstack.errors import ConfigError, MjstackError
+from mjstack.errors import ArgumentError, ConfigError, MjstackError
 from mjstack.jobs import check_ranks, count_devices
 
 SHORT = ["sim=native", "gates=[batch]", *one_second_episode()]
@@ -358,6 +358,8 @@ def test_an_environment_of_later_worlds_starts_and_ends_like_them() -> None:
     for ours, theirs in zip(*found, strict=True):
         for name in ours:
             assert torch.equal(ours[name], theirs[name]), name
+    with pytest.raises(ArgumentError, match="first_world: found -1, expected an integer of at"):
+        mjstack.make_env(overrides, nworld=2, first_world=-1)
 
 
 # Ranks that do not fit together

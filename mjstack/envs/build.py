@@ -83,7 +83,12 @@ def build_env(
             ``batch=auto`` they are measured first, in worlds that are gone again before these are
             made.
         first_world: Number of the first world; see `Env`.
+
+    Raises:
+        ArgumentError: The number of the first world is negative.
     """
+    if first_world < 0:
+        raise ArgumentError("first_world", first_world, "an integer of at least 0")
     model = build_model(cfg) if model is None else model
     nworld = cfg.nworld if nworld is None else nworld
     backend, device = resolve_backend(cfg, backend, device)

@@ -109,6 +109,7 @@ class Env:
         self._all_worlds = torch.ones_like(self.success)
         self._version = 0
         self._started = False
+        self._closed = False
         self._delay = CommandDelay(sim.ctrl, cfg.timing.command_delay)
 
         # Terms are checked on worlds that have started, because a term may read anything.
@@ -155,8 +156,14 @@ class Env:
         Raises:
             ArgumentError: The seed or the mask cannot be used.
         """
+        if self._closed:
+            expected = "an open environment"
+            raise ArgumentError("env", "reset() after close()", expected, "Make a new one")
         if mask is not None:
             self.sim.check_mask(mask)
+            if not self._started:
+                expected = "none at the first reset"
+                raise ArgumentError("mask", "a part of the worlds", expected, "Call env.reset()")
         if seed is not None:
             self.seed = check_seed(seed, masked=mask is not None)
             self.key.fill_(self.seed)
@@ -253,6 +260,7 @@ class Env:
     def close(self) -> None:
         """Give the simulation's threads and buffers back. Nothing can be stepped afterwards."""
         self._started = False
+        self._closed = True
         self.sim.synchronize()
         self.graph.drop()
         self._draws.close()

@@ -72,6 +72,8 @@ class JointPosition(_Commands):
             if name not in names:
                 raise UnknownName("action joint", name, [*parts, *names])
         chosen = [names.index(name) for name in joints]
+        if not chosen or len(set(chosen)) < len(chosen):
+            raise ParameterError("joints", joints, "at least one joint, each once")
         self._set_up(env, chosen, len(chosen))
         self._mode = mode
         self._scale = scale
@@ -151,13 +153,16 @@ class EndEffectorDelta(_Commands):
                 as it always does with 0.
 
         Raises:
-            ParameterError: The robot has no joint that rolls the gripper and nothing else.
+            ParameterError: The robot has no joint that rolls the gripper and nothing else; or the
+                gripper is to tilt where ``upright`` is 0.
         """
         # Loads Warp, which other actions do not need.
         from mjstack.kinematics.batched_ik import BatchedIk
 
         self._n_arm = env.index.n_arm
         self._set_up(env, range(self._n_arm), dim=3 + bool(roll) + bool(tilt))
+        if tilt and not upright:
+            raise ParameterError("tilt", tilt, "0, because upright is 0")
         self._tilt = tilt
         self._all = robot(env).ctrl
         self._scale = scale

@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,16 +45,67 @@ class Plot:
             for metric in curves.values()
         )
 
+    def groups(self, rows: Sequence[Row]) -> Iterator[tuple[str, list[Row]]]:
+        """The rows of each line by its name, in the order of what they are drawn over."""
+        names = [", ".join(str(row.get(key, "")) for key in self.lines) for row in rows]
+        for name in dict.fromkeys(names):
+            group = [row for row, label in zip(rows, names, strict=True) if label == name]
+            yield name, sorted(group, key=lambda row: row[self.over])
+
+    def is_numeric(self, rows: Sequence[Row]) -> bool:
+        """Whether the jobs are drawn over a number."""
+        values = [row.get(self.over) for row in rows]
+        numbers = [v for v in values if isinstance(v, int | float) and not isinstance(v, bool)]
+        return len(numbers) == len(values) and len(set(numbers)) > 1
+
 
 def save_sweep(path: Path, plot: Plot, rows: Sequence[Row]) -> None:
     """Draw a panel for each metric: curves over a number, else a bar for each job.
 
     A job that did not pass interrupts its curves, and a cross marks it.
     """
-    values = [row.get(plot.over) for row in rows]
-    numbers = [v for v in values if isinstance(v, int | float) and not isinstance(v, bool)]
-    curves = len(numbers) == len(values) and len(set(numbers)) > 1
-    (_draw_curves if curves else _draw_bars)(path, plot, rows)
+    (_draw_curves if plot.is_numeric(rows) else _draw_bars)(path, plot, rows)
+
+
+def crossover(plot: Plot, rows: Sequence[Row]) -> tuple[float, str, str] | None:
+    """Where one of two lines passes the other, in the first curve of the first panel.
+
+    Interpolated between the two numbers that bracket it, straight in logarithms. Jobs that did not
+    pass do not count.
+
+    Returns:
+        The number, the line that is above from there on, and the other; None if the rows do not
+        show it.
+    """
+    groups = dict(plot.groups(rows)) if plot.is_numeric(rows) else {}
+    if len(groups) != 2:
+        return None
+    first, second = groups
+    metric = next(iter(next(iter(plot.panels.values())).values()))
+    upper, lower = (
+        {row[plot.over]: _value(row, metric) for row in group} for group in groups.values()
+    )
+    points = [
+        (x, math.log(upper[x] / lower[x]))
+        for x in sorted(upper.keys() & lower.keys())
+        if x > 0 and upper[x] > 0.0 and lower[x] > 0.0
+    ]
+    for (x0, gap0), (x1, gap1) in itertools.pairwise(points):
+        if (gap0 > 0.0) != (gap1 > 0.0):
+            at = math.exp(math.log(x0) + math.log(x1 / x0) * -gap0 / (gap1 - gap0))
+            return at, *((first, second) if gap1 > 0.0 else (second, first))
+    return None
+
+
+def describe_crossover(plot: Plot, rows: Sequence[Row]) -> str:
+    """The crossover in a sentence; empty where there is none."""
+    crossing = crossover(plot, rows)
+    if crossing is None:
+        return ""
+    at, above, below = crossing
+    panel, curves = next(iter(plot.panels.items()))
+    what = f"{next(iter(curves))}, {panel}".removeprefix(", ")
+    return f"Crossover: from {plot.over} of about {at:,.0f} on {above} is above {below} ({what})."
 
 
 def _value(row: Row, metric: str) -> float:
@@ -69,9 +120,7 @@ def _value(row: Row, metric: str) -> float:
 
 
 def _draw_curves(path: Path, plot: Plot, rows: Sequence[Row]) -> None:
-    lines: dict[str, list[Row]] = {}
-    for row in rows:
-        lines.setdefault(", ".join(str(row.get(key, "")) for key in plot.lines), []).append(row)
+    crossing = crossover(plot, rows)
     ticks = sorted({row[plot.over] for row in rows})
     wide = ticks[0] > 0 and ticks[-1] / ticks[0] > 8
     size = (6.0 * len(plot.panels), 4.8)
@@ -79,8 +128,7 @@ def _draw_curves(path: Path, plot: Plot, rows: Sequence[Row]) -> None:
     with figure(path, title, len(plot.panels), figsize=size, squeeze=False) as (_, (panels,)):
         for axes, (label, curves) in zip(panels, plot.panels.items(), strict=True):
             heights: list[float] = []
-            for number, (name, jobs) in enumerate(lines.items()):
-                group = sorted(jobs, key=lambda row: row[plot.over])
+            for number, (name, group) in enumerate(plot.groups(rows)):
                 color = _COLORS[number % len(_COLORS)]
                 x = [row[plot.over] for row in group]
                 for (curve, metric), style in zip(curves.items(), itertools.cycle(_STYLES)):
@@ -100,6 +148,9 @@ def _draw_curves(path: Path, plot: Plot, rows: Sequence[Row]) -> None:
                 axes.set_yscale("log")
             axes.set_xticks(ticks, [f"{tick:,}" for tick in ticks], rotation=45)
             axes.grid(alpha=0.3)
+            if crossing is not None:
+                text = f"crossover, {crossing[0]:,.0f}"
+                axes.axvline(crossing[0], color="0.4", linestyle=":", label=text)
             if axes.get_legend_handles_labels()[0]:
                 axes.legend(frameon=False, fontsize=8)
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mjstack.config.schema import Backend, Config
-from mjstack.errors import ConfigError, DeviceError
+from mjstack.errors import ArgumentError, ConfigError, DeviceError
 from mjstack.sim.native import NativeSimulation
 from mjstack.sim.simulation import Simulation
 from mjstack.sim.sizes import BatchSizes, resolve_sizes
@@ -134,9 +134,12 @@ class StateRenderer:
             call writes into them.
 
         Raises:
+            ArgumentError: There are more states than worlds.
             MjstackError: This machine cannot draw.
         """
         n = len(qpos)
+        if n > self._sim.nworld:
+            raise ArgumentError("qpos", f"{n} states", f"at most {self._sim.nworld}")
         self._sim.qpos[:n] = qpos
         for name, values in (fields or {}).items():
             self._sim.fields[name][:n] = values
