@@ -1,5 +1,6 @@
 """Sweeps: composes and checks their jobs, claims their folder, and shows their table."""
 
+import itertools
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -7,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf, open_dict
 
@@ -30,7 +30,16 @@ def expand(master: DictConfig, overrides: Sequence[str]) -> list[list[str]]:
         return []
     params = OmegaConf.select(master, "hydra.sweeper.params") or {}
     texts = [*(f"{key}={value}" for key, value in params.items()), *own_overrides(overrides)]
-    (jobs,) = BasicSweeper.split_arguments(list(map(parse, texts)), None)
+    values: dict[str, list[str]] = {}  # of each key, the last override's
+    for override in map(parse, texts):
+        key = override.get_key_element()
+        if override.is_discrete_sweep():
+            values[key] = [f"{key}={value}" for value in override.sweep_string_iterator()]
+        elif override.is_sweep_override():  # a glob
+            raise MjstackError(f"{' '.join(overrides)}: expected a list of values.")
+        else:
+            values[key] = [f"{key}={override.get_value_element_as_str()}"]
+    jobs = [list(job) for job in itertools.product(*values.values())]
     if not jobs:
         raise MjstackError(f"{' '.join(overrides)}: has no jobs, expected at least one value.")
     return jobs

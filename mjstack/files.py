@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+import mjstack
 from mjstack.errors import FolderError, MjstackError, first_line
 
 _MOST_TEXT = 2**26  # bytes of JSON or YAML
@@ -244,9 +245,21 @@ def check_unused(folder: Path, job: str = "", *, marker: str = "", key: str = _K
         if job and json.loads((folder / "report.json").read_text())["resumes"] == job:
             return
     raise FolderError(
-        f"{folder} has {used[0].name}, expected a new or an empty folder, or one with which this"
-        f" job can go on. Set {key} to another"
+        f"{folder} has {used[0].name}{made_by(folder)}, expected a new or an empty folder, or one"
+        f" with which this job can go on. Set {key} to another"
     )
+
+
+def made_by(folder: Path) -> str:
+    """The version of mjstack that made a run's or a sweep's folder, to follow its name; empty if it
+    is this one, or no report has it.
+    """
+    for report in (folder / "report.json", *sorted(folder.glob("*/report.json"))):
+        with suppress(OSError, ValueError, LookupError, TypeError, RecursionError):
+            check_regular(report)
+            version = json.loads(report.read_text())["provenance"]["versions"]["mjstack"]
+            return "" if version == mjstack.__version__ else f" of mjstack {str(version)[:40]}"
+    return ""
 
 
 def lock_folder(folder: Path, *, shared: bool = False) -> int:

@@ -10,6 +10,7 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from threading import current_thread, main_thread
 from types import FrameType
 
 EXIT_CODE = 130
@@ -27,7 +28,8 @@ def handle_interrupts() -> Iterator[None]:
     _running = _asked = False
     before = {}
     for number in (signal.SIGINT, signal.SIGTERM):
-        if signal.getsignal(number) != signal.SIG_IGN:
+        # The main thread alone may set handlers.
+        if current_thread() is main_thread() and signal.getsignal(number) != signal.SIG_IGN:
             before[number] = signal.signal(number, _handle)
     try:
         yield

@@ -95,6 +95,22 @@ def test_vector_groups(make: Make) -> None:
         GymnasiumVectorEnv(inner, group="polcy")
 
 
+@pytest.mark.full
+def test_vector_seeding(make: Make) -> None:
+    env = GymnasiumVectorEnv(make())
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-1.0, 1.0, (2 * FRAMES, *env.action_space.shape)).astype(np.float32)
+
+    def rollout(seed: int) -> np.ndarray:
+        return np.stack([env.reset(seed=seed)[0], *(env.step(action)[0] for action in actions)])
+
+    first = rollout(7)
+    other = rollout(8)
+    assert np.array_equal(first, rollout(7))
+    assert not np.isclose(first[0], other[0]).all(1).any()
+    assert env.np_random_seed == 7
+
+
 def test_vector_autoreset_in_the_same_step(make: Make) -> None:
     """Against an identical environment without the adapter, over two episodes with unequal ends."""
     inner = make()
@@ -171,13 +187,18 @@ def test_vector_wrappers_of_gymnasium_work(make: Make) -> None:
 
 WRONG = [
     ({"action": np.zeros((3, 2))}, r"action: found shape \(3, 2\), expected a float32 array"),
+    ({"action": np.zeros(6)}, r"action: found shape \(6,\), expected"),
     ({"action": "up"}, r"action: found str, expected"),
+    ({"action": np.full((3, 6), np.nan)}, r"found \[nan.* in world 0, expected finite numbers"),
     ({"seed": -1}, "seed: found -1"),
+    ({"seed": [1, 2, 3]}, "seed: found"),
     ({"options": {"mask": None}}, "reset option 'mask' does not exist"),
     (
         {"options": {"reset_mask": np.ones(4, dtype=bool)}},
         r"found a torch.bool tensor of shape \(4,\) on cpu, expected a torch.bool",
     ),
+    ({"options": {"reset_mask": np.ones(3)}}, r"found a torch.float64 tensor of shape"),
+    ({"options": {"reset_mask": np.ones(3, dtype=bool)}, "seed": 1}, "no mask beside it"),
 ]
 
 

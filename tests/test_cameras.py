@@ -594,6 +594,7 @@ def test_rsl_rl_gets_images_and_keeps_them(make: Make) -> None:
         ("robot.wrist_camera=null", "scene.cameras.wrist.pose=null: expected a pose"),
         ("robot.wrist_camera.mount=lid", "scene.cameras.wrist.pose.mount: body 'lid'"),
         ("cameras=side", "'side' does not exist. Available: front, top, wrist"),
+        ("cameras=[] gate.parity.images=x.npz", "gate.parity.images=x.npz: expected null, because"),
     ],
 )
 def test_a_bad_value_is_one_line(overrides: str, message: str) -> None:

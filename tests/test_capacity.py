@@ -91,6 +91,22 @@ def test_peaks_survive_masked_resets(
 
 
 @pytest.mark.full
+def test_a_peak_after_a_reset_counts(
+    backend: str, make_sim: Make, get_stage: Callable[[str], Stage]
+) -> None:
+    sim = make_sim(backend, 2)
+    sim.step(1)
+    quiet = sim.lasting_peaks()[1]
+    sim.reset(torch.tensor([True, False], device=sim.device))
+    sim.ctrl.fill_(0.3)
+    start(sim, get_stage("so101"))  # by masked resets
+    sim.step(1)
+    rows = sim.lasting_peaks()[1]
+    assert (rows > quiet).all()
+    assert torch.equal(rows, torch.maximum(quiet, sim.peak_constraints))
+
+
+@pytest.mark.full
 def test_peaks_of_an_environment_outlive_its_episodes(backend: str) -> None:
     """Every world ends in every third step; the loop keeps what it sees before each reset."""
     cfg = load_config(["termination.time_out.params.steps=3", "seed=3"])

@@ -70,6 +70,8 @@ sim=mjwarp sim.device=cuda:77
 -x nworld=3
 hydra.run.dir=afile/below
 hydra.nothing=1
+hydra/job_logging=none
+hydra.output_subdir=/proc/x
 '+hydra.callbacks.x={_target_: nope.nope}' gates=[baseline]
 -m nworld=1,0
 video=true gates=[batch]
@@ -395,3 +397,30 @@ def test_a_reader_that_goes_away_fails_nothing(tmp_path: Path) -> None:
     assert done.wait() == 0, done.stderr and done.stderr.read()
     report = json.loads((tmp_path / "run" / "report.json").read_text())
     assert [gate["status"] for gate in report["gates"]] == ["pass", "pass"]
+
+
+@pytest.mark.full
+def test_the_command_in_another_program_leaves_its_ctrl_c_alone(folder: Path) -> None:
+    program = """
+import os, signal, sys, threading
+signal.signal(signal.SIGINT, signal.default_int_handler)  # it may be ignored where tests run
+from mjstack.__main__ import main
+sys.argv = ["mjstack", "nworld=many"]
+
+def call():
+    try:
+        main()
+    except SystemExit as stop:
+        print(stop.code)
+
+thread = threading.Thread(target=call)
+thread.start()
+thread.join()
+call()
+try:
+    os.kill(os.getpid(), signal.SIGINT)
+except KeyboardInterrupt:
+    print("mine")
+"""
+    done = in_a_process(folder, "-c", program)
+    assert done.stdout.split() == ["2", "2", "mine"], done.stderr

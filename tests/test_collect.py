@@ -259,6 +259,11 @@ def test_what_is_left_beside_the_dataset(demos: SimpleNamespace) -> None:
     size = sum(map(len, contents(demos.dataset).values()))
     assert metrics["megabytes"] == pytest.approx(size / 1e6)
     assert f"not stacked: {4 - succeeded} of 4 worlds" in "\n".join(gate["details"])
+    text = (demos.home / "report.md").read_text()
+    state = steps_of(demos.dataset, 0)["observation.state"]
+    (cells,) = re.findall(r"(?m)^\| observation.state gripper.pos \| rad \|(.*)$", text)
+    low, _, high = (float(cell) for cell in cells.split("|")[:3])
+    assert low - 1e-4 <= state[:, 5].min() < state[:, 5].max() <= high + 1e-4
 
 
 @pytest.mark.full
@@ -275,7 +280,9 @@ def test_the_same_command_again_does_nothing(
     before = contents(demos.dataset / "data")
     assert run(demos.args) == 0
     assert contents(demos.dataset / "data") == before
-    assert "4 episodes, 4 asked for" in report_of(demos.home)["gates"][0]["reason"]
+    reason = report_of(demos.home)["gates"][0]["reason"]
+    assert "4 episodes, 4 asked for" in reason
+    assert reason.endswith("; they were there already")
 
 
 OTHER_EPISODES = "mjstack: outputs/demos/dataset has episodes of another configuration: "
@@ -617,9 +624,12 @@ def test_the_buffer_bounds_the_worlds() -> None:
     stage = Stage(cfg)
     world = 4 * 600 * (6 + 24 + 46 + 6 + 1)  # bytes: state, both groups, action, reward
     with native_env(cfg) as env:
-        for buffer, worlds in ((0.9, 1), (1.5, 1), (3.5, 3), (7.5, 7), (2**30 / world, 100)):
+        for buffer, worlds in ((1.5, 1), (3.5, 3), (7.5, 7), (2**30 / world, 100)):
             cfg.job.buffer_gib = buffer * world / 2**30  # type: ignore[attr-defined]
             assert CollectPlan.of(stage, Path(), env).most == worlds
+        cfg.job.buffer_gib = 0.9 * world / 2**30  # type: ignore[attr-defined]
+        with pytest.raises(ConfigError, match=r"job.buffer_gib"):
+            CollectPlan.of(stage, Path(), env)
 
 
 def test_steps_come_to_the_host_in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -81,6 +81,7 @@ def test_the_report_of_a_training_that_fails(tmp_path: Path) -> None:
     broken = tables["Judged episodes that broke a rule"]
     assert broken["header"] == ["round", "judged", "REACHED"]
     assert [row[1] for row in broken["rows"]] == ["2", "4"]
+    assert [row[0] for row in tables["Time"]["rows"]] == ["expert", "training", "judgement"]
     metrics = gates["train"]["metrics"]
     assert metrics["expert_s"] > rows["played_s"].sum()  # the expert's own round too
     assert gates["success"]["metrics"]["failed.REACHED"] > 0

@@ -478,3 +478,19 @@ def test_constraint_rows_too_few(cfg: Config) -> None:
     rows = re.search(r"up to (\d+) rows", message)
     assert rows is not None
     assert int(rows[1]) > 40
+
+
+@pytest.mark.parametrize(
+    ("mask", "words"),
+    [
+        (torch.ones(2, dtype=torch.bool), ["shape (2,)"]),
+        (torch.ones((3, 1), dtype=torch.bool), ["shape (3, 1)"]),
+        (torch.ones(3), ["torch.float32"]),
+        (torch.tensor([0, 1, 2]), ["torch.int64"]),
+        (torch.ones(3, dtype=torch.bool, device="meta"), ["on meta"]),
+        ([True, False, True], ["list"]),
+    ],
+)
+def test_reset_mask_of_the_wrong_kind(env: Env, mask: object, words: list[str]) -> None:
+    expected = "bool tensor of shape (3,) on cpu"
+    fails(ArgumentError, lambda: env.reset(mask=mask), "mask: found", expected, *words)  # type: ignore[arg-type]

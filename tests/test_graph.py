@@ -161,6 +161,15 @@ def test_a_graph_warms_up_captures_and_replays(device: str) -> None:
     assert graph.capture_seconds > 0.0
 
 
+def test_without_capture_the_work_just_runs() -> None:
+    calls = []
+    graph = StepGraph(lambda: calls.append(1), "cpu", "off", name="counting")
+    for _ in range(3):
+        graph()
+    assert len(calls) == 3
+    assert not graph.captured
+
+
 @pytest.mark.full
 @on_cuda
 def test_an_episode_of_the_gate_is_captured_and_accepted() -> None:

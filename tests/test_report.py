@@ -115,6 +115,16 @@ def test_conclude(outcomes: list[Status], expected: Status) -> None:
     assert report.status is expected
 
 
+def test_markdown_has_every_gate_and_skip(tmp_path: Path) -> None:
+    skip = GateResult(name="throughput_cuda", status=Status.skipped, reason="no CUDA device")
+    gates = [gate(Status.passed, "baseline", xy=0.1), skip]
+    write_report(Report(folder=tmp_path, provenance={"device": "cpu"}, gates=gates))
+    text = (tmp_path / "report.md").read_text()
+    assert "## baseline: pass" in text
+    assert "| xy | 0.1 |" in text
+    assert "\n## throughput_cuda: skip\n\nno CUDA device\n" in text
+
+
 def test_table_cells_survive_a_bar_in_a_reason(tmp_path: Path) -> None:
     bad = GateResult(name="baseline", status=Status.failed, reason="a | b")
     write_report(Report(folder=tmp_path, gates=[bad]))

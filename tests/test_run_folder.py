@@ -23,6 +23,7 @@ import hydra.core.utils
 import pytest
 from compositions import load_config
 
+import mjstack
 from mjstack import cli
 from mjstack.__main__ import main
 from mjstack.config.explain import own_overrides
@@ -414,3 +415,15 @@ def denied(what: str, begin: Callable[..., int], output: Path) -> tuple[int, lis
     for path in (Path(), *Path().glob("*")):
         path.chmod(0o755)
     return status, output.read_text().splitlines()
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("report", ["given/report.json", "given/0/report.json"])
+def test_a_folder_of_another_version_is_named(
+    report: str, begin: Callable[..., int], error_line: Callable[[], str]
+) -> None:
+    for version, says in (("0.1.0", " of mjstack 0.1.0,"), (mjstack.__version__, ",")):
+        facts = {"provenance": {"versions": {"mjstack": version}}}
+        put(Path(), {report: json.dumps(facts)})
+        assert begin("-m", "seed=0,1", "hydra.sweep.dir=given") == 2
+        assert f"given has {Path(report).parts[1]}{says}" in error_line()

@@ -446,3 +446,16 @@ def test_an_unsupported_model_is_refused_in_one_line(
     edit(spec)
     make = partial(make_simulation, spec.compile(), load_config([]), 1, backend=backend)
     assert re.search(rf"{message}.*\.$", refusal(partial(make, device="cpu")))
+
+
+def test_twice_the_same_run(backend: str, make_sim: Make, get_stage: GetStage) -> None:
+    finals = []
+    for _ in range(2):
+        sim = make_sim(backend, N)
+        start_moving(sim, get_stage("so101"))
+        for _ in range(4):
+            sim.step(10)
+        finals.append([getattr(sim, name).clone() for name in VIEWS])
+    for a, b in zip(*finals, strict=True):
+        assert_same_run(a, b, backend)
+    assert not torch.equal(finals[0][0][0], finals[0][0][1])

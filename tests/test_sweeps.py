@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -233,3 +234,26 @@ def test_a_report_is_read_back(tmp_path: Path) -> None:
     written = Report(folder=tmp_path, resumes="gates", status=Status.failed, gates=[gate])
     write_report(written)
     assert read_report(tmp_path) == written
+
+
+def test_the_locks_of_gpus_are_the_users_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    locks = tmp_path / f"mjstack-gpus-{os.getuid()}"
+    locks.mkdir(mode=0o777)
+    (slot,) = Queueing().slots()
+    assert slot.lock is not None
+    assert slot.lock.parent == locks
+    assert locks.stat().st_mode & 0o777 == 0o700
+    locks.rmdir()
+    (tmp_path / "elsewhere").mkdir()
+    locks.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(FolderError, match=r"is another user's or no folder.*Set TMPDIR"):
+        Queueing().slots()
+    user = os.getuid()
+    monkeypatch.setattr("os.getuid", lambda: user + 1)
+    (tmp_path / f"mjstack-gpus-{user + 1}").mkdir()
+    with pytest.raises(FolderError, match="is another user's"):
+        Queueing().slots()

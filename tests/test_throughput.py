@@ -111,6 +111,7 @@ def test_native_measurements(new_run: Callable[..., Run]) -> None:
     )
     assert m["env_step.managers_over_physics.median"] > 0.0
     assert m["env_step.managers_ms_per_step.median"] < m["env_step.ms_per_env_step.max"]
+    assert result.notes["gpu_power_and_memory"] == "not measured: no GPU"
     for name in ("physics", "episode", "env_step"):
         assert m[f"{name}.captured"] is False  # native MuJoCo has nothing to capture
         assert m[f"{name}.warm_up_s"] == m[f"{name}.capture_s"] == 0.0

@@ -112,6 +112,7 @@ def measure_env_step(
     if cameras:
         samples["images_ms_per_step"] = ms * images
         samples["images_per_s"] = rate = len(cameras) * env.nworld * steps / images
+        samples["images_over_physics"] = images / physics
         size = image_bytes(sim.model, cameras, env.nworld, mjwarp=sim.backend == "mjwarp")
         out.facts["images_mb"] = size / 1e6
         out.headline += f" with images, {np.median(rate):,.0f} images/s"

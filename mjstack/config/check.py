@@ -247,6 +247,12 @@ def _gates(cfg: Config) -> Checks:
     _require("gate.parity.states: phase", gate.parity.states.values(), phases)
     if phases:
         _require("gate.throughput.from_phase: phase", [gate.throughput.from_phase], phases)
+    for name in ("step1", "step50"):
+        wrong = set(getattr(gate.parity, name)) != set(PARITY_FIELDS)
+        yield f"gate.parity.{name}", wrong, f"a number for each of {', '.join(PARITY_FIELDS)}"
+    wrong = gate.parity.images is not None and not cfg.scene.cameras
+    expected = "null, because there are no cameras. Set cameras to those of that run"
+    yield "gate.parity.images", wrong, expected
     from_file = reads_starts_file(cfg.reset)
     expected = "1, because with reset=starts_file worlds start alike under every seed"
     yield "gate.success.seeds", from_file and gate.success.seeds > 1, expected

@@ -33,6 +33,12 @@ TERM_GROUPS = ("action", "observation", "reset", "termination", "reward")
 
 def check_overrides(overrides: Sequence[str]) -> None:
     """Raise a `MjstackError` for the first override that cannot be used alone."""
+    for override in overrides:
+        if re.match(r"[+~]*hydra([./]job_logging|\.output_subdir)", override):
+            raise MjstackError(
+                f"{override}: expected Hydra's own, because every run has run.log and .hydra. Leave"
+                " it out."
+            )
     for override in own_overrides(overrides):
         parsed = parse(override)
         key = parsed.key_or_group

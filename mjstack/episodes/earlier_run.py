@@ -15,7 +15,7 @@ from mjstack.config.schema import Config, TermCfg
 from mjstack.config.session import read_yaml
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.errors import FolderError, MjstackError
-from mjstack.files import reading, write_atomic
+from mjstack.files import made_by, reading, write_atomic
 
 REPORT = "report.json"
 COPY = "starts_played.npz"
@@ -64,7 +64,8 @@ class EarlierRun:
             cfg = load_saved(saved)
         except MjstackError as error:
             raise FolderError(
-                f"{key}={name}: .hydra/config.yaml is no configuration of this mjstack: {error}"
+                f"{key}={name}: .hydra/config.yaml{made_by(folder)} is no configuration of this"
+                f" mjstack: {error}"
             ) from error
         with reading(report, "Name another folder"):
             provenance = dict(json.loads(report.read_text())["provenance"])

@@ -1,6 +1,7 @@
 """Gate *throughput*: the speed of physics, of the validated episode and of ``env.step``."""
 
 import gc
+import os
 import time
 from collections.abc import Callable
 from contextlib import closing
@@ -57,7 +58,11 @@ def _measure(run: Run, gate: str, backend: Backend, device: str) -> GateResult:
     on_cuda = device.startswith("cuda")
     seconds = t.max_seconds if on_cuda else t.cpu_max_seconds
     limits = {"seconds": seconds, "repetitions": t.repetitions, "meter": EnergyMeter(device)}
-    result.metrics = {"worlds": cfg.nworld}
+    result.metrics = {
+        "worlds": cfg.nworld,
+        "cpu_count": os.cpu_count() or 1,
+        "time_budget_s": seconds,
+    }
 
     # The measurements
     worlds = (run, backend, device, result, limits)
@@ -65,6 +70,8 @@ def _measure(run: Run, gate: str, backend: Backend, device: str) -> GateResult:
     for name in ("env_step", "cameras") if cfg.scene.cameras else ("env_step",):
         if name in t.measurements:
             measured[name] = _guarded(name, _on_environment, name, *worlds)
+    if not on_cuda:
+        result.notes["gpu_power_and_memory"] = "not measured: no GPU"
 
     # Whether they count
     episode = measured.get("episode", Measurement(name="episode"))

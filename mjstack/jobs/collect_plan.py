@@ -49,7 +49,7 @@ class CollectPlan:
         home: The job's folder.
         spec: The dataset's columns and provenance.
         most: Largest number of worlds of a batch: those whose steps fit into the buffers of all
-            ranks, at least one in each.
+            ranks.
     """
 
     home: Path
@@ -61,9 +61,11 @@ class CollectPlan:
         """Plan from an environment of the demonstrations, with any number of worlds.
 
         Raises:
-            ConfigError: A column's name is taken.
+            ConfigError: The steps of not even one world fit into the buffer, or a column's name is
+                taken.
         """
         cfg = stage.cfg
+        gib = cast(CollectJobCfg, cfg.job).buffer_gib
         provenance = run_provenance(stage)
         # They differ between calls that make the same episodes.
         del provenance["date"], provenance["config_sha256"]
@@ -72,8 +74,10 @@ class CollectPlan:
         if spec.videos:
             step += 4 * stage.model.nq
         world = stage.episode_steps * step / 2**30
-        share = max(1, int(cast(CollectJobCfg, cfg.job).buffer_gib / world))
-        return cls(home=home, spec=spec, most=min(cfg.nworld, stage.ranks.size * share))
+        if gib < world:
+            expected = f"at least {world:.2g}, which the steps of one world take"
+            raise ConfigError("job.buffer_gib", gib, expected)
+        return cls(home=home, spec=spec, most=min(cfg.nworld, stage.ranks.size * int(gib / world)))
 
 
 def collect_folder(cfg: Config) -> Path:
@@ -86,7 +90,8 @@ def plan_collection(stage: Stage) -> CollectPlan:
     """Plan the configured dataset.
 
     Raises:
-        MjstackError: Its episodes would not differ, or have images that cannot be kept or encoded.
+        MjstackError: Its episodes would not differ, do not fit into the buffer, or have images that
+            cannot be kept or encoded.
     """
     cfg = stage.cfg
     played = demonstration_config(cfg, stage.action)
@@ -174,7 +179,7 @@ def read_batches(path: Path) -> list[BatchRecord]:
     """The batches of earlier calls.
 
     Raises:
-        FolderError: The file cannot be read.
+        FolderError: The file cannot be read, or is of version 0.1.
     """
     if not path.exists():
         return []

@@ -17,7 +17,7 @@ from mjstack.episodes.rollout import POLICY
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Assets, Stage, require_episode
 from mjstack.errors import ConfigError, FolderError
-from mjstack.files import reading, to_csv, write_atomic
+from mjstack.files import made_by, reading, to_csv, write_atomic
 from mjstack.gates.runner import run_guarded
 from mjstack.gates.success import run_success
 from mjstack.jobs.gates import check_task
@@ -26,10 +26,12 @@ from mjstack.jobs.showing import check_showing
 from mjstack.report.picture import save_curves
 from mjstack.report.record import GateResult, Status
 from mjstack.report.table import Table
+from mjstack.report.text import label
 from mjstack.train.trainer import FAILED, LAST, Trainer, whole_starts
 
 NAME = "train"
 CONFIG = "training.json"  # the configuration of the training in the folder
+_TIMES = ("expert_s", "training_s")  # metrics of a training: parts of its time
 _ENDS = ("low", "high")  # of an interval
 # Keys of the job; changing one of these changes no training.
 _WITHOUT_EFFECT = ("folder", "test_seed", "iterations", "minutes", "max_minutes")
@@ -84,8 +86,8 @@ def _check_folder(folder: Path, cfg: Config) -> None:
         changes = differences(json.loads(path.read_text()), training_config(cfg))
     if changes:
         raise FolderError(
-            f"{folder} has a training of another configuration: {changes}. Set job.folder to"
-            " another folder, or these keys back"
+            f"{folder} has a training{made_by(folder)} of another configuration: {changes}. Set"
+            " job.folder to another folder, or these keys back"
         )
 
 
@@ -96,7 +98,13 @@ def _run(trainer: Trainer, run: Run, folder: Path) -> None:
         write_atomic(folder / CONFIG, json.dumps(training_config(run.cfg), indent=1) + "\n")
     run_guarded(run, NAME, partial(_train, trainer, folder), "worlds")
     if run.artifacts.results[NAME].status is Status.passed:
-        run_guarded(run.on(judged_stage(run.stage, folder / LAST)), "success", run_success)
+        judged = run.on(judged_stage(run.stage, folder / LAST))
+        run_guarded(judged, "success", run_success)
+        trained = run.artifacts.results[NAME]
+        times = {name: trained.metrics[name] for name in _TIMES if name in trained.metrics}
+        times["judgement_s"] = judged.artifacts.results["success"].seconds
+        rows = [[label(name), f"{seconds:.1f} s"] for name, seconds in times.items()]
+        trained.tables.append(Table(title="Time", header=["part", "time"], rows=rows))
 
 
 def judged_stage(stage: Stage, policy: Path) -> Stage:
