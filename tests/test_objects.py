@@ -16,7 +16,7 @@ from environments import mask_of
 
 from mjstack import make_env
 from mjstack.config import load_config
-from mjstack.config.schema import Config
+from mjstack.config.schema import Config, ObjectCfg
 from mjstack.drivers.closed_loop import make_expert
 from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.envs import Env
@@ -433,3 +433,21 @@ def test_starts_and_commands_are_those_of_before(robot: str, task: str) -> None:
         expected = recorded["open_loop"][:, number]
         np.testing.assert_allclose(targets, expected, rtol=0.0, atol=0.01)  # mink's, then
     jitter.close()
+
+
+@pytest.mark.parametrize(
+    ("shape", "size", "quat", "radius", "faces"),
+    [
+        ("box", [0.01, 0.02, 0.02], None, 0.03, True),
+        ("cylinder", [0.03, 0.04], None, 0.05, False),
+        ("cylinder", [0.03, 0.04], [1.0, 1.0, 0.0, 0.0], 0.05, True),
+        ("capsule", [0.03, 0.04], None, 0.07, True),
+        ("sphere", [0.03], None, 0.03, False),
+    ],
+)
+def test_what_holds_a_shape_and_what_jaws_turn_to(
+    shape: str, size: list[float], quat: list[float] | None, radius: float, faces: bool
+) -> None:
+    thing = ObjectCfg(shape=shape, size=size, quat=quat)
+    assert thing.radius == pytest.approx(radius, rel=1e-12)
+    assert thing.has_faces == faces

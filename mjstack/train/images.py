@@ -1,6 +1,4 @@
-"""Images that a policy learns from: those of its own rounds, as they were rendered in them, on the
-device.
-"""
+"""Images that a policy learns from. Its own rounds have rendered them; they stay on the device."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence

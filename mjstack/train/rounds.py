@@ -93,8 +93,8 @@ class MixedDriver(Driver):
 
 
 def _channels(job: CloneJobCfg) -> Sequence[Channels]:
-    """What is recorded of an episode: observations before each step, labels, and who drove; for a
-    policy that sees images also positions, and the images of the steps in which it is queried.
+    """Channels of an episode: observations before each step, labels, and where the expert drove. A
+    policy that sees images adds positions, and the images of the steps in which it is queried.
     """
 
     def read_before(env: Env, driver: Driver) -> Read:

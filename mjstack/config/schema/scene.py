@@ -4,13 +4,11 @@ import itertools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 from mjstack.config.fields import spec
 
 OUTPUTS = ("rgb", "depth", "segmentation")
 _ROUND = (2, "radius and half length")
-_SQUARE = 0.004  # m: jaws take a box whose sides differ by no more across any of them
 SHAPES = {  # and the sizes of each
     "box": (3, "half sizes"),
     "cylinder": _ROUND,
@@ -48,22 +46,6 @@ class BoxCfg:
     stiffness and damping."""
     wall_solref: list[float] = spec(length=2)
     """Contact parameters of the walls."""
-
-
-class Grasp(NamedTuple):
-    """How jaws take an object from above.
-
-    Attributes:
-        axis: Number of the body axis whose heading tells how they are turned.
-        turn: From that heading to the way that they close [rad].
-        period: After which turn the object looks the same to them [rad]; 0: after any.
-        width: Size of the object between them [m].
-    """
-
-    axis: int
-    turn: float
-    period: float
-    width: float
 
 
 @dataclass(slots=True)
@@ -183,32 +165,16 @@ class ObjectCfg(ShapeCfg):
         return 0.0 if self.parts or self.file else super(ObjectCfg, self).half_height
 
     @property
-    def grasp(self) -> Grasp:
-        """How jaws take it from above; of a box whose sides differ, across the shorter one."""
-        up = [abs(part) for part in self.axes[2]]
-        vertical = up.index(max(up))
-        if self.shape == "box":
-            first, second = (k for k in range(3) if k != vertical)
-            widths = [2.0 * self.half[k] for k in (first, second)]
-            if abs(widths[0] - widths[1]) <= _SQUARE:
-                return Grasp(first, 0.0, 0.5 * math.pi, max(widths))
-            axis = second if widths[1] < widths[0] else first
-            return Grasp(axis, 0.0, math.pi, min(widths))
-        length = {"cylinder": 2, "capsule": 0}.get(self.shape, vertical)
-        lies = length != vertical
-        return Grasp(length, 0.5 * math.pi, math.pi * lies, 2.0 * self.size[0])
-
-    @property
     def has_faces(self) -> bool:
         """Whether it matters how jaws that grasp it from above are turned."""
-        return self.grasp.period > 0.0
+        return self.shape != "sphere" and not (self.shape == "cylinder" and self.upright)
 
     @property
     def radius(self) -> float:
         """Radius of the sphere around its centre that holds it [m]."""
         if self.shape == "capsule":
             return sum(self.size)
-        return math.hypot(*(half / self.size[0] for half in self.half)) * self.size[0]
+        return math.hypot(*(half / self.size[0] for half in self.size)) * self.size[0]
 
 
 @dataclass(slots=True)

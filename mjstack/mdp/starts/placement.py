@@ -207,7 +207,7 @@ def _around(thing: ObjectCfg, top: float, boxes: _Boxes, clear: float) -> np.nda
 
 
 def _fixed_boxes(data: mujoco.MjData, geoms: np.ndarray) -> _Boxes:
-    """What holds geoms that are fixed to the world."""
+    """Boxes around geoms that are fixed to the world."""
     model = data.model
     centers, halves = world_boxes(data, geoms)
     turned = np.tile([0.0, 1.0, 0.0], (len(geoms), 1))
