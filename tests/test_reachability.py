@@ -251,7 +251,7 @@ def with_wall(
     z = cfg.scene.table_top + 0.0275
     quat = [math.cos(0.5 * euler), 0.0, 0.0, math.sin(0.5 * euler)]
     spec.worldbody.add_geom(
-        name="box_wall",
+        name="wall",
         type=mujoco.mjtGeom.mjGEOM_BOX,
         pos=[*xy, z],
         size=[*half, 0.0275],
@@ -267,7 +267,7 @@ def test_nothing_starts_in_a_wall(robot: str, euler: float) -> None:
     red_x, red_y = cfg.scene.objects["red"].xy
     model = with_wall(cfg, (red_x, red_y + 0.06), (0.05, 0.003), euler)
     index = SceneIndex(model, cfg.robot, cfg.scene)
-    wall = model.geom("box_wall").id
+    wall = model.geom("wall").id
     offsets, free = placement_of(cfg, model).choose(random_draws())
     assert free.all()
     cube = model.geom("red").id
