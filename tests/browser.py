@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import contextlib
 import json
+import re
 import shutil
 import subprocess
 import tempfile
@@ -13,6 +14,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from urllib.request import urlopen
+
+import msgspec
+import numpy as np
+import zstandard
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome", "chrome-headless-shell")
 FLAGS = (
@@ -27,6 +32,32 @@ FLAGS = (
     "--no-first-run",
 )
 EXECUTABLE = next(filter(None, map(shutil.which, NAMES)), None)
+
+
+def messages(path: Path) -> list[tuple[float, dict[str, Any]]]:
+    """What a page plays: time [s] and message."""
+    (held,) = re.findall(r'__VISER_EMBED_DATA__="([^"]+)"', path.read_text())
+    packed = base64.b64decode(held)
+    plain = zstandard.ZstdDecompressor().decompress(packed[8:])
+    size = int.from_bytes(plain[:8], "little")
+    scene = msgspec.msgpack.decode(plain[8 : 8 + size])
+    buffers = []
+    at = 8 + size
+    for length in scene["binaryBufferLengths"]:
+        at += -at % 8
+        buffers.append(plain[at : at + length])
+        at += length
+
+    def restore(value: Any) -> Any:
+        if isinstance(value, dict):
+            marks = [key for key in value if key.startswith("__binary")]
+            if marks:
+                kind = value.get("dtype", "float32")
+                return np.frombuffer(buffers[value[marks[0]]], kind)
+            return {key: restore(part) for key, part in value.items()}
+        return [restore(part) for part in value] if isinstance(value, list) else value
+
+    return [(time, restore(message)) for time, message in scene["messages"]]
 
 
 class Tab:

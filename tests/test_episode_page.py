@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import base64
 import io
 import json
 import re
 import urllib.parse
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import matplotlib.image
-import msgspec
 import mujoco
 import numpy as np
 import pytest
-import zstandard
-from browser import EXECUTABLE, Tab, browse
+from browser import EXECUTABLE, Tab, browse, messages
 from environments import one_second_episode
 
 import mjstack.report.web as web
@@ -53,32 +50,6 @@ PRIMITIVES = """
   </worldbody>
 </mujoco>
 """
-
-
-def messages(path: Path) -> list[tuple[float, dict[str, Any]]]:
-    """What a page plays: time [s] and message."""
-    (held,) = re.findall(r'__VISER_EMBED_DATA__="([^"]+)"', path.read_text())
-    packed = base64.b64decode(held)
-    plain = zstandard.ZstdDecompressor().decompress(packed[8:])
-    size = int.from_bytes(plain[:8], "little")
-    scene = msgspec.msgpack.decode(plain[8 : 8 + size])
-    buffers = []
-    at = 8 + size
-    for length in scene["binaryBufferLengths"]:
-        at += -at % 8
-        buffers.append(plain[at : at + length])
-        at += length
-
-    def restore(value: Any) -> Any:
-        if isinstance(value, dict):
-            marks = [key for key in value if key.startswith("__binary")]
-            if marks:
-                kind = value.get("dtype", "float32")
-                return np.frombuffer(buffers[value[marks[0]]], kind)
-            return {key: restore(part) for key, part in value.items()}
-        return [restore(part) for part in value] if isinstance(value, list) else value
-
-    return [(time, restore(message)) for time, message in scene["messages"]]
 
 
 def outside(path: Path) -> list[str]:
@@ -131,6 +102,9 @@ def test_a_page_holds_every_frame(get_stage: Callable[..., Stage], tmp_path: Pat
     path = tmp_path / "episode.html"
     worlds = motion(get_stage, 3, 5)
     worlds[2].qpos[3:] = np.nan  # it diverged
+    seen = np.zeros((5, 8, 12, 3), np.uint8)
+    seen[2:] = 200
+    worlds[1] = replace(worlds[1], images={"wrist": seen})
     model = get_stage("so101").assets.visual_model
     save_episode(path, model, worlds, 0.04)
     assert outside(path) == []
@@ -166,6 +140,13 @@ def test_a_page_holds_every_frame(get_stage: Callable[..., Stage], tmp_path: Pat
         if message.get("name") == "/0" and message["type"] == "BatchedMeshesMessage"
     ]
     assert tables[0][0].tolist() != tables[0][1].tolist() == tables[0][2].tolist()
+    images = [
+        (time, "_data" in message.get("updates", {}))
+        for time, message in sent
+        if message.get("name") == "/image/1/wrist"
+    ]
+    assert images[0] == (0.0, False)
+    assert [time for time, changed in images if changed] == [pytest.approx(0.08)]
 
 
 def test_sixty_four_worlds_are_shared_by_the_gates() -> None:

@@ -2,19 +2,24 @@
 first.
 """
 
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.recorder import Channels, Read, Recorder
+from mjstack.episodes.rollout import POLICY
 from mjstack.episodes.stage import Stage
 from mjstack.files import read_npz, reading, write_npz
 from mjstack.report.page import MOST_WORLDS, Page, World, frame_stride
 from mjstack.report.write import safely_write
+from mjstack.sim import Simulation
 
+MOST_SEEN = 4  # worlds of a gate with what their driver saw
 _BYTES = 64 * 2**20  # of one recording
 _PARTS = ("label", "failed", "qpos")  # of a world, in the file
 
@@ -37,8 +42,48 @@ def motion_recorder(step_dt: float) -> Recorder:
     return Recorder(Channels(bind, ends))
 
 
+def draw_seen(
+    stage: Stage, qpos: np.ndarray, sim: Simulation, world: int = 0, stride: int = 1
+) -> dict[str, np.ndarray]:
+    """Draw what a policy that sees images saw in a world.
+
+    Args:
+        stage: On which it was played.
+        qpos: Its positions every ``stride`` control steps, shape ``(frames, nq)``; NaN where it was
+            not played.
+        sim: The worlds, whose looks are still those of the episode.
+        world: Its place among them.
+        stride: Control steps between two positions.
+
+    Returns:
+        Images by camera, each ``(frames, height, width, 3)``, uint8, which change where the policy
+        was queried. None of a driver that sees no images.
+    """
+    policy = stage.assets.policy if stage.cfg.controller.name == POLICY else None
+    if policy is None or not policy.network.vision.sizes:
+        return {}
+    looks = {name: values[world : world + 1] for name, values in sim.fields.items()}
+    queried = np.arange(len(qpos)) * stride // policy.execute * policy.execute // stride
+    frames, rows = np.unique(queried, return_inverse=True)
+    drawn: dict[str, list[np.ndarray]] = {}
+    cameras = list(policy.network.vision.sizes)
+    with closing(stage.color_renderer(1, list(looks), cameras)) as renderer:
+        for state in torch.from_numpy(np.nan_to_num(qpos[frames])):
+            for name, image in renderer.draw(state[None], looks).items():
+                drawn.setdefault(name.removeprefix("images."), []).append(
+                    image[0].cpu().numpy().copy()
+                )
+    return {name: np.stack(images)[rows] for name, images in drawn.items()}
+
+
 def show_batch(
-    stage: Stage, page: Page, path: Path, gate: str, qpos: Tensor, failed: np.ndarray
+    stage: Stage,
+    page: Page,
+    path: Path,
+    gate: str,
+    qpos: Tensor,
+    sim: Simulation,
+    failed: np.ndarray,
 ) -> None:
     """Add a gate's worlds to the page, failing ones first. A file keeps them for a resumed run.
 
@@ -48,16 +93,19 @@ def show_batch(
         path: The file.
         gate: The gate's name.
         qpos: Positions that `motion_recorder` has recorded of the configured seed.
+        sim: The worlds that have played it.
         failed: Bits of the task's rules, shape ``(nworld,)``.
     """
     rules = stage.check.rules
     chosen = np.argsort(failed[: qpos.shape[1]] == 0, kind="stable")[:MOST_WORLDS].tolist()
     motions = qpos[:, chosen].float().swapaxes(0, 1).cpu().numpy()
     moving: list[World] = []
+    stride = frame_stride(stage.cfg.timing.step_dt)
     for world, motion in zip(chosen, motions, strict=True):
         problem = rules.describe(int(failed[world]))
         label = f"{world}: {problem}" if problem else str(world)
-        moving.append(World(label=label, qpos=motion, failed=bool(problem)))
+        seen = draw_seen(stage, motion, sim, world, stride) if len(moving) < MOST_SEEN else {}
+        moving.append(World(label=label, qpos=motion, failed=bool(problem), images=seen))
     page.worlds3d[gate] = moving
     arrays = {name: [getattr(world, name) for world in moving] for name in _PARTS}
     if problem := safely_write(path, write_npz, arrays, stops=False):

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mjstack.config.schema import Backend, Config
+from mjstack.episodes.motion import draw_seen
 from mjstack.episodes.recorder import Snapshots, WorldRecorder
 from mjstack.episodes.rollout import NOMINAL, Episode, Observer, State
 from mjstack.episodes.stage import Stage, TextHook
@@ -143,7 +144,13 @@ class Run:
         return Status.failed if bits else Status.passed, reason, metrics
 
     def show_world(
-        self, part: str, label: str, qpos: np.ndarray, status: Status, title: str = ""
+        self,
+        part: str,
+        label: str,
+        qpos: np.ndarray,
+        status: Status,
+        sim: Simulation,
+        title: str = "",
     ) -> None:
         """Show a world that was played alone, on the run's page if that has worlds in motion.
 
@@ -152,12 +159,15 @@ class Run:
             label: Its text on the page.
             qpos: Positions at every step end, shape ``(steps, nq)``.
             status: How it ended.
+            sim: The world.
             title: Title of the run's pictures, if they show it too.
         """
         if self.page.motion:
-            frames = qpos[:: frame_stride(self.cfg.timing.step_dt)]
-            self.page.worlds3d[part] = [
-                World(label=label, qpos=frames, failed=status is Status.failed)
-            ]
+            stride = frame_stride(self.cfg.timing.step_dt)
+            frames = qpos[::stride]
+            seen = draw_seen(self.stage, frames, sim, stride=stride)
+            failed = status is Status.failed
+            world = World(label=label, qpos=frames, failed=failed, images=seen)
+            self.page.worlds3d[part] = [world]
         if title:
             self.artifacts.pictured = (title, qpos)

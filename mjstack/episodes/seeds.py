@@ -115,7 +115,8 @@ class _Player:
                         tally.details.append(problem)
                 if self._motion is not None and self.path is not None:
                     qpos = self._motion.rows["qpos"]
-                    show_batch(run.stage, run.page, self.path, tally.gate, qpos, record.failed)
+                    page = (run.stage, run.page, self.path, tally.gate)
+                    show_batch(*page, qpos, sim, record.failed)
                 self._count(record)
         except Exception as error:
             check_interrupt()

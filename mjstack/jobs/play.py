@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import Config, PlayJobCfg
+from mjstack.episodes.motion import draw_seen
 from mjstack.episodes.recorder import WorldRecorder
 from mjstack.episodes.replay import simulate_alone
 from mjstack.episodes.rollout import POLICY, play_episode, rollout
@@ -67,7 +68,9 @@ def play_worlds(run: Run) -> list[GateResult]:
     stage = run.stage
     cfg = stage.cfg
     advance = stage.progress.advance
+    job = cast(PlayJobCfg, cfg.job)
     positions = []
+    seen = []
     fields = []
     details = []
     succeeded = 0
@@ -88,8 +91,10 @@ def play_worlds(run: Run) -> list[GateResult]:
                 succeeded += status is Status.passed
                 outcome = outcome or f"succeeded, {stage.check.headline(metrics)}"
             positions.append(recorder.qpos)
+            if cfg.video and job.camera is None:
+                seen.append(draw_seen(stage, recorder.qpos, sim))
             fields.append({name: value.clone() for name, value in sim.fields.items()})
-            run.show_world(f"{NAME}_{world}", str(world), recorder.qpos, status)
+            run.show_world(f"{NAME}_{world}", str(world), recorder.qpos, status, sim)
             details.append(f"world {world}: {outcome}")
             run.print_line(details[-1])
     result = GateResult(
@@ -101,7 +106,7 @@ def play_worlds(run: Run) -> list[GateResult]:
         details=details,
     )
     if cfg.video:
-        _save(run, np.stack(positions), fields, result)
+        _save(run, np.stack(positions), fields, seen, result)
     return [result]
 
 
@@ -109,6 +114,7 @@ def _save(
     run: Run,
     qpos: np.ndarray,
     fields: Sequence[Mapping[str, torch.Tensor]],
+    seen: Sequence[Mapping[str, np.ndarray]],
     result: GateResult,
 ) -> None:
     """Write the video; without one there is nothing to look at, and the job fails."""
@@ -126,7 +132,7 @@ def _save(
             save_video, path, model, qpos, step_dt, advance, fps=job.fps, width=job.width
         )
         if job.camera is None:
-            save()
+            save(seen=seen)
             return
         looks = {field: torch.cat([world[field] for world in fields]) for field in fields[0]}
         name = f"images.{job.camera}"

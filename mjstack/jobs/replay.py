@@ -100,11 +100,11 @@ def _replay(
     with closing(simulate_alone(stage, backend, device)) as sim:
         episode = stage.play(sim, stage.cfg.reset, observers, seed=plan.seed, worlds=[plan.world])
         lines = trace.explain(episode)
-    qpos = trace.arrays["qpos"]
-    status, reason, metrics = run.judge_one(episode)
+        qpos = trace.arrays["qpos"]
+        status, reason, metrics = run.judge_one(episode)
+        title = f"world {plan.world} of seed {plan.seed}, replayed ({backend})" if first else ""
+        run.show_world(f"replay_{backend}", f"{plan.world}, {backend}", qpos, status, sim, title)
     agrees, comparison = _compare(plan, number, episode, qpos[-1], changes, run)
-    title = f"world {plan.world} of seed {plan.seed}, replayed ({backend})" if first else ""
-    run.show_world(f"replay_{backend}", f"{plan.world}, {backend}", qpos, status, title)
     lines += [_first_sign(monitor, episode) for monitor in monitors]
     for line in lines:
         run.print_line(f"  {line}")

@@ -53,11 +53,13 @@ class World:
         label: Its text, short.
         qpos: Positions at frames, shape ``(frames, nq)``; NaN where it was not played.
         failed: Whether it failed, which colours its table.
+        images: What its driver saw, by camera, each ``(frames, height, width, 3)``, uint8.
     """
 
     label: str
     qpos: np.ndarray
     failed: bool = False
+    images: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
 @dataclass(kw_only=True, slots=True)

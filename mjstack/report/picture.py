@@ -106,6 +106,7 @@ def save_video(
     fps: float = 25.0,
     width: int | None = None,
     draw: Draw | None = None,
+    seen: Sequence[Mapping[str, np.ndarray]] = (),
 ) -> None:
     """Write a video of episodes in real time, side by side: an mp4, or a GIF or WebP that loops, by
     the file's ending.
@@ -120,6 +121,8 @@ def save_video(
         width: Of the video [pixels]; 640 by default with one world, 960 with several.
         draw: Draws a state of every world, shape ``(worlds, nq)``, as images ``(height, width,
             3)``, uint8. By default the scene is seen from the side.
+        seen: Images of each world by camera, each ``(steps, height, width, 3)``, that stand in its
+            corner.
 
     Raises:
         MjstackError: This machine cannot draw offscreen, or lacks what writes the format.
@@ -138,6 +141,13 @@ def save_video(
             images = _render(model, chosen.reshape(-1, nq), wide, 3 * wide // 4)
         else:
             images = (image for frame in chosen for image in draw(frame))
+        if seen:
+            corners = (
+                [rows[number * skip] for rows in cameras.values()]
+                for number in numbers
+                for cameras in seen
+            )
+            images = map(_with_corner, images, corners)
         for done in range(1, len(chosen) + 1):
             check_interrupt()
             yield _side_by_side(list(itertools.islice(images, worlds)), columns, wide)
@@ -145,6 +155,18 @@ def save_video(
                 advance("pictures of the video", done, count)
 
     write(path, frames, count, step_dt * skip)
+
+
+def _with_corner(image: np.ndarray, seen: Sequence[np.ndarray]) -> np.ndarray:
+    """An image with others in its upper left corner, each a quarter as high."""
+    frame = Image.fromarray(image)
+    tall = frame.height // 4
+    left = 0
+    for small in seen:
+        wide = tall * small.shape[1] // small.shape[0]
+        frame.paste(Image.fromarray(small).resize((wide, tall)), (left, 0))
+        left += wide
+    return np.asarray(frame)
 
 
 def _side_by_side(images: Sequence[np.ndarray], columns: int, wide: int) -> Image.Image:

@@ -33,6 +33,8 @@ _LOOPBACK = ("127.0.0.1", "::1", "localhost")
 _MESSAGE = 2**16  # bytes, the largest of a browser
 _MARGIN = 0.12  # m between worlds
 _FAILED = np.array([0.86, 0.35, 0.32])
+_IMAGE = 0.16  # m, height of what a driver saw
+_UPRIGHT = (0.5, -0.5, -0.5, 0.5)  # it faces the viewer
 
 
 def lacks_viser() -> str:
@@ -46,7 +48,12 @@ class Stage:
     """Worlds side by side in a viser server's scene."""
 
     def __init__(
-        self, server: Any, shapes: Shapes, labels: Sequence[str], tints: Sequence[np.ndarray | None]
+        self,
+        server: Any,
+        shapes: Shapes,
+        labels: Sequence[str],
+        tints: Sequence[np.ndarray | None],
+        seen: Sequence[Mapping[str, np.ndarray]] = (),
     ) -> None:
         """Add the worlds.
 
@@ -55,6 +62,8 @@ class Stage:
             shapes: The geometry of each world.
             labels: The text of each world.
             tints: The colour of what does not move in each world; None for the model's own.
+            seen: Images of each world by camera, ``(frames, height, width, 3)``; they stand behind
+                its table.
         """
         self._shapes = shapes
         count = len(labels)
@@ -79,7 +88,25 @@ class Stage:
             )
             self._handles.append((body, handle))
 
-        # Texts, the floor, and where one looks from
+        # Images, texts, the floor, and where one looks from
+        self._images: list[tuple[np.ndarray, Any]] = []
+        for world, cameras in enumerate(seen):
+            x, y = self._offsets[world]
+            left = y + low[1]
+            for name, images in cameras.items():
+                wide = _IMAGE * images.shape[2] / images.shape[1]
+                handle = server.scene.add_image(
+                    f"/image/{world}/{name}",
+                    images[0],
+                    wide,
+                    _IMAGE,
+                    wxyz=_UPRIGHT,
+                    position=(x + low[0], left + 0.5 * wide, high[2] + 0.5 * _IMAGE),
+                    cast_shadow=False,
+                    receive_shadow=False,
+                )
+                left += wide + 0.02
+                self._images.append((images, handle))
         for world, text in enumerate(labels):
             x, y = self._offsets[world]
             server.scene.add_label(
@@ -111,10 +138,14 @@ class Stage:
         server.initial_camera.position = centre + reach * np.array([0.75, -0.45, 0.6])
         server.initial_camera.look_at = centre + reach * np.array([0.1, -0.06, 0.0])
 
-    def update(self, qpos: np.ndarray) -> None:
-        """Move the worlds to positions of shape ``(worlds, nq)``; a body that rests costs
-        nothing.
+    def update(self, qpos: np.ndarray, frame: int = 0) -> None:
+        """Move the worlds to positions of shape ``(worlds, nq)``, and show the images of a frame;
+        what rests costs nothing.
         """
+        for images, handle in self._images:
+            image = images[min(frame, len(images) - 1)]
+            if not np.array_equal(handle.image, image):
+                handle.image = image
         places, turns = self._round(*self._shapes.poses(qpos))
         old_places, old_turns = self._last
         for body, handle in self._handles:
@@ -159,15 +190,17 @@ def save_episode(
     server = start_server("127.0.0.1", 0)
     try:
         tints = [_FAILED if world.failed else None for world in worlds]
-        stage = Stage(server, Shapes(model), [world.label for world in worlds], tints)
+        labels = [world.label for world in worlds]
+        seen = [world.images for world in worlds]
+        stage = Stage(server, Shapes(model), labels, tints, seen)
         qpos = np.stack([_fill(world, worlds) for world in worlds], axis=1)
         stage.update(qpos[0])
         scene = server.get_scene_serializer()
         with server.atomic():  # no browser waits for the messages
-            for row in qpos[1:]:
+            for frame, row in enumerate(qpos[1:], 1):
                 check_interrupt()
                 scene.insert_sleep(frame_dt)
-                stage.update(row)
+                stage.update(row, frame)
         scene.insert_sleep(1.0)
         page = scene.as_html().replace("<title>Viser</title>", "<title>Episode</title>", 1)
         path.write_text(page, encoding="utf-8")

@@ -1,0 +1,36 @@
+#!/usr/bin/env bash
+# Trainings that have not been run on CUDA, side by side on one GPU, each with a log. Any of them goes on where it was
+# stopped.
+#
+#     tools/gpu_lanes.sh outputs/lanes ppo_stack_0 ppo_stack_1 ppo_stack_2
+#     LIFT=mine/conf tools/gpu_lanes.sh outputs/lanes ppo_lift    # the folder of docs/own_tasks.md
+set -u
+out=${1:?a folder}
+shift
+pixels="experiment=pixels nworld=2048"
+ppo="trainer=ppo nworld=4096 job.iterations=null gate.success.rate=0.0001"
+declare -A lanes=(
+  [ppo_lift]="--config-dir ${LIFT:-lift/conf} task=lift $ppo job.minutes=10"
+  [hz10]="nworld=2048 job.chunk=5 job.execute=5 gate.success.seeds=2"
+  [pixels_rebot]="$pixels robot=rebot"
+  [pixels_looks]="$pixels looks=randomized"
+  [pixels_wrist]="$pixels cameras=wrist"
+  [pixels_front]="$pixels cameras=front"
+)
+for seed in 0 1 2; do
+  lanes[ppo_stack_$seed]="$ppo reset=expert_states job.minutes=20 seed=$seed"
+  lanes[pixels_$seed]="$pixels seed=$seed"
+done
+for size in 64 160; do
+  lanes[pixels_$size]="$pixels scene.cameras.front.size=[$size,$size] scene.cameras.wrist.size=[$size,$size]"
+done
+for name; do
+  [[ -n ${lanes[$name]:-} ]] || { echo "no lane $name: there are ${!lanes[*]}" >&2; exit 2; }
+done
+mkdir -p "$out"
+for name; do
+  # shellcheck disable=SC2086 # a lane is several words
+  ${PYTHON:-python} -m mjstack job=train ${lanes[$name]} "job.folder=$out/$name" >> "$out/$name.log" 2>&1 &
+done
+wait
+tail -n 3 "$out"/*.log
