@@ -32,9 +32,10 @@ test-rest: $(READY_DEV)
 
 test-all: test test-rest
 
-# Odd command lines, four times as many as test-rest tries.
+# Odd command lines and damaged folders, many more than test-rest tries.
 fuzz: $(READY_DEV)
 	$(BIN)/python tests/test_fuzz.py commands 0-999
+	$(BIN)/python tests/test_fuzz.py folders 0-499
 
 # build/site/index.html opens from the disk. The build fetches nothing.
 docs: $(READY_DOCS)

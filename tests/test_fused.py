@@ -151,7 +151,6 @@ def solved_alike(worlds: Worlds) -> dict[str, np.ndarray]:
     [
         ("elliptic", 1, 2),
         pytest.param("elliptic", 3, 2, marks=pytest.mark.full),
-        pytest.param("elliptic", 4, 5, marks=pytest.mark.full),
         pytest.param("elliptic", 6, 8, marks=pytest.mark.full),
         ("pyramidal", 3, 3),
         pytest.param("pyramidal", 6, 5, marks=pytest.mark.full),
@@ -254,8 +253,11 @@ def test_a_world_that_is_not_finite_is_alone(device: str) -> None:
 @pytest.mark.parametrize(("boxes", "slides"), [(0, 1), (5, 1), (5, 2), (5, 3), (8, 0), (9, 6)])
 def test_sizes(boxes: int, slides: int, device: str) -> None:
     """On CUDA a row of the Hessian is a thread's up to 31 degrees of freedom; columns of J are
-    padded to 4, and above 32 to 16.
+    padded to 4, and above 32 to 16. A CPU, where each is compiled for some ten seconds, knows no
+    such bounds.
     """
+    if device == "cpu" and (boxes, slides) not in ((0, 1), (5, 2), (9, 6)):
+        pytest.skip("bounds of CUDA")
     arm = "<body pos='{} 1 .15'><joint type='slide' axis='0 0 1'/><geom size='.1'/></body>"
     arms = "".join(map(arm.format, range(slides)))
     model = model_of(f"<geom type='plane' size='9 9 .1'/>{heap(boxes, 3)}{arms}")

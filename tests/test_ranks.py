@@ -135,9 +135,10 @@ def test_ranks_play_what_one_plays(backend: str, tmp_path: Path) -> None:
     args += ["nworld=5", "gate.batch.seeds=2", "controller=closed_loop"]
     assert run([*args, f"hydra.run.dir={tmp_path}/one"]) == 1  # the episodes are too short
     text = play(0, [*args, "devices=2", f"hydra.run.dir={tmp_path}/two"], tmp_path, 1)
-    play(3, [*args, f"hydra.run.dir={tmp_path}/three"], tmp_path, 1)
     assert_same_episodes(tmp_path / "one", tmp_path / "two")
-    assert_same_episodes(tmp_path / "one", tmp_path / "three")
+    if backend == "native":
+        play(3, [*args, f"hydra.run.dir={tmp_path}/three"], tmp_path, 1)
+        assert_same_episodes(tmp_path / "one", tmp_path / "three")
     with np.load(tmp_path / "two/starts_seed0.npz") as starts:
         assert {len(array) for array in starts.values()} == {5}
 
@@ -255,8 +256,7 @@ def rank_process(parent: int, rank: int) -> int:
 
 @pytest.mark.full
 @pytest.mark.skipif(not Path("/proc").exists(), reason="a system without /proc")
-@pytest.mark.parametrize("rank", [0, 1])
-@pytest.mark.parametrize("delay", [0.5, 2.0])
+@pytest.mark.parametrize(("rank", "delay"), [(0, 0.5), (1, 2.0)])
 def test_a_rank_killed_while_ranks_start_is_a_failure(
     rank: int, delay: float, tmp_path: Path
 ) -> None:

@@ -188,27 +188,20 @@ def test_a_process_may_come_when_the_first_one_has_begun(
     assert check_train(cfg).folder == tmp_path
 
 
-FEW = ("nworld=32", "job.episodes=64", "gate.success.rate=0.5")
-
-
 @pytest.mark.full
 @pytest.mark.parametrize(
-    ("overrides", "episodes", "rate", "minutes"),
-    [(["task=reach", "nworld=64"], 128, 0.99, 4.0), (["reset=jitter", *FEW], 64, 0.5, 6.0)],
-    ids=["reach", "stack"],
+    ("overrides", "rate"),
+    [(["trainer=clone", "task=reach"], 0.99), (["reset=jitter"], 62 / 64)],
+    ids=["clone-reach", "dagger-stack"],
 )
-def test_two_cores_train(
-    overrides: list[str], episodes: int, rate: float, minutes: float, tmp_path: Path
-) -> None:
-    """In two and three minutes of both, twice as many of processor time, as other work may share
-    the machine. Every unseen world reaches its point, half of them at least stack.
-    """
+def test_two_cores_train(overrides: list[str], rate: float, tmp_path: Path) -> None:
+    """In two minutes of both, four of processor time, as other work may share the machine."""
     began = time.process_time()
     out = tmp_path / "training"
-    assert run(["job=train", "trainer=clone", "sim=native", *overrides, f"job.folder={out}"]) == 0
-    assert report(out)["train"]["metrics"]["episodes_played"] == episodes
+    command = ["job=train", "sim=native", "nworld=64", *overrides, "gate.success.rate=0.5"]
+    assert run([*command, f"job.folder={out}"]) == 0
     assert report(out)["success"]["metrics"]["success_rate"] >= rate
-    assert time.process_time() - began < 60.0 * minutes
+    assert time.process_time() - began < 240.0
 
 
 @pytest.mark.full
