@@ -9,7 +9,6 @@ import shutil
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,10 +17,10 @@ from compositions import refusal
 from ik_arm import Arm
 
 from mjstack import load_config
+from mjstack.bench.episode import play_bare
 from mjstack.config.fingerprint import config_content
 from mjstack.config.schema import Backend, Config
 from mjstack.drivers.open_loop import OpenLoopPlanner
-from mjstack.episodes.rollout import rollout
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, MjstackError, UnknownName
 from mjstack.kinematics.reach import PointReach
@@ -183,10 +182,10 @@ def test_bare_steps_command_the_robots_own_actuators(tmp_path: Path) -> None:
     lines = ['<motor name="fan" site="left_grasp"/>', *reversed(block.splitlines())]
     stage = Stage(changed(tmp_path, block, "\n".join(lines)))
     sim = stage.simulation(1, Backend.native, "cpu")
-    env = stage.start(sim, stage.cfg.reset)
     command = torch.arange(1.0, 7.0, dtype=sim.ctrl.dtype)
-    driver = SimpleNamespace(steps=1, command=lambda: command[None])
-    rollout(env, driver, physics=lambda: None)  # type: ignore[arg-type]
+    sim.bare_step = lambda: sim.synchronize  # type: ignore[attr-defined]
+    sim.latch = sim.synchronize  # type: ignore[attr-defined]
+    play_bare(stage, sim, command[None, None])  # type: ignore[arg-type]
     sim.close()
     names = [stage.model.actuator(i).name for i in range(stage.model.nu)]
     joints = stage.cfg.robot.joints

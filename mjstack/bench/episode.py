@@ -16,11 +16,12 @@ from mjstack.bench.timing import (
     EnergyObserver,
     Measurement,
     lost_worlds,
+    timed,
 )
 from mjstack.drivers.driver import OpenLoopDriver
 from mjstack.drivers.open_loop import JointTrajectory
 from mjstack.episodes.recorder import CommandRecorder
-from mjstack.episodes.rollout import FEEDBACK, Episode, Observer, rollout
+from mjstack.episodes.rollout import FEEDBACK, Episode
 from mjstack.episodes.stage import Stage
 from mjstack.errors import name_worlds
 from mjstack.sim import Simulation
@@ -58,14 +59,9 @@ def measure_episode(
     mjwarp = sim.backend == "mjwarp"
     out = Measurement(name="episode")
     steps = stage.episode_steps
-    if before is not None and (before.description, len(before.start)) != (
-        sim.description,
-        sim.nworld,
-    ):
-        before = None
-
     # The repetitions, and about how long one takes. Bare steps are measured once at least.
-    played = [before] if before is not None else []
+    worlds = (sim.description, sim.nworld)
+    played = [before] if before and (before.description, len(before.start)) == worlds else []
     estimate = max([step_seconds * steps, *(episode.timing.seconds for episode in played)])
     rounds = repetitions - len(played)
     if mjwarp:
@@ -89,12 +85,12 @@ def measure_episode(
         return out
 
     # The result
-    failed = sorted({world for p in played for world in np.flatnonzero(p.failed).tolist()})
-    timings = [p.timing for p in played]
+    failed = np.flatnonzero(np.any([episode.failed for episode in played], axis=0)).tolist()
+    timings = [episode.timing for episode in played]
     times = [timing.seconds for timing in timings]
     out.samples = {"seconds": times, **out.samples}
     out.facts = {
-        "of_the_batch_gate": int(before is not None),
+        "of_the_batch_gate": int(played[0] is before),
         "succeeded": sim.nworld - len(failed),
     }
     used = meter if played[-1] is not before else NO_METER
@@ -137,11 +133,15 @@ def play_bare(
         knots = commands.transpose(0, 1)
         driver = OpenLoopDriver(JointTrajectory(knots, weights, numbers, np.zeros(len(knots))), [])
 
-    def physics() -> None:
-        for _ in range(cfg.timing.decimation):
-            step()
+    columns = env.index.on(sim.device, sim.ctrl.dtype).ctrl
 
-    seconds = rollout(env, driver, physics=physics).seconds
+    def play() -> None:
+        for _ in range(driver.steps):
+            columns.write(sim.ctrl, driver.command())
+            for _ in range(cfg.timing.decimation):
+                step()
+
+    seconds = timed(sim, play)
     sim.latch()
     if lost := int(lost_worlds(sim).sum()):
         return seconds, f"{lost} worlds overflowed or diverged with bare steps"
@@ -157,12 +157,11 @@ def _play(stage: Stage, sim: Simulation, meter: EnergyMeter, out: Measurement) -
     """
     cfg = stage.cfg
     mjwarp = sim.backend == "mjwarp"
-    recorder = CommandRecorder()
     keep = mjwarp and cfg.controller.name in FEEDBACK
-    recorders: list[Observer] = [recorder] if keep else []
+    recorders = [CommandRecorder()] if keep else []
     episode = stage.play(sim, cfg.reset, [*recorders, EnergyObserver(meter)])
     if mjwarp:
-        commands = recorder.commands if keep else None
+        commands = recorders[0].commands if keep else None
         bare, problem = play_bare(stage, cast("MjwarpSimulation", sim), commands)
         out.problem = out.problem or problem
         out.samples.setdefault("bare_seconds", []).append(bare)

@@ -58,7 +58,7 @@ class Observer:
         """Conclude. Called once when the device has done the last step, the last observer first."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, kw_only=True)
 class RolloutTiming:
     """The time of a rollout.
 
@@ -86,7 +86,6 @@ def rollout(
     steps: int | None = None,
     advance: Advance | None = None,
     label: str = "steps",
-    physics: Callable[[], None] | None = None,
 ) -> RolloutTiming:
     """Drive every world through an episode. On CUDA a step is one captured graph.
 
@@ -97,34 +96,23 @@ def rollout(
         steps: Number of control steps; the driver's if None.
         advance: Told about progress.
         label: Name of the steps in the progress.
-        physics: Replaces the environment's step: the driver's command goes to the actuators
-            unchanged, and this advances the physics by one control step. It is not captured here.
     """
     sim = env.sim
-    columns = env.index.on(sim.device, sim.ctrl.dtype).ctrl
     steps = driver.steps if steps is None else steps
     for observer in observers:
         observer.start(env, driver)
 
     # A step, and its graph
     def work() -> None:
-        command = driver.command()
-        if physics is None:
-            env.action_manager.process(command)
-            env.advance()
-        else:
-            columns.write(sim.ctrl, command)
-            physics()
+        env.action_manager.process(driver.command())
+        env.advance()
         for observer in observers:
             observer.update()
 
-    if physics is None:
-        play = env.captured(work, "a step of the episode")
-    else:
-        play = StepGraph(work, sim.device, "off", name="the physics")
+    play = env.captured(work, "a step of the episode")
     # On Warp's CPU device physics alone is captured, once for all episodes.
     graph: StepGraph | None = play
-    if sim.device.type != "cuda" and physics is None:
+    if sim.device.type != "cuda":
         graph = sim.graph_of(env.cfg.timing.decimation, kinematics=True)
 
     def graph_seconds() -> tuple[float, float]:
@@ -201,7 +189,7 @@ def restore(sim: Simulation, state: State) -> None:
     sim.forward()
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, kw_only=True)
 class Episode:
     """A judged episode of every world.
 
