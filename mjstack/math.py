@@ -181,6 +181,12 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     return 0.0 if successes == 0 else centre - half, 1.0 if successes == trials else centre + half
 
 
+def rate_interval(name: str, successes: int, trials: int) -> dict[str, float]:
+    """A success rate and its 95 % interval: ``NAME``, ``NAME_low95`` and ``NAME_high95``."""
+    low, high = wilson_interval(successes, trials)
+    return {name: successes / trials, f"{name}_low95": low, f"{name}_high95": high}
+
+
 def mcnemar_p_value(only_a: int, only_b: int) -> float:
     """Two-sided p-value of McNemar's exact test: how probable it is that pairs of which one side
     alone won are split so unevenly or more, if either side wins such a pair with probability 1/2.

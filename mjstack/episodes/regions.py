@@ -13,7 +13,7 @@ from mjstack.config.schema import Config
 from mjstack.episodes.record import REGIONS
 from mjstack.episodes.tally import rate_cells
 from mjstack.files import to_csv, write_atomic
-from mjstack.math import wilson_interval
+from mjstack.math import rate_interval
 from mjstack.report.table import Table
 from mjstack.report.write import safely_write
 
@@ -76,11 +76,8 @@ def find_regions(
                 edges = (key * widths[axes], np.minimum((key + 1.0) * widths[axes], ends[axes]))
                 names = [_BOUNDS[2 * axis + end] for axis in axes for end in (0, 1)]
                 bounds = zip(names, np.column_stack(edges).round(9).ravel().tolist(), strict=True)
-                low, high = wilson_interval(k, n)
-                interval = {"rate": k / n, "rate_low95": low, "rate_high95": high}
-                out.append(
-                    {"object": name, **dict(bounds), "episodes": n, "succeeded": k, **interval}
-                )
+                region = {"object": name, **dict(bounds), "episodes": n, "succeeded": k}
+                out.append(region | rate_interval("rate", k, n))
     return sorted(out, key=lambda region: (region["rate"], region["rate_high95"]))
 
 

@@ -13,7 +13,7 @@ from mjstack.episodes.record import FAILING, EpisodeRecord
 from mjstack.episodes.rollout import Episode
 from mjstack.errors import name_worlds
 from mjstack.files import to_csv
-from mjstack.math import wilson_interval
+from mjstack.math import rate_interval, wilson_interval
 from mjstack.report.record import GateResult, Status
 from mjstack.report.table import Table
 from mjstack.report.text import format_percent
@@ -211,14 +211,8 @@ class EpisodeTally:
 
 
 def rate_metrics(succeeded: int, episodes: int) -> dict[str, float]:
-    """A success rate with its 95 % interval, by name."""
-    low, high = wilson_interval(succeeded, episodes)
-    return {
-        "succeeded": succeeded,
-        "success_rate": succeeded / episodes,
-        "success_rate_low95": low,
-        "success_rate_high95": high,
-    }
+    """A number of successes, and their rate with its 95 % interval, by name."""
+    return {"succeeded": succeeded} | rate_interval("success_rate", succeeded, episodes)
 
 
 def rate_cells(k: int, n: int) -> list[str]:

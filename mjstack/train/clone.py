@@ -8,13 +8,13 @@ from collections import Counter
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from mjstack.config.schema import CloneJobCfg
 from mjstack.episodes.rollout import STATE_BASED
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, MjstackError, UnknownName
-from mjstack.math import wilson_interval
+from mjstack.math import rate_interval
 from mjstack.train.clone_learner import CloneLearner
 from mjstack.train.clone_network import vision_of
 from mjstack.train.dataset import check_dataset, read_demonstrations
@@ -34,15 +34,16 @@ from mjstack.train.trainer import (
 def check_clone(stage: Stage) -> range:
     """Check the expert, the observation, the sizes and the dataset; see `Trainer`."""
     cfg = stage.cfg
-    job = cast(CloneJobCfg, cfg.job)
+    job: CloneJobCfg = cfg.job
     if job.rounds:
         _check_rounds(stage, job)
     _check_vision(stage, job)
     widths = observed_widths(stage)
     if job.dataset is not None:
         return check_dataset(stage, widths)
-    if job.episodes < 2 * stage.ranks.size:
-        expected = f"at least {2 * stage.ranks.size}, because one of each rank's is for validation"
+    least = 2 * stage.ranks.size
+    if job.episodes < least:
+        expected = f"at least {least}, because one of each rank's is for validation"
         raise ConfigError("job.episodes", job.episodes, expected)
     batches = (job.rounds + 1) * math.ceil(job.episodes / cfg.nworld)
     return range(cfg.seed, cfg.seed + batches)
@@ -84,11 +85,14 @@ def _check_vision(stage: Stage, job: CloneJobCfg) -> None:
 def train_clone(stage: Stage, folder: Path) -> Trained:
     """Fit a network to the expert's answers; see `Trainer`."""
     # An earlier call's training, which may be complete
-    job = cast(CloneJobCfg, stage.cfg.job)
+    job: CloneJobCfg = stage.cfg.job
     earlier = earlier_state(stage, folder)
-    if earlier and _is_complete(job, earlier[1]):
-        stage.progress.print_line(f"train: {folder} is trained already, and is judged anew")
-        return _trained(job, folder, earlier[1])
+    if earlier:
+        _, facts = earlier
+        complete = len(facts["curve"]) == job.rounds if job.rounds else facts["done"] == job.batches
+        if complete:
+            stage.progress.print_line(f"train: {folder} is trained already, and is judged anew")
+            return _trained(job, folder, facts)
 
     # The first episodes give the scale
     pool = None
@@ -97,16 +101,15 @@ def train_clone(stage: Stage, folder: Path) -> Trained:
         pool = ImagePool(sizes, earlier[1]["pool"] if earlier else rows, stage.backend[1])
     if job.dataset is None:
         first = make_round(stage, folder, None, 0, pool)
-        who = "" if job.rounds == 0 else "round 0: "
-        _judge(stage, f"{who}the expert", first)
+        _judge(stage, "round 0: the expert" if job.rounds else "the expert", first)
     else:
         began = time.perf_counter()
         first = read_demonstrations(stage, observed_widths(stage))
         first = replace(first, seconds=time.perf_counter() - began)
     if len(first.ends) < 2:
         raise MjstackError(
-            f"{first.source}: {len(first.ends)} of {first.played}"
-            " episodes succeeded, expected two at least",
+            f"{first.source}: {len(first.ends)} of {first.played} episodes succeeded, expected two"
+            " at least",
             "Ask for more (job.episodes), or look at why with gates=[success]",
         )
 
@@ -132,12 +135,6 @@ def train_clone(stage: Stage, folder: Path) -> Trained:
     return _trained(job, folder, learner.facts())
 
 
-def _is_complete(job: CloneJobCfg, facts: dict[str, Any]) -> bool:
-    if job.rounds:
-        return len(facts["curve"]) == job.rounds
-    return bool(facts["done"] == job.batches)
-
-
 def _judge(stage: Stage, who: str, episodes: Demonstrations) -> dict[str, float]:
     """Print how many judged episodes of all ranks succeeded, and return their figures.
 
@@ -151,12 +148,9 @@ def _judge(stage: Stage, who: str, episodes: Demonstrations) -> dict[str, float]
     succeeded = sum(successes)
     judged = sum(numbers)
     stage.progress.print_line(f"train: {who} succeeded in {succeeded} of {judged} episodes")
-    low, high = wilson_interval(succeeded, judged)
     rules: Counter[str] = sum(broken, Counter())
     return {
-        "success": succeeded / judged,
-        "success_low95": low,
-        "success_high95": high,
+        **rate_interval("success", succeeded, judged),
         "judged": judged,
         "played_s": max(seconds),
         **{f"{FAILED}{rule}": count for rule, count in rules.items()},

@@ -127,12 +127,7 @@ class Learner(ABC):
     def _save(self, **figures: Any) -> None:
         """Add a row to the curve, with figures in front of it, and write policies and state."""
         row = figures | self._new_row()
-        if not all(bool(value.isfinite().all()) for value in self._networks.parameters()):
-            raise MjstackError(
-                f"train: the network's weights are not finite after {self.step} {self.done};"
-                f" {self._folder} keeps what was saved before",
-                "Lower job.learning_rate, or look at observations and rewards",
-            )
+        self._check_finite(self.done)
         best = all(self.score(row) >= self.score(earlier) for earlier in self.curve)
         self.curve.append(row)
         # JSON has no NaN
@@ -147,6 +142,15 @@ class Learner(ABC):
                     self._events.add_scalar(f"train/{name}", value, self.done)
                 self._events.flush()
         self._write_state()
+
+    def _check_finite(self, done: int) -> None:
+        """Raise a `MjstackError` if a number of the networks is not finite after so many steps."""
+        if not all(bool(value.isfinite().all()) for value in self._networks.state_dict().values()):
+            raise MjstackError(
+                f"train: the networks' numbers are not finite after {self.step} {done};"
+                f" {self._folder} keeps what was saved before",
+                "Lower job.learning_rate, or look at observations and rewards",
+            )
 
     def facts(self) -> dict[str, Any]:
         """Everything of the training that is no tensor, in JSON's types."""
@@ -168,9 +172,8 @@ class Learner(ABC):
         self._networks.load_state_dict({name: state[name] for name in self._networks.state_dict()})
         moments: dict[int, dict[str, Tensor]] = {}
         for key, value in state.items():
-            owner, _, rest = key.partition(".")
-            if owner == "optimizer":
-                number, _, name = rest.partition(".")
+            if key.startswith("optimizer."):
+                _, number, name = key.split(".", 2)
                 moments.setdefault(int(number), {})[name] = value
         self._optimizer.load_state_dict(self._optimizer.state_dict() | {"state": moments})
         self.done = facts["done"]

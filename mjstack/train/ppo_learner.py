@@ -4,7 +4,7 @@ import math
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +19,6 @@ from mjstack.envs import Env, build_env
 from mjstack.envs.statistics import join_statistics
 from mjstack.episodes.rollout import Observer
 from mjstack.episodes.stage import Stage
-from mjstack.errors import MjstackError
 from mjstack.policy import Policy, PolicyNetwork
 from mjstack.train.learner import Learner
 
@@ -61,7 +60,8 @@ class PpoLearner(Learner):
         """Build the environment of a configuration, and networks with random weights: the actor
         sees the observation group ``job.group``, the critic all groups.
         """
-        self._job = job = cast(PpoJobCfg, cfg.job)
+        job: PpoJobCfg = cfg.job
+        self._job = job
         super().__init__(stage, cfg, folder, job.save_every)
         worlds = stage.worlds
         backend, device = stage.backend
@@ -150,15 +150,9 @@ class PpoLearner(Learner):
         Raises:
             MjstackError: A number of the networks is not finite.
         """
-        spread = self._spread
+        self._runner.learn(1, init_at_random_ep_len=self._spread)
         self._spread = False
-        self._runner.learn(1, init_at_random_ep_len=spread)
-        if not all(bool(value.isfinite().all()) for value in self._networks.state_dict().values()):
-            raise MjstackError(
-                f"train: the networks' numbers are not finite after iteration {self.done + 1};"
-                f" {self._folder} keeps what was saved before",
-                "Lower job.learning_rate, or look at observations and rewards",
-            )
+        self._check_finite(self.done + 1)
 
     def _show(self) -> None:
         job = self._job
@@ -220,11 +214,8 @@ class PpoLearner(Learner):
 
     @override
     def facts(self) -> dict[str, Any]:
-        numbers = {
-            "learning_rate": self._alg.learning_rate,
-            "episode": int(self._env.episode.max()),
-        }
-        return super().facts() | numbers
+        episode = int(self._env.episode.max())
+        return super().facts() | {"learning_rate": self._alg.learning_rate, "episode": episode}
 
     def restore(self, state: dict[str, Tensor], facts: dict[str, Any]) -> None:
         """See `Learner`. All worlds begin the episode after the latest one."""
