@@ -194,7 +194,7 @@ def test_actions_of_a_policys_own_are_described(tmp_path: Path) -> None:
     cfg = configure("task=reach", *own)
     policy = make_policy(cfg, chunk=1, execute=5)
     save_policy(tmp_path / "policy", policy)
-    facts = export_facts(configure("task=reach"), load_policy(tmp_path / "policy"))
+    facts = export_facts(Stage(replace(configure("task=reach"), policy=str(tmp_path / "policy"))))
     assert list(facts["action"]["terms"]) == list(cfg.action)
     assert facts["action"]["width"] == policy.network.width == policy.widths["last_action"]
     assert facts["columns"]["units"][-1] == "1"

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import pytest
@@ -223,7 +222,7 @@ def test_images_of_a_round_come_again(backend: str, tmp_path: Path) -> None:
     """
     args = [*TINY, f"sim={backend}", "looks=randomized", "job.episodes=6"]
     stage = Stage(load_config(args))
-    job = cast(CloneJobCfg, stage.cfg.job)
+    job: CloneJobCfg = stage.cfg.job
     sizes = vision_of(stage.cfg, job).sizes
     pools = [ImagePool(sizes, 1000, "cpu") for _ in range(2)]
     played, read = (make_round(stage, tmp_path, None, 0, pool) for pool in pools)
@@ -280,15 +279,6 @@ def test_a_training_goes_on_where_it_was_interrupted(trained: Path, tmp_path: Pa
         interrupted(command, CloneLearner, number)
     assert run(command) == 0
     assert same(tmp_path / "last", trained / "last")
-
-
-@pytest.mark.full
-def test_a_clone_goes_on_where_it_was_interrupted(tmp_path: Path) -> None:
-    command = [*TINY, "trainer=clone", "job.rounds=0"]
-    interrupted([*command, f"job.folder={tmp_path}/parts"], CloneLearner, 4)
-    for name in ("parts", "whole"):
-        assert run([*command, f"job.folder={tmp_path}/{name}"]) == 0
-    assert same(tmp_path / "parts/last", tmp_path / "whole/last")
 
 
 @pytest.mark.full

@@ -10,13 +10,12 @@ import math
 from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import cast
 
 import torch
 from common import count, make_parser, run
 from torch.profiler import ProfilerActivity, profile
 
-from mjstack.config.schema import CloneJobCfg, Config
+from mjstack.config.schema import Config
 from mjstack.envs.buffers import Advance
 from mjstack.episodes.stage import Stage
 from mjstack.report.table import Table
@@ -33,7 +32,7 @@ def measure(args: argparse.Namespace, cfg: Config, advance: Advance) -> Iterator
     kinds = [ProfilerActivity.CPU, *[ProfilerActivity.CUDA] * device.startswith("cuda")]
     with TemporaryDirectory() as name:
         folder = Path(name)
-        sizes = vision_of(cfg, cast(CloneJobCfg, cfg.job)).sizes
+        sizes = vision_of(cfg, cfg.job).sizes
         pool = ImagePool(sizes, pool_rows(stage, stage.episode_steps), device)
         episodes = make_round(stage, folder, None, 0, pool)
         learner = CloneLearner(stage, episodes, folder, pool)

@@ -4,7 +4,7 @@ wherever they are.
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -22,9 +22,9 @@ WITHOUT_EFFECT = ("batch", "gates", "gate", "graph", "view", "video", "run", "wo
 POLICY_FILE = "policy.json"  # of a policy's folder; it names the weights by their SHA-256
 
 
-def config_content(cfg: Config) -> dict[str, Any]:
+def config_content(cfg: Config, without: Iterable[str] = ()) -> dict[str, Any]:
     """The whole configuration in JSON's types, with the SHA-256 of the robot's file, of each starts
-    file and of the policy in place of its path.
+    file and of the policy in place of its path; some keys at its top may be left out.
 
     Raises:
         ConfigError: One of these files cannot be read.
@@ -32,7 +32,7 @@ def config_content(cfg: Config) -> dict[str, Any]:
     config: dict[str, Any] = json.loads(json.dumps(asdict(cfg)))
     if cfg.robot.file is not None:
         config["robot"]["file"] = _content("robot.file", cfg.robot.file)
-    for key in _OF_THE_CALL:
+    for key in (*_OF_THE_CALL, *without):
         del config[key]
     if cfg.policy is None:  # hashes without one are older than it
         del config["policy"]

@@ -22,7 +22,7 @@ _USED = ("codebase_version", "fps", "features", "total_episodes", "total_frames"
 _ORDER = ("episode_index", "frame_index")
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, kw_only=True)
 class StoredDataset:
     """A dataset to read from.
 
@@ -197,7 +197,7 @@ def read_tasks(folder: Path, info: dict[str, Any]) -> list[str]:
         return []
     path = folder / lerobot.TASKS
     with readable(path):
-        tasks = _read_table(path, ["task"])["task"].to_pylist()[:count]
+        tasks = read_table(path, ["task"])["task"].to_pylist()[:count]
         if [type(task) for task in tasks] != [str] * count:
             raise ValueError(f"not {count} texts")
     return tasks
@@ -213,7 +213,7 @@ def read_rows(folder: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
     for shard in range(info["mjstack"]["shards"]):
         path = lerobot.shard_path(folder, lerobot.EPISODES, shard)
         with readable(path):
-            for row in _read_table(path).to_pylist():
+            for row in read_table(path).to_pylist():
                 start = rows[-1]["dataset_to_index"] if rows else 0
                 place = (len(rows), start, start + row["length"])
                 names = ("episode_index", "dataset_from_index", "dataset_to_index")
@@ -278,7 +278,7 @@ def read_columns(path: Path, info: dict[str, Any], names: Sequence[str]) -> dict
     Raises:
         Exception: It cannot be read, or a row has not as many numbers as info.json says.
     """
-    table = _read_table(path, names)
+    table = read_table(path, names)
     columns = {}
     for name in names:
         column = table[name].combine_chunks()
@@ -309,7 +309,8 @@ def uncommitted(folder: Path, shards: int) -> list[Path]:
     return [path for path in paths if f"{path.parent.name}/{path.stem}" not in counted]
 
 
-def _read_table(path: Path, columns: Sequence[str] | None = None) -> Any:
+def read_table(path: Path, columns: Sequence[str] | None = None) -> Any:
+    """A file as an Arrow table, or these of its columns."""
     return lerobot.require_pyarrow()[1].ParquetFile(path).read(columns=columns)
 
 

@@ -17,7 +17,7 @@ from mjstack.episodes.stage import Stage
 from mjstack.sim import Simulation
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class BatchPlan:
     """A batch to be played.
 
@@ -30,7 +30,7 @@ class BatchPlan:
     worlds: Sequence[int]
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class Batch:
     """A batch that was played and judged. Its environment's worlds stand where the episode ended.
 

@@ -21,7 +21,7 @@ REPORT = "report.json"
 COPY = "starts_played.npz"
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, kw_only=True)
 class EarlierRun:
     """A run of job=gates, finished or not.
 

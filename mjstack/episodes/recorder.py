@@ -26,7 +26,7 @@ def start_and_every_step(steps: int) -> range:
     return range(steps + 1)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Channels:
     """Values to record, by name.
 
@@ -113,7 +113,8 @@ class WorldRecorder(Recorder):
         return self.rows["phase"][:, 0].cpu().numpy()
 
 
-def _read_commands(env: Env, driver: Driver) -> Read:
+def read_commands(env: Env, driver: Driver) -> Read:
+    """Read the joint targets that went to the actuators as ``ctrl``, float32."""
     ctrl = env.sim.ctrl
     columns = env.index.on(env.device, ctrl.dtype).ctrl
     return lambda: {"ctrl": columns.read(ctrl).float()}
@@ -126,7 +127,7 @@ class CommandRecorder(Recorder):
     worlds with six joint targets.
     """
 
-    channels = (Channels(_read_commands),)
+    channels = (Channels(read_commands),)
 
     @property
     def commands(self) -> Tensor:

@@ -3,20 +3,20 @@ them. All that a trainer or a benchmark needs of a run.
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import mujoco
-import numpy as np
 
 from mjstack.config.schema import Backend, Config, TermCfg
 from mjstack.distributed import Ranks, current_ranks
 from mjstack.drivers.driver import Driver, OpenLoopDriver
 from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.drivers.policy import PolicyDriver
-from mjstack.envs import Env, driven_config
+from mjstack.envs import Env, build_env, driven_config
 from mjstack.envs.buffers import Advance, Workload, measured_sizes, play_workload
 from mjstack.episodes.rollout import (
     CLOSED_LOOP,
@@ -50,7 +50,7 @@ from mjstack.tasks.check import EpisodeCheck, make_check
 TextHook = Callable[[str], None]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Progress:
     """Where a run prints. By default nowhere.
 
@@ -248,18 +248,10 @@ class Stage:
         return OpenLoopDriver(trajectory.to(sim.device, sim.ctrl.dtype), self.planner.phases)
 
     def play(
-        self,
-        sim: Simulation,
-        reset: Reset,
-        observers: Sequence[Observer] = (),
-        *,
-        seed: int | None = None,
-        worlds: Sequence[int] | None = None,
+        self, sim: Simulation, reset: Reset, observers: Sequence[Observer] = (), **options: Any
     ) -> Episode:
-        """Roll out one judged episode, at which the observers look on; other arguments as of
-        `start`.
-        """
-        env = self.start(sim, reset, seed=seed, worlds=worlds)
+        """Roll out one judged episode, at which the observers look on; options as of `start`."""
+        env = self.start(sim, reset, **options)
         return play_episode(env, self.driver(env), observers, advance=self.progress.advance)
 
     # Simulations
@@ -304,14 +296,13 @@ class Stage:
         # Native MuJoCo has no fixed buffers.
         if not self.cfg.batch.auto or self.backend[0] is Backend.native:
             return resolve_sizes(self.cfg)
-        sizes = self.measured.get("task")
-        if sizes is None:
+        if "task" not in self.measured:
             what = "the driven task"
             source = f"{what} in {self.measuring_nworld} worlds"
             task = self.play_task(self.cfg.reset)
-            sizes = self.measured["task"] = measured_sizes(self.cfg, what, task, source)
-            self.progress.print_line(str(sizes))
-        return apply_configured(self.cfg, sizes)
+            self.measured["task"] = measured_sizes(self.cfg, what, task, source)
+            self.progress.print_line(str(self.measured["task"]))
+        return apply_configured(self.cfg, self.measured["task"])
 
     @property
     def env_sizes(self) -> BatchSizes | None:
@@ -337,11 +328,14 @@ class Stage:
         spare.
         """
         stage = self.with_config(replace(self.cfg, reset=reset))
+        make = stage.measuring_simulation
+        return play_workload(self.cfg, make, lambda sim: stage.play(sim, reset).failed, sizes)
 
-        def play(sim: Simulation) -> np.ndarray:
-            return stage.play(sim, reset).failed
-
-        return play_workload(self.cfg, stage.measuring_simulation, play, sizes)
+    def native_env(self, cfg: Config, nworld: int = 1) -> closing[Env]:
+        """An environment of the scene on native MuJoCo, to find out about its terms."""
+        return closing(
+            build_env(cfg, model=self.model, nworld=nworld, backend=Backend.native, device="cpu")
+        )
 
     def color_renderer(
         self, count: int, fields: Sequence[str], cameras: Sequence[str] | None = None

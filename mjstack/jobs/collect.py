@@ -11,7 +11,6 @@ from contextlib import closing, nullcontext
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 
@@ -58,7 +57,7 @@ def check_collect(cfg: Config) -> CheckedJob:
         check_folder(plan.home / DATASET, plan.spec)
     return CheckedJob(
         stage=stage,
-        title=f"task {cfg.task.name}, {cast(CollectJobCfg, cfg.job).episodes:,} demonstrations",
+        title=f"task {cfg.task.name}, {cfg.job.episodes:,} demonstrations",
         work=partial(run_collect, plan),
         folder=plan.home,
         resumes=NAME,
@@ -118,7 +117,7 @@ class Collection:
         self._began = time.perf_counter()
         self._stage = stage
         self._plan = plan
-        self._job = cast(CollectJobCfg, stage.cfg.job)
+        self._job: CollectJobCfg = stage.cfg.job
         self._record_path = plan.home / BATCHES
         self.path = plan.home / DATASET
         self._source = EpisodeSource(stage, plan.spec, self.path)

@@ -6,12 +6,10 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import torch
 
-from mjstack.config.schema import CollectJobCfg
 from mjstack.datasets import DatasetSpec, EpisodeData
 from mjstack.datasets.part import Part, PartWriter
 from mjstack.datasets.spec import typed_episode
@@ -19,7 +17,7 @@ from mjstack.datasets.units import LEROBOT, LerobotUnits
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.batches import Batch
-from mjstack.episodes.recorder import Channels, Read, start_and_every_step
+from mjstack.episodes.recorder import Channels, Read, read_commands, start_and_every_step
 from mjstack.episodes.stage import Stage
 from mjstack.jobs.collect_plan import ACTION, IMAGES, REWARD, STATE
 from mjstack.managers.episode import required_fields
@@ -51,10 +49,9 @@ def demonstration_channels(stage: Stage) -> list[Channels]:
         }
 
     def read_step(env: Env, driver: Driver) -> Read:
-        ctrl = env.sim.ctrl
-        columns = env.index.on(env.device, ctrl.dtype).ctrl
+        commands = read_commands(env, driver)
         reward = env.reward_manager.reward
-        return lambda: {ACTION: columns.read(ctrl).float(), REWARD: reward[:, None]}
+        return lambda: {ACTION: commands()["ctrl"], REWARD: reward[:, None]}
 
     return [Channels(read_before, start_and_every_step), Channels(read_step)]
 
@@ -74,7 +71,7 @@ class EpisodeSource:
         self._folder = folder
         self.drawing = 0.0
         self._units: LerobotUnits | None = None
-        if cast(CollectJobCfg, stage.cfg.job).units == LEROBOT:
+        if stage.cfg.job.units == LEROBOT:
             self._units = LerobotUnits(stage.cfg.robot, stage.index.ctrl_range)
         self._most_rendered = 0  # states at once
         self._renderer: StateRenderer | None = None
@@ -109,7 +106,7 @@ class EpisodeSource:
         worlds = batch.plan.worlds
         order = {world: number for number, world in enumerate(chosen) if world in worlds}
         episodes = self.episodes(batch, [worlds.index(world) for world in order])
-        images_gib = cast(CollectJobCfg, self._stage.cfg.job).buffer_gib
+        images_gib = self._stage.cfg.job.buffer_gib
         files: list[Part] = []
         writer: PartWriter | None = None
         try:

@@ -5,7 +5,6 @@ of the batches that were played.
 import json
 import os
 from collections.abc import Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -15,13 +14,13 @@ import torch
 
 from mjstack.config.fingerprint import WITHOUT_EFFECT, config_content, config_hash, differences
 from mjstack.config.functions import offered
-from mjstack.config.schema import Backend, CollectJobCfg, Config, ObservationTermCfg
+from mjstack.config.schema import CollectJobCfg, Config, ObservationTermCfg
 from mjstack.datasets import DatasetSpec, Feature, Video
 from mjstack.datasets.reader import check_same, read_info
 from mjstack.datasets.spec import term_columns
 from mjstack.datasets.units import LEROBOT, LerobotUnits
 from mjstack.datasets.video import check_encoder
-from mjstack.envs import Env, build_env, demonstration_config
+from mjstack.envs import Env, demonstration_config
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, FolderError
 from mjstack.files import lock_folder, reading
@@ -41,7 +40,7 @@ IMAGES = "observation.images"
 _WITHOUT_EFFECT = (*WITHOUT_EFFECT, "action", "termination", "nworld")
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, kw_only=True)
 class CollectPlan:
     """A dataset to be collected.
 
@@ -65,7 +64,7 @@ class CollectPlan:
                 taken.
         """
         cfg = stage.cfg
-        gib = cast(CollectJobCfg, cfg.job).buffer_gib
+        gib = cfg.job.buffer_gib
         provenance = run_provenance(stage)
         # They differ between calls that make the same episodes.
         del provenance["date"], provenance["config_sha256"]
@@ -83,7 +82,7 @@ class CollectPlan:
 def collect_folder(cfg: Config) -> Path:
     """Where a configuration's dataset is, so that another call finds it."""
     name = config_hash(episode_config(cfg))[:12]
-    return Path(cast(CollectJobCfg, cfg.job).folder or f"outputs/collect/{name}")
+    return Path(cfg.job.folder or f"outputs/collect/{name}")
 
 
 def plan_collection(stage: Stage) -> CollectPlan:
@@ -95,9 +94,8 @@ def plan_collection(stage: Stage) -> CollectPlan:
     """
     cfg = stage.cfg
     played = demonstration_config(cfg, stage.action)
-    env = build_env(played, model=stage.model, nworld=2, backend=Backend.native, device="cpu")
-    with closing(env):
-        if cast(CollectJobCfg, cfg.job).episodes > 1:
+    with stage.native_env(played, nworld=2) as env:
+        if cfg.job.episodes > 1:
             _check_starts(env)
         plan = CollectPlan.of(stage, collect_folder(cfg), env)
     for name, camera in cfg.scene.cameras.items():
@@ -198,12 +196,9 @@ def episode_config(cfg: Config) -> dict[str, Any]:
     Raises:
         ConfigError: The starts file cannot be read.
     """
-    config = config_content(cfg)
-    for key in _WITHOUT_EFFECT:
-        del config[key]
-    backend, _ = resolve_backend(cfg)
-    config["sim"] = {"backend": backend}
-    job = cast(CollectJobCfg, cfg.job)
+    config = config_content(cfg, _WITHOUT_EFFECT)
+    config["sim"] = {"backend": resolve_backend(cfg)[0]}
+    job: CollectJobCfg = cfg.job
     config["job"] = {"keep_failures": job.keep_failures}
     if job.units == LEROBOT:
         config["job"]["units"] = job.units
@@ -220,7 +215,7 @@ def make_spec(env: Env, cfg: Config, provenance: Mapping[str, Any]) -> DatasetSp
         ConfigError: An observation group has a name that is taken.
     """
     config = episode_config(cfg)
-    job = cast(CollectJobCfg, cfg.job)
+    job: CollectJobCfg = cfg.job
     joints = tuple(cfg.robot.joints)
     units = joint_units(env)
     positions = Feature(dtype="float32", names=tuple(f"{name}.pos" for name in joints), units=units)

@@ -8,13 +8,13 @@ from dataclasses import replace
 from functools import partial
 from itertools import groupby
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from mjstack.config.fingerprint import config_content, differences
 from mjstack.config.load import load_config
-from mjstack.config.schema import Backend, CompareJobCfg, Config
+from mjstack.config.schema import Backend, Config
 from mjstack.episodes.batches import BatchPlan, play_batches
 from mjstack.episodes.motion import motion_recorder
 from mjstack.episodes.replay import simulate_alone
@@ -50,7 +50,7 @@ def check_compare(cfg: Config, overrides: Sequence[str]) -> CheckedJob:
     """Raise for sides that cannot be played here or do not start alike, before anything is
     written. The overrides are the command line's.
     """
-    against = cast(CompareJobCfg, cfg.job).against
+    against = cfg.job.against
     if not against:
         expected = 'what the second side changes, such as ["controller=policy","policy=DIR"]'
         raise ConfigError("job.against", "[]", expected)

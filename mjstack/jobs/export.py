@@ -2,7 +2,6 @@
 MuJoCo.
 """
 
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,8 +9,8 @@ from typing import Any
 import mujoco
 
 import mjstack
-from mjstack.config.schema import Backend, Config
-from mjstack.envs import build_env, driven_config
+from mjstack.config.schema import Config
+from mjstack.envs import driven_config
 from mjstack.episodes.rollout import POLICY as DRIVER
 from mjstack.episodes.stage import Stage
 from mjstack.errors import FolderError
@@ -20,7 +19,6 @@ from mjstack.gates.runner import run_guarded
 from mjstack.jobs.collect_plan import group_feature, joint_units
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import CheckedJob, Job, model_bytes
-from mjstack.policy import Policy
 from mjstack.policy.checkpoint import policy_facts
 from mjstack.policy.onnx import require_onnx, to_onnx
 from mjstack.report.record import GateResult, Status
@@ -38,17 +36,14 @@ def check_export(cfg: Config) -> CheckedJob:
     return CheckedJob(
         stage=stage,
         title=f"task {cfg.task.name}, policy {stage.assets.policy.folder}",
-        work=lambda run, folder: run_guarded(
-            run, NAME, lambda run: export_policy(run.stage, folder)
-        ),
+        work=lambda run, folder: run_guarded(run, NAME, lambda run: export_policy(stage, folder)),
     )
 
 
 def export_policy(stage: Stage, folder: Path) -> list[GateResult]:
     """Write both files, or none."""
     policy = stage.assets.policy
-    facts = export_facts(stage.cfg, policy)
-    files = {MODEL: model_bytes(stage.model), POLICY: to_onnx(policy.network, facts)}
+    files = {MODEL: model_bytes(stage.model), POLICY: to_onnx(policy.network, export_facts(stage))}
     try:
         for name, content in files.items():
             write_atomic(folder / name, content)
@@ -72,11 +67,12 @@ def export_policy(stage: Stage, folder: Path) -> list[GateResult]:
     ]
 
 
-def export_facts(cfg: Config, policy: Policy) -> dict:
+def export_facts(stage: Stage) -> dict[str, Any]:
     """Everything that a program needs beside the network, in JSON's types, by name."""
-    cfg = driven_config(cfg, action=policy.action)
+    policy = stage.assets.policy
+    cfg = driven_config(stage.cfg, action=policy.action)
     cfg.observation = {policy.group: policy.observation}
-    with closing(build_env(cfg, nworld=1, backend=Backend.native, device="cpu")) as env:
+    with stage.native_env(cfg) as env:
         units = joint_units(env)
         columns = group_feature(env, policy.group, units)
         index = env.index

@@ -1,7 +1,6 @@
 """Job *gates*: a configuration and a folder in, gates run, a report left behind."""
 
-from contextlib import closing, suppress
-from functools import partial
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +8,7 @@ import torch
 
 from mjstack.config.fingerprint import config_content, differences
 from mjstack.config.schema import Backend, Config
-from mjstack.envs import build_env, driven_config
+from mjstack.envs import driven_config
 from mjstack.episodes.earlier_run import EarlierRun
 from mjstack.episodes.record import STEMS
 from mjstack.episodes.rollout import CLOSED_LOOP, POLICY, STATE_BASED
@@ -142,8 +141,7 @@ def check_env(stage: Stage, cfg: Config, *, drives: bool = False, **keys: str) -
         drives: Whether the driver is built for it too, which a policy of other worlds does not fit.
         keys: The key of each group whose terms come from elsewhere.
     """
-    world = partial(build_env, model=stage.model, nworld=1, backend=Backend.native, device="cpu")
-    with renamed_keys(keys), closing(world(cfg)) as env:
+    with renamed_keys(keys), stage.native_env(cfg) as env:
         if drives:
             env.reset()
             stage.driver(env)
@@ -195,11 +193,8 @@ def _check_resumed(stage: Stage, name: str) -> list[str]:
 
 def _played_config(cfg: Config) -> dict[str, Any]:
     """Everything that the episodes of batch and success depend on; more seeds may be asked for."""
-    config = config_content(cfg)
-    for key in ("gates", "view", "video", "graph"):
-        del config[key]
-    backend, _ = resolve_backend(cfg)
-    config["sim"] = {"backend": backend, "step": cfg.sim.step}
+    config = config_content(cfg, ("gates", "view", "video", "graph"))
+    config["sim"] = {"backend": resolve_backend(cfg)[0], "step": cfg.sim.step}
     config["gate"] = {name: config["gate"][name] for name in STEMS}
     for gate in config["gate"].values():
         del gate["seeds"]

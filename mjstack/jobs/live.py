@@ -53,8 +53,7 @@ class LiveView(Observer):
         """
         self._server = server
         self._stage = stage
-        self._renderer: StateRenderer | None = None
-        self._fields: list[str] = []  # of the renderer's state
+        self._renderers: dict[tuple[str, ...], StateRenderer] = {}  # by model fields of a state
         self._view: SceneView | None = None
         self._nworld = 0
         self._numbers = [0]  # of the worlds in the picture
@@ -100,9 +99,8 @@ class LiveView(Observer):
 
     def close(self) -> None:
         """Give back what draws the cameras."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        for renderer in self._renderers.values():
+            renderer.close()
 
     @override
     def after_step(self, step: int) -> None:
@@ -247,11 +245,10 @@ class LiveView(Observer):
             return {name: images[world] for name, images in env.images.items()}
         row = slice(world, world + 1)
         looks = {name: values[row] for name, values in env.sim.fields.items()}
-        if self._renderer is None or self._fields != list(looks):
-            self.close()
-            self._fields = list(looks)
-            self._renderer = self._stage.color_renderer(1, self._fields)
-        images = self._renderer.draw(env.sim.qpos[row].nan_to_num(), looks)
+        names = (*looks,)
+        if names not in self._renderers:
+            self._renderers[names] = self._stage.color_renderer(1, names)
+        images = self._renderers[names].draw(env.sim.qpos[row].nan_to_num(), looks)
         return {name: image[0] for name, image in images.items()}
 
 

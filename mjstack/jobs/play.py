@@ -7,7 +7,6 @@ from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import torch
@@ -43,7 +42,7 @@ def check_play(cfg: Config) -> CheckedJob:
     if not cfg.controller.phases and cfg.controller.name != POLICY:
         expected = "a task with phases, which the expert follows"
         raise ConfigError("task", cfg.task.name, expected, "Name a policy: policy=FOLDER")
-    job = cast(PlayJobCfg, cfg.job)
+    job: PlayJobCfg = cfg.job
     if job.camera is not None and job.camera not in cfg.scene.cameras:
         names = ", ".join(cfg.scene.cameras) or "there is none"
         expected = f"null, or one of scene.cameras: {names}"
@@ -120,7 +119,7 @@ def _save(
     """Write the video; without one there is nothing to look at, and the job fails."""
     assert run.folder is not None
     stage = run.stage
-    job = cast(PlayJobCfg, stage.cfg.job)
+    job: PlayJobCfg = stage.cfg.job
     path = run.folder / f"episode.{job.format}"
 
     def write(path: Path) -> None:

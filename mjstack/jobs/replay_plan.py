@@ -23,7 +23,7 @@ _SAME_START = 1e-6
 _NATIVE = (Backend.native, "cpu")
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, kw_only=True)
 class ReplayPlan:
     """One world, or all failing ones, to be played again.
 

@@ -42,7 +42,7 @@ log = logging.getLogger(__name__)
 VIEWS = ("false", "true", "web")  # of a job that shows worlds
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Job:
     """One kind of job; ``conf/job/<name>.yaml`` names it.
 
@@ -60,7 +60,7 @@ class Job:
     views: tuple[str, ...] = ("false",)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, kw_only=True)
 class CheckedJob:
     """A job that has passed its checks.
 

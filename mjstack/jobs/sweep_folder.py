@@ -18,7 +18,7 @@ SWEEP = "sweep.json"
 _ENDED = (Status.passed, Status.failed)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class SweepJob:
     """A job of a sweep: its number, its folder and its overrides."""
 

@@ -8,7 +8,6 @@ import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import cast
 
 from mjstack.config.fingerprint import WITHOUT_EFFECT, config_content, config_hash, differences
 from mjstack.config.functions import find_object
@@ -39,9 +38,7 @@ _WITHOUT_EFFECT = ("folder", "test_seed", "iterations", "minutes", "max_minutes"
 
 def training_config(cfg: Config) -> dict:
     """Everything that a training depends on, in JSON's types."""
-    config = config_content(cfg)
-    for key in WITHOUT_EFFECT:
-        del config[key]
+    config = config_content(cfg, WITHOUT_EFFECT)
     for key in _WITHOUT_EFFECT:
         config["job"].pop(key, None)
     return config
@@ -50,7 +47,7 @@ def training_config(cfg: Config) -> dict:
 def check_train(cfg: Config) -> CheckedJob:
     """Raise for what cannot be done, before anything is written."""
     require_episode(cfg)
-    job = cast(TrainJobCfg, cfg.job)
+    job: TrainJobCfg = cfg.job
     trainer = find_object("job.trainer", job.trainer)
     if not isinstance(trainer, Trainer):
         raise ConfigError("job.trainer", job.trainer, "a mjstack.train.trainer.Trainer")
@@ -116,7 +113,7 @@ def judged_stage(stage: Stage, policy: Path) -> Stage:
     gate.success = replace(gate.success, reset=whole_starts(cfg.reset))
     judged = replace(
         cfg,
-        seed=cast(TrainJobCfg, cfg.job).test_seed,
+        seed=cfg.job.test_seed,
         policy=str(policy),
         controller=replace(cfg.controller, name=POLICY),
         gate=gate,
@@ -131,23 +128,24 @@ def _train(trainer: Trainer, folder: Path, run: Run) -> list[GateResult]:
     began = time.perf_counter()
     trained = trainer.train(run.stage, folder)
     rows = trained.curve
+    last = rows[-1]
+    words = {name: name.replace("_", " ") for name in last}
     if run.stage.ranks.writes:
         write_atomic(folder / f"{NAME}.csv", to_csv(rows))
         title = f"{run.cfg.robot.title}, task {run.cfg.task.name}: training"
-        lines = {name.replace("_", " "): [row[name] for row in rows] for name in trained.lines}
+        lines = {words[name]: [row[name] for row in rows] for name in trained.lines}
         at = [row[trained.abscissa] for row in rows]
         bands = {
-            name.replace("_", " "): [[row[f"{name}_{end}95"] for row in rows] for end in _ENDS]
+            words[name]: [[row[f"{name}_{end}95"] for row in rows] for end in _ENDS]
             for name in trained.lines
             if all(f"{name}_low95" in row for row in rows)
         }
         picture = (at, lines, title, trained.abscissa, trained.scale, bands)
         run.draw(f"{NAME}.png", save_curves, *picture)
     seconds = time.perf_counter() - began
-    last = rows[-1]
-    figures = ", ".join(f"{name.replace('_', ' ')} {last[name]:.4g}" for name in trained.lines)
+    figures = ", ".join(f"{words[name]} {last[name]:.4g}" for name in trained.lines)
     rules = {name.removeprefix(FAILED): name for name in last if name.startswith(FAILED)}
-    columns = {name.replace("_", " "): name for name in last if name not in rules.values()}
+    columns = {words[name]: name for name in last if name not in rules.values()}
     tables = [Table.of(columns, rows, "Curve")]
     if rules:
         counted = {name: name for name in (trained.abscissa, "judged")}

@@ -3,7 +3,9 @@
 import os
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import torch
@@ -98,25 +100,14 @@ class StateRenderer:
         labels: Names of the things in the segmentation, see `Cameras`.
     """
 
-    def __init__(
-        self,
-        model: mujoco.MjModel,
-        cfg: Config,
-        count: int,
-        *,
-        backend: Backend | None = None,
-        device: str | None = None,
-        fields: Sequence[str] = (),
-    ) -> None:
-        """Make worlds and the configuration's cameras for at most ``count`` states at once; other
-        arguments as of `make_simulation`.
+    def __init__(self, model: mujoco.MjModel, cfg: Config, count: int, **options: Any) -> None:
+        """Make worlds and the configuration's cameras for at most ``count`` states at once; options
+        as of `make_simulation`.
 
         Raises:
             MjstackError: The images do not fit into memory.
         """
-        self._sim = make_simulation(
-            model, cfg, count, backend=backend, device=device, fields=fields
-        )
+        self._sim = make_simulation(model, cfg, count, **options)
         self._cameras = self._sim.make_cameras(cfg.scene.cameras)
         self._images = self._cameras.allocate()
         self._world = torch.arange(count, device=self._sim.device)
@@ -180,9 +171,8 @@ def device_memory(device: str) -> tuple[int, int] | None:
 
 def cuda_driver() -> str:
     """Version of the NVIDIA driver, from the kernel module; ``unknown`` where it does not tell."""
-    try:
+    with suppress(OSError):
         text = Path("/proc/driver/nvidia/version").read_text()
-    except OSError:
-        text = ""
-    match = re.search(r"\b\d{3}\.\d+(\.\d+)?\b", text)
-    return match.group() if match else "unknown"
+        if match := re.search(r"\b\d{3}\.\d+(\.\d+)?\b", text):
+            return match.group()
+    return "unknown"

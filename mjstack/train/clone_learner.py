@@ -6,7 +6,7 @@ import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -52,7 +52,8 @@ class CloneLearner(Learner):
         and state, and the pool has the images, if it sees any.
         """
         cfg = with_observation(stage.cfg)
-        self._job = job = cast(CloneJobCfg, cfg.job)
+        job: CloneJobCfg = cfg.job
+        self._job = job
         super().__init__(stage, cfg, folder, job.save_every)
         self.trainer = "dagger" if job.rounds else "clone"
         ranks = stage.ranks

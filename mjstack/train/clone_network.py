@@ -20,7 +20,7 @@ def make_network(cfg: Config, demonstrations: Demonstrations, ranks: Ranks) -> P
     """A network with random weights by the configured seed, on the CPU. Its scale is that of the
     demonstrations of all ranks.
     """
-    job = cast(CloneJobCfg, cfg.job)
+    job: CloneJobCfg = cfg.job
     seen = demonstrations.seen
     labels = demonstrations.labels
     with torch.random.fork_rng(devices=[]):
@@ -42,7 +42,7 @@ def input_noise(cfg: Config, model: mujoco.MjModel, widths: Mapping[str, int]) -
     """Half-width of the noise on each column of the observation in a training, shape ``(n,)``.
     ``widths`` are the numbers of each term.
     """
-    job = cast(CloneJobCfg, cfg.job)
+    job: CloneJobCfg = cfg.job
     slides = slide_joints(model, cfg.robot.joints)
     widest: list[float] = []
     for name, width in widths.items():

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from operator import index
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from mjstack.datasets.reader import (
     check_types,
     data_files,
     read_columns,
+    read_table,
     readable,
 )
 from mjstack.datasets.spec import term_columns
@@ -119,7 +120,7 @@ def read_demonstrations(stage: Stage, widths: dict[str, int]) -> Demonstrations:
 
 
 def _folder(cfg: Config) -> Path:
-    return Path(str(cast(CloneJobCfg, cfg.job).dataset))
+    return Path(str(cfg.job.dataset))
 
 
 def _read_info(folder: Path) -> dict[str, Any]:
@@ -181,7 +182,7 @@ def _find_columns(
                 )
         return [places[column] for column in columns]
 
-    job = cast(CloneJobCfg, cfg.job)
+    job: CloneJobCfg = cfg.job
     terms = job.observation[job.group].terms
     numbers = [
         column
@@ -211,9 +212,7 @@ def _rows(folder: Path, info: dict[str, Any]) -> tuple[list[int], list[int]]:
     seeds: list[int] = []
     for path in data_files(folder, info, lerobot.EPISODES):
         with readable(path):
-            file = lerobot.require_pyarrow()[1].ParquetFile(path)
-            names = [name for name in ("length", "seed") if name in file.schema_arrow.names]
-            columns = file.read(columns=names).to_pydict()
+            columns = read_table(path, ["length", "seed"]).to_pydict()  # if it has seeds
             lengths += map(index, columns["length"])
             seeds += map(index, columns.get("seed", ()))
     return lengths, seeds
@@ -228,7 +227,7 @@ def _task_number(cfg: Config) -> int:
     folder = _folder(cfg)
     path = folder / lerobot.TASKS
     with readable(path):
-        table = lerobot.require_pyarrow()[1].ParquetFile(path).read()
+        table = read_table(path)
         names = table.column_names
         text = "task" if "task" in names else next(n for n in names if n != "task_index")
         numbers = map(index, table["task_index"].to_pylist())

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,7 +21,7 @@ _ROWS = ("seen", "labels", "driven", "qpos")
 _SUMS = ("played", "judged", "succeeded", "seconds")
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, kw_only=True)
 class Demonstrations:
     """Episodes, one after the other, with the expert's answers in every step.
 
@@ -129,7 +129,7 @@ class Demonstrations:
 
     def render(self, stage: Stage, pool: ImagePool) -> None:
         """Give the pool the images that it got when these episodes were played."""
-        job = cast(CloneJobCfg, stage.cfg.job)
+        job: CloneJobCfg = stage.cfg.job
         episode = self.episode()
         names = job.vision.cameras
         renderer = stage.color_renderer(min(AT_ONCE, len(episode)), list(self.fields), names)

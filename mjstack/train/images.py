@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import cast
 
 import torch
 from torch import Tensor
@@ -77,7 +76,7 @@ def pool_rows(stage: Stage, steps: int) -> int:
     Raises:
         ConfigError: They, or the images of one batch of worlds, do not fit into memory.
     """
-    job = cast(CloneJobCfg, stage.cfg.job)
+    job: CloneJobCfg = stage.cfg.job
     answers = math.ceil(math.ceil(job.length * steps) / job.execute)
     cameras = stage.cfg.scene.cameras
     size = 3 * sum(math.prod(cameras[name].size) for name in job.vision.cameras)

@@ -3,7 +3,6 @@
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
 
 import torch
 
@@ -27,7 +26,6 @@ from mjstack.train.trainer import (
     Trained,
     Trainer,
     observed_group,
-    one_world,
     whole_starts,
 )
 
@@ -39,7 +37,7 @@ def _environment(cfg: Config) -> Config:
     """The configuration of the environment: the policy's observation group beside or in place of
     the task's, all of which the critic sees.
     """
-    job = cast(PpoJobCfg, cfg.job)
+    job: PpoJobCfg = cfg.job
     return replace(cfg, observation=cfg.observation | {job.group: observed_group(job)})
 
 
@@ -63,7 +61,7 @@ def _record_states(stage: Stage, path: Path) -> None:
         OSError: The file cannot be written.
     """
     cfg = stage.cfg
-    worlds = cast(PpoJobCfg, cfg.job).expert_worlds
+    worlds = cfg.job.expert_worlds
     channels = Channels(_read_state, lambda steps: range(1, steps + 1, _STRIDE))
     for batch in play_batches(
         stage,
@@ -89,7 +87,7 @@ def _record_states(stage: Stage, path: Path) -> None:
 def check_ppo(stage: Stage) -> range:
     """Check the terms and the sizes; see `Trainer`."""
     cfg = stage.cfg
-    job = cast(PpoJobCfg, cfg.job)
+    job: PpoJobCfg = cfg.job
     if job.iterations is None and job.minutes is None:
         raise ConfigError("job.iterations", None, "a number, or a limit in job.minutes")
     worlds = cfg.nworld // stage.ranks.size
@@ -103,7 +101,7 @@ def check_ppo(stage: Stage) -> range:
         check_params(label, resolve_func(label, term.func), term.params, 1)
     reset = {name: term for name, term in cfg.reset.items() if name not in unrecorded}
     keys = {f"observation.{job.group}": f"job.observation.{job.group}"}
-    with renamed_keys(keys), one_world(stage, replace(_environment(cfg), reset=reset)):
+    with renamed_keys(keys), stage.native_env(replace(_environment(cfg), reset=reset)):
         pass
     return range(cfg.seed, cfg.seed + 1)
 

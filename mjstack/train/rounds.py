@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -144,7 +144,7 @@ def make_round(
     Raises:
         FolderError: It was played on another kind of device or in another number of ranks.
     """
-    job = cast(CloneJobCfg, stage.cfg.job)
+    job: CloneJobCfg = stage.cfg.job
     if not job.rounds:
         return _play_round(stage, policy, number, pool)
     ranks = stage.ranks
@@ -176,7 +176,7 @@ def _play_round(
     rounds those that the task's check does not accept, too.
     """
     cfg = stage.cfg
-    job = cast(CloneJobCfg, cfg.job)
+    job: CloneJobCfg = cfg.job
     began = time.perf_counter()
     nworld = min(cfg.nworld, job.episodes)
     worlds = stage.ranks.share(nworld)
@@ -193,13 +193,10 @@ def _play_round(
         images = learner.query_images if learner else QueryImages(env, cameras, names, job.execute)
         # Whole answers: the policy takes over where it is queried.
         spell = job.execute * max(1, round(job.spell / env.cfg.timing.step_dt / job.execute))
-        shares: dict[str, Any] = {
-            "beta": beta,
-            "alone": alone,
-            "spell": spell,
-            "length": job.length,
-        }
-        return MixedDriver(stage.driver(env), learner, env, images, **shares)
+        expert = stage.driver(env)
+        return MixedDriver(
+            expert, learner, env, images, beta=beta, alone=alone, spell=spell, length=job.length
+        )
 
     parts = []
     for batch in play_batches(

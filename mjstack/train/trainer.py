@@ -1,23 +1,15 @@
 """A trainer, as job=train runs it."""
 
 from collections.abc import Callable
-from contextlib import closing, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from torch import Tensor
 
 from mjstack.config.check import starts_midway, with_region
-from mjstack.config.schema import (
-    Backend,
-    CloneJobCfg,
-    Config,
-    ObservationGroupCfg,
-    PpoJobCfg,
-    TermCfg,
-)
-from mjstack.envs import Env, build_env
+from mjstack.config.schema import CloneJobCfg, Config, ObservationGroupCfg, PpoJobCfg, TermCfg
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, FolderError, MjstackError, UnknownName, renamed_keys
 from mjstack.policy.checkpoint import read_state
@@ -50,7 +42,7 @@ class Trained:
     scale: str = "linear"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Trainer:
     """One way to train; ``conf/trainer/<name>.yaml`` names it.
 
@@ -72,13 +64,6 @@ def whole_starts(reset: dict[str, TermCfg]) -> dict[str, TermCfg]:
     return {name: term for name, term in reset.items() if not starts_midway(term)}
 
 
-def one_world(stage: Stage, cfg: Config) -> closing[Env]:
-    """A world on native MuJoCo, to find out about terms."""
-    return closing(
-        build_env(cfg, model=stage.model, nworld=1, backend=Backend.native, device="cpu")
-    )
-
-
 def observed_group(job: CloneJobCfg | PpoJobCfg) -> ObservationGroupCfg:
     """The observation group of a new policy.
 
@@ -98,13 +83,13 @@ def observed_group(job: CloneJobCfg | PpoJobCfg) -> ObservationGroupCfg:
 
 def with_observation(cfg: Config) -> Config:
     """The configuration, with the observation group of a new policy in place of its groups."""
-    job = cast(CloneJobCfg, cfg.job)
+    job: CloneJobCfg = cfg.job
     return replace(cfg, observation={job.group: observed_group(job)})
 
 
 def training_config(stage: Stage) -> Config:
     """The configuration of the episodes in which a new policy learns."""
-    job = cast(CloneJobCfg, stage.cfg.job)
+    job: CloneJobCfg = stage.cfg.job
 
     def widen(xy: Any) -> Any:
         with suppress(TypeError):
@@ -120,10 +105,10 @@ def observed_widths(stage: Stage) -> dict[str, int]:
     Raises:
         MjstackError: A term of its episodes cannot be used.
     """
-    job = cast(CloneJobCfg, stage.cfg.job)
+    job: CloneJobCfg = stage.cfg.job
     names = {"observation": "job.observation"}
     try:
-        with renamed_keys(names), one_world(stage, training_config(stage)) as env:
+        with renamed_keys(names), stage.native_env(training_config(stage)) as env:
             return env.observation_manager.term_dims[job.group]
     except ConfigError as error:
         if job.wider == 0.0 or not (error.key.startswith("reset.") and error.key.endswith(".xy")):

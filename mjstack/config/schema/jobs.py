@@ -76,6 +76,10 @@ class TrainJobCfg(JobCfg):
     """Terms of the group that the policy does not see; NAME? if there is that one."""
     observation_noise: bool = spec()
     """Whether its observations have their noise."""
+    hidden: list[int] = spec(ge=1, le=65536)
+    """Widths of the network's hidden layers."""
+    learning_rate: float = spec(gt=0.0)
+    """At the start. Of a clone a cosine brings it to 0; of PPO it stays within 0.00001 and 0.01."""
 
 
 @dataclass(slots=True)
@@ -129,14 +133,10 @@ class CloneJobCfg(TrainJobCfg):
     loss: str = spec(choices=("squared", "absolute"))
     """Error of a joint target. Where the expert's answer jumps, the least absolute error is one of
     the answers, and the least squared one lies between them."""
-    learning_rate: float = spec(gt=0.0)
-    """Of AdamW at the start; a cosine brings it to 0."""
     averaging: float = spec(ge=0.0, le=1.0)
     """Share of the policy's weights that a batch keeps: they are an average."""
     episodes: int = spec(unit="episodes", ge=1)
     """Episodes that the expert plays."""
-    hidden: list[int] = spec(ge=1, le=65536)
-    """Widths of the network's hidden layers."""
     batches: int = spec(ge=1)
     """Steps of the optimizer."""
     batch_size: int = spec(ge=1)
@@ -165,8 +165,6 @@ class PpoJobCfg(TrainJobCfg):
     """Iterations between two saved policies."""
     expert_worlds: int = spec(unit="worlds", ge=1)
     """reset=expert_states: worlds in which the expert plays at the beginning."""
-    hidden: list[int] = spec(ge=1, le=65536)
-    """Widths of the hidden layers of actor and critic."""
     horizon: int = spec(unit="decisions", ge=1)
     """Decisions of every world per iteration."""
     epochs: int = spec(ge=1)
@@ -185,8 +183,6 @@ class PpoJobCfg(TrainJobCfg):
     """Weight of the entropy."""
     desired_kl: float = spec(gt=0.0)
     """Change of the policy per iteration to which rsl_rl adapts the learning rate."""
-    learning_rate: float = spec(gt=0.0)
-    """At the start; it stays within 0.00001 and 0.01."""
 
 
 # Trainers with keys of their own; the others have those of clone.

@@ -1,7 +1,7 @@
 """The whole configuration."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mjstack.config.fields import MOST_SEEDS, MOST_WORLDS, spec
 from mjstack.config.schema.jobs import JobCfg
@@ -17,6 +17,11 @@ from mjstack.config.schema.run import (
 )
 from mjstack.config.schema.scene import SceneCfg
 from mjstack.config.schema.task import ControllerCfg, TaskCfg
+
+if TYPE_CHECKING:  # each job has keys of its own class
+    AnyJob = Any
+else:
+    AnyJob = JobCfg
 
 
 @dataclass(slots=True)
@@ -54,7 +59,7 @@ class Config:
     """Joint trajectories planned before the episode, feedback, or a trained policy."""
     gate: GateCfg = field(default_factory=GateCfg)
     """Parameters of the gates, all in use at once; gates=[...] chooses gates."""
-    job: JobCfg = spec()
+    job: AnyJob = spec()
     """Work of the command."""
     nworld: int = spec(unit="worlds", ge=1, le=MOST_WORLDS)
     """Worlds of the batch, capacity and throughput gates."""
