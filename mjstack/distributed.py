@@ -31,7 +31,7 @@ _GRACE = 10.0  # s, in which a rank that has gone leaves its reason
 _KILLED = " was killed"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Ranks:
     """The processes of a job.
 

@@ -159,14 +159,11 @@ def _find_file(key: str, file: str | None, *groups: str) -> str | None:
     if file is None:
         return None
     folders = [folder / group for folder in config_folders() for group in groups]
-    paths = list(
-        dict.fromkeys(path.resolve() for path in (*(f / file for f in folders), Path(file)))
-    )
-    match = next((path for path in paths if path.is_file()), None)
-    if match is None:
-        expected = f"an MJCF file; there is no {' and no '.join(map(str, paths))}"
-        raise ConfigError(key, file, expected)
-    return str(match)
+    paths = dict.fromkeys(str((folder / file).resolve()) for folder in [*folders, Path()])
+    for path in paths:
+        if Path(path).is_file():
+            return path
+    raise ConfigError(key, file, f"an MJCF file; there is no {' and no '.join(paths)}")
 
 
 def _choose_phases(cfg: Config) -> None:

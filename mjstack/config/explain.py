@@ -164,10 +164,9 @@ def _unknown_key(key: str, known: Iterable[str], overrides: Sequence[str]) -> Mj
     hint = f" Did you mean '{near[0]}'?" if near else ""
     if key.partition(".")[0] in TERM_GROUPS:
         problem = f"'{key}' is not in the configuration.{hint} To add it, write +{key}=..."
-    else:
-        hint = hint or " " + suggest(key, _beside(key, keys))
-        problem = f"configuration key '{key}' does not exist.{hint}"
-    return MjstackError(problem)
+        return MjstackError(problem)
+    hint = hint or f" {suggest(key, _beside(key, keys))}"
+    return MjstackError(f"configuration key '{key}' does not exist.{hint}")
 
 
 def _beside(key: str, keys: Iterable[str]) -> set[str]:

@@ -33,7 +33,7 @@ _PLURALS = {int: "integers", float: "numbers", str: "names"}
 _hints = cache(get_type_hints)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, kw_only=True)
 class Range:
     """Values that a field accepts. Of a list or a mapping, limits hold for every item.
 

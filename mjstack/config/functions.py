@@ -51,29 +51,25 @@ def find_object(label: str, path: str) -> Any:
     """
     module_name, _, attribute = path.rpartition(".")
     if not module_name:
-        raise TermError(
-            label, f"func={path}: expected a dotted name, such as mjstack.mdp.reward.reach"
-        )
+        expected = "expected a dotted name, such as mjstack.mdp.reward.reach"
+        raise TermError(label, f"func={path}: {expected}")
     try:
         module = importlib.import_module(module_name)
     except MissingExtra:
         raise
     except Exception as error:  # the module is the user's, and may raise anything
         kind = "" if isinstance(error, ImportError) else f"{type(error).__name__}: "
-        reason = f"{kind}{first_line(error)}"
-        raise TermError(
-            label, f"func={path}: module '{module_name}' cannot be imported ({reason})"
-        ) from error
-    if not hasattr(module, attribute):
-        names = [
-            name
-            for name, value in vars(module).items()
-            if callable(value) and getattr(value, "__module__", "") == module_name
-        ]
-        raise TermError(
-            label, f"func={path}: '{attribute}' does not exist. {suggest(attribute, names)}"
-        )
-    return getattr(module, attribute)
+        problem = f"module '{module_name}' cannot be imported ({kind}{first_line(error)})"
+        raise TermError(label, f"func={path}: {problem}") from error
+    if hasattr(module, attribute):
+        return getattr(module, attribute)
+    names = [
+        name
+        for name, value in vars(module).items()
+        if callable(value) and getattr(value, "__module__", "") == module_name
+    ]
+    hint = suggest(attribute, names)
+    raise TermError(label, f"func={path}: '{attribute}' does not exist. {hint}")
 
 
 def offered(path: str, name: str) -> Any:

@@ -31,7 +31,7 @@ INDICES = {
 OWN_VALUES = {"success": "bool", "seed": "int64", "world": "int64"}  # of every episode's row
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, kw_only=True)
 class Feature:
     """One column of the frames: a vector of named numbers.
 
@@ -51,7 +51,7 @@ class Feature:
         return len(self.names)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, kw_only=True)
 class Video:
     """A camera's images, which each frame has one of. They are kept as videos.
 
@@ -66,7 +66,7 @@ class Video:
     codec: str = "h264"
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, kw_only=True)
 class DatasetSpec:
     """Everything that all episodes of a dataset share.
 

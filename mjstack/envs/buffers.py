@@ -36,7 +36,7 @@ Advance = Callable[[str, int, int], None]
 """Reports progress: the work in progress, how much is done, and of how much."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, kw_only=True)
 class Peaks:
     """The most that worlds used over all physics steps of a run, and what they lost.
 
@@ -111,7 +111,7 @@ def recommend_sizes(peaks: Peaks, margin: float, source: str) -> BatchSizes:
     )
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, kw_only=True)
 class Workload:
     """One run and what it used.
 

@@ -14,7 +14,7 @@ _UNBOUNDED = torch.finfo(torch.float32).max
 FARTHEST = 5.0  # standard deviations: an observation beyond is taken for one there
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, kw_only=True)
 class Vision:
     """Images that a policy sees, and the layers that read them.
 

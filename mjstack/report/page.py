@@ -45,7 +45,7 @@ class Worlds:
     maps: list[Map] = field(default_factory=list)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, kw_only=True)
 class World:
     """A world in motion.
 

@@ -18,7 +18,7 @@ _NAMES = 12  # episodes of a rule
 _SPREAD = ("median", "min", "max")
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, kw_only=True)
 class Plots:
     """Figures under a heading.
 
@@ -37,7 +37,7 @@ Part = str | list[str] | Path | Plots | Table
 """A paragraph, lines of a list, a picture, plots or a table."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, kw_only=True)
 class Section:
     """A heading and what is below it.
 

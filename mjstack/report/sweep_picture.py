@@ -19,7 +19,7 @@ _STYLES = ("-o", "--s", ":^", "-.v")
 _RED = "#cc2a24"
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, kw_only=True)
 class Plot:
     """What a picture of a sweep shows.
 

@@ -8,7 +8,7 @@ from mjstack.config.schema import BatchCfg, Config, PlacementsCfg
 KEYS = ("nconmax", "njmax", "nccdmax")
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, kw_only=True)
 class BatchSizes:
     """How much room the worlds have.
 

@@ -11,7 +11,7 @@ from mjstack.sim.graph import side_by_side
 from mjstack.sim.mujoco_warp import mjw
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class StepPlan:
     """How the physics steps of a model are done.
 
