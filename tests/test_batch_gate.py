@@ -99,7 +99,8 @@ def test_seeds_add_up(two_seeds: tuple[Path, GateResult, list[str]]) -> None:
     assert (metrics["success_rate_low95"], metrics["success_rate_high95"]) == (low, high)
     count = len(failing)
     for words in (
-        f"{count} of 14 world-episodes ({', '.join(failing)}) failed: not stacked in {count}",
+        f"{count} of 14 world-episodes ({', '.join(failing)}) failed: not stacked in {count}"
+        f" (xy_err in {count})",
         f"{succeeded} of 14 world-episodes succeeded (",
         "95 % interval",
         f"job=replay run={folder} world={failing[0]}",

@@ -81,6 +81,7 @@ def batch(count: int) -> tuple[GateResult, Worlds]:
         reason="some failed",
         metrics={"xy_err_max_m": 0.02, "dz_m": 0.04, "final.red.m": 1.0, "final.blue.m": 2.0},
         thresholds={"xy_err_m": 0.015, "dz_min_m": 0.03, "dz_max_m": 0.05, "window_steps": 50},
+        beyond=["stacked_steps.xy_err"],
     )
     return gate, worlds
 
@@ -136,6 +137,13 @@ def test_gates_are_tables(tmp_path: Path) -> None:
         ["success", "", "51"],
         ["STACKED", "not stacked", "13"],
     ]
+
+
+def test_a_broken_threshold_is_red(tmp_path: Path) -> None:
+    cells = re.findall(r"<td class='([^']*)'[^>]*>([\d.]+ m)", page(tmp_path))
+    grades = {text: "bad" in kinds.split() for kinds, text in cells}
+    assert grades["0.02 m"]  # xy err
+    assert not grades["0.04 m"]  # dz
 
 
 def test_histograms_count_every_world(tmp_path: Path) -> None:

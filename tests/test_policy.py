@@ -492,7 +492,9 @@ def test_mjwarp_plays_a_policy_as_native_does(folder: Path, tmp_path: Path) -> N
     assert gates["capacity"]["status"] == "pass"
     compared = {name.partition(".")[0] for name in gates["parity"]["metrics"] if ".step50." in name}
     assert compared == {"third_1", "third_2", "third_3"}
-    assert gates["parity"]["reason"] == "failed: red not lifted, red not carried, not stacked"
+    carried = "red not carried (carry_m 0 of 0.05, carry_steps 0 of 10)"
+    words = f"failed: red not lifted, {carried}, not stacked (xy_err 0 of 5, dz_min 0 of 5)"
+    assert gates["parity"]["reason"] == words
 
 
 def test_a_replay_names_a_policy_that_was_written_anew(folder: Path, tmp_path: Path) -> None:

@@ -92,12 +92,13 @@ def test_failing_world_fails_again_bit_for_bit(
     (gate,) = report["gates"]
     assert (gate["name"], gate["status"]) == ("replay_native", "fail")
     as_recorded = "as recorded, and it ends bit for bit where it did"
-    assert gate["reason"] == f"failed: not stacked; {as_recorded}"
+    assert gate["reason"] == f"failed: not stacked (xy_err 0 of 50); {as_recorded}"
     assert gate["metrics"]["xy_err_m"] == record.values["xy_err_m"][2]
     assert gate["thresholds"]["xy_err_m"] == 0.00134
     broken = [line for line in gate["details"] if "BROKEN" in line]
     assert len(broken) == 1
     assert broken[0].startswith("STACKED: BROKEN, not stacked: stacked_steps 0, xy_err_m ")
+    assert gate["beyond"] == ["stacked_steps.xy_err"]
     assert f"xy_err_m {record.values['xy_err_m'][2]:.4g}, dz_m" in broken[0]
     assert broken[0].endswith("(wanted: at least 50)")
     assert len(gate["details"]) == len(RULES)

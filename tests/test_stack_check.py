@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 import torch
 from check_cases import BLUE, RED, Altered, Cases, rules_of
+from compositions import load_config
 from recordings import World, feed
+
+from mjstack.tasks.check import make_check
 
 RULES = rules_of("stack")
 CASES = Cases(RULES, rel=1e-4)
@@ -268,6 +271,34 @@ def test_altered_recording(name: str, altered: Altered) -> None:
     result, k, world = altered[name]
     assert CASES.broken(result, k) == CASES.breaks[name]
     CASES.assert_same(result, k, world.outcome)
+
+
+@pytest.mark.parametrize(
+    ("name", "rule", "words"),
+    [
+        ("xy_err", "STACKED", " (xy_err 0 of 50)"),
+        ("dz_min", "STACKED", " (dz_min 0 of 50)"),
+        ("dz_max", "STACKED", " (dz_max 0 of 50)"),
+        ("gap_above", "SUPPORTED", " (gap 0 of 50)"),
+        ("open_fraction", "RELEASED", " (open_fraction 6 of 50)"),
+        ("carry_distance", "CARRY", " (carry_m 0.05 of 0.05)"),
+        ("rest_speed", "REST_SPEED", ""),  # its only one
+    ],
+)
+def test_the_threshold_that_broke_is_named(
+    name: str, rule: str, words: str, altered: Altered
+) -> None:
+    result, k, _ = altered[f"{name}_outside"]
+    check = make_check(load_config([]))
+    values = {value: found.numpy() for value, found in result.values.items()}
+    one = {value: found[k : k + 1] for value, found in values.items()}
+    why, beyond = check.why(result.failed[k : k + 1].numpy(), one)
+    assert why == {rule: words}
+    assert len(beyond) == 1
+    every, all_beyond = check.why(result.failed.numpy(), values)
+    assert set(every) == set(RULES)
+    assert beyond[0] in all_beyond
+    assert every["STACKED"].startswith(" (xy_err in ")
 
 
 @pytest.mark.full

@@ -136,12 +136,14 @@ class Run:
         else:
             self.page.pictures.append(name)
 
-    def judge_one(self, episode: Episode) -> tuple[Status, str, dict[str, float]]:
-        """Status, reason and metrics of a one-world episode."""
-        bits = int(episode.failed[0])
+    def judge_one(self, episode: Episode) -> tuple[Status, str, dict[str, float], list[str]]:
+        """Status, reason and metrics of a one-world episode, and names of those beyond limits."""
         metrics = {name: float(values[0]) for name, values in episode.values.items()}
-        reason = f"failed: {self.stage.check.rules.describe(bits)}" if bits else ""
-        return Status.failed if bits else Status.passed, reason, metrics
+        check = self.stage.check
+        broken, beyond = check.why(episode.failed, episode.values)
+        words = ", ".join(f"{check.rules.texts[name]}{why}" for name, why in broken.items())
+        status = Status.failed if broken else Status.passed
+        return status, f"failed: {words}" if words else "", metrics, beyond
 
     def show_world(
         self,

@@ -149,13 +149,15 @@ class EpisodeTally:
             tables: More of them than `tables`.
         """
         failed = np.flatnonzero(self.array("failed"))
-        broken = {
-            self.check.rules.texts[rule]: episodes
-            for rule, episodes in self.check.rules.failing(self.array("failed")).items()
-        }
+        texts = self.check.rules.texts
+        which = self.check.rules.failing(self.array("failed"))
+        broken = {texts[rule]: episodes for rule, episodes in which.items()}
+        values = [name for name in self.records[0].worlds if name.startswith("value.")]
+        measured = {name.removeprefix("value."): self.array(name) for name in values}
+        why, beyond = self.check.why(self.array("failed"), measured)
         reason = [*parts]
         if len(failed):
-            counts = "; ".join(f"{text} in {len(episodes)}" for text, episodes in broken.items())
+            counts = "; ".join(f"{texts[n]} in {len(which[n])}{words}" for n, words in why.items())
             reason.append(f"{self._name(failed, 8)} failed: {counts}")
         look = ""
         if len(failed) and self.path is not None and self.replayed:
@@ -172,6 +174,7 @@ class EpisodeTally:
             reason="; ".join([*reason, *self.problems]) + look,
             thresholds=self.check.thresholds() | thresholds,
             metrics=self.metrics() | metrics,
+            beyond=beyond,
             notes=self.notes,
             details=named + self.details,
             tables=[*self.tables(), *tables],

@@ -10,7 +10,7 @@ def run_baseline(run: Run) -> list[GateResult]:
     cfg = run.cfg
     sim = run.nominal.sim
     episode = run.nominal.episode
-    status, reason, metrics = run.judge_one(episode)
+    status, reason, metrics, beyond = run.judge_one(episode)
     headline = run.stage.check.headline(metrics)
     run.print_line(f"{cfg.task.name} check: {headline}")
     timing = episode.timing
@@ -30,5 +30,6 @@ def run_baseline(run: Run) -> list[GateResult]:
     result = GateResult(name="baseline", status=status, reason=reason or headline)
     result.thresholds = thresholds
     result.metrics = metrics
+    result.beyond = beyond
     result.notes["backend"] = sim.description
     return [result]

@@ -45,7 +45,7 @@ def _compare(run: Run, mjwarp: Simulation) -> GateResult:
 
     world = WorldRecorder()
     episode = run.stage.play(mjwarp, NOMINAL, [*run.viewers, world])
-    status, reason, judged = run.judge_one(episode)
+    status, reason, judged, result.beyond = run.judge_one(episode)
     if status is Status.failed:
         problems.append(reason)
     if bits := int(mjwarp.overflow[0]):

@@ -86,7 +86,7 @@ def play_worlds(run: Run) -> list[GateResult]:
                 rollout(env, driver, observers, advance=advance, label=label)
             else:
                 episode = play_episode(env, driver, observers, advance=advance, label=label)
-                status, outcome, metrics = run.judge_one(episode)
+                status, outcome, metrics, _ = run.judge_one(episode)
                 succeeded += status is Status.passed
                 outcome = outcome or f"succeeded, {stage.check.headline(metrics)}"
             positions.append(recorder.qpos)

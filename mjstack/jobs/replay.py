@@ -101,7 +101,7 @@ def _replay(
         episode = stage.play(sim, stage.cfg.reset, observers, seed=plan.seed, worlds=[plan.world])
         lines = trace.explain(episode)
         qpos = trace.arrays["qpos"]
-        status, reason, metrics = run.judge_one(episode)
+        status, reason, metrics, beyond = run.judge_one(episode)
         title = f"world {plan.world} of seed {plan.seed}, replayed ({backend})" if first else ""
         run.show_world(f"replay_{backend}", f"{plan.world}, {backend}", qpos, status, sim, title)
     agrees, comparison = _compare(plan, number, episode, qpos[-1], changes, run)
@@ -119,6 +119,7 @@ def _replay(
             reason=f"{reason or f'succeeded, {check.headline(metrics)}'}; {comparison}",
             thresholds=check.thresholds(),
             metrics=facts | metrics,
+            beyond=beyond,
             notes={"backend": episode.description, "recorded": recorded, "trajectory": name},
             details=lines + changes,
         )

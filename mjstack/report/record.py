@@ -29,6 +29,7 @@ class GateResult:
         seconds: Wall time.
         thresholds: Required values, by name with unit.
         metrics: Measured values, by name with unit; numbers alone.
+        beyond: Names of those that broke a rule's threshold.
         notes: Facts in words, by name: the backend, why something was not measured.
         details: Longer findings, a line each, for the report's text.
         tables: Tables for the report's text.
@@ -40,6 +41,7 @@ class GateResult:
     seconds: float = 0.0
     thresholds: dict[str, float] = field(default_factory=dict)
     metrics: dict[str, float] = field(default_factory=dict)
+    beyond: list[str] = field(default_factory=list)
     notes: dict[str, str] = field(default_factory=dict)
     details: list[str] = field(default_factory=list)
     tables: list[Table] = field(default_factory=list)

@@ -111,7 +111,7 @@ def _parts(gate: GateResult, worlds: Mapping[str, Worlds]) -> Iterator[Part]:
     yield from _take_limited(metrics, thresholds)
     yield from gate.tables
     yield from _take_matrices(metrics)
-    yield from _beside_limits(metrics, thresholds)
+    yield from _beside_limits(metrics, thresholds, gate.beyond)
     if gate.notes:
         rows = [[label(name), format_value(value)] for name, value in gate.notes.items()]
         yield Table(title="Notes", header=["note", ""], rows=rows)
@@ -169,15 +169,19 @@ def _take_matrices(metrics: dict[str, float]) -> Iterator[Table]:
 
 
 def _beside_limits(
-    metrics: Mapping[str, float], thresholds: Mapping[str, float]
+    metrics: Mapping[str, float], thresholds: Mapping[str, float], beyond: Sequence[str]
 ) -> Iterator[Table]:
-    """What was measured beside what is required."""
+    """What was measured beside what is required, in red where a threshold broke."""
+    broken = {*beyond, *(name.rpartition(".")[2] for name in beyond)}
     required = {name: with_unit(name, value) for name, value in thresholds.items()}
     rows = []
     for name, value in metrics.items():
         limits = _limits_of(name, thresholds)
         cell = " to ".join(with_unit(limit, thresholds[limit]) for limit in limits)
-        rows.append([label(name), with_unit(name, value), cell])
+        found = with_unit(name, value)
+        names = {name, *(limit.removesuffix(unit_ending(limit)) for limit in limits)}
+        grade = "" if broken.isdisjoint(names) else "bad"
+        rows.append([label(name), Marked(found, grade=grade), cell])
         required = {name: text for name, text in required.items() if name not in limits}
     rows += [[label(name), "", text] for name, text in required.items()]
     if rows:

@@ -1,6 +1,7 @@
 """Task *box*: objects into a box, one after the other, each to its place."""
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -15,6 +16,7 @@ from mjstack.mdp.geometry import place_xy
 from mjstack.scene import lowest_height
 from mjstack.tasks.check import EpisodeCheck, Judgement, Rule
 from mjstack.tasks.parts import (
+    AllOf,
     AtLeast,
     Carried,
     Condition,
@@ -151,7 +153,8 @@ class BoxCheck(EpisodeCheck):
             after=release,
         )
         text = "an object not at rest in the box at the end"
-        inside = InWindow("INSIDE", text, self.resting, t.window, measure=self.trace)
+        rests = AllOf(("untouched", "inside", "rest_speed"), self.rests)
+        inside = InWindow("INSIDE", text, rests, t.window, measure=self.trace)
         order = _Order(self.objects, release)
         jaw_clear = _JawClear(self.cfg.robot.jaw_bodies, self._high[2], t.jaw_clearance)
         return [grasp, lift, carry, drop, release, settled, order, inside, jaw_clear]
@@ -194,8 +197,13 @@ class BoxCheck(EpisodeCheck):
         """Whether each object is out of the jaws, inside and slow, shape ``(nworld, objects)``,
         bool.
         """
+        return self.rests(step).all(-1)
+
+    @once_per_step
+    def rests(self, step: Step) -> Tensor:
+        """The same for each of these three, shape ``(nworld, objects, 3)``, bool."""
         slow = step.corner_speed < self.t.rest_speed
-        return step.untouched & self.placed(step) & slow
+        return torch.stack((step.untouched, self.placed(step), slow), dim=-1)
 
     @once_per_step
     def outside(self, step: Step) -> Tensor:
@@ -280,6 +288,7 @@ class _Drop(AtLeast):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.expected = ["0"] * len(self.objects)
+        self.limits = [dict.fromkeys(limits, (0.0, 0.0)) for limits in self.limits]
 
     def start(self, view: TaskView) -> None:
         super().start(view)
@@ -354,6 +363,7 @@ class _JawClear(Rule):
 
     def __init__(self, jaws: Sequence[str], rim: float, least: float) -> None:
         super().__init__("JAW_CLEAR", "gripper too low at the end", expected=f"at least {least:g}")
+        self.limits = [{"jaw_clearance_m": (least, math.inf)}]
         self._jaws = jaws
         self._rim = rim
         self._least = least

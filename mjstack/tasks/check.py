@@ -114,6 +114,8 @@ class Rule(ABC):
         texts: The failure in words if it is broken, by name; one entry, or one for each object.
         suffixes: Part of the names of the measured values that tell about each of them.
         expected: The measured values that each of them expects, in words.
+        limits: The least and the largest of each measured value for which each of them holds, by
+            the value's name: they tell which of several thresholds broke.
         phases: For each object, the phases in which it counts.
         at_end: Whether it can only hold at the end of a whole episode.
     """
@@ -143,6 +145,7 @@ class Rule(ABC):
             for suffix, object in zip(self.suffixes, objects or [""], strict=True)
         }
         self.expected = [expected] * len(self.texts)
+        self.limits: list[dict[str, tuple[float, float]]] = [{} for _ in self.texts]
 
     def start(self, view: TaskView) -> None:  # noqa: B027
         """Allocate for the worlds of a view."""
@@ -291,6 +294,34 @@ class EpisodeCheck(ABC):
         failed = torch.stack(bits).sum(0, dtype=torch.int32)
         return CheckResult(failed, values, names, self._view.phased)
 
+    def why(
+        self, failed: np.ndarray, values: Mapping[str, np.ndarray]
+    ) -> tuple[dict[str, str], list[str]]:
+        """Say which thresholds broke.
+
+        Args:
+            failed: Bits of every world, shape ``(nworld,)``.
+            values: What was measured, each ``(nworld,)``.
+
+        Returns:
+            The thresholds in words, by the name of each rule that was broken; empty where the rule
+            has but one. And the names of all values beyond their limits.
+        """
+        broken = dict.fromkeys(self.rules.failing(failed), "")
+        beyond = []
+        for name, limits in chain(*(zip(r.texts, r.limits, strict=True) for r in self._rules)):
+            wrong = failed & self.rules[name] != 0
+            words = []
+            for value, (low, high) in limits.items() if name in broken else ():
+                found = values[value]
+                if count := int(np.sum(wrong & ~((low <= found) & (found <= high)))):
+                    number = f"{found[0]:.4g} of {low:g}" if len(failed) == 1 else f"in {count}"
+                    words.append(f"{value.rpartition('.')[2]} {number}")
+                    beyond.append(value)
+            if words and len(limits) > 1:
+                broken[name] = f" ({', '.join(words)})"
+        return broken, beyond
+
     @abstractmethod
     def placed(self, step: Step) -> Tensor:
         """Whether each object is where it belongs, in the order of ``objects``, shape ``(nworld,
@@ -334,8 +365,9 @@ class EpisodeCheck(ABC):
         return report
 
     def headline(self, values: Mapping[str, float]) -> str:
-        """A world's values in a few words."""
-        return ", ".join(f"{name} {value:.4g}" for name, value in values.items())
+        """A world's values in a few words; those of parts, with a dot, are left out."""
+        named = {name: value for name, value in values.items() if "." not in name}
+        return ", ".join(f"{name} {value:.4g}" for name, value in named.items())
 
 
 def check_class(cfg: Config) -> type[EpisodeCheck] | None:

@@ -23,6 +23,23 @@ Condition = Callable[[Step], Tensor]
 # Conditions
 
 
+@dataclass(frozen=True, slots=True)
+class AllOf:
+    """A condition that holds where all its parts do, each of which keeps a threshold.
+
+    Attributes:
+        names: Those of the thresholds.
+        parts: Whether each part holds, shape ``(nworld, n, parts)`` or ``(nworld, parts)``, bool.
+    """
+
+    names: tuple[str, ...]
+    parts: Condition
+
+    def __call__(self, step: Step) -> Tensor:
+        """Shape ``(nworld, n)`` or ``(nworld,)``, bool."""
+        return self.parts(step).all(-1)
+
+
 def airborne(*objects: str, height: float) -> Condition:
     """Objects whose lowest point is higher than that above the table [m]. Without phases both jaws
     have to press on them too, so that a throw or a push is none.
@@ -46,11 +63,11 @@ def released(*objects: str, open_fraction: float) -> Condition:
     from 0 (closed) to 1 (open).
     """
 
-    def condition(step: Step) -> Tensor:
-        open_wide = step.narrowest >= open_fraction
-        return step.view.columns(objects).read(step.untouched) & open_wide
+    def parts(step: Step) -> Tensor:
+        untouched = step.view.columns(objects).read(step.untouched)
+        return torch.stack(torch.broadcast_tensors(untouched, step.narrowest >= open_fraction), -1)
 
-    return condition
+    return AllOf(("untouched", "open_fraction"), parts)
 
 
 def on_top(object: str, onto: str, *, xy_err: float, dz_min: float, dz_max: float) -> Condition:
@@ -58,11 +75,11 @@ def on_top(object: str, onto: str, *, xy_err: float, dz_min: float, dz_max: floa
     heights [m].
     """
 
-    def condition(step: Step) -> Tensor:
+    def parts(step: Step) -> Tensor:
         apart, dz = offset(step, object, onto)
-        return (apart <= xy_err) & (dz.clamp(dz_min, dz_max) == dz)
+        return torch.stack((apart <= xy_err, dz >= dz_min, dz <= dz_max), dim=-1)
 
-    return condition
+    return AllOf(("xy_err", "dz_min", "dz_max"), parts)
 
 
 def offset(step: Step, object: str, onto: str) -> tuple[Tensor, Tensor]:
@@ -96,16 +113,16 @@ def on_table(object: str, *, gap: float) -> Condition:
     centre at least half its size from the edges.
     """
 
-    def condition(step: Step) -> Tensor:
+    def parts(step: Step) -> Tensor:
         scene = step.view.env.cfg.scene
         half = scene.objects[object].half
         room = step.view.constant(*(scene.table_half[i] - half[i] for i in (0, 1)), gap)
         center = step.view.constant(*scene.table_center[:2], 0.0)
         height = step.height[:, step.view.objects.index(object), None]
         at = torch.cat((step.center(object)[:, :2], height), dim=1)
-        return ((at - center).abs() <= room).all(1)
+        return (at - center).abs() <= room
 
-    return condition
+    return AllOf(("x", "y", "gap"), parts)
 
 
 # Rules
@@ -142,6 +159,7 @@ class AtLeast(Rule):
     def __post_init__(self) -> None:
         self.value = self.value or f"{self.name.lower()}_steps{{}}"
         super().__init__(self.name, self.text, self.objects, expected=f"at least {self.least:g}")
+        self.limits = [{self.value.format(end): (self.least, math.inf)} for end in self.suffixes]
 
     @override
     def start(self, view: TaskView) -> None:
@@ -203,6 +221,9 @@ class Carried(Streak):
         self.least = self.distance
         self.value = f"{self.name.lower()}{{}}_m"
         super().__post_init__()
+        self._count = f"{self.name.lower()}_steps{{}}"
+        for limits, end in zip(self.limits, self.suffixes, strict=True):
+            limits[self._count.format(end)] = (self._steps, math.inf)
 
     @override
     def start(self, view: TaskView) -> None:
@@ -210,6 +231,7 @@ class Carried(Streak):
         size = len(self.objects)
         self._from = view.zeros(size, 2)  # where the streak began
         self._far = view.counter(size)  # farthest from there
+        self._longest = view.counter(size)
 
     @override
     def update(self, step: Step) -> None:
@@ -220,13 +242,20 @@ class Carried(Streak):
         self.length.add_(1.0).mul_(counts)
         away = torch.linalg.vector_norm(xy - self._from, dim=-1)
         self._far.copy_(torch.where(counts, torch.maximum(self._far, away), 0.0))
+        torch.maximum(self._longest, self.length, out=self._longest)
         far = torch.where(self.length >= self._steps, self._far, 0.0)
         torch.maximum(self.best, far, out=self.best)
+
+    @override
+    def judge(self, end: Step) -> Judgement:
+        holds, values = super().judge(end)
+        return holds, values | self.by_object(self._count, self._longest)
 
 
 @dataclass(eq=False)
 class InWindow(Rule):
-    """A condition holds in all of the last steps of the episode.
+    """A condition holds in all of the last steps of the episode. Of an `AllOf` each part is
+    counted, so that a failure names it.
 
     Attributes:
         name: See `Rule`; also ``text``.
@@ -246,20 +275,27 @@ class InWindow(Rule):
 
     def __post_init__(self) -> None:
         super().__init__(self.name, self.text, expected=f"at least {self.window}")
+        self._total = f"{self.name.lower()}_steps"
+        names = self.condition.names if isinstance(self.condition, AllOf) else ()
+        self._values = [f"{self._total}.{name}" for name in names]
+        self.limits = [dict.fromkeys(self._values or [self._total], (self.window, math.inf))]
 
     @override
     def start(self, view: TaskView) -> None:
-        self.length = view.zeros()  # of the streak that lasts to the end
+        self.length = view.zeros(len(self._values) or 1)  # of the streaks that last to the end
 
     @override
     def update(self, step: Step) -> None:
-        holds = self.condition(step)
-        self.length.add_(1.0).mul_(holds if holds.dim() == 1 else holds.all(1))
+        parted = getattr(self.condition, "parts", None)
+        holds = parted(step) if parted else self.condition(step)[..., None]
+        self.length.add_(1.0).mul_(holds if holds.dim() == 2 else holds.all(1))
 
     @override
     def judge(self, end: Step) -> Judgement:
-        values = {f"{self.name.lower()}_steps": self.length, **self.measure(end)}
-        return self.length >= self.window, values
+        total = self.length.amin(1)
+        parts = dict(zip(self._values, self.length.unbind(1), strict=False))
+        values = {self._total: total, **parts, **self.measure(end)}
+        return total >= self.window, values
 
 
 @dataclass(eq=False)
@@ -291,6 +327,8 @@ class AtRest(Rule):
         self.suffixes = ["speed_m_per_s", "position_m", "rotation_deg"]
         limits = (self.speed, self.position, self.rotation_deg)
         self.expected = [f"at most {limit:g}" for limit in limits]
+        names = [f"rest_{suffix}" for suffix in self.suffixes]
+        self.limits = [{name: (0.0, limit)} for name, limit in zip(names, limits, strict=True)]
 
     @override
     def start(self, view: TaskView) -> None:
