@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -19,6 +20,7 @@ from mjstack.envs import Env, driven_config
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ArgumentError
 from mjstack.managers.episode import required_fields
+from mjstack.scene.index import gripper_targets
 from mjstack.scene.phases import build_phases
 from mjstack.sim import make_simulation
 
@@ -313,3 +315,42 @@ def test_jaws_turn_to_an_object_that_has_faces(
         apart = max(apart, float((command[0] - command[1]).abs().max()))
         env.step(command)
     assert (apart > 0.05) == (shape == "box"), apart
+
+
+def test_jaws_close_as_far_as_an_object_is_wide(robot: str, get_stage: GetStage) -> None:
+    stage = get_stage(robot)
+    profile = stage.cfg.robot
+    widths = (None, 0.044, 0.032, 0.050)
+    opened, cube, peg, wide = gripper_targets(stage.model, profile, widths)
+    assert opened.tolist() == profile.gripper_open
+    assert cube.tolist() == profile.gripper_closed  # a cube of 44 mm: exactly as before
+    apart = []
+    joints = [stage.model.joint(name).qposadr[0] for name in profile.gripper_joints]
+    data = mujoco.MjData(stage.model)
+    for target in (peg, cube, wide):
+        data.qpos[joints] = target
+        mujoco.mj_kinematics(stage.model, data)
+        apart.append(float(np.linalg.norm(np.subtract(*data.site_xpos[stage.index.grasp_sites]))))
+    np.testing.assert_allclose(np.diff(apart), [0.012, 0.006], rtol=0.0, atol=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("robot", "expert", "half"), [("so101", "closed_loop", 0.016), ("rebot", "open_loop", 0.012)]
+)
+def test_a_narrow_peg_is_lifted(robot: str, expert: str, half: float) -> None:
+    peg = f"scene.objects.red.size=[{half},{half},0.022]"
+    options = [f"robot={robot}", f"controller={expert}", "sim=native", "nworld=1", peg]
+    lifted = []
+    for width in (0.044, 2.0 * half):  # the second: jaws that close as they do around a cube
+        cfg = load_config([*options, f"robot.closed_width={width}", *at_double_speed()])
+        stage = Stage(cfg)
+        failed = stage.play(stage.batch_simulation(1), cfg.reset).result.failed.numpy()
+        lifted.append("LIFT" not in stage.check.rules.failing(failed))
+    assert lifted == [True, False]
+
+
+def test_a_phase_has_a_width_of_its_own() -> None:
+    cfg = load_config(["controller.phases.lift_red.width=0.03", "scene.objects.red.size.0=0.02"])
+    widths = {phase.name: phase.width for phase in build_phases(cfg)}
+    assert widths["above_red"] is None
+    assert (widths["grasp_red"], widths["lift_red"], widths["above_blue"]) == (0.04, 0.03, 0.04)

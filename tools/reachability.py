@@ -34,7 +34,7 @@ class Upright(PointReach):
     """Reach of the grasp point with the gripper as upright as it goes."""
 
     def __init__(self, model: mujoco.MjModel, cfg: Config, gripper: str) -> None:
-        arguments = (model, cfg.robot, cfg.robot.grips[gripper])
+        arguments = (model, cfg.robot, getattr(cfg.robot, f"gripper_{gripper}"))
         super().__init__(*arguments)
         self.point = PointReach(*arguments)
         self.ahead = PointReach(*arguments, ahead=1.0)

@@ -219,7 +219,7 @@ def _phases(cfg: Config) -> Checks:
         key = f"controller.phases.{name}"
         wrong = number == 0 and phase.anchor is None
         yield f"{key}.anchor", wrong, "an object or a place, as the phase is the first"
-        _require(f"{key}.grasps: object", [phase.grasps], cfg.scene.objects)
+        _require(f"{key}.grasps: object that moves", [phase.grasps], cfg.scene.free)
         _require(f"{key}.retry: phase", [phase.retry], phases)
         for role, source in (("anchor", phase.anchor), ("toward", phase.toward)):
             _require(f"{key}.{role}: object or place", [source], known)

@@ -18,6 +18,7 @@ from mjstack.kinematics.batched_ik import BatchedIk
 from mjstack.managers.view import EnvView
 from mjstack.math import atan2
 from mjstack.mdp.geometry import gripper_opening, objects_in_hand, place_xy, pose_w, robot
+from mjstack.scene.index import gripper_targets
 from mjstack.scene.phases import Phase, build_phases, source_names
 
 STAY = 0.3  # how much a roll made so far weighs against the face that is nearer
@@ -81,8 +82,9 @@ class FeedbackDriver(Driver):
         self._source = torch.tensor([t.source for t in targets], device=device)
         self._toward = torch.tensor([max(t.toward, 0) for t in targets], device=device)
         self._turns = torch.tensor([float(t.toward >= 0) for t in targets], device=device)
-        grips = [cfg.robot.grips[phase.spec.gripper] for phase in self._plan]
-        self._grip = torch.tensor(grips, device=device)
+        widths = [phase.width for phase in self._plan]
+        grips = gripper_targets(env.sim.model, cfg.robot, widths)
+        self._grip = torch.tensor(grips, dtype=torch.float32, device=device)
 
         # Inverse kinematics
         self._ik = BatchedIk(

@@ -12,6 +12,7 @@ from mjstack.config.schema import Config
 from mjstack.errors import Unreachable
 from mjstack.interrupt import check_interrupt
 from mjstack.kinematics.mink_ik import GraspIk
+from mjstack.scene.index import gripper_targets
 from mjstack.scene.phases import build_phases, nominal_xy, target_xy
 
 # Of batched inverse kinematics: enough for a start far from the nominal one.
@@ -94,6 +95,8 @@ class OpenLoopPlanner:
         self._cfg = cfg
         self.phases = build_phases(cfg)
         self.ik = GraspIk(cfg.robot, cfg.model, tolerance=cfg.controller.ik_tolerance)
+        widths = [phase.width for phase in self.phases]
+        self._grips = gripper_targets(self.ik.model, cfg.robot, widths)
         self._nodes = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, cfg.controller.knots))
         self._weights, self._numbers = self._step_weights()
         self._last: tuple[np.ndarray, JointTrajectory] | None = None
@@ -241,7 +244,7 @@ class OpenLoopPlanner:
             if phase.target is not None:
                 ends[:, i + 1, :2] = target_xy(phase.target, where)
                 ends[:, i + 1, 2] = phase.target.z
-            ends[:, i + 1, 3:] = robot.grips[phase.spec.gripper]
+            ends[:, i + 1, 3:] = self._grips[i]
         # The first phase's target stands from the first step; only the gripper moves from home.
         ends[:, 0, :3] = ends[:, 1, :3]
         ends[:, 0, 3:] = robot.home[len(robot.arm_joints) :]

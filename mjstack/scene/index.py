@@ -80,7 +80,8 @@ class RobotTensors:
         home: Joint values at home, shape ``(n,)``.
         start: Start of environments, clear of the table, shape ``(n,)``.
         gripper_open: Command of the open gripper, shape ``(n_gripper,)``.
-        gripper_closed: Command of the closed gripper, shape ``(n_gripper,)``.
+        gripper_closed: Command of the gripper closed around the narrowest object of the scene, or
+            ``robot.closed_width``, shape ``(n_gripper,)``.
         gripper_travel: The open less the closed one, shape ``(n_gripper,)``.
     """
 
@@ -125,6 +126,8 @@ class SceneIndex:
         joints = [model.joint(name).id for name in robot.joints]
         self._robot = robot
         self._tensors: dict[tuple[torch.device, torch.dtype], RobotTensors] = {}
+        narrowest = min([robot.closed_width, *(thing.width for thing in scene.free.values())])
+        self._closed = gripper_targets(model, robot, [narrowest])[0]
         self.robot_qpos = np.array([model.jnt_qposadr[j] for j in joints])
         self.robot_qvel = np.array([model.jnt_dofadr[j] for j in joints])
         self.robot_range = model.jnt_range[joints].copy()
@@ -176,7 +179,7 @@ class SceneIndex:
             addresses = (self.robot_qpos, self.robot_qvel, self.ctrl, gripper)
             columns = [Columns(a, device) for a in addresses]
             r = self._robot
-            poses = (r.home, r.start, r.gripper_open, r.gripper_closed)
+            poses = (r.home, r.start, r.gripper_open, self._closed)
             numbers = [
                 torch.as_tensor(np.asarray(values, dtype=float), dtype=dtype, device=device)
                 for values in (self.robot_range, self.ctrl_range, *poses)
@@ -219,6 +222,42 @@ def joint_limits(model: mujoco.MjModel, names: Sequence[str]) -> tuple[np.ndarra
     spans = (model.jnt_range[joints], model.actuator_ctrlrange[servos])
     low, high = np.where(np.stack(limited)[..., None], spans, [-np.inf, np.inf]).transpose(2, 0, 1)
     return low.max(axis=0), high.min(axis=0)
+
+
+def gripper_targets(
+    model: mujoco.MjModel, robot: RobotCfg, widths: Sequence[float | None]
+) -> np.ndarray:
+    """Joint targets of jaws closed around objects [rad, m], shape ``(n, n_gripper)``.
+
+    ``robot.gripper_closed`` is for ``robot.closed_width``. Around other objects the grasp sites are
+    as much nearer to each other, or farther apart, as far as the joints' ranges allow.
+
+    Args:
+        model: A compiled model that contains the robot.
+        robot: The robot's profile.
+        widths: How wide each object is across the jaws [m]; None for the open gripper.
+    """
+    opened, closed = np.array([robot.gripper_open, robot.gripper_closed], dtype=float)
+    shares = np.linspace(-2.0, 1.0, 301)[:, None]  # of the way from closed (the 200th) to open
+    targets = np.clip(
+        closed + shares * (opened - closed), *joint_limits(model, robot.gripper_joints)
+    )
+    data = mujoco.MjData(model)
+    addresses = [int(model.joint(name).qposadr[0]) for name in robot.gripper_joints]
+    sites = [model.site(name).id for name in robot.grasp_sites]
+    apart = np.empty(len(targets))
+    for k, target in enumerate(targets):
+        data.qpos[addresses] = target
+        mujoco.mj_kinematics(model, data)
+        apart[k] = np.linalg.norm(np.subtract(*data.site_xpos[sites]))
+    closer = apart[200] - robot.closed_width
+
+    def around(width: float | None) -> list[float]:
+        if width is None or width == robot.closed_width:
+            return robot.gripper_open if width is None else robot.gripper_closed
+        return [float(np.interp(closer + width, apart, column)) for column in targets.T]
+
+    return np.array([around(width) for width in widths])
 
 
 def locked_home(robot: RobotCfg) -> np.ndarray:

@@ -38,6 +38,7 @@ class Phase:
         target: Where it brings the grasp point; None where the last target holds.
         grasped: Number of the object that it grasps, or -1.
         carried: Number of the object that is in the hand all through it, or -1.
+        width: Width [m] to which the jaws close; None for an open gripper.
     """
 
     name: str
@@ -47,6 +48,7 @@ class Phase:
     target: Target | None
     grasped: int
     carried: int
+    width: float | None
 
 
 def source_names(scene: SceneCfg) -> list[str]:
@@ -103,11 +105,15 @@ def build_phases(cfg: Config) -> list[Phase]:
         stop = start + round(spec.seconds / cfg.timing.step_dt)
         grasped = -1 if spec.grasps is None else sources.index(spec.grasps)
         carried = sources.index(load) if in_hand and spec.grasps is None else -1
-        phases.append(Phase(name, start, stop, spec, target, grasped, carried))
-        start = stop
         if spec.grasps is not None:
             load = spec.grasps
             in_hand = True
+        width = spec.width
+        if width is None:
+            width = scene.objects[load].width if in_hand else cfg.robot.closed_width
+        width = width if spec.gripper == "closed" else None
+        phases.append(Phase(name, start, stop, spec, target, grasped, carried, width))
+        start = stop
     return phases
 
 
@@ -135,6 +141,6 @@ def object_targets(cfg: Config) -> dict[str, list[tuple[Phase, Target]]]:
     for phase in build_phases(cfg):
         target = phase.target
         if target is not None and (thing := names[target.source]) in out:
-            key = (round(target.z, 6), phase.spec.gripper, target.offset, target.toward)
+            key = (round(target.z, 6), phase.width, target.offset, target.toward)
             out[thing].setdefault(key, (phase, target))
     return {name: list(targets.values()) for name, targets in out.items()}

@@ -105,7 +105,9 @@ class RobotCfg:
     gripper_open: list[float] = spec(unit="rad, m")
     """Joint targets of the open gripper."""
     gripper_closed: list[float] = spec(unit="rad, m")
-    """Joint targets of the gripper around an object."""
+    """Joint targets of the gripper around an object as wide as ``closed_width``."""
+    closed_width: float = spec(0.044, unit="m", gt=0.0)
+    """Width of that object. Around another one the jaws close as much nearer or farther."""
     arm_force_limit: float | None = spec(None, unit="N m, N", gt=0.0)
     """Largest force of the arm's servos. null: the file's own."""
     servos: dict[str, ServoCfg] = spec(factory=dict)
@@ -143,8 +145,3 @@ class RobotCfg:
     def joints(self) -> list[str]:
         """The arm's joints and then the gripper's, in the order of all joint values."""
         return [*self.arm_joints, *self.gripper_joints]
-
-    @property
-    def grips(self) -> dict[str, list[float]]:
-        """Joint targets of the gripper by the word for it in a phase."""
-        return {"open": self.gripper_open, "closed": self.gripper_closed}

@@ -170,6 +170,19 @@ class ObjectCfg(ShapeCfg):
         return self.shape != "sphere" and not (self.shape == "cylinder" and self.upright)
 
     @property
+    def level_axes(self) -> list[int]:
+        """Numbers of its two most level axes as it starts, the one along which it is narrower
+        first.
+        """
+        up = max(range(3), key=lambda k: abs(self.axes[2][k]))
+        return sorted((k for k in range(3) if k != up), key=lambda k: self.half[k])
+
+    @property
+    def width(self) -> float:
+        """How wide it is across the jaws that grasp it from above [m]."""
+        return 2.0 * self.half[self.level_axes[0]]
+
+    @property
     def radius(self) -> float:
         """Radius of the sphere around its centre that holds it [m]."""
         if self.shape == "capsule":

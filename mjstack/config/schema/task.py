@@ -98,6 +98,9 @@ class PhaseCfg:
     """Whether ``scene.grasp_offset`` is added to the height."""
     gripper: str = spec(choices=("open", "closed"))
     """open or closed."""
+    width: float | None = spec(None, unit="m", ge=0.0)
+    """Width of an object around which the jaws close as much; null: that of the grasped object, and
+    without one ``robot.closed_width``."""
     seconds: float = spec(unit="s", gt=0.0, le=600.0)
     """Duration."""
     observe: bool = False

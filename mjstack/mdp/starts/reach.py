@@ -8,6 +8,7 @@ import numpy as np
 from mjstack.errors import ParameterError
 from mjstack.kinematics.reach import PointReach
 from mjstack.managers.view import EnvView
+from mjstack.scene.index import gripper_targets
 from mjstack.scene.phases import nominal_xy, object_targets, source_names, target_xy
 
 _GRID = 0.02  # [m] between the positions whose reach is tried
@@ -56,10 +57,10 @@ def out_of_reach(env: EnvView, name: str, xy: np.ndarray) -> tuple[int, str] | N
         points[:, column, :2] = target_xy(target, sources)
         points[:, column, 2] = target.z
     distances = np.zeros(points.shape[:2])
-    openings = np.array([phase.spec.gripper for phase, _ in targets])
-    for gripper in np.unique(openings):
-        reach = PointReach(env.sim.model, env.cfg.robot, env.cfg.robot.grips[gripper])
-        columns = openings == gripper
+    for width in {phase.width for phase, _ in targets}:
+        (gripper,) = gripper_targets(env.sim.model, env.cfg.robot, [width])
+        reach = PointReach(env.sim.model, env.cfg.robot, gripper.tolist())
+        columns = [phase.width == width for phase, _ in targets]
         left = reach.solve(points[:, columns].reshape(-1, 3))[1]
         distances[:, columns] = left.reshape(len(xy), -1)
     if (distances <= env.cfg.controller.ik_tolerance).all():
