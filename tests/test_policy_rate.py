@@ -241,3 +241,35 @@ def test_a_late_command_moves_the_arm_as_the_same_command_later() -> None:
         direct.step(waiting.pop(0))
         assert torch.equal(delayed.sim.qpos, direct.sim.qpos), step
     assert not torch.equal(delayed.sim.ctrl, direct.sim.ctrl)
+
+
+def test_each_world_has_a_delay_of_its_own_the_same_on_both_backends() -> None:
+    """A world moves as one whose delay is the same in every world, to the bit, and draws a new one
+    for its next episode.
+    """
+    plain = ("action=joint_absolute", "reset=randomized", "timing.command_delay=1")
+    drawn: list[list[int]] = []
+    for backend in ("native", "mjwarp"):
+        env = on_new_sim(backend, 16, configure(*plain, "timing.random_delay=3"))
+        env.reset(seed=5)
+        late = env.command_delay.steps.clone()
+        assert set(late.tolist()) == {1, 2, 3, 4}
+        generator = torch.Generator().manual_seed(0)
+        moves = 0.1 * torch.rand((8, *env.sim.ctrl.shape), generator=generator)
+        start = env.sim.ctrl.clone()
+        ends = []
+        for move in moves:
+            env.step(start.float() + move)
+            ends.append(env.sim.qpos.clone())
+        env.reset(mask=late == 2)
+        drawn += [late.tolist(), env.command_delay.steps.tolist()]
+        assert torch.equal(env.command_delay.steps[late != 2], late[late != 2])
+        if backend == "native":
+            for steps in range(1, 5):
+                same = on_new_sim("native", 16, configure(*plain, f"timing.command_delay={steps}"))
+                same.reset(seed=5)
+                for move, end in zip(moves, ends, strict=True):
+                    same.step(start.float() + move)
+                    assert torch.equal(same.sim.qpos[late == steps], end[late == steps])
+    assert drawn[:2] == drawn[2:]
+    assert drawn[0] != drawn[1]

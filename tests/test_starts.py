@@ -15,8 +15,8 @@ from environments import configure, on_shared_sim
 from stack_checker import rotation_matrix
 
 import mjstack
-from mjstack.config.schema import Config
-from mjstack.envs import Env
+from mjstack.config.schema import Backend, Config
+from mjstack.envs import Env, build_env
 from mjstack.mdp.starts.placement import Placement, may_meet
 
 MANY = 200
@@ -264,3 +264,50 @@ def test_starts_in_the_box_scene_are_uniform_over_the_pairs_that_fit(robot: str)
     assert counts[0][~possible].sum() < 0.01 * len(placed)
     assert chi_square_tail([each[possible] for each in counts]) > 1e-3
     env.close()
+
+
+def test_joint_zeros_move_the_arm_and_no_measured_joint() -> None:
+    """The arm stands as the model does with each joint turned by its world's angle; both backends
+    have the same frames.
+    """
+    width = 0.17
+    zeros = f"+reset.zeros={{func: mjstack.mdp.reset.JointZeros, params: {{arm: {width}}}}}"
+    cfg = configure(zeros, "reset=randomized", "action=joint_absolute")
+    frames = []
+    for backend in (Backend.native, Backend.mjwarp):
+        env = build_env(cfg, nworld=16, backend=backend, device="cpu")
+        env.reset(seed=0)
+        frames.append(env.sim.fields["body_quat"].float().clone())
+        if backend is Backend.native:
+            check_zeros(env, width)
+        env.close()
+    assert torch.equal(*frames)
+
+
+def check_zeros(env: Env, width: float) -> None:
+    m = env.sim.model
+    data = mujoco.MjData(m)
+    without = configure("reset=randomized")
+    plain = build_env(without, nworld=16, backend=Backend.native, device="cpu")
+    plain.reset(seed=0)
+    assert torch.equal(
+        plain.sim.qpos[:, env.index.robot_qpos], env.sim.qpos[:, env.index.robot_qpos]
+    )
+    plain.close()
+    env.sim.forward()
+    tips = []
+    for world in range(env.nworld):
+        data.qpos[:] = env.sim.qpos[world]
+        for name in env.cfg.robot.joints:
+            joint = m.joint(name)
+            body = int(joint.bodyid[0])
+            turn, nominal = np.zeros(4), m.body_quat[body].copy()
+            mujoco.mju_negQuat(nominal, nominal)
+            mujoco.mju_mulQuat(turn, nominal, env.sim.fields["body_quat"][world, body].numpy())
+            angle = 2.0 * math.atan2(turn[1:] @ joint.axis, turn[0])
+            assert abs(angle) <= (width if name in env.cfg.robot.arm_joints else 0.0) + 1e-9
+            data.qpos[joint.qposadr[0]] += angle
+        mujoco.mj_kinematics(m, data)
+        np.testing.assert_allclose(env.sim.site_xpos[world], data.site_xpos, rtol=0, atol=1e-9)
+        tips.append(data.site_xpos[env.index.grasp_sites[0]].copy())
+    assert np.ptp(tips, axis=0).min() > 0.02

@@ -70,7 +70,7 @@ TERMINATIONS = {
     "overflow": {},
 }
 OF_PLACES = ("object_to_place", "near_place")  # in test_objects.py
-RESETS = ("home", "JointNoise", "JitterObjects", "RandomizeObjects")
+RESETS = ("home", "JointNoise", "JointZeros", "JitterObjects", "RandomizeObjects")
 RESETS += ("ObjectMass", "ObjectFriction", "ActuatorGains")
 
 

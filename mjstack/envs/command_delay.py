@@ -1,4 +1,4 @@
-"""Commands that take effect late, as ``timing.command_delay`` says."""
+"""Commands that take effect late, as ``timing.command_delay`` and ``random_delay`` say."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -6,19 +6,26 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor
 
+from mjstack.managers.view import EnvView, random_uniform
+
 
 class CommandDelay:
-    """Holds the commands that physics has not seen yet, the oldest first."""
+    """Holds the commands that physics has not seen yet, the oldest first.
 
-    def __init__(self, ctrl: Tensor, steps: int) -> None:
-        """Hold none yet.
+    Attributes:
+        steps: Control steps by which the commands of each world are late, shape ``(nworld,)``,
+            int64.
+    """
 
-        Args:
-            ctrl: The simulation's commands, shape ``(nworld, nu)``, which keep their address.
-            steps: Control steps by which they are late; with 0 nothing is held.
-        """
-        self._ctrl = ctrl
-        self._waiting = ctrl.new_zeros((steps, *ctrl.shape))
+    def __init__(self, env: EnvView) -> None:
+        """Hold none yet."""
+        timing = env.cfg.timing
+        self._env = env
+        self._least = timing.command_delay
+        self._choices = 1 + timing.random_delay
+        self.steps = torch.full_like(env.world, self._least)
+        most = timing.command_delay + timing.random_delay
+        self._waiting = env.sim.ctrl.new_zeros((most, *env.sim.ctrl.shape))
 
     @contextmanager
     def late(self) -> Iterator[None]:
@@ -26,15 +33,24 @@ class CommandDelay:
         if not len(self._waiting):
             yield
             return
-        command = self._ctrl.clone()
-        self._ctrl.copy_(self._waiting[0])
-        self._waiting.copy_(torch.cat((self._waiting[1:], command[None])))
+        ctrl = self._env.sim.ctrl
+        command = ctrl.clone()
+        commands = torch.cat((self._waiting, command[None]))
+        row = (len(self._waiting) - self.steps)[None, :, None]
+        ctrl.copy_(commands.gather(0, row.expand(1, *ctrl.shape))[0])
+        self._waiting.copy_(commands[1:])
         yield
-        self._ctrl.copy_(command)
+        ctrl.copy_(command)
 
     def reset(self, mask: Tensor) -> None:
-        """Let the start's command hold in the masked worlds; the mask is of shape ``(nworld,)``,
-        bool.
+        """Let the start's command hold in the masked worlds, and draw how late their next ones are;
+        the mask is of shape ``(nworld,)``, bool.
         """
-        if len(self._waiting):
-            torch.where(mask[:, None], self._ctrl, self._waiting, out=self._waiting)
+        if not len(self._waiting):
+            return
+        torch.where(mask[:, None], self._env.sim.ctrl, self._waiting, out=self._waiting)
+        if self._choices > 1:
+            # In float64 the product cannot round up to the number of choices
+            share = 0.5 * (random_uniform(self._env, "timing.random_delay", 1)[:, 0].double() + 1.0)
+            steps = self._least + (share * self._choices).long()
+            torch.where(mask, steps, self.steps, out=self.steps)

@@ -63,6 +63,7 @@ class Env:
         reset_manager: How episodes start.
         termination_manager: How they end.
         reward_manager: What they are worth.
+        command_delay: The commands that physics has not seen yet, and how late each world's are.
         faults: What went wrong on the device; `FaultLatch.raise_first` raises it.
         graph: What `step` repeats, captured or not.
         images: What the cameras have drawn last, by output and camera, such as ``images.front``;
@@ -110,7 +111,7 @@ class Env:
         self._version = 0
         self._started = False
         self._closed = False
-        self._delay = CommandDelay(sim.ctrl, cfg.timing.command_delay)
+        self.command_delay = CommandDelay(self)
 
         # Terms are checked on worlds that have started, because a term may read anything.
         self.reset_manager = ResetManager(self, cfg.reset)
@@ -275,7 +276,7 @@ class Env:
 
     def _step_physics(self) -> None:
         current_term.label = ""
-        with self._delay.late():
+        with self.command_delay.late():
             self.sim.step(self.cfg.timing.decimation, kinematics=True)
 
     def _evaluate(self, ended: Tensor | None = None, *, last: bool = True) -> Tensor | None:
@@ -357,7 +358,7 @@ class Env:
         self.episode_step.masked_fill_(mask, 0)
         self.reset_manager.reset(mask)
         self.sim.kinematics(mask)
-        self._delay.reset(mask)
+        self.command_delay.reset(mask)
 
     def _reset_managers(self, mask: Tensor) -> None:
         """Clear what managers keep from step to step."""

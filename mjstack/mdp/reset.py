@@ -5,6 +5,7 @@ values each time.
 import math
 from collections.abc import Sequence
 
+import mujoco
 import torch
 from torch import Tensor
 from typing_extensions import override
@@ -55,6 +56,46 @@ class JointNoise:
         noise = random_uniform(env, self.label, self._width.shape[0], at=at)
         command = robot(env).ctrl.read(env.sim.ctrl)[at] + self._width * noise
         write_robot(env, mask, torch.clamp(command, self._low, self._high), at)
+
+
+@uses_fields("body_quat")
+class JointZeros:
+    """Turns the zero of every hinge by a random angle that nobody measures, as the calibrations of
+    real arms differ: positions and commands count from the zero that the servo believes in, and the
+    arm is elsewhere. Objects are placed clear of where it would be without.
+    """
+
+    label = "reset.zeros"
+
+    def __init__(self, env: EnvView, *, arm: NotNegative, gripper: NotNegative = 0.0) -> None:
+        """Take the half-widths.
+
+        Args:
+            env: The environment.
+            arm: Of the arm's hinges [rad].
+            gripper: Of the gripper's [rad].
+
+        Raises:
+            ParameterError: The axis of a joint is not at its body's origin.
+        """
+        model = env.sim.model
+        joints = [model.joint(name).id for name in env.cfg.robot.joints]
+        if model.jnt_pos[joints].any():
+            expected = "a robot whose joints have pos 0, each at the origin of its body"
+            raise ParameterError("arm", arm, expected)
+        hinge = torch.from_numpy(model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE)
+        width = torch.full((len(joints),), gripper, dtype=torch.float64)
+        width[: env.index.n_arm] = arm
+        self._half = (0.5 * width * hinge).to(env.device)
+        self._axis = torch.from_numpy(model.jnt_axis[joints].copy()).to(env.device)
+        self._frames = Elements(env, "body_quat", model.jnt_bodyid[joints].tolist())
+
+    def __call__(self, env: EnvView, mask: Tensor) -> None:
+        """Write the frames of the joints' bodies."""
+        at = rows_of(mask)
+        half = self._half * random_uniform(env, self.label, len(self._half), at=at).double()
+        turn = torch.cat((torch.cos(half)[..., None], torch.sin(half)[..., None] * self._axis), -1)
+        self._frames.write(mask, quat_mul(self._frames.nominal.expand_as(turn), turn), at)
 
 
 @offers("reset term")

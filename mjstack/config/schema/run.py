@@ -30,6 +30,8 @@ class TimingCfg:
     """Control rate that these make: ``task.control_hz`` of the built-in tasks."""
     command_delay: int = spec(0, unit="control steps", ge=0, le=1000)
     """Control steps between a command and its effect; until then the start's command holds."""
+    random_delay: int = spec(0, unit="control steps", ge=0, le=1000)
+    """The most that commands are later still: each world draws 0 to this for each episode."""
 
     @property
     def step_dt(self) -> float:
