@@ -30,7 +30,6 @@ from mjstack.config.schema import Backend, Config
 from mjstack.datasets import DatasetSpec, DatasetWriter, Feature
 from mjstack.datasets.part import PartWriter
 from mjstack.datasets.spec import INDICES
-from mjstack.datasets.units import LerobotUnits
 from mjstack.envs import Env, build_env, demonstration_config
 from mjstack.episodes.batches import Batch, BatchPlan
 from mjstack.episodes.recorder import CommandRecorder
@@ -50,6 +49,7 @@ from mjstack.jobs.collect_plan import (
     plan_collection,
 )
 from mjstack.managers.episode import required_fields
+from mjstack.robots.units import LerobotUnits
 from mjstack.sim import make_simulation
 
 COMMAND = ["job=collect", "sim=native", "job.folder=outputs/demos"]
@@ -171,7 +171,7 @@ def test_lerobot_units_are_those_of_the_real_arm(demos: SimpleNamespace) -> None
     assert info["features"]["action"]["names"] == names
     assert info["mjstack"]["units"]["action"] == ["deg"] * 5 + ["%"]
     low, high = np.array(Stage(demos.cfg).index.ctrl_range).T
-    units = LerobotUnits(demos.cfg.robot, np.stack([low, high], 1))
+    units = LerobotUnits(5, np.stack([low, high], 1))
     for number in range(4):
         si, degrees = steps_of(demos.dataset, number), steps_of(dataset, number)
         for name in ("observation.state", "action"):
@@ -184,7 +184,7 @@ def test_lerobot_units_are_those_of_the_real_arm(demos: SimpleNamespace) -> None
 def test_ends_and_middles_of_lerobots_units() -> None:
     cfg = load_config([])
     ranges = np.array(Stage(cfg).index.ctrl_range)
-    units = LerobotUnits(cfg.robot, ranges)
+    units = LerobotUnits(len(cfg.robot.arm_joints), ranges)
     half = np.rad2deg(0.5 * (ranges[:5, 1] - ranges[:5, 0]))
     for values, arm, gripper in (
         (ranges[:, 0], -half, 0.0),

@@ -10,6 +10,7 @@ import runpy
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ import pytest
 import torch
 from environments import configure, has_gl
 from policies import make_policy, write_policy
+from safetensors.torch import load_file
 
 import mjstack
 from mjstack.cli import run
@@ -27,9 +29,11 @@ from mjstack.config.session import search_path
 from mjstack.drivers.policy import PolicyDriver
 from mjstack.episodes.rollout import NOMINAL
 from mjstack.episodes.stage import Stage
+from mjstack.errors import FolderError, MissingExtra, MjstackError
 from mjstack.jobs import play as play_job
 from mjstack.jobs.export import check_export, export_facts
-from mjstack.policy import Vision, load_policy, save_policy
+from mjstack.policy import Vision, lerobot, load_policy, save_policy
+from mjstack.policy.lerobot import lerobot_files
 from mjstack.policy.onnx import to_onnx
 
 SEEN = ("observation=state", "+observation.policy.terms.joint_vel.history=2")
@@ -253,3 +257,48 @@ def test_a_full_disk_leaves_neither_file(
     assert not list(out.glob("*.onnx")) + list(out.glob("*.mjb"))
     (gate,) = json.loads((out / "report.json").read_text())["gates"]
     assert "cannot be written (No space left on device), and nothing was exported" in gate["reason"]
+
+
+def test_lerobots_folder_has_its_own_files_and_the_weights(tmp_path: Path) -> None:
+    """LeRobot itself loads it in test_lerobot.py. One that sees measured joints alone takes a real
+    arm's.
+    """
+    for observation, key in (("state", "environment_state"), ("pixels", "state")):
+        policy = write_noiseless(tmp_path / observation, configure(f"observation={observation}"))
+        out = tmp_path / f"{observation}_out"
+        assert export(policy, out, "job.format=lerobot") == 0
+        config = json.loads((out / "config.json").read_text())
+        assert config["type"] == "mjstack"
+        assert list(config["input_features"]) == [f"observation.{key}"]
+        assert config["output_features"]["action"] == {"type": "ACTION", "shape": [6]}
+        assert (config["robot_type"], config["task"], config["fps"]) == ("so_follower", "stack", 50)
+        weights = load_file(out / "model.safetensors")
+        for name, value in load_policy(policy).network.state_dict().items():
+            assert torch.equal(weights[f"network.{name}"], value)
+        for kind in ("pre", "post"):
+            chain = json.loads((out / f"policy_{kind}processor.json").read_text())["steps"]
+            assert chain[-1]["registry_name"] == "device_processor"
+        assert not (out / "policy.onnx").exists()
+
+
+def test_lerobots_robots_take_joint_targets_alone(tmp_path: Path) -> None:
+    cfg = configure("action=ee_delta", "timing.policy_decimation=5")
+    save_policy(tmp_path / "policy", make_policy(cfg, chunk=1, execute=5))
+    limits = np.zeros((6, 2))
+    with pytest.raises(FolderError, match=r"its actions are arm, gripper, expected joint targets"):
+        lerobot_files(load_policy(tmp_path / "policy"), limits)
+
+
+def test_a_missing_lerobot_and_another_version_are_one_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(lerobot, "version", lambda name: "0.5.0")
+    with pytest.raises(MjstackError, match=r"LeRobot 0.5.0 is installed, expected 0\.6\.x"):
+        lerobot.require_lerobot("policy")
+
+    def missing(name: str) -> str:
+        raise PackageNotFoundError(name)
+
+    monkeypatch.setattr(lerobot, "version", missing)
+    with pytest.raises(MissingExtra, match=r"pip install 'mjstack\[lerobot\]'"):
+        lerobot.require_lerobot("policy")

@@ -52,6 +52,7 @@ HOMES = {
     "gymnasium": ("adapters/",),
     "rsl_rl": ("adapters/",),
     "tensordict": ("adapters/",),
+    "lerobot": ("adapters/lerobot/", "policy/lerobot.py"),
     "pyarrow": ("datasets/",),
     "safetensors": ("policy/",),
     "trimesh": ("report/geometry.py",),

@@ -20,7 +20,6 @@ from policies import interrupted, report, same
 
 from mjstack.cli import run
 from mjstack.config.schema import CloneJobCfg, VisionCfg
-from mjstack.drivers.driver import Driver
 from mjstack.drivers.policy import PolicyDriver
 from mjstack.envs import Env
 from mjstack.episodes.motion import draw_seen
@@ -105,8 +104,8 @@ def test_what_a_policy_saw_is_drawn_again(trained: Path) -> None:
     cfg = load_config([*SMALL, *chosen])
     stage = Stage(cfg)
 
-    def bind(env: Env, driver: Driver) -> Read:
-        images = cast(PolicyDriver, driver).query_images.images
+    def bind(env: Env, driver: PolicyDriver) -> Read:
+        images = driver.query_images.images
         return lambda: {"qpos": env.sim.qpos.double(), **images}
 
     recorder = Recorder(Channels(bind, start_and_every_step))

@@ -17,7 +17,7 @@ from mjstack.managers.observation import ObservationManager
 from mjstack.policy import Policy
 from mjstack.sim.cameras import Cameras, with_outputs
 
-_GRID = 2.0**20  # per unit of an action
+GRID = 2.0**20  # per unit of an action
 
 
 class QueryImages:
@@ -137,5 +137,5 @@ class PolicyDriver(Driver):
         self.query_images.draw()
         images = [image.to(self._dtype) for image in self.query_images.images.values()]
         chunk = self._network(self._observed.to(self._dtype), images)[:, : self._chunk.shape[1]]
-        chunk = (torch.round(chunk * _GRID) / _GRID).float()
+        chunk = (torch.round(chunk * GRID) / GRID).float()
         torch.where(due[:, None, None], chunk, self._chunk, out=self._chunk)

@@ -13,7 +13,6 @@ import torch
 from mjstack.datasets import DatasetSpec, EpisodeData
 from mjstack.datasets.part import Part, PartWriter
 from mjstack.datasets.spec import typed_episode
-from mjstack.datasets.units import LEROBOT, LerobotUnits
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.batches import Batch
@@ -21,6 +20,7 @@ from mjstack.episodes.recorder import Channels, Read, read_commands, start_and_e
 from mjstack.episodes.stage import Stage
 from mjstack.jobs.collect_plan import ACTION, IMAGES, REWARD, STATE
 from mjstack.managers.episode import required_fields
+from mjstack.robots.units import LEROBOT, LerobotUnits
 from mjstack.sim import StateRenderer
 from mjstack.sim.cameras import with_outputs
 
@@ -72,7 +72,7 @@ class EpisodeSource:
         self.drawing = 0.0
         self._units: LerobotUnits | None = None
         if stage.cfg.job.units == LEROBOT:
-            self._units = LerobotUnits(stage.cfg.robot, stage.index.ctrl_range)
+            self._units = LerobotUnits(stage.index.n_arm, stage.index.ctrl_range)
         self._most_rendered = 0  # states at once
         self._renderer: StateRenderer | None = None
         self._cameras = with_outputs(stage.cfg.scene.cameras, ["rgb"])

@@ -18,7 +18,6 @@ from mjstack.config.schema import CollectJobCfg, Config, ObservationTermCfg
 from mjstack.datasets import DatasetSpec, Feature, Video
 from mjstack.datasets.reader import check_same, read_info
 from mjstack.datasets.spec import term_columns
-from mjstack.datasets.units import LEROBOT, LerobotUnits
 from mjstack.datasets.video import check_encoder
 from mjstack.envs import Env, demonstration_config
 from mjstack.episodes.stage import Stage
@@ -26,6 +25,7 @@ from mjstack.errors import ConfigError, FolderError
 from mjstack.files import lock_folder, reading
 from mjstack.jobs.runner import run_provenance
 from mjstack.mdp.starts.placement import SCHEMA
+from mjstack.robots.units import LEROBOT, LerobotUnits
 from mjstack.sim import resolve_backend
 
 NAME = "collect"
@@ -220,7 +220,9 @@ def make_spec(env: Env, cfg: Config, provenance: Mapping[str, Any]) -> DatasetSp
     units = joint_units(env)
     positions = Feature(dtype="float32", names=tuple(f"{name}.pos" for name in joints), units=units)
     if job.units == LEROBOT:
-        positions = replace(positions, units=LerobotUnits(cfg.robot, env.index.ctrl_range).units)
+        positions = replace(
+            positions, units=LerobotUnits(env.index.n_arm, env.index.ctrl_range).units
+        )
     features = {STATE: positions}
     for group in cfg.observation:
         name = f"observation.{group}"

@@ -1,5 +1,5 @@
 """Job *export*: a trained policy as ONNX, and the scene that it was trained for as a model file of
-MuJoCo.
+MuJoCo; or the policy as a folder of LeRobot's.
 """
 
 from dataclasses import replace
@@ -20,6 +20,7 @@ from mjstack.jobs.collect_plan import group_feature, joint_units
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import CheckedJob, Job, model_bytes
 from mjstack.policy.checkpoint import policy_facts
+from mjstack.policy.lerobot import lerobot_files
 from mjstack.policy.onnx import require_onnx, to_onnx
 from mjstack.report.record import GateResult, Status
 
@@ -30,7 +31,8 @@ MODEL = "model.mjb"
 
 def check_export(cfg: Config) -> CheckedJob:
     """Raise for what cannot be exported, before anything is written."""
-    require_onnx()
+    if cfg.job.format == "onnx":
+        require_onnx()
     stage = Stage(replace(cfg, controller=replace(cfg.controller, name=DRIVER)))
     check_task(stage)
     return CheckedJob(
@@ -41,14 +43,21 @@ def check_export(cfg: Config) -> CheckedJob:
 
 
 def export_policy(stage: Stage, folder: Path) -> list[GateResult]:
-    """Write both files, or none."""
+    """Write all files, or none."""
     policy = stage.assets.policy
-    files = {MODEL: model_bytes(stage.model), POLICY: to_onnx(policy.network, export_facts(stage))}
+    main = POLICY
+    if stage.cfg.job.format == "lerobot":
+        files = lerobot_files(policy, stage.index.ctrl_range)
+        main = next(iter(files))
+    else:
+        onnx = to_onnx(policy.network, export_facts(stage))
+        files = {MODEL: model_bytes(stage.model), POLICY: onnx}
     try:
         for name, content in files.items():
             write_atomic(folder / name, content)
     except OSError as error:
-        (folder / MODEL).unlink(missing_ok=True)
+        for name in files:
+            (folder / name).unlink(missing_ok=True)
         raise FolderError(
             f"{folder} cannot be written ({error.strerror or error}), and nothing was exported",
             "Make room, or set hydra.run.dir to another",
@@ -60,7 +69,8 @@ def export_policy(stage: Stage, folder: Path) -> list[GateResult]:
         GateResult(
             name=NAME,
             status=Status.passed,
-            reason=f"{folder / POLICY}: {width} numbers observed, {shape}; {folder / MODEL}",
+            reason=f"{folder / main}: {width} numbers observed, {shape};"
+            f" {', '.join(name for name in files if name != main)}",
             metrics={"inputs": width, **sizes},
             notes={"policy": str(policy.folder)},
         )

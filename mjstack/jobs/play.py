@@ -67,7 +67,7 @@ def play_worlds(run: Run) -> list[GateResult]:
     stage = run.stage
     cfg = stage.cfg
     advance = stage.progress.advance
-    job = cast(PlayJobCfg, cfg.job)
+    job: PlayJobCfg = cfg.job
     positions = []
     seen = []
     fields = []

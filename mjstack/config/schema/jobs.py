@@ -51,6 +51,14 @@ class PlayJobCfg(JobCfg):
 
 
 @dataclass(slots=True)
+class ExportJobCfg(JobCfg):
+    """A trained policy as files of others."""
+
+    format: str = spec(choices=("onnx", "lerobot"))
+    """onnx: policy.onnx, and the scene as model.mjb; lerobot: the folder of a LeRobot policy."""
+
+
+@dataclass(slots=True)
 class CompareJobCfg(JobCfg):
     """Two policies, drivers or settings, compared on equal starts."""
 
@@ -192,5 +200,6 @@ JOB_SCHEMAS = {
     "collect": CollectJobCfg,
     "play": PlayJobCfg,
     "compare": CompareJobCfg,
+    "export": ExportJobCfg,
     "train": CloneJobCfg,
 }

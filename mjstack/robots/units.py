@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mjstack.config.schema import RobotCfg
+from mjstack.errors import ArgumentError
 
 LEROBOT = "lerobot"  # beside "si"
 
@@ -17,9 +17,9 @@ class LerobotUnits:
         units: Unit of each joint's numbers.
     """
 
-    def __init__(self, robot: RobotCfg, ranges: np.ndarray) -> None:
+    def __init__(self, arm_joints: int, ranges: np.ndarray) -> None:
         """Take the joints' ranges [rad, m], shape ``(joints, 2)``, the arm's first."""
-        arm = np.arange(len(ranges)) < len(robot.arm_joints)
+        arm = np.arange(len(ranges)) < arm_joints
         low, high = ranges.astype(np.float64).T
         self._zero = np.where(arm, 0.5 * (low + high), low)
         self._scale = np.where(arm, 180.0 / np.pi, 100.0 / (high - low))
@@ -32,3 +32,19 @@ class LerobotUnits:
     def to_si(self, values: np.ndarray) -> np.ndarray:
         """Convert back to rad and m, shape ``(…, joints)``; float32, rounded once."""
         return (values.astype(np.float64) / self._scale + self._zero).astype(np.float32)
+
+    def check_commands(self, commands: np.ndarray, positions: np.ndarray) -> None:
+        """Check the first commands of an episode, from where the arm stands in these units; both of
+        shape ``(worlds, joints)``.
+
+        Raises:
+            ArgumentError: They are radians: near to where the arm stands in those, and far from it
+                in degrees.
+        """
+        arm = [k for k, unit in enumerate(self.units) if unit == "deg"]
+        degrees = np.abs(commands - positions)[:, arm].max()
+        radians = np.abs(commands - self.to_si(positions))[:, arm].max()
+        if radians < 0.6 and degrees > 30.0:  # within 34 degrees of there
+            expected = f"degrees, near {positions[0, arm].round(1).tolist()}, where the arm stands"
+            fix = "Record the data with job.units=lerobot, or set units=si"
+            raise ArgumentError("action", f"{commands[0, arm].tolist()}, rad", expected, fix)

@@ -1,0 +1,347 @@
+"""LeRobot's environment ``mjstack``: worlds of a task as one batched vector environment."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs.configs import EnvConfig
+
+from mjstack.config import load_config
+from mjstack.config.schema import Config
+from mjstack.envs import Env, driven_config
+from mjstack.episodes.rollout import reset_worlds
+from mjstack.episodes.stage import Stage
+from mjstack.errors import ArgumentError, ConfigError, UnknownName
+from mjstack.robots.units import LEROBOT, LerobotUnits
+from mjstack.sim import StateRenderer
+from mjstack.sim.cameras import with_outputs
+from mjstack.sim.sizes import resolve_env_sizes
+from mjstack.tasks.check import make_check
+
+GROUP = "policy"  # the observation group that is LeRobot's environment_state
+TIMINGS = {30: "hz30", 50: "default"}  # by control rate [Hz]
+_FILMED = 10  # worlds that are drawn at a time
+_FILM = ("cameras=front", "scene.cameras.front.size=[240,240]")
+
+
+@EnvConfig.register_subclass("mjstack")
+@dataclass
+class MjstackEnv(EnvConfig):
+    """A task of mjstack. Starts are ``reset=randomized`` unless the overrides say otherwise.
+
+    Attributes:
+        task: Its task.
+        fps: Control rate [Hz], 30 or 50.
+        robot: Its robot.
+        cameras: Cameras whose images the policy sees, such as ``[front,wrist]``.
+        observation_height: Pixels of their images.
+        observation_width: The same.
+        units: ``lerobot``: degrees, and 0 to 100 for the gripper; ``si``: rad and m.
+        device: ``auto``, ``cpu`` or ``cuda:N``.
+        overrides: More overrides of mjstack's configuration, which win.
+        config_dir: A folder with more choices, such as ``push/conf``.
+    """
+
+    task: str | None = "stack"
+    fps: int = 30
+    robot: str = "so101"
+    cameras: list[str] = field(default_factory=list)
+    observation_height: int = 128
+    observation_width: int = 128
+    units: str = LEROBOT
+    device: str = "auto"
+    overrides: list[str] = field(default_factory=list)
+    config_dir: str | None = None
+
+    @property
+    def gym_kwargs(self) -> dict:
+        """None: nothing is made through Gymnasium's registry."""
+        return {}
+
+    def compose(self, *more: str) -> Config:
+        """Mjstack's configuration, with more overrides.
+
+        Raises:
+            MjstackError: A field or an override cannot be used.
+        """
+        for key, choices in (("fps", TIMINGS), ("units", (LEROBOT, "si"))):
+            if getattr(self, key) not in choices:
+                expected = f"one of {', '.join(map(str, choices))}"
+                raise ConfigError(f"env.{key}", getattr(self, key), expected)
+        chosen = {
+            "task": self.task,
+            "robot": self.robot,
+            "timing": TIMINGS[self.fps],
+            "sim.device": self.device,
+            "observation": "state",
+            "reset": "randomized",
+        }
+        size = f"size=[{self.observation_height},{self.observation_width}]"
+        return load_config(
+            [
+                *(f"{key}={value}" for key, value in chosen.items()),
+                *([f"cameras=[{','.join(self.cameras)}]"] if self.cameras else []),
+                *(f"scene.cameras.{name}.{size}" for name in self.cameras),
+                *more,
+                *self.overrides,
+            ],
+            config_dir=self.config_dir,
+        )
+
+    def create_envs(
+        self, n_envs: int, use_async_envs: bool = False
+    ) -> dict[str, dict[int, VectorEnv]]:
+        """Make one vector environment of all worlds, and describe its features.
+
+        Raises:
+            MjstackError: The configuration cannot be used.
+        """
+        film = None if self.cameras else self.compose(*_FILM)
+        worlds = LerobotVectorEnv(self.compose(), n_envs, units=self.units, film=film)
+        boxes: Any = worlds.single_observation_space
+        state, seen = (boxes[name].shape for name in ("agent_pos", "environment_state"))
+        self.features = {
+            "action": PolicyFeature(FeatureType.ACTION, worlds.single_action_space.shape),
+            "agent_pos": PolicyFeature(FeatureType.STATE, state),
+            "environment_state": PolicyFeature(FeatureType.ENV, seen),
+        }
+        self.features_map = {
+            "action": "action",
+            "agent_pos": "observation.state",
+            "environment_state": "observation.environment_state",
+        }
+        for name in self.cameras:
+            shape = boxes["pixels"][name].shape
+            self.features[f"observation.images.{name}"] = PolicyFeature(FeatureType.VISUAL, shape)
+            self.features_map[f"observation.images.{name}"] = f"observation.images.{name}"
+        return {self.type: {0: worlds}}
+
+
+class LerobotVectorEnv(VectorEnv):
+    """Worlds of a task as LeRobot's evaluation steps them.
+
+    All episodes are as long as the task's. The task's check judges them, and `step` says so in
+    ``is_success`` of the last step alone; then the worlds stand still until they are reset. The
+    reward is 1 for a success there. Actions are absolute joint targets.
+
+    Attributes:
+        inner: The environment.
+    """
+
+    def __init__(
+        self, cfg: Config, nworld: int, *, units: str = LEROBOT, film: Config | None = None
+    ) -> None:
+        """Make the worlds.
+
+        Args:
+            cfg: The configuration. Its action terms, rewards and terminations do not count.
+            nworld: How many worlds.
+            units: As of `MjstackEnv`.
+            film: The same scene with a camera that `render` draws, where ``cfg`` has none.
+
+        Raises:
+            MjstackError: The configuration cannot be used.
+        """
+        if cfg.task.check is None:
+            raise ConfigError("task", cfg.task.name, "a task with a check, which judges episodes")
+        if GROUP not in cfg.observation:
+            raise UnknownName("observation group", GROUP, cfg.observation)
+        if units == LEROBOT and not cfg.robot.lerobot_type:
+            expected = "a robot that LeRobot has a follower of (robot.lerobot_type)"
+            raise ConfigError("robot", cfg.robot.name, expected, "Set units=si, or robot=so101")
+        stage = Stage(cfg)
+        cameras = with_outputs(cfg.scene.cameras, ["rgb"])
+        played = replace(
+            driven_config(cfg),
+            observation={GROUP: replace(cfg.observation[GROUP], noise=False)},
+            scene=replace(cfg.scene, cameras=cameras),
+        )
+        sim = stage.simulation(nworld, *stage.backend, sizes=resolve_env_sizes(cfg))
+        self.inner = env = Env(sim, stage.index, played, check_faults=False)
+        self._joints = env.index.on(env.device, env.sim.qpos.dtype).qpos
+        self._units = (
+            LerobotUnits(env.index.n_arm, env.index.ctrl_range) if units == LEROBOT else None
+        )
+        self._check = make_check(played)
+        self._phase = torch.zeros(nworld, dtype=torch.int64, device=env.device)
+        self._left = 0  # control steps of the episode
+        self._film = film
+        self._renderer: StateRenderer | None = None
+
+        # Gymnasium's and LeRobot's attributes
+        self.num_envs = nworld
+        self.metadata = {
+            "autoreset_mode": AutoresetMode.DISABLED,
+            "render_modes": ["rgb_array"],
+            "render_fps": round(cfg.task.control_hz),
+        }
+        low, high = env.index.ctrl_range.T
+        if self._units is not None:
+            low, high = self._units.from_si(low), self._units.from_si(high)
+        self.single_action_space = spaces.Box(low.astype(np.float32), high.astype(np.float32))
+        width = env.observation_manager.group_dims[GROUP]
+        boxes: dict[str, spaces.Space] = {
+            "agent_pos": spaces.Box(-np.inf, np.inf, low.shape, np.float32),
+            "environment_state": spaces.Box(-np.inf, np.inf, (width,), np.float32),
+        }
+        if cameras:
+            images = {name: (*camera.size, 3) for name, camera in cameras.items()}
+            boxes["pixels"] = spaces.Dict(
+                {name: spaces.Box(0, 255, shape, np.uint8) for name, shape in images.items()}
+            )
+        self.single_observation_space = spaces.Dict(boxes)
+        self.observation_space = batch_space(self.single_observation_space, nworld)
+        self.action_space = batch_space(self.single_action_space, nworld)
+        self._shared = {
+            "_max_episode_steps": cfg.task.episode_steps,
+            "task_description": cfg.task.instruction,
+            "task": cfg.task.name,
+        }
+
+    def reset(
+        self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Start an episode in every world.
+
+        Args:
+            seed: A number for each world, or the first of them. World k starts as world ``seed[k]``
+                of any batch of mjstack does under the configured seed: the same number is the same
+                start, wherever it stands. Without it every world goes on to its next episode.
+            options: Not used.
+        """
+        env = self.inner
+        if seed is None:
+            env.reset()
+            env.sim.forward()
+        else:
+            if isinstance(seed, int):
+                seed = range(seed, seed + self.num_envs)
+            numbers = list(seed)
+            if len(numbers) != self.num_envs:
+                expected = f"a number for each of {self.num_envs} worlds"
+                raise ArgumentError("seed", f"{len(numbers)} numbers", expected)
+            reset_worlds(env, env.cfg.seed, numbers)
+        self._left = env.cfg.task.episode_steps
+        self._check.start(env, self._left, [])
+        return self._observe(), {}
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[dict[str, Any], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Advance every world by one control step, or none if the episode is over.
+
+        Args:
+            actions: Joint targets in the environment's units, shape ``(num_envs, joints)``.
+
+        Raises:
+            MjstackError: The actions have another width, are not finite or in other units.
+        """
+        env = self.inner
+        commands = np.asarray(actions, np.float32)
+        if commands.shape != self.action_space.shape:
+            expected = f"shape {self.action_space.shape}, a target for each joint"
+            raise ArgumentError("action", f"shape {commands.shape}", expected)
+        success = np.zeros(self.num_envs, bool)
+        if self._left:
+            if self._units is not None:
+                if self._left == env.cfg.task.episode_steps:
+                    self._units.check_commands(commands, self._observe()["agent_pos"])
+                commands = self._units.to_si(commands)
+            env.step(torch.tensor(commands, device=env.device))
+            self._check.update(self._phase)
+            self._left -= 1
+            if not self._left:
+                success = (self._check.result().failed == 0).cpu().numpy()
+        ended = np.full(self.num_envs, not self._left)
+        infos: dict[str, Any] = {"is_success": success}
+        if not self._left:
+            infos |= {"final_info": {"is_success": success}, "_final_info": ended}
+        reward = success.astype(np.float32)
+        return self._observe(), reward, np.zeros_like(ended), ended, infos
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> Sequence[Any]:
+        """A value of every world, by the name that LeRobot has for it. Pictures of ``render`` are
+        drawn when they are taken, such as by ``[:10]``.
+        """
+        return _Pictures(self) if name == "render" else self.get_attr(name)
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """As `call`, for what every world shares.
+
+        Raises:
+            AttributeError: There is no such value.
+        """
+        if name not in self._shared:
+            raise AttributeError(name)
+        return (self._shared[name],) * self.num_envs
+
+    def render(self) -> tuple[np.ndarray, ...]:
+        """A picture of every world, each ``(height, width, 3)``, uint8."""
+        return tuple(self.draw(range(self.num_envs)))
+
+    def draw(self, worlds: Sequence[int]) -> Iterator[np.ndarray]:
+        """Draw some worlds: the first camera's images, or those of ``film``.
+
+        Raises:
+            MjstackError: This machine cannot draw.
+        """
+        env = self.inner
+        if self._film is None:
+            image = next(iter(env.images.values()))
+            yield from (image[world].cpu().numpy().copy() for world in worlds)
+            return
+        # Visual geoms are in the drawn model alone, bodies in both.
+        fields = {name: env.sim.fields[name] for name in env.sim.fields if name[:5] == "body_"}
+        if self._renderer is None:
+            self._renderer = Stage(self._film).color_renderer(_FILMED, [*fields])
+        for start in range(0, len(worlds), _FILMED):
+            rows = torch.tensor(worlds[start : start + _FILMED], device=env.device)
+            changed = {name: values[rows] for name, values in fields.items()}
+            for images in self._renderer.draw(env.sim.qpos[rows], changed).values():
+                yield from images.cpu().numpy().copy()
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Give the simulation's threads and buffers back."""
+        if self._renderer is not None:
+            self._renderer.close()
+        self.inner.close()
+
+    def _observe(self) -> dict[str, Any]:
+        """Observations of the current state. What is not finite is 0: the check fails its world."""
+        env = self.inner
+        positions = self._joints.read(env.sim.qpos).cpu().numpy()
+        if self._units is not None:
+            positions = self._units.from_si(positions)
+        group = env.observation_manager.groups[GROUP].cpu().numpy()
+        seen: dict[str, Any] = {
+            name: np.nan_to_num(values.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+            for name, values in (("agent_pos", positions), ("environment_state", group))
+        }
+        if env.images:
+            seen["pixels"] = {
+                name.removeprefix("images."): image.to("cpu", copy=True).numpy()
+                for name, image in env.images.items()
+            }
+        return seen
+
+
+class _Pictures(Sequence[np.ndarray]):
+    """A picture of every world, drawn when it is taken."""
+
+    def __init__(self, worlds: LerobotVectorEnv) -> None:
+        self._worlds = worlds
+
+    def __len__(self) -> int:
+        return self._worlds.num_envs
+
+    def __getitem__(self, index: int | slice) -> Any:
+        numbers = range(len(self))[index]
+        if isinstance(numbers, int):
+            return next(self._worlds.draw([numbers]))
+        return list(self._worlds.draw(numbers))
