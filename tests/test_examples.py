@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from functools import cache
 from pathlib import Path
 
@@ -17,14 +18,19 @@ from mjstack.episodes.rollout import play_episode
 from mjstack.episodes.stage import Stage
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
+FRANKA = Path(os.environ.get("MENAGERIE_ROOT", "/nowhere")) / "franka_emika_panda"
+needs_franka = pytest.mark.skipif(
+    not FRANKA.is_dir(), reason="MENAGERIE_ROOT has no franka_emika_panda"
+)
 
 
 @cache
 def arguments(example: str, robot: str) -> tuple[str, ...]:
     """A command line on native MuJoCo, with phases of half their time."""
     folder = EXAMPLES / example / "conf"
-    task = "stack" if example == "scara" else example
-    chosen = (f"robot={robot}", f"task={task}")
+    task = "stack" if example in ("scara", "panda") else example
+    model = "menagerie" if example == "panda" else "builtin"
+    chosen = (f"robot={robot}", f"task={task}", f"model={model}")
     cfg = load_config(chosen, config_dir=folder)
     return (
         f"--config-dir={folder}",
@@ -59,6 +65,7 @@ def play_gates(example: str, robot: str, folder: Path, *overrides: str) -> dict[
         ("push", "so101", "baseline,batch"),
         pytest.param("push", "rebot", "baseline,parity,batch", marks=pytest.mark.full),
         ("scara", "scara", "baseline,batch,success"),
+        pytest.param("panda", "panda", "baseline,batch", marks=needs_franka),
     ],
 )
 def test_the_gates_pass(example: str, robot: str, gates: str, tmp_path: Path) -> None:
@@ -120,7 +127,9 @@ def test_worlds_that_are_not_driven_fail(example: str, rules: list[str]) -> None
     assert failing == {name: [0, 1] for name in rules}
 
 
-@pytest.mark.parametrize(("example", "most"), [("push", 120), ("tower", 80), ("scara", 40)])
+@pytest.mark.parametrize(
+    ("example", "most"), [("push", 120), ("tower", 80), ("scara", 40), ("panda", 40)]
+)
 def test_an_example_is_short(example: str, most: int) -> None:
     folder = EXAMPLES / example
     files = [*folder.rglob("*.yaml"), *folder.rglob("*.py")]

@@ -10,6 +10,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -139,6 +140,32 @@ def test_grasp_sites_are_added_where_the_file_lacks_them(tmp_path: Path) -> None
     parts = {"left_grasp": ["left_finger"]}
     site = build_model(replace(cfg, robot=replace(cfg.robot, grasp_parts=parts))).site("left_grasp")
     np.testing.assert_allclose(site.pos, 0.0)
+    robot = replace(cfg.robot, grasp_parts=parts, grasp_pos={"left_grasp": [0.0, 0.0, -0.1]})
+    site = build_model(replace(cfg, robot=robot)).site("left_grasp")
+    np.testing.assert_allclose(site.pos, [0.0, 0.0, -0.1])
+
+
+def test_fingers_on_a_tendon_move_as_its_own_servo_moves_them(tmp_path: Path) -> None:
+    """The file's servo takes 0 to 250 for 0 to 0.05 m, and pushes with 3 N at most."""
+    fingers = re.search(r'<position name="left".*<position name="right"[^>]*>', MJCF, re.DOTALL)
+    assert fingers is not None
+    parts = "".join(f'<joint joint="{name}" coef="0.5"/>' for name in ("left", "right"))
+    servo = """<general name="hand" tendon="split" ctrlrange="0 250" forcerange="-3 3"
+      biastype="affine" gainprm="0.1" biasprm="0 -500 -20"/>"""
+    tendon = f'</actuator><tendon><fixed name="split">{parts}</fixed></tendon>'
+    cfg = changed(tmp_path, f"{fingers[0]}\n  </actuator>", servo + tendon)
+    file = mujoco.MjModel.from_xml_path(str(cfg.robot.file))
+    split = robot_spec(cfg.robot, cfg.model).compile()
+    np.testing.assert_allclose(split.actuator("left").ctrlrange, [0.0, 0.05])
+    moved = []
+    for model, names, target in ((file, ["hand"], 100.0), (split, ["left", "right"], 0.02)):
+        data = mujoco.MjData(model)
+        data.ctrl[[model.actuator(name).id for name in names]] = target
+        for _ in range(400):
+            mujoco.mj_step(model, data)
+        moved.append([float(data.joint(name).qpos[0]) for name in ("left", "right")])
+    assert 0.01 < moved[0][0] < 0.021
+    np.testing.assert_allclose(moved[1], moved[0], rtol=0.0, atol=1e-7)
 
 
 def scara_points(n: int) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Robot descriptions as MjSpec: any MJCF file, mjstack's own mesh-free ones, or Menagerie's."""
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import mujoco
@@ -43,6 +43,7 @@ def robot_spec(robot: RobotCfg, model: ModelCfg) -> mujoco.MjSpec:
     if robot.approach_body:
         _require("robot.approach_body: body", robot.approach_body, spec.bodies)
     _add_grasp_sites(spec, robot)
+    _split_tendon_servos(spec, robot.gripper_joints)
     for key in ("arm_joints", "gripper_joints"):
         for name in getattr(robot, key):
             _require(f"robot.{key}: joint", name, spec.joints)
@@ -132,12 +133,36 @@ def _add_grasp_sites(spec: mujoco.MjSpec, robot: RobotCfg) -> None:
             _require("grasp site", site, spec.sites)
         parts = robot.grasp_parts[site]
         if spec.body(parts[0]) is not None:
-            spec.body(parts[0]).add_site(name=site, group=4)
+            pos = robot.grasp_pos.get(site, [0.0, 0.0, 0.0])
+            spec.body(parts[0]).add_site(name=site, pos=pos, group=4)
             continue
         for name in parts:
             _require("geom", name, spec.geoms)
         geoms = [spec.geom(name) for name in parts]
         geoms[0].parent.add_site(name=site, pos=np.mean([g.pos for g in geoms], axis=0), group=4)
+
+
+def _split_tendon_servos(spec: mujoco.MjSpec, joints: Sequence[str]) -> None:
+    """Put a servo of each finger in place of a position servo that moves them by a tendon.
+
+    Its target is the finger's position, whatever the tendon's unit is. Gains and force are the
+    finger's share, so that fingers which move alike feel the same.
+    """
+    for servo in list(spec.actuators):
+        if servo.trntype != mujoco.mjtTrn.mjTRN_TENDON:
+            continue
+        share = {part.target.name: part.coef for part in spec.tendon(servo.target).path}
+        offset, stiffness, damping = servo.biasprm[:3] * [1.0, -1.0, -1.0]
+        if not share.keys() <= set(joints) or not stiffness > 0.0:
+            continue
+        moved = sum(share.values())  # of the tendon, where all fingers move by 1
+        span = (servo.gainprm[0] * servo.ctrlrange + offset) / (stiffness * moved)
+        for name, part in share.items():
+            actuator = spec.add_actuator(name=name, target=name, ctrlrange=np.sort(span))
+            actuator.trntype = mujoco.mjtTrn.mjTRN_JOINT
+            actuator.set_to_position(kp=part * moved * stiffness, kv=part * moved * damping)
+            actuator.forcerange = part * servo.forcerange
+        spec.delete(servo)
 
 
 def _prepare_joint(spec: mujoco.MjSpec, name: str) -> None:

@@ -98,6 +98,8 @@ class RobotCfg:
     """Two sites, one on each jaw. Their midpoint is the grasp point."""
     grasp_parts: dict[str, list[str]] = field(default_factory=dict)
     """Where a grasp site goes that the file lacks: the mean of these geoms or bodies of one jaw."""
+    grasp_pos: dict[str, list[float]] = spec(factory=dict, unit="m", length=3)
+    """Where such a site lies in the frame of the body that ``grasp_parts`` names; its origin."""
     home: list[float] = spec(unit="rad, m")
     """Joint values at which a driven episode begins."""
     start: list[float] = spec(factory=list, unit="rad, m")
