@@ -119,18 +119,19 @@ def _parts(gate: GateResult, worlds: Mapping[str, Worlds]) -> Iterator[Part]:
 
 
 def _take_limited(metrics: dict[str, float], thresholds: dict[str, float]) -> Iterator[Table]:
-    """Metrics ``STATE.GROUP.NAME`` with a threshold ``GROUP.NAME``, taken out of both mappings: a
-    row per state and group, in which each stands beside its limit.
+    """Metrics ``STATE.GROUP.NAME`` with a threshold of this name or ``GROUP.NAME``, taken out of
+    both mappings: a row per state and group, in which each stands beside its limit.
     """
     cells: dict[str, dict[str, str]] = {}
     limits = set()
     for name in list(metrics):
         state, _, quantity = name.partition(".")
         group, dot, column = quantity.rpartition(".")
-        if not dot or quantity not in thresholds:
+        key = name if name in thresholds else quantity
+        if not dot or key not in thresholds:
             continue
-        limits.add(quantity)
-        limit = float(thresholds[quantity])
+        limits.add(key)
+        limit = float(thresholds[key])
         value = float(metrics.pop(name))
         grade = "good" if value <= 0.5 * limit else "near" if value <= limit else "bad"
         row = cells.setdefault(f"{label(state)}, {label(group)}", {})
