@@ -4,6 +4,7 @@ time.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache, reduce
@@ -172,6 +173,17 @@ def quats(yaw: np.ndarray) -> np.ndarray:
     """Rotations about z [rad], as a starts file has them, shape ``(..., 4)``."""
     zero = np.zeros_like(yaw)
     return np.stack((np.cos(0.5 * yaw), zero, zero, np.sin(0.5 * yaw)), axis=-1)
+
+
+def report_of(folder: Path) -> dict[str, Any]:
+    """The report that a run has left."""
+    return json.loads((folder / "report.json").read_text())
+
+
+def gate_of(folder: Path) -> dict[str, Any]:
+    """Its one gate."""
+    (gate,) = report_of(folder)["gates"]
+    return gate
 
 
 def record_of(folder: Path, seed: int = 0, gate: str = "batch") -> EpisodeRecord:

@@ -4,7 +4,6 @@ what trainings leave, interrupted ones and ones in two processes.
 
 from __future__ import annotations
 
-import json
 import os
 import socket
 import subprocess
@@ -16,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 from compositions import load_config
-from environments import configure
+from environments import configure, report_of
 
 import mjstack.interrupt as interrupt
 from mjstack.cli import run
@@ -77,8 +76,7 @@ def write_policy(folder: Path, cfg: Config, **options: int | str) -> Path:
 
 def report(folder: Path) -> dict:
     """The gates of a run's report by name."""
-    gates = json.loads((folder / "report.json").read_text())["gates"]
-    return {gate["name"]: gate for gate in gates}
+    return {gate["name"]: gate for gate in report_of(folder)["gates"]}
 
 
 def curve(folder: Path) -> np.ndarray:

@@ -153,15 +153,6 @@ def test_vector_autoreset_in_the_same_step(make: Make) -> None:
 
 
 @pytest.mark.full
-def test_vector_final_obs_of_all_groups(make: Make) -> None:
-    env = GymnasiumVectorEnv(make("task.episode_steps=1"), group=None)
-    env.reset(seed=0)
-    *_, infos = env.step(zeros(env))
-    assert infos["final_obs"].shape == (3,)
-    assert all(final in env.single_observation_space for final in infos["final_obs"])
-
-
-@pytest.mark.full
 def test_vector_success_ends_an_episode(make: Make) -> None:
     env = GymnasiumVectorEnv(make(*SUCCESS, "task.success.params.steps=2"))
     env.reset(seed=0)

@@ -141,24 +141,6 @@ def test_the_table_is_written_once(
     assert f"{FAILING} has every failing episode with what was measured" in result.details
 
 
-@pytest.mark.full
-def test_second_seed_is_what_it_is_alone(
-    two_seeds: tuple[Path, GateResult, list[str]], new_run: Callable[..., Run], tmp_path: Path
-) -> None:
-    """Worlds are started anew: nothing of seed 0 is left in them. Fewer of them, too, because
-    nworld does not matter.
-    """
-    result = play(new_run("sim=native", "nworld=3", "seed=1", *TIGHT), tmp_path)
-    alone = record_of(tmp_path, 1)
-    first, second = (record_of(two_seeds[0], seed) for seed in (0, 1))
-    assert np.array_equal(alone.qpos, second.qpos[:3])
-    assert np.array_equal(alone.failed, second.failed[:3])
-    assert not np.array_equal(first.qpos, second.qpos)
-    worlds = ", ".join(map(str, np.flatnonzero(alone.failed)))
-    assert f"({worlds}) failed" in result.reason  # one seed: it is not in names of worlds
-    assert result.metrics["worlds"] == 3
-
-
 @pytest.mark.parametrize("nu", [6, 8])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_commands_do_not_depend_on_nworld(nu: int, dtype: torch.dtype) -> None:
@@ -240,6 +222,8 @@ def test_full_disk_takes_no_verdict_back(
     run.folder = tmp_path
     (result,) = GATES[gate](run)
     assert result.status is Status.passed
+    assert "2 of 2 " in result.reason  # what is allowed is named, and voids figures of the batch
+    assert gate == "success" or not {"episode_s", "world_steps_per_s"} & set(result.metrics)
     problems = [line for line in result.details if "No space left on device" in line]
     files = (starts_name(0), REGIONS) if gate == "success" else ()
     for name in (f"{STEMS[gate]}_seed0.npz", FAILING, *files):
@@ -253,17 +237,6 @@ def test_damaged_record_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(FolderError, match=r"worlds_seed0\.npz: cannot be read") as caught:
         EpisodeRecord.read(tmp_path, 0)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.full
-def test_a_few_failures_may_be_allowed(new_run: Callable[..., Run]) -> None:
-    """nworld=2 of seed 0 has world 1 off; allowed, it is still named."""
-    result = play(new_run("sim=native", "nworld=2", "gate.batch.failed_worlds=1", *TIGHT), None)
-    assert result.status is Status.passed
-    assert "1 of 2 worlds succeeded (50 %," in result.reason
-    assert "1 of 2 worlds (1) failed: not stacked in 1" in result.reason
-    # Allowed, and void nonetheless
-    assert not {"episode_s", "world_steps_per_s"} & set(result.metrics)
 
 
 @pytest.mark.full

@@ -19,7 +19,6 @@ from ik_arm import Arm, results, tensors
 from test_robot_models import REPO, upstream
 
 from mjstack.episodes.stage import Stage
-from mjstack.errors import ArgumentError
 from mjstack.kinematics.mink_ik import GraspIk
 from mjstack.robots import robot_spec
 from mjstack.sim.warp_setup import torch_stream_scope
@@ -356,14 +355,6 @@ def test_the_approach_axis_turns_where_it_is_wished(
         ik.solve(*tensors(device, start, target))[0].cpu().double().numpy()
     )  # not where it was wished before
     assert np.mean(arm.directions(down)[1][:, 2]) < np.mean(wished[:, 2]) - 0.1
-
-
-@pytest.mark.full
-def test_a_wished_approach_needs_a_direction_per_world(arm: Arm) -> None:
-    start = torch.tensor(arm.at_home(4))
-    down = torch.tensor([[0.0, 0.0, -1.0]])
-    with pytest.raises(ArgumentError, match="approach: found shape"):
-        arm.solver(4, "cpu", approach_gain=0.1).solve(start, start[:, :3], approach=down)
 
 
 @pytest.mark.full

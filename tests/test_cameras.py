@@ -87,7 +87,8 @@ def drawn_anew(env: Env, camera: str) -> list[bool]:
 @pytest.mark.parametrize("mjwarp", ["mjwarp", MJWARP_CUDA])
 def test_images_of_both_backends(make: Make, mjwarp: str) -> None:
     oblong = "scene.cameras.wrist.size=[28,36]"
-    overrides = ["reset=randomized", *small("front", "wrist", outputs=ALL), oblong]
+    overrides = ["looks=randomized", "reset=randomized"]
+    overrides += [*small("front", "wrist", outputs=ALL), oblong]
     sizes = {"front": (32, 32), "wrist": (28, 36)}
     found = {}
     for backend in ("native", mjwarp):
@@ -135,12 +136,11 @@ def test_without_cameras_nothing_is_drawn_or_kept() -> None:
     assert off.scene.cameras == {}
 
 
-@pytest.mark.parametrize("robot", ["so101", pytest.param("rebot", marks=pytest.mark.full)])
 @pytest.mark.parametrize("backend", ["native", pytest.param("mjwarp", marks=pytest.mark.full)])
-def test_physics_is_the_same_to_the_bit(make: Make, robot: str, backend: str) -> None:
+def test_physics_is_the_same_to_the_bit(make: Make, backend: str) -> None:
     ends = []
     for more in ([], small("wrist", size=4)):
-        env = make(backend, f"robot={robot}", "reset=randomized", *more)
+        env = make(backend, "reset=randomized", *more)
         sim = env.sim
         env.reset_manager.reset(torch.ones(2, dtype=torch.bool))
         generator = torch.Generator().manual_seed(0)
@@ -352,26 +352,6 @@ def test_looks_stay_in_their_ranges(make: Make) -> None:
     assert (fields["geom_rgba"][:, robot] == model.geom_rgba[None, robot]).all()
 
 
-@GL
-@pytest.mark.full
-@pytest.mark.parametrize("mjwarp", ["mjwarp", MJWARP_CUDA])
-def test_both_backends_draw_the_same_looks(make: Make, mjwarp: str) -> None:
-    outputs = small("front", "wrist", outputs=ALL, size=96)
-    envs = [
-        make(backend, "looks=randomized", "reset=randomized", *outputs, nworld=4)
-        for backend in ("native", mjwarp)
-    ]
-    for env in envs:
-        env.reset(seed=1)
-    for camera in ("front", "wrist"):
-        a, b = (env.images[f"images.{camera}"].cpu().float() for env in envs)
-        same = torch.eq(*(env.images[f"segmentation.{camera}"].cpu() for env in envs))
-        assert same.float().mean() > 0.995
-        assert (a - b).abs()[same].mean() < 4.0
-        means = a.mean(dim=(1, 2))
-        assert torch.cdist(means, means).fill_diagonal_(99.0).min() > 2.0  # worlds differ
-
-
 @pytest.mark.parametrize(
     ("override", "message"),
     [
@@ -480,9 +460,9 @@ def test_images_that_compare_too_little_fail(monkeypatch: pytest.MonkeyPatch) ->
 
 @GL
 @pytest.mark.full
-def test_parity_compares_images_here_and_elsewhere(robot: str, tmp_path: Path) -> None:
-    overrides = [f"robot={robot}", "gates=[parity]", "sim=mjwarp", "sim.device=cpu"]
-    overrides += [*at_double_speed(robot), *small("front", "top", "wrist", size=128)]
+def test_parity_compares_images_here_and_elsewhere(tmp_path: Path) -> None:
+    overrides = ["gates=[parity]", "sim=mjwarp", "sim.device=cpu"]
+    overrides += [*at_double_speed(), *small("front", "top", "wrist", size=128)]
     (result,) = run_parity(Run(Stage(load_config(overrides)), folder=tmp_path))
     assert result.status is Status.passed
     assert result.metrics["images.front.iou.red"] > 0.99
@@ -510,7 +490,7 @@ def test_parity_compares_images_here_and_elsewhere(robot: str, tmp_path: Path) -
     there = f"gate.parity.images={file}"
     size = "scene.cameras.front.size=[64,64]"
     for args, message in (
-        ([*overrides[:4], *small("front")], r"drawn with .*cameras\.top\.size=.*, expected none"),
+        ([*overrides[:3], *small("front")], r"drawn with .*cameras\.top\.size=.*, expected none"),
         ([*overrides, size], r"scene.cameras.front.size=\[128, 128\], expected \[64, 64\]"),
     ):
         with pytest.raises(FolderError, match=message):

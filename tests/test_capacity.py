@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 import torch
 from compositions import load_config
-from environments import at_double_speed, on_backend, on_cuda, one_second_episode
+from environments import at_double_speed, on_cuda, one_second_episode
 
 import mjstack
 from mjstack.config.schema import Backend
-from mjstack.envs import Env, build_env
+from mjstack.envs import Env
 from mjstack.envs.buffers import (
     Peaks,
     Workload,
@@ -104,23 +104,6 @@ def test_a_peak_after_a_reset_counts(
     rows = sim.lasting_peaks()[1]
     assert (rows > quiet).all()
     assert torch.equal(rows, torch.maximum(quiet, sim.peak_constraints))
-
-
-@pytest.mark.full
-def test_peaks_of_an_environment_outlive_its_episodes(backend: str) -> None:
-    """Every world ends in every third step; the loop keeps what it sees before each reset."""
-    cfg = load_config(["termination.time_out.params.steps=3", "seed=3"])
-    env = build_env(cfg, nworld=2, **on_backend(backend))
-    env.reset(seed=3)
-    seen = torch.zeros(2, dtype=torch.int32, device=env.device)
-    for _ in range(8):
-        play_random_actions(env, 1)
-        seen = torch.maximum(seen, env.sim.constraint_count)
-    found = read_peaks(env.sim)
-    assert env.episode.tolist() == [2, 2]
-    assert (torch.from_numpy(found.rows) >= seen.cpu()).all()
-    assert found.rows.max() >= int(env.sim.peak_constraints.max())
-    assert found.contacts.min() > 0
 
 
 # From peaks to sizes

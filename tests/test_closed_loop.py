@@ -236,19 +236,6 @@ def test_worlds_start_over_by_themselves() -> None:
 
 
 @pytest.mark.full
-def test_a_world_does_not_depend_on_its_neighbours(drive: Drive) -> None:
-    runs = []
-    for nworld in (1, 4):
-        env, controller = drive(*at_double_speed(), nworld=nworld)
-        commands = []
-        for _ in range(70):
-            commands.append(controller.command()[0].clone())
-            env.step(commands[-1].expand(nworld, -1) if nworld == 1 else controller._command)
-        runs.append(torch.stack(commands))
-    torch.testing.assert_close(runs[0], runs[1], rtol=0.0, atol=1e-6)
-
-
-@pytest.mark.full
 def test_out_of_reach_is_flagged_in_its_world(drive: Drive) -> None:
     env, controller = drive(nworld=2)
     env.sim.qpos[1, env.index.object_qpos[0]] = 0.9

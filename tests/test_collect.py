@@ -20,7 +20,7 @@ import pytest
 import torch
 from compositions import load_config, put
 from dataset_checker import check_dataset, contents
-from environments import at_double_speed, on_cuda, one_second_episode, two_starts
+from environments import at_double_speed, on_cuda, report_of, two_starts
 from stubs import episodes_of, fake_batches, pairs
 
 from mjstack.cli import run
@@ -60,10 +60,6 @@ STEPS = 300  # of a demonstration at double speed
 def steps_of(dataset: Path, number: int) -> dict[str, np.ndarray]:
     table = pq.read_table(dataset / "data", filters=[("episode_index", "==", number)])
     return {name: np.array(table[name].to_pylist()) for name in table.column_names}
-
-
-def report_of(folder: Path) -> dict:
-    return json.loads((folder / "report.json").read_text())
 
 
 def gate_episode(cfg: Config) -> SimpleNamespace:
@@ -647,20 +643,6 @@ def test_steps_come_to_the_host_in_chunks(monkeypatch: pytest.MonkeyPatch) -> No
         for episode in episodes:
             for name, values in rows.items():
                 assert np.array_equal(episode.arrays[name], values[:5, episode.world].numpy())
-
-
-@pytest.mark.full
-def test_mjwarp_demonstrations(folder: Path) -> None:
-    """Their steps are nearly those of the same worlds on native MuJoCo."""
-    args = ["nworld=1", "job.episodes=1", "job.keep_failures=true", *one_second_episode()]
-    assert collect(*args, "sim=mjwarp", "sim.device=cpu", "job.folder=warp") == 0
-    assert collect(*args) == 0
-    check_dataset(Path("warp/dataset"))
-    warp = steps_of(Path("warp/dataset"), 0)
-    native = steps_of(folder / "dataset", 0)
-    for name in ("observation.state", "action"):
-        assert np.ptp(native[name], axis=0).max() > 0.5
-        assert np.abs(warp[name] - native[name]).max() < 1e-2, name
 
 
 @pytest.mark.full

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import torch
 from check_cases import rules_of
-from environments import at_double_speed, one_second_episode
+from environments import at_double_speed
 
 from mjstack import interrupt
 from mjstack.config import Config
@@ -24,7 +24,6 @@ from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError
 from mjstack.gates.batch import run_batch
-from mjstack.gates.capacity import run_capacity
 from mjstack.gates.runner import run_guarded
 from mjstack.gates.throughput import run_throughput
 from mjstack.jobs import gates
@@ -75,22 +74,6 @@ def test_native(get_stage: Callable[[str], Stage], make_sim: Callable[..., Simul
     assert broken[5] == {"STEPS"}
 
 
-@pytest.mark.full
-def test_mjwarp(get_stage: Callable[..., Stage], make_sim: Callable[..., Simulation]) -> None:
-    stage = get_stage("so101", *at_double_speed())
-    sim = make_sim("mjwarp", 3)
-    push = teleport(stage, 1)
-
-    def hook(step: int, sim: Simulation) -> None:
-        push(step, sim)
-        if step == stage.phase("above_blue").start:
-            sim.qvel[2, stage.index.object_qvel[1]] = math.nan
-
-    broken = rules(stage.play(sim, stage.cfg.reset, [Hook(hook)]).result.failed)
-    assert broken[:2] == [set(), {"STACKED"}]
-    assert {"FINITE", "STACKED"} <= broken[2]
-
-
 def crowd(stage: Stage, sim: Simulation, world: int) -> None:
     """Puts both cubes of one world into each other, the table and the gripper: far more contacts
     than elsewhere.
@@ -127,37 +110,6 @@ def test_overflow_in_exactly_the_crowded_world(
     sim.reset(torch.tensor([False, True, False]))
     sim.step(1)
     assert sim.overflow.tolist() == [0, 0, 0]
-
-
-SHORT = ("sim=native", "nworld=2", "gate.capacity.random_steps=20")
-
-
-@pytest.mark.full
-@pytest.mark.parametrize(
-    ("key", "room", "buffer", "peak"),
-    [
-        ("njmax", 100, "njmax", "peak_constraint_rows_per_world"),
-        ("nconmax", 8, "contact pool", "peak_contacts_per_world"),
-    ],
-)
-def test_capacity_gate_names_worlds_and_the_fix(
-    key: str, room: int, buffer: str, peak: str, new_run: Callable[..., Run]
-) -> None:
-    (result,) = run_capacity(new_run(*SHORT, f"batch.{key}={room}", *one_second_episode()))
-    assert result.status is Status.failed
-    assert f"{buffer} overflow in 2 of 2 worlds (0, 1)" in result.reason
-    assert f"room for {room} per world" in result.reason
-    recommended = int(result.reason.split(f"batch.{key}=")[1].split()[0].rstrip(".;"))
-    assert recommended == result.metrics[f"recommended.{key}"]
-    assert recommended > int(result.metrics[peak]) > room
-
-
-def test_capacity_gate_passes_with_what_it_recommends(new_run: Callable[..., Run]) -> None:
-    sizes = ("batch.njmax=184", "batch.nconmax=40")
-    (result,) = run_capacity(new_run(*SHORT, *sizes, *at_double_speed()))
-    assert result.status is Status.passed, result.reason
-    assert int(result.metrics["recommended.njmax"]) <= 184
-    assert int(result.metrics["recommended.nconmax"]) <= 40
 
 
 @pytest.mark.full

@@ -97,8 +97,11 @@ def test_a_masked_reset_touches_nobody_else(backend: str, task: str, robot: str)
 
 @pytest.mark.full
 def test_starts_depend_on_seed_world_and_episode_alone(robot: str) -> None:
-    """On how many worlds there are, which of them reset with it, and the backend they do not."""
+    """On how many worlds there are, which of them reset with it, and the backend they do not. The
+    configuration's seed is the one of a reset without.
+    """
     cfg = randomized("reach", robot)
+    cfg.seed = 5
     names = ("qpos", "qvel", "ctrl", "site_xpos")
 
     def starts(env: Env) -> dict[str, torch.Tensor]:
@@ -108,7 +111,7 @@ def test_starts_depend_on_seed_world_and_episode_alone(robot: str) -> None:
     runs = {}
     for backend, nworld in (("native", N), ("native", 2), ("mjwarp", N)):
         env = on_shared_sim(backend, nworld, cfg)
-        env.reset(seed=5)
+        env.reset(seed=5 if backend == "mjwarp" else None)
         if nworld == N:
             env.reset(mask=mask_of(env, 1, 3))
             env.step(actions(env, 1)[0])
@@ -127,6 +130,11 @@ def test_starts_depend_on_seed_world_and_episode_alone(robot: str) -> None:
         # float32 holds seven digits: gains up to a thousand, metres and radians of order one.
         torch.testing.assert_close(warp[name][[0, 1]], four[name][[0, 1]], rtol=1e-6, atol=2e-6)
     assert not torch.equal(four["qpos"][0], two["qpos"][0])  # another episode
+    env.reset(seed=5)
+    before = starts(env)["qpos"]
+    env.reset(seed=6)
+    assert not env.episode.any()
+    assert (starts(env)["qpos"] != before).any(1).all()
 
 
 @scenes
@@ -144,34 +152,6 @@ def test_world_k_of_n_is_world_k_of_one(backend: str, task: str, robot: str) -> 
         assert_traces(play(one, actions(one, 13)), many_trace, 0, k, backend)
     rows = many_trace[-1]["qpos"]
     assert len({tuple(row) for row in rows.tolist()}) == N
-
-
-# Reproducibility
-
-
-@pytest.mark.full
-@scenes
-def test_the_seed_decides_the_episode(backend: str, task: str, robot: str) -> None:
-    cfg = randomized(task, robot, steps=6)
-    cfg.seed = 11
-    env = on_shared_sim(backend, 3, cfg)
-    moves = actions(env, 8)
-    first_start = returned(env.reset())  # the configuration's own seed
-    first = play(env, moves)
-    again_start = returned(env.reset(seed=11))
-    again = play(env, moves)
-    assert_rows(first_start, again_start, slice(None), slice(None), backend)
-    assert_traces(first, again, slice(None), slice(None), backend)
-    assert first[-1]["episode"].tolist() == [1, 1, 1]
-
-    next_start = returned(env.reset())
-    assert env.episode.tolist() == [2, 2, 2]
-    other_start = returned(env.reset(seed=12))
-    assert env.episode.tolist() == [0, 0, 0]
-    for start in (next_start, other_start):
-        for k in range(3):
-            for name in start:
-                assert not torch.equal(start[name][k], first_start[name][k]), name
 
 
 # Outputs are written anew
@@ -394,7 +374,7 @@ def test_noise_then_clip_then_scale(backend: str) -> None:
     assert (seen["clipped"] == -0.5).any()
 
 
-# Every action group and every reset group
+# Every action group
 
 
 def assert_layout(env: Env, row: dict[str, torch.Tensor]) -> None:
@@ -494,18 +474,6 @@ def test_end_effector_delta_moves_the_commanded_grasp_point(backend: str, robot:
         np.testing.assert_allclose(commanded() - before, expected, atol=5e-4)
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("reset", ["nominal", "jitter", "randomized"])
-@scenes
-def test_every_reset_group_steps(backend: str, task: str, robot: str, reset: str) -> None:
-    env = on_shared_sim(backend, 3, configure(f"task={task}", f"reset={reset}", robot=robot))
-    assert_layout(env, returned(env.reset(seed=0)))
-    rows = {tuple(row) for row in env.sim.qpos.tolist()}
-    assert len(rows) == (1 if reset == "nominal" else 3)
-    for move in actions(env, 3):
-        assert_layout(env, returned(env.step(move)))
-
-
 # Ends of episodes
 
 
@@ -542,12 +510,6 @@ def _below_the_table(env: Env, world: int) -> None:
     env.sim.qpos[world, env.index.object_qpos[0] + 2] = under
 
 
-def _beyond_its_range(env: Env, world: int) -> None:
-    """By more than a step can bring back: MuJoCo pushes with all its might."""
-    low, high = env.index.robot_range[0]
-    env.sim.qpos[world, env.index.robot_qpos[0]] = high + 0.5 * (high - low)
-
-
 def _not_a_number(env: Env, world: int) -> None:
     env.sim.qvel[world, env.index.object_qvel[0]] = math.nan
 
@@ -560,7 +522,6 @@ def _overflow(env: Env, world: int) -> None:
     ("term", "world", "spoil"),
     [
         ("object_off_table", 0, _below_the_table),
-        pytest.param("joint_limit", 2, _beyond_its_range, marks=pytest.mark.full),
         ("non_finite", 1, _not_a_number),
         ("overflow", 0, _overflow),
     ],
@@ -581,19 +542,6 @@ def test_time_out_at_exactly_its_step(backend: str) -> None:
         _, _, terminated, truncated, _ = env.step(zeros(env))
         assert not terminated.any()
         assert truncated.tolist() == [step in (5, 10), step == 7, step in (5, 10)]
-
-
-@pytest.mark.full
-def test_what_happened_outweighs_the_clock(backend: str) -> None:
-    env = on_shared_sim(backend, 3, randomized("stack", "so101", steps=2))
-    env.reset(seed=0)
-    env.step(zeros(env))
-    env.sim.qpos[1, env.index.object_qpos[0] + 1] += 1.0
-    _, _, terminated, truncated, _ = env.step(zeros(env))
-    assert terminated.tolist() == [False, True, False]
-    assert truncated.tolist() == [True, False, True]
-    column = env.termination_manager.names.index("time_out")
-    assert env.termination_manager.values[:, column].tolist() == [True] * 3
 
 
 def test_statistics_are_those_of_the_episodes_that_ended(backend: str) -> None:

@@ -253,11 +253,10 @@ def test_a_world_that_is_not_finite_is_alone(device: str) -> None:
 @pytest.mark.parametrize(("boxes", "slides"), [(0, 1), (5, 1), (5, 2), (5, 3), (8, 0), (9, 6)])
 def test_sizes(boxes: int, slides: int, device: str) -> None:
     """On CUDA a row of the Hessian is a thread's up to 31 degrees of freedom; columns of J are
-    padded to 4, and above 32 to 16. A CPU, where each is compiled for some ten seconds, knows no
-    such bounds.
+    padded to 4, and above 32 to 16. The CPU device solves some of these sizes in other tests too.
     """
-    if device == "cpu" and (boxes, slides) not in ((0, 1), (5, 2), (9, 6)):
-        pytest.skip("bounds of CUDA")
+    if device == "cpu" and (boxes, slides) in ((5, 1), (5, 3), (8, 0)):
+        pytest.skip("their kernels take half a minute to compile each")
     arm = "<body pos='{} 1 .15'><joint type='slide' axis='0 0 1'/><geom size='.1'/></body>"
     arms = "".join(map(arm.format, range(slides)))
     model = model_of(f"<geom type='plane' size='9 9 .1'/>{heap(boxes, 3)}{arms}")

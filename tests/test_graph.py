@@ -11,7 +11,7 @@ import pytest
 import torch
 import warp as wp
 from compositions import make_env
-from environments import CUDA, actions, configure, on_cuda, returned, zeros
+from environments import CUDA, actions, on_cuda, returned, zeros
 
 from mjstack.envs import Env
 from mjstack.errors import MjstackError
@@ -168,18 +168,6 @@ def test_without_capture_the_work_just_runs() -> None:
         graph()
     assert len(calls) == 3
     assert not graph.captured
-
-
-@pytest.mark.full
-@on_cuda
-def test_an_episode_of_the_gate_is_captured_and_accepted() -> None:
-    from mjstack.episodes.stage import Stage
-
-    stage = Stage(configure("nworld=32", "sim=mjwarp", "graph=require"))
-    sim = stage.batch_simulation(32)
-    episode = stage.play(sim, stage.cfg.reset)
-    assert not episode.result.failed.any()
-    assert episode.timing.capture_seconds > 0.0
 
 
 @wp.kernel

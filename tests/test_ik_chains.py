@@ -163,3 +163,5 @@ def test_shapes_are_not_broadcast() -> None:
             ik.solve(*arguments)
     with pytest.raises(ArgumentError, match="q: found shape"):
         ik.forward(torch.zeros(3, 4))
+    with pytest.raises(ArgumentError, match="approach: found shape"):
+        odd_arm().solver(3, approach_gain=0.1).solve(q, goal, approach=goal[:1])

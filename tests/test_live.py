@@ -23,7 +23,6 @@ import msgspec
 import numpy as np
 import pytest
 import test_ppo
-import test_train
 import viser
 import viser.infra._infra
 from browser import EXECUTABLE, browse
@@ -451,7 +450,6 @@ def test_worlds_move_as_without_it(tmp_path: Path, port: int) -> None:
 
 JOBS: dict[str, tuple[tuple[str, ...], set[str]]] = {
     "play": (("job=play", "task=reach", "sim=native", "nworld=1"), {"play"}),
-    "clone": (test_train.REACH, {"train", "success"}),
     "ppo": (test_ppo.REACH, {"train", "success"}),
 }
 

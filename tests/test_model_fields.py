@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from comparison import assert_worlds_step_alone
 from compositions import load_config
 from environments import CUDA, on_backend, start_moving
 
@@ -258,17 +257,6 @@ def test_static_geoms_follow_their_fields(backend: str) -> None:
             np.testing.assert_allclose(sim.geom_xpos[k].double().cpu(), data.geom_xpos, atol=1e-4)
             np.testing.assert_allclose(sim.site_xpos[k].double().cpu(), data.site_xpos, atol=1e-4)
     assert sim.contact_count.tolist() == [0, 1, 0]
-
-
-@pytest.mark.full
-def test_world_k_of_n_is_world_k_of_one(
-    backend: str, make_fields: Make, get_stage: GetStage
-) -> None:
-    many = make_fields(backend)
-    stage = get_stage("so101")
-    randomise(many, stage)
-    start_moving(many, stage)
-    assert_worlds_step_alone(many, make_fields(backend, 1), backend)
 
 
 @pytest.mark.full

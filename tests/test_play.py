@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -11,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 from compositions import load_config
-from environments import configure, has_gl
+from environments import configure, gate_of, has_gl
 from PIL import Image, ImageSequence
 from policies import write_policy
 
@@ -27,11 +26,6 @@ from mjstack.report.picture import save_video
 from mjstack.scene import build_model
 
 REACH = ("job=play", "task=reach", "task.episode_steps=60", "sim=native")
-
-
-def result(folder: Path) -> dict:
-    (gate,) = json.loads((folder / "report.json").read_text())["gates"]
-    return gate
 
 
 @pytest.fixture
@@ -56,7 +50,7 @@ def test_a_policy_plays_worlds_as_a_batch_starts_them(
     policy = write_policy(tmp_path / "policy", configure("task=reach"))
     out = tmp_path / "out"
     assert run([*REACH, f"policy={policy}", "nworld=2", "seed=5", f"hydra.run.dir={out}"]) == 0
-    gate = result(out)
+    gate = gate_of(out)
     assert gate["reason"] == "0 of 2 worlds succeeded"  # a world that fails is shown all the same
     assert "world 1: failed: grasp point not above red" in gate["details"]
     assert (out / "episode.mp4").exists()
@@ -99,7 +93,7 @@ def test_a_task_without_a_check_is_shown_unjudged(saved: list[np.ndarray], tmp_p
     args = [*REACH, "task.check=null", "task.success=null", f"policy={policy}", "nworld=1"]
     args.append(f"hydra.run.dir={out}")
     assert run(args) == 0
-    assert result(out)["reason"] == "not judged: the task has no check"
+    assert gate_of(out)["reason"] == "not judged: the task has no check"
     assert len(saved) == 1
 
 
@@ -242,5 +236,5 @@ def test_a_video_that_cannot_be_written_fails_the_job(
     policy = write_policy(tmp_path / "policy", configure("task=reach"))
     out = tmp_path / "out"
     assert run([*REACH, f"policy={policy}", "nworld=1", f"hydra.run.dir={out}"]) == 1
-    assert "episode.mp4 was not written: No space left on device" in result(out)["reason"]
+    assert "episode.mp4 was not written: No space left on device" in gate_of(out)["reason"]
     assert not (out / "episode.mp4").exists()

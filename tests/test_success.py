@@ -5,7 +5,6 @@ both backends.
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -16,7 +15,7 @@ import pytest
 import torch
 from check_cases import rules_of
 from compositions import load_config
-from environments import at_double_speed, configure, on_cuda, one_second_episode, record_of
+from environments import at_double_speed, configure, gate_of, on_cuda, one_second_episode
 
 from mjstack.cli import run
 from mjstack.config.schema import Config
@@ -53,26 +52,12 @@ def passed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module")
-def warp(passed: Path) -> Path:
-    """The folder of a run on Warp's CPU device from the first two of the native run's layouts."""
-    folder = passed.parent / "warp"
-    start = ("reset=starts_file", f"starts={passed}/starts_seed0.npz")
-    assert command(folder, "sim=mjwarp", "sim.device=cpu", "nworld=2", *start) == 0
-    return folder
-
-
 def counts(metrics: dict[str, float], *names: str) -> list[float]:
     return [metrics[name] for name in names]
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:
     return list(csv.DictReader(path.read_text().splitlines()))
-
-
-def gate_of(folder: Path) -> dict:
-    (gate,) = json.loads((folder / "report.json").read_text())["gates"]
-    return gate
 
 
 def play(run: Run, folder: Path | None = None) -> GateResult:
@@ -176,22 +161,6 @@ def test_seeds_add_up_and_the_rate_decides(hasty: Callable[..., Run], tmp_path: 
     result = play(hasty("gate.success.rate=0"))
     assert result.status is Status.passed
     assert "2 of 2 episodes (0, 1) failed: " in result.reason
-
-
-@pytest.mark.full
-def test_both_backends_start_and_end_alike(passed: Path, warp: Path) -> None:
-    native, mjwarp = (record_of(folder, gate="success") for folder in (passed, warp))
-    assert (native.backend, mjwarp.backend) == ("native", "mjwarp")
-    qpos, places, error = ("start_qpos", "start_places", "value.xy_err_m")
-    assert mjwarp.worlds[qpos].dtype == np.float32
-    assert np.abs(native.worlds[qpos][:2] - mjwarp.worlds[qpos]).max() < 1e-7
-    rounded = native.worlds[places][:2].astype(np.float32)
-    assert np.array_equal(rounded[..., :2], mjwarp.worlds[places][..., :2])
-    assert np.array_equal(native.failed[:2], mjwarp.failed)
-    assert np.abs(native.worlds[error][:2] - mjwarp.worlds[error]).max() < 0.003
-    notes = gate_of(warp)["notes"]
-    assert notes["starts"] == f"starts={passed}/starts_seed0.npz"
-    assert "Warp" in notes["backend"]
 
 
 @pytest.mark.full

@@ -16,7 +16,6 @@ from typing import IO, Any
 
 import pytest
 from compositions import load_config
-from environments import one_second_episode
 from matplotlib.axes import Axes
 
 from mjstack.cli import run
@@ -106,19 +105,6 @@ def test_throughput_goes_on_and_leaves_table_and_plot(
     # Other jobs of the same numbers are not mixed with these.
     assert run([*TINY, "nworld=4,8"]) == 2
     assert "has another sweep, whose job 0 is nworld=1" in capsys.readouterr().err
-
-
-@pytest.mark.full
-def test_a_job_that_fails_is_a_gap(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sweep, "Child", InThisProcess)
-    args = [*TINY, *one_second_episode(), "nworld=1", "batch.njmax=40"]
-    args[args.index("sim=native")] = "sim=mjwarp"
-    assert run([*args, "sim.device=cpu"]) == 1
-    (row,) = table(folder)
-    assert row["status"] == "fail"
-    assert "buffer overflow" in row["reason"]
-    assert row["succeeded"] == "0"
-    assert not any(row.get(name) for name in (RATE, "env_step.env_steps_per_s.median"))
 
 
 def listed(folder: Path, *overrides: str) -> list[SweepJob]:

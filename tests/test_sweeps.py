@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_ranks import SHORT, report_of, start
+from environments import report_of
+from test_ranks import SHORT, start
 from test_run_folder import contents
 
 from mjstack import process

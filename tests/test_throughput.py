@@ -154,8 +154,10 @@ def test_the_batch_gates_episode_is_the_first_repetition(
 
 
 @pytest.mark.full
-def test_episode_alternates_with_bare_steps_on_mjwarp(new_run: Callable[..., Run]) -> None:
-    result = measure(new_run, *MJWARP, f"{ONLY}[episode]", "gate.throughput.repetitions=1")
+def test_mjwarp_alternates_with_bare_steps_and_tells_warm_up_and_capture_apart(
+    new_run: Callable[..., Run],
+) -> None:
+    result = measure(new_run, *MJWARP, "gate.throughput.episodes=1")
     assert result.status is Status.passed, result.reason
     m = result.metrics
     assert m["episode.succeeded"] == 1
@@ -164,21 +166,12 @@ def test_episode_alternates_with_bare_steps_on_mjwarp(new_run: Callable[..., Run
     )
     assert "x bare steps" in result.reason
     # Warp's CPU device: physics is captured, the step around it is not.
-    assert (m["episode.captured"], m["episode.physics_captured"]) == (False, True)
-    assert m["episode.warm_up_s"] > 0.0
-    assert m["episode.capture_s"] > 0.0
-
-
-@pytest.mark.full
-def test_warm_up_and_capture_are_apart_on_mjwarp(new_run: Callable[..., Run]) -> None:
-    result = measure(new_run, *MJWARP, f"{ONLY}[physics,env_step]")
-    assert result.status is Status.passed, result.reason
-    m = result.metrics
-    for name in ("physics", "env_step"):
+    for name in ("episode", "env_step"):
+        assert (m[f"{name}.captured"], m[f"{name}.physics_captured"]) == (False, True)
+    for name in ("physics", "episode", "env_step"):
         assert m[f"{name}.warm_up_s"] > 0.0
         assert m[f"{name}.capture_s"] > 0.0
     assert m["physics.captured"] is True
-    assert (m["env_step.captured"], m["env_step.physics_captured"]) == (False, True)
     # The first call of a step was neither timed nor the estimate: eager it takes some 0.15 s.
     assert 1e-3 * m["physics.ms_per_batched_step.max"] * 10 < m["physics.warm_up_s"]
 
@@ -250,28 +243,12 @@ def test_bare_steps_that_lose_worlds_do_not_count(
 
 
 @pytest.mark.full
-@pytest.mark.parametrize(
-    ("overrides", "reason"),
-    [
-        (
-            (*NATIVE, "gate.throughput.repetitions=1", "task.check.xy_err=1e-7"),
-            "2 of 2 worlds (0, 1) failed the check",
-        ),
-        # 40 rows hold a start above the table, and neither a grasped cube nor thrashing.
-        ((*MJWARP, "batch.njmax=40", f"{ONLY}[physics]"), "physics: no figure: "),
-        (
-            (*MJWARP, "batch.njmax=40", f"{ONLY}[env_step]", "gate.throughput.env_steps=20"),
-            "env_step: no figure: ",
-        ),
-    ],
-)
-def test_worlds_that_fail_void_every_figure(
-    overrides: tuple[str, ...], reason: str, new_run: Callable[..., Run]
-) -> None:
-    result = measure(new_run, *overrides)
+def test_worlds_that_fail_void_every_figure(new_run: Callable[..., Run]) -> None:
+    tight = ("gate.throughput.repetitions=1", "task.check.xy_err=1e-7")
+    result = measure(new_run, *NATIVE, *tight)
     assert result.status is Status.failed
-    assert reason in result.reason
-    assert result.reason.count("no figure") == (1 if MJWARP[0] in overrides else 3)
+    assert "2 of 2 worlds (0, 1) failed the check" in result.reason
+    assert result.reason.count("no figure") == 3
     assert speeds(result) == []
     assert result.metrics.get("episode.succeeded", 0) == 0
 
@@ -286,9 +263,11 @@ def test_steps_not_made_void_the_figure(
         step(self, max(1, n - 1), kinematics=kinematics)
 
     monkeypatch.setattr(NativeSimulation, "step", lazy)
-    result = measure(new_run, *NATIVE, f"{ONLY}[physics]")
+    result = measure(new_run, *NATIVE, f"{ONLY}[physics,env_step]")
     assert result.status is Status.failed
-    assert "physics: no figure: 2 worlds overflowed, diverged or were not stepped" in result.reason
+    for name in ("physics", "env_step"):
+        problem = f"{name}: no figure: 2 worlds overflowed, diverged or were not stepped"
+        assert problem in result.reason
     assert speeds(result) == []
 
 

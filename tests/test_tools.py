@@ -154,11 +154,11 @@ def test_random_actions_for_a_while() -> None:
 
 
 def test_equal_runs_have_equal_verdicts(tmp_path: Path) -> None:
+    """What makes equal runs bit for bit alike has its own tests: this one reads a run twice."""
     command = [sys.executable, str(TOOLS / "verdicts.py")]
-    files = []
-    for name in ("before", "after"):
-        files.append(tmp_path / f"{name}.json")
-        options = ["--only=so101_reach", f"--folder={tmp_path}/{name}", f"--out={files[-1]}"]
+    files = [tmp_path / f"{name}.json" for name in ("before", "after")]
+    for file in files:  # the second call finds the run in the folder
+        options = ["--only=so101_reach", f"--folder={tmp_path}/runs", f"--out={file}"]
         subprocess.run([*command, "--python", sys.executable, *options], check=True)
     subprocess.run([*command, "--compare", *files], check=True)
     before, after = (json.loads(file.read_text()) for file in files)
