@@ -130,9 +130,8 @@ def test_ranks_play_what_one_plays(tmp_path: Path) -> None:
     assert run([*args, f"hydra.run.dir={tmp_path}/one"]) == 1  # the episodes are too short
     text = play(0, [*args, "devices=2", f"hydra.run.dir={tmp_path}/two"], tmp_path, 1)
     assert_same_episodes(tmp_path / "one", tmp_path / "two")
-    if backend == "native":
-        play(3, [*args, f"hydra.run.dir={tmp_path}/three"], tmp_path, 1)
-        assert_same_episodes(tmp_path / "one", tmp_path / "three")
+    play(3, [*args, f"hydra.run.dir={tmp_path}/three"], tmp_path, 1)
+    assert_same_episodes(tmp_path / "one", tmp_path / "three")
     with np.load(tmp_path / "two/starts_seed0.npz") as starts:
         assert {len(array) for array in starts.values()} == {5}
 
