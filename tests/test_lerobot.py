@@ -4,6 +4,8 @@ an environment with it and runs these; elsewhere they are skipped.
 
 from __future__ import annotations
 
+import json
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -16,16 +18,22 @@ from policies import make_policy
 
 pytest.importorskip("lerobot", reason="LeRobot is not installed")
 
+from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.configs.policies import PreTrainedConfig
-from lerobot.policies.factory import get_policy_class
+from lerobot.envs import preprocess_observation
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from lerobot.robots import make_robot_from_config
 
-from mjstack.adapters.lerobot import LerobotVectorEnv, MjstackEnv
+from mjstack.adapters.lerobot import LerobotVectorEnv, MjstackEnv, MjstackFollower
+from mjstack.adapters.lerobot.robot import MjstackCameraConfig, MjstackFollowerConfig
+from mjstack.cli import run
 from mjstack.drivers.closed_loop import make_expert
 from mjstack.drivers.policy import PolicyDriver
 from mjstack.episodes.stage import Stage
-from mjstack.errors import ArgumentError, ConfigError
+from mjstack.errors import ArgumentError, ConfigError, FolderError
 from mjstack.jobs.export import export_policy
 from mjstack.policy import Vision, load_policy, save_policy
+from mjstack.policy.lerobot import LerobotPolicy
 
 NATIVE = ["sim=native", "reset=jitter"]
 
@@ -176,3 +184,160 @@ def test_an_exported_policy_gives_the_drivers_actions(tmp_path: Path, sees: str)
     worlds.close()
     with pytest.raises(ArgumentError, match=r"observation\..*: found 5 numbers, expected"):
         exported.predict_action_chunk({name: value[:, :5] for name, value in batch.items()})
+
+
+@pytest.fixture(scope="module")
+def act(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a small ACT with random weights, which sees joints, the state and an image."""
+    from lerobot.policies.act.configuration_act import ACTConfig
+    from lerobot.policies.act.modeling_act import ACTPolicy
+
+    shapes = {
+        "observation.state": (FeatureType.STATE, (6,)),
+        "observation.environment_state": (FeatureType.ENV, (28,)),
+        "observation.images.front": (FeatureType.VISUAL, (3, 64, 64)),
+    }
+    small = {"dim_model": 32, "n_heads": 2, "dim_feedforward": 32, "n_encoder_layers": 1}
+    config = ACTConfig(
+        input_features={key: PolicyFeature(*shape) for key, shape in shapes.items()},
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (6,))},
+        pretrained_backbone_weights=None,
+        device="cpu",
+        push_to_hub=False,
+        chunk_size=5,
+        n_action_steps=5,
+        n_vae_encoder_layers=1,
+        **small,
+    )
+    folder = tmp_path_factory.mktemp("act")
+    degrees = torch.tensor([0.0, -22.9, 27.1, 67.4, 88.0, 45.6])  # the SO-101's start
+    unit = {"mean": torch.zeros(6), "std": torch.ones(6)}
+    statistics = {"observation.state": unit, "action": {"mean": degrees, "std": torch.ones(6)}}
+    torch.manual_seed(0)
+    ACTPolicy(config).save_pretrained(folder)
+    for processor in make_pre_post_processors(config, dataset_stats=statistics):
+        processor.save_pretrained(folder)
+    return folder
+
+
+SCENE = ("timing=hz30", "observation=state", "cameras=front", "scene.cameras.front.size=[64,64]")
+
+
+def drive(folder: Path, *overrides: str) -> Stage:
+    args = ["sim=native", "controller=policy", f"policy=lerobot:{folder}", *overrides]
+    return Stage(configure(*args))
+
+
+def test_our_rollout_drives_as_lerobots_does(act: Path) -> None:
+    """Its joint targets are the same numbers in both."""
+    config = PreTrainedConfig.from_pretrained(act)
+    policy = get_policy_class("act").from_pretrained(act, config=config)
+    before, after = make_pre_post_processors(config, str(act))
+    worlds, _ = make_worlds(2, cameras=["front"], observation_height=64, observation_width=64)
+    seen, _ = worlds.reset(seed=0)
+    stage = drive(act, *SCENE, "reset=jitter", "nworld=2")
+    env = stage.start(stage.batch_simulation(2), stage.cfg.reset, worlds=[0, 1])
+    driver = stage.driver(env)
+    assert env.cfg.graph == "off"
+    for _ in range(12):
+        targets = driver.command()
+        batch = preprocess_observation(seen) | {
+            "task": ["Put the red cube onto the blue cube."] * 2
+        }
+        actions = after(policy.select_action(before(batch))).detach().numpy()
+        expected = worlds._units.to_si(actions)
+        np.testing.assert_allclose(targets.numpy(), expected, rtol=0, atol=1e-6)
+        assert targets.std(0).max() > 0.0
+        env.step(targets)
+        seen, *_ = worlds.step(actions)
+    worlds.close()
+    env.close()
+
+
+def test_gate_success_judges_act_with_its_interval_and_failing_rules(
+    act: Path, tmp_path: Path
+) -> None:
+    args = ["gates=[success]", "sim=native", "nworld=3", *SCENE, "controller=policy"]
+    short = ["task.episode_steps=60"]
+    assert run([*args, *short, f"policy=lerobot:{act}", f"hydra.run.dir={tmp_path / 'run'}"]) == 1
+    (gate,) = json.loads((tmp_path / "run" / "report.json").read_text())["gates"]
+    assert gate["reason"].startswith("0 of 3 episodes succeeded (0 %, 95 % interval 0 to 56.15 %)")
+    assert gate["metrics"]["distinct_starts"] == 3
+    assert gate["metrics"]["reached_and_lost"] == 0
+    assert any("STACKED" in line or "not stacked" in line for line in gate["details"])
+    assert (tmp_path / "run" / "episode.html").is_file()
+    replay = ["job=replay", f"run={tmp_path / 'run'}", "world=0", f"hydra.run.dir={tmp_path / 'b'}"]
+    assert run(replay) == 2  # a run's folder may be a stranger's
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (
+            ["cameras=front", "scene.cameras.front.size=[32,32]"],
+            r"images\.front of shape",
+        ),
+        (["cameras=wrist"], r"images\.front of shape \(3, 64, 64\), .* missing"),
+        ([*SCENE, "observation=real"], r"_state of shape \(28,\), and here it is \(22,\)"),
+    ],
+)
+def test_a_scene_without_what_it_sees_is_one_line(
+    act: Path, overrides: list[str], message: str
+) -> None:
+    stage = drive(act, "nworld=1", "observation=state", *overrides)
+    env = stage.start(stage.batch_simulation(1), stage.cfg.reset)
+    with pytest.raises(FolderError, match=message):
+        stage.driver(env)
+    env.close()
+
+
+def test_a_folder_that_cannot_be_loaded_is_one_line(act: Path, tmp_path: Path) -> None:
+    with pytest.raises(FolderError, match=r"has no config\.json, expected a folder"):
+        LerobotPolicy(f"lerobot:{tmp_path}", "cpu", 6)
+    with pytest.raises(FolderError, match="its actions have 6 numbers, expected 7, a target"):
+        LerobotPolicy(f"lerobot:{act}", "cpu", 7)
+    shutil.copy(act / "config.json", tmp_path)
+    with pytest.raises(FolderError, match="LeRobot cannot load it"):
+        LerobotPolicy(f"lerobot:{tmp_path}", "cpu", 6)
+
+
+def test_a_follower_has_the_real_ones_words(tmp_path: Path) -> None:
+    """Names, features and robot type are those of LeRobot's; calibration gives the same units."""
+    from lerobot.robots.so_follower import SOFollower, SOFollowerRobotConfig
+
+    cameras = {"front": MjstackCameraConfig(width=64, height=48, fps=30)}
+    config = MjstackFollowerConfig(id="one", calibration_dir=tmp_path, seed=3, cameras=cameras)
+    follower = make_robot_from_config(config)
+    assert isinstance(follower, MjstackFollower)
+    real = SOFollower.__dict__
+    assert follower.name == real["name"]
+    joints = [f"{name}.pos" for name in ("shoulder_pan", "shoulder_lift", "elbow_flex")]
+    joints += ["wrist_flex.pos", "wrist_roll.pos", "gripper.pos"]
+    assert list(follower.action_features) == joints
+    assert follower.observation_features["front"] == (48, 64, 3)
+    assert SOFollowerRobotConfig(port="").use_degrees
+    follower.connect()
+    seen = follower.get_observation()
+    assert seen.keys() == follower.observation_features.keys()
+    assert seen["front"].shape == (48, 64, 3)
+    # A bus with this calibration gives these numbers, to a tick of its encoders
+    index = follower._world.inner.index
+    angles = follower._world.inner.sim.qpos[0, index.robot_qpos].numpy()
+    middles = index.ctrl_range.mean(1)
+    turns = (angles - middles) / (2 * np.pi)
+    values = [seen[name] for name in joints]
+    for part, turn, value in zip(follower.calibration.values(), turns, values, strict=True):
+        span = part.range_max - part.range_min
+        bus = 360 * turn if part.id < 6 else 50 + 100 * turn * 4095 / span
+        assert bus == pytest.approx(value, abs=0.1)
+    with pytest.raises(ArgumentError, match=r"action: found none for gripper\.pos"):
+        follower.send_action(dict.fromkeys(joints[:5], 0.0))
+    targets = {name: seen[name] for name in joints}
+    targets["shoulder_pan.pos"] += 5.0
+    assert follower.send_action(targets) == pytest.approx(targets)
+    for _ in range(400):  # longer than the task's episode
+        follower.send_action(targets)
+    assert follower.get_observation()["shoulder_pan.pos"] > seen["shoulder_pan.pos"] + 3
+    follower.disconnect()
+    assert not follower.is_connected
+    assert not list(tmp_path.iterdir())

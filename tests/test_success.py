@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,13 +20,15 @@ from environments import at_double_speed, configure, gate_of, on_cuda, one_secon
 
 from mjstack.cli import run
 from mjstack.config.schema import Config
+from mjstack.drivers.driver import Driver
+from mjstack.envs import Env
 from mjstack.episodes.failures import FailureMonitor, Sign
 from mjstack.episodes.record import FAILING
 from mjstack.episodes.regions import describe_region, find_regions, radial_yaw_deg, regions_table
-from mjstack.episodes.rollout import Hook
+from mjstack.episodes.rollout import Hook, rollout
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Progress, Stage
-from mjstack.gates.success import run_success, success_config
+from mjstack.gates.success import Goal, find_doubts, run_success, success_config
 from mjstack.jobs.gates import check_machine
 from mjstack.math import wilson_interval
 from mjstack.report.record import GateResult, Status
@@ -430,3 +433,39 @@ def test_steps_with_the_tracker_are_one_graph(
     assert int(watch._now) == episode.timing.steps
     sim.close()
     assert play(new_run(*device, robot=robot), tmp_path).metrics["succeeded"] >= 61
+
+
+def test_evaluations_that_show_less_than_they_seem_to_are_flagged() -> None:
+    """Repeated starts, a success that flickers, 10 episodes for a claim of 95 %; a good one not."""
+    assert find_doubts(distinct=200, episodes=200, successes=199, lost=0, rate=0.95) == []
+    (repeated,) = find_doubts(distinct=50, episodes=200, successes=200, lost=0, rate=0.95)
+    assert repeated == "150 of 200 starts are there twice"
+    (lost,) = find_doubts(distinct=300, episodes=300, successes=296, lost=4, rate=0.95)
+    assert lost.startswith("4 episodes reached the goal and lost it")
+    (few,) = find_doubts(distinct=10, episodes=10, successes=10, lost=0, rate=0.95)
+    assert few.startswith("10 episodes show at least 72.25 %, not 95 %")
+
+
+class Retreat(Driver):
+    """Goes where another driver goes, and back to the start."""
+
+    def __init__(self, driver: Driver, env: Env, after: int) -> None:
+        super().__init__(env.nworld, driver.steps, env.device)
+        self._driver = driver
+        self._start = env.sim.ctrl.clone()
+        self._left = after
+
+    def command(self) -> torch.Tensor:
+        self._left -= 1
+        return self._driver.command() if self._left >= 0 else self._start
+
+
+@pytest.mark.parametrize(("after", "lost"), [(120, 2), (1000, 0)])
+def test_a_goal_that_is_reached_and_lost_is_counted(after: int, lost: int) -> None:
+    cfg = configure("task=reach", "sim=native", "nworld=2", "controller=closed_loop")
+    stage = Stage(cfg)
+    with closing(stage.batch_simulation(2)) as sim:
+        env = stage.start(sim, cfg.reset)
+        goal = Goal(Run(stage))
+        rollout(env, Retreat(stage.driver(env), env, after), [goal])
+        assert goal.lost == lost

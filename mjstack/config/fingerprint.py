@@ -37,7 +37,9 @@ def config_content(cfg: Config, without: Iterable[str] = ()) -> dict[str, Any]:
     if cfg.policy is None:  # hashes without one are older than it
         del config["policy"]
     else:
-        config["policy"] = _content("policy", str(Path(cfg.policy) / POLICY_FILE))
+        folder = cfg.policy.removeprefix("lerobot:")
+        file = POLICY_FILE if folder == cfg.policy else "model.safetensors"
+        config["policy"] = _content("policy", str(Path(folder) / file))
     for name, term in cfg.reset.items():
         path = term.params.get("path")
         params = config["reset"][name]["params"]

@@ -57,10 +57,12 @@ def draw_seen(
 
     Returns:
         Images by camera, each ``(frames, height, width, 3)``, uint8, which change where the policy
-        was queried. None of a driver that sees no images.
+        was queried. None of a driver that sees no images, or of LeRobot's.
     """
-    policy = stage.assets.policy if stage.cfg.controller.name == POLICY else None
-    if policy is None or not policy.network.vision.sizes:
+    if stage.cfg.controller.name != POLICY or stage.assets.lerobot_policy:
+        return {}
+    policy = stage.assets.policy
+    if not policy.network.vision.sizes:
         return {}
     looks = {name: values[world : world + 1] for name, values in sim.fields.items()}
     queried = np.arange(len(qpos)) * stride // policy.execute * policy.execute // stride

@@ -14,6 +14,7 @@ import mujoco
 from mjstack.config.schema import Backend, Config, TermCfg
 from mjstack.distributed import Ranks, current_ranks
 from mjstack.drivers.driver import Driver, OpenLoopDriver
+from mjstack.drivers.lerobot import LerobotDriver
 from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.drivers.policy import PolicyDriver
 from mjstack.envs import Env, build_env, driven_config
@@ -33,6 +34,7 @@ from mjstack.errors import ConfigError
 from mjstack.managers.episode import required_fields
 from mjstack.mdp.geometry import source_xy
 from mjstack.policy import Policy, load_policy
+from mjstack.policy.lerobot import PREFIX, LerobotPolicy
 from mjstack.scene import SceneIndex, build_model
 from mjstack.scene.phases import Phase
 from mjstack.sim import (
@@ -104,6 +106,18 @@ class Assets:
             expected = "the folder of a trained policy, which controller=policy plays"
             raise ConfigError("policy", None, expected)
         return load_policy(Path(self.cfg.policy))
+
+    @cached_property
+    def lerobot_policy(self) -> LerobotPolicy | None:
+        """The policy of ``policy=lerobot:FOLDER``, None if it is another.
+
+        Raises:
+            MjstackError: It cannot be loaded.
+        """
+        if not (self.cfg.policy or "").startswith(PREFIX):
+            return None
+        joints = len(self.cfg.robot.joints)
+        return LerobotPolicy(str(self.cfg.policy), resolve_backend(self.cfg)[1], joints)
 
 
 @dataclass(eq=False)
@@ -194,7 +208,7 @@ class Stage:
         Raises:
             MjstackError: The policy cannot be read, or was trained for something else.
         """
-        if self.cfg.controller.name != POLICY:
+        if self.cfg.controller.name != POLICY or self.assets.lerobot_policy:
             return self.cfg.controller.action
         policy = self.assets.policy
         policy.check_fit(self.cfg)
@@ -205,6 +219,8 @@ class Stage:
         cfg = driven_config(self.cfg, reset, self.action)
         if self.cfg.view == "web":
             cfg = replace(cfg, reward=self.cfg.reward, task=self.cfg.task)
+        if self.cfg.controller.name == POLICY and self.assets.lerobot_policy:
+            cfg = replace(cfg, graph="off")  # it acts on the host
         return cfg
 
     def start(
@@ -232,6 +248,8 @@ class Stage:
     def driver(self, env: Env) -> Driver:
         """The configured driver, for worlds that have started."""
         name = env.cfg.controller.name
+        if name == POLICY and self.assets.lerobot_policy:
+            return LerobotDriver(env, self.assets.lerobot_policy, self.cfg)
         if name == POLICY:
             return PolicyDriver(env, self.assets.policy, self.cfg.scene.cameras)
         if name == CLOSED_LOOP:  # loads Warp, which a native open-loop run does not need

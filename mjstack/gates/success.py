@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from typing_extensions import override
 
 from mjstack.config.check import places_objects, reads_starts_file, with_region
@@ -14,10 +15,12 @@ from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.record import starts_name
 from mjstack.episodes.regions import find_regions, regions_table, save_regions
-from mjstack.episodes.rollout import CLOSED_LOOP, FEEDBACK, Observer
+from mjstack.episodes.rollout import CLOSED_LOOP, FEEDBACK, POLICY, Observer
 from mjstack.episodes.run import Run, needs_episode, spread
 from mjstack.episodes.seeds import play_seeds
 from mjstack.files import write_npz
+from mjstack.managers.term import Term
+from mjstack.math import wilson_interval
 from mjstack.mdp.starts.starts_file import start_arrays
 from mjstack.report.record import GateResult
 from mjstack.report.text import format_percent
@@ -45,15 +48,18 @@ def run_success(run: Run) -> list[GateResult]:
     cfg = success_run.cfg
     t = cfg.gate.success
     unwritten: list[str] = []
+    goals = [Goal(success_run) for _ in range(t.seeds) if cfg.controller.name == POLICY]
     tally = play_seeds(
         success_run,
         "success",
         count=t.seeds,
         noun="episodes",
         signs=True,
-        observers=lambda seed: [_StartsWriter(success_run, seed, unwritten)],
+        observers=lambda seed: [
+            _StartsWriter(success_run, seed, unwritten),
+            *goals[seed - cfg.seed :][:1],
+        ],
     )
-    tally.details = unwritten + tally.details
     starts = tally.array("start_places")
     retries = tally.array("retries")
     succeeded = tally.array("failed") == 0
@@ -67,8 +73,13 @@ def run_success(run: Run) -> list[GateResult]:
         episodes=t.cell_episodes,
         objects=tally.records[0].object_names,
     )
+    distinct = len(np.unique(np.round(starts, 6).reshape(len(starts), -1), axis=0))
+    lost = sum(goal.lost for goal in goals)
+    doubts = find_doubts(distinct, tally.episodes, tally.successes, lost, t.rate)
+    tally.details = unwritten + doubts + tally.details
     metrics = {
-        "distinct_starts": len(np.unique(np.round(starts, 6).reshape(len(starts), -1), axis=0)),
+        "distinct_starts": distinct,
+        **({"reached_and_lost": lost} if goals else {}),
         "retried": retried,
         "retries": int(retries.sum()),
         "retried_succeeded": retried_succeeded,
@@ -92,6 +103,61 @@ def run_success(run: Run) -> list[GateResult]:
         tables=regions_table(cfg, regions),
     )
     return [result]
+
+
+def find_doubts(distinct: int, episodes: int, successes: int, lost: int, rate: float) -> list[str]:
+    """What keeps an evaluation from showing the rate that it seems to show, a line each.
+
+    Args:
+        distinct: How many of its starts differ.
+        episodes: How many episodes it has.
+        successes: How many of them succeeded, at their end.
+        lost: How many reached the goal and lost it again.
+        rate: The rate that is claimed.
+    """
+    doubts = []
+    if distinct < episodes:
+        doubts.append(f"{episodes - distinct} of {episodes} starts are there twice")
+    low, _ = wilson_interval(successes, episodes)
+    if low < rate <= successes / episodes:
+        bound = f"at least {format_percent(low)}, not {format_percent(rate)}"
+        doubts.append(f"{episodes} episodes show {bound}: play more (nworld, gate.success.seeds)")
+    if lost:
+        noun = "episode" if lost == 1 else "episodes"
+        doubts.append(f"{lost} {noun} reached the goal and lost it: a success in any step is none")
+    return doubts
+
+
+class Goal(Observer):
+    """Counts episodes in which the task's goal held in some step, and does not at the end.
+
+    Attributes:
+        lost: How many, at the end.
+    """
+
+    lost = 0
+
+    def __init__(self, run: Run) -> None:
+        """Look on at the episodes of a run, whose ranks share them."""
+        self._term = run.cfg.task.success
+        self._ranks = run.stage.ranks
+
+    @override
+    def start(self, env: Env, driver: Driver) -> None:
+        super().start(env, driver)
+        self._holds = torch.zeros_like(env.success)
+        self._reached = torch.zeros_like(env.success)
+        self._success = Term("task.success", self._term, env) if self._term else None
+
+    @override
+    def update(self) -> None:
+        if self._success is not None:
+            self._holds.copy_(self._success(self.env))
+            self._reached |= self._holds
+
+    @override
+    def finish(self) -> None:
+        self.lost = sum(self._ranks.gather(int((self._reached & ~self._holds).sum())))
 
 
 class _StartsWriter(Observer):

@@ -19,6 +19,7 @@ from mjstack.gates.runner import run_guarded
 from mjstack.jobs.collect_plan import group_feature, joint_units
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import CheckedJob, Job, model_bytes
+from mjstack.policy import save_policy
 from mjstack.policy.checkpoint import policy_facts
 from mjstack.policy.lerobot import lerobot_files
 from mjstack.policy.onnx import require_onnx, to_onnx
@@ -55,6 +56,8 @@ def export_policy(stage: Stage, folder: Path) -> list[GateResult]:
     try:
         for name, content in files.items():
             write_atomic(folder / name, content)
+        if main != POLICY:
+            save_policy(folder, policy)  # the environment takes its observation from there
     except OSError as error:
         for name in files:
             (folder / name).unlink(missing_ok=True)

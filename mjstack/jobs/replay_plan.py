@@ -16,6 +16,7 @@ from mjstack.episodes.replay import simulate_alone
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, DeviceError, FolderError
 from mjstack.gates.success import success_config
+from mjstack.policy.lerobot import PREFIX
 from mjstack.sim import resolve_backend, resolve_device
 
 # [m, rad], and of quaternions: backends differ by rounding, another start by more
@@ -70,6 +71,9 @@ def plan_replay(cfg: Config) -> ReplayPlan:
             raise ConfigError(key, "null", f"{expected}, because job=replay plays one again", fix)
     resolve_backend(cfg)  # what this command line asks for must be there
     run = EarlierRun.read(str(cfg.run))
+    if (run.cfg.policy or "").startswith(PREFIX):
+        problem = f"run={cfg.run}: its policy is LeRobot's, whose folder may run code"
+        raise FolderError(f"{problem}: expected a run without", "Look at its episode.html")
 
     # The worlds: [gate:][seed:]number or [gate:]failing
     *heads, tail = str(cfg.world).split(":")

@@ -1,13 +1,16 @@
 """Policies in LeRobot's folders: ours, written, and those that LeRobot has trained, loaded."""
 
 import json
+from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from safetensors.torch import save
 
-from mjstack.errors import FolderError, MissingExtra, MjstackError
+from mjstack.errors import FolderError, MissingExtra, MjstackError, first_line
 from mjstack.policy.checkpoint import Policy
 
 SERIES = "0.6."  # whose interfaces these are
@@ -103,3 +106,72 @@ def lerobot_files(policy: Policy, ctrl_range: np.ndarray) -> dict[str, bytes]:
         files[f"{label}.json"] = {"name": label, "steps": chain}
     texts = {name: (json.dumps(data, indent=2) + "\n").encode() for name, data in files.items()}
     return {"model.safetensors": save(weights), **texts}
+
+
+class LerobotPolicy:
+    """A policy that LeRobot has trained, in its units. The folder is trusted code: the files of its
+    processors may name classes to import.
+
+    Attributes:
+        folder: Where it is, as the user named it.
+        inputs: Shape of each observation that it takes, by LeRobot's names.
+        period: Control steps between two observations that it looks at.
+    """
+
+    def __init__(self, name: str, device: str, joints: int) -> None:
+        """Load it.
+
+        Args:
+            name: ``lerobot:`` and its folder.
+            device: Where it computes.
+            joints: How many joint targets its actions are to be.
+
+        Raises:
+            MjstackError: LeRobot is missing or cannot load it, or its actions are others.
+        """
+        self.folder = name
+        path = name.removeprefix(PREFIX)
+        require_lerobot(f"policy={name}")
+        if not (Path(path) / "config.json").is_file():
+            expected = "has no config.json, expected a folder pretrained_model of LeRobot's"
+            raise FolderError(f"policy={name}: {expected}", "Name a local folder")
+        from lerobot.configs.policies import PreTrainedConfig
+        from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+
+        try:
+            config = PreTrainedConfig.from_pretrained(path, cli_overrides=[f"--device={device}"])
+            self._policy = get_policy_class(config.type).from_pretrained(path, config=config)
+            self._before, self._after = make_pre_post_processors(
+                config, path, preprocessor_overrides={"device_processor": {"device": device}}
+            )
+        except Exception as error:  # of any of its packages
+            reason = f"LeRobot cannot load it ({type(error).__name__}: {first_line(error)})"
+            raise FolderError(f"policy={name}: {reason}", "Try it with lerobot-eval") from error
+        self.inputs = {key: tuple(part.shape) for key, part in config.input_features.items()}
+        width = config.action_feature.shape[0]
+        if width != joints:
+            problem = (
+                f"its actions have {width} numbers, expected {joints}, a target for each joint"
+            )
+            raise FolderError(f"policy={name}: {problem}", "Name a policy of this robot")
+        self.period = getattr(config, "n_action_steps", 1) if config.n_obs_steps == 1 else 1
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        self._policy.reset()
+
+    def act(self, seen: Mapping[str, Any], task: str) -> np.ndarray:
+        """Joint targets of the next step, shape ``(worlds, joints)``, float32.
+
+        Args:
+            seen: Observations by LeRobot's names: images ``(worlds, height, width, 3)``, uint8, the
+                rest ``(worlds, width)``, float32.
+            task: The task in words.
+        """
+        batch: dict[str, Any] = {"task": [task] * len(next(iter(seen.values())))}
+        for key, value in seen.items():
+            part = torch.as_tensor(value)
+            batch[key] = part.permute(0, 3, 1, 2) / 255 if key.startswith(IMAGES) else part
+        with torch.inference_mode():
+            actions = self._after(self._policy.select_action(self._before(batch)))
+        return actions.cpu().numpy()

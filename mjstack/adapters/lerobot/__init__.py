@@ -14,8 +14,9 @@ require_lerobot("mjstack.adapters.lerobot")
 
 from mjstack.adapters.lerobot.env import LerobotVectorEnv, MjstackEnv  # noqa: E402
 from mjstack.adapters.lerobot.policy import MjstackConfig, MjstackPolicy  # noqa: E402
+from mjstack.adapters.lerobot.robot import MjstackFollower  # noqa: E402
 
-__all__ = ["LerobotVectorEnv", "MjstackConfig", "MjstackEnv", "MjstackPolicy"]
+__all__ = ["LerobotVectorEnv", "MjstackConfig", "MjstackEnv", "MjstackFollower", "MjstackPolicy"]
 
 
 def _print_error(

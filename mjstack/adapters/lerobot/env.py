@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from mjstack.envs import Env, driven_config
 from mjstack.episodes.rollout import reset_worlds
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ArgumentError, ConfigError, UnknownName
+from mjstack.policy import load_policy
 from mjstack.robots.units import LEROBOT, LerobotUnits
 from mjstack.sim import StateRenderer
 from mjstack.sim.cameras import with_outputs
@@ -26,6 +28,7 @@ from mjstack.tasks.check import make_check
 
 GROUP = "policy"  # the observation group that is LeRobot's environment_state
 TIMINGS = {30: "hz30", 50: "default"}  # by control rate [Hz]
+_ENDLESS = 1 << 30  # control steps
 _FILMED = 10  # worlds that are drawn at a time
 _FILM = ("cameras=front", "scene.cameras.front.size=[240,240]")
 
@@ -36,7 +39,7 @@ class MjstackEnv(EnvConfig):
     """A task of mjstack. Starts are ``reset=randomized`` unless the overrides say otherwise.
 
     Attributes:
-        task: Its task.
+        task: Its task; null for the default one.
         fps: Control rate [Hz], 30 or 50.
         robot: Its robot.
         cameras: Cameras whose images the policy sees, such as ``[front,wrist]``.
@@ -46,9 +49,11 @@ class MjstackEnv(EnvConfig):
         device: ``auto``, ``cpu`` or ``cuda:N``.
         overrides: More overrides of mjstack's configuration, which win.
         config_dir: A folder with more choices, such as ``push/conf``.
+        policy: Folder of a policy of mjstack's, or of its export, whose observation is then
+            ``environment_state``; that of the configuration without.
     """
 
-    task: str | None = "stack"
+    task: str | None = None
     fps: int = 30
     robot: str = "so101"
     cameras: list[str] = field(default_factory=list)
@@ -58,6 +63,7 @@ class MjstackEnv(EnvConfig):
     device: str = "auto"
     overrides: list[str] = field(default_factory=list)
     config_dir: str | None = None
+    policy: str | None = None
 
     @property
     def gym_kwargs(self) -> dict:
@@ -85,7 +91,7 @@ class MjstackEnv(EnvConfig):
         size = f"size=[{self.observation_height},{self.observation_width}]"
         return load_config(
             [
-                *(f"{key}={value}" for key, value in chosen.items()),
+                *(f"{key}={value}" for key, value in chosen.items() if value is not None),
                 *([f"cameras=[{','.join(self.cameras)}]"] if self.cameras else []),
                 *(f"scene.cameras.{name}.{size}" for name in self.cameras),
                 *more,
@@ -102,8 +108,13 @@ class MjstackEnv(EnvConfig):
         Raises:
             MjstackError: The configuration cannot be used.
         """
+        cfg = self.compose()
         film = None if self.cameras else self.compose(*_FILM)
-        worlds = LerobotVectorEnv(self.compose(), n_envs, units=self.units, film=film)
+        if self.policy is not None:
+            policy = load_policy(Path(self.policy))
+            policy.check_fit(cfg)
+            cfg = replace(cfg, observation={GROUP: policy.observation})
+        worlds = LerobotVectorEnv(cfg, n_envs, units=self.units, film=film)
         boxes: Any = worlds.single_observation_space
         state, seen = (boxes[name].shape for name in ("agent_pos", "environment_state"))
         self.features = {
@@ -135,7 +146,13 @@ class LerobotVectorEnv(VectorEnv):
     """
 
     def __init__(
-        self, cfg: Config, nworld: int, *, units: str = LEROBOT, film: Config | None = None
+        self,
+        cfg: Config,
+        nworld: int,
+        *,
+        units: str = LEROBOT,
+        film: Config | None = None,
+        endless: bool = False,
     ) -> None:
         """Make the worlds.
 
@@ -144,6 +161,7 @@ class LerobotVectorEnv(VectorEnv):
             nworld: How many worlds.
             units: As of `MjstackEnv`.
             film: The same scene with a camera that `render` draws, where ``cfg`` has none.
+            endless: Whether episodes go on, and nothing judges them.
 
         Raises:
             MjstackError: The configuration cannot be used.
@@ -170,6 +188,7 @@ class LerobotVectorEnv(VectorEnv):
         )
         self._check = make_check(played)
         self._phase = torch.zeros(nworld, dtype=torch.int64, device=env.device)
+        self._steps = _ENDLESS if endless else cfg.task.episode_steps
         self._left = 0  # control steps of the episode
         self._film = film
         self._renderer: StateRenderer | None = None
@@ -200,7 +219,7 @@ class LerobotVectorEnv(VectorEnv):
         self.action_space = batch_space(self.single_action_space, nworld)
         self._shared = {
             "_max_episode_steps": cfg.task.episode_steps,
-            "task_description": cfg.task.instruction,
+            "task_description": cfg.task.instruction or cfg.task.name,
             "task": cfg.task.name,
         }
 
@@ -227,7 +246,7 @@ class LerobotVectorEnv(VectorEnv):
                 expected = f"a number for each of {self.num_envs} worlds"
                 raise ArgumentError("seed", f"{len(numbers)} numbers", expected)
             reset_worlds(env, env.cfg.seed, numbers)
-        self._left = env.cfg.task.episode_steps
+        self._left = self._steps
         self._check.start(env, self._left, [])
         return self._observe(), {}
 
@@ -250,7 +269,7 @@ class LerobotVectorEnv(VectorEnv):
         success = np.zeros(self.num_envs, bool)
         if self._left:
             if self._units is not None:
-                if self._left == env.cfg.task.episode_steps:
+                if self._left == self._steps:
                     self._units.check_commands(commands, self._observe()["agent_pos"])
                 commands = self._units.to_si(commands)
             env.step(torch.tensor(commands, device=env.device))

@@ -133,7 +133,7 @@ class MjstackPolicy(PreTrainedPolicy):
         seen = batch[self._seen]
         if seen.shape[-1] != self._width:
             expected = f"{self._width}, as the policy was trained"
-            fix = "Choose its observation: --env.overrides='[observation=...]'"
+            fix = "Name its folder: --env.policy=FOLDER"
             raise ArgumentError(self._seen, f"{seen.shape[-1]} numbers", expected, fix)
         if self._seen == STATE:
             positions = self._units.to_si(seen.cpu().numpy()) - self._home
