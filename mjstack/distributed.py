@@ -64,16 +64,6 @@ class Ranks:
         self.sum_(count)
         return bool(count > 0.0)
 
-    def stop_together(self) -> None:
-        """Stop here if any process was asked to: one that goes on would wait for the others in its
-        next sum.
-
-        Raises:
-            KeyboardInterrupt: One was.
-        """
-        if self.any(interrupted()):
-            raise KeyboardInterrupt
-
     def average_gradients(self, parameters: Iterable[Tensor]) -> None:
         """Replace gradients by their means over the processes, in place."""
         if self.size == 1:

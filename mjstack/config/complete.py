@@ -17,7 +17,6 @@ from mjstack.config.schema import (
     ObservationGroupCfg,
     ObservationTermCfg,
     RewardTermCfg,
-    RobotCfg,
     SceneCfg,
     TermCfg,
     TerminationTermCfg,
@@ -58,10 +57,14 @@ def complete(cfg: Config) -> None:
         parent = reduce(getattr, path, cfg)
         if hasattr(parent, last):  # not every job has observations
             setattr(parent, last, _typed_all(key, getattr(parent, last), kind))
-    _complete_robot(cfg.robot)
+    robot = cfg.robot
+    robot.title = robot.title or robot.name
+    robot.start = robot.start or list(robot.home)
+    robot.ik_joints = robot.ik_joints or [n for n in robot.arm_joints if n not in robot.locked]
+    robot.file = _find_file("robot.file", robot.file, "robot")
     _complete_scene(cfg.scene)
     for camera in cfg.scene.cameras.values():
-        camera.pose = camera.pose or cfg.robot.wrist_camera
+        camera.pose = camera.pose or robot.wrist_camera
     _choose_phases(cfg)
 
 
@@ -98,14 +101,6 @@ def typed(key: str, node: Any, kind: type) -> Any:
     value = OmegaConf.to_object(typed)
     check_fields(key, value)
     return value
-
-
-def _complete_robot(robot: RobotCfg) -> None:
-    """Fill in what a robot's YAML left out, and find its file."""
-    robot.title = robot.title or robot.name
-    robot.start = robot.start or list(robot.home)
-    robot.ik_joints = robot.ik_joints or [n for n in robot.arm_joints if n not in robot.locked]
-    robot.file = _find_file("robot.file", robot.file, "robot")
 
 
 def _complete_scene(scene: SceneCfg) -> None:

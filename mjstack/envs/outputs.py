@@ -24,7 +24,6 @@ class Outputs:
         observations: ObservationManager,
         success: Tensor,
     ) -> None:
-        """Allocate the buffers."""
         self._rewards = rewards
         self._ends = ends
         self._groups = observations.groups

@@ -12,7 +12,6 @@ class EpisodeStatistics:
     def __init__(
         self, reward_names: list[str], termination_names: list[str], device: torch.device
     ) -> None:
-        """Allocate the sums."""
         self._names = [
             *("steps", "success", "return"),
             *(f"reward/{name}" for name in reward_names),

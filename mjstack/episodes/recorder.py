@@ -16,11 +16,6 @@ from mjstack.episodes.rollout import Observer, State
 Read = Callable[[], Mapping[str, Tensor]]
 
 
-def every_step(steps: int) -> range:
-    """The ends of all steps of an episode."""
-    return range(1, steps + 1)
-
-
 def start_and_every_step(steps: int) -> range:
     """The start of an episode, and the ends of all its steps: row i is what step i begins from."""
     return range(steps + 1)
@@ -37,7 +32,7 @@ class Channels:
     """
 
     bind: Callable[[Env, Driver], Read]
-    ends: Callable[[int], Sequence[int]] = every_step
+    ends: Callable[[int], Sequence[int]] = lambda steps: range(1, steps + 1)
 
 
 class Recorder(Observer):

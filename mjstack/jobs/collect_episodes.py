@@ -65,7 +65,6 @@ class EpisodeSource:
     """
 
     def __init__(self, stage: Stage, spec: DatasetSpec, folder: Path) -> None:
-        """Take the stage, and the dataset's spec and folder."""
         self._stage = stage
         self._spec = spec
         self._folder = folder

@@ -25,7 +25,6 @@ class ObjectOffTable:
     """When an object's centre is beside the table or below its top."""
 
     def __init__(self, env: EnvView) -> None:
-        """Read the table's place."""
         scene = env.cfg.scene
         x, y, _ = scene.table_half
         constant = env.index.constant

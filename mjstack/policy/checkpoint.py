@@ -242,6 +242,9 @@ def _from_facts(facts: Mapping[str, Any], path: Path) -> Policy:
     action = facts["action"]
     # A term may have no numbers here, such as headings where nothing is a box.
     widths = {name: _whole(name, width, least=0) for name, width in seen["widths"].items()}
+    key = f"observation.{seen['group']}"
+    group = typed(key, {"noise": seen["noise"]}, ObservationGroupCfg)
+    group.terms = _read_terms(f"{key}.terms", seen["terms"], ObservationTermCfg, path)
     vision = _read_vision(facts)
     with torch.device("meta"):
         network = PolicyNetwork(
@@ -254,7 +257,7 @@ def _from_facts(facts: Mapping[str, Any], path: Path) -> Policy:
     policy = Policy(
         network=network,
         group=str(seen["group"]),
-        observation=_read_group(seen, path),
+        observation=group,
         widths=widths,
         execute=_whole("action.execute", action["execute"], most=_MOST_STEPS),
         action=_read_terms("action", action["terms"], TermCfg, path),
@@ -300,14 +303,6 @@ def _whole(name: str, value: object, least: int = 1, most: int = _MOST_COUNT) ->
 
 def _weights_name(digest: str) -> str:
     return f"weights-{digest[:12]}.safetensors"
-
-
-def _read_group(seen: Mapping[str, Any], path: Path) -> ObservationGroupCfg:
-    """The observation group of a policy's file, its functions checked."""
-    key = f"observation.{seen['group']}"
-    group = typed(key, {"noise": seen["noise"]}, ObservationGroupCfg)
-    group.terms = _read_terms(f"{key}.terms", seen["terms"], ObservationTermCfg, path)
-    return group
 
 
 def _read_terms(key: str, nodes: Mapping[str, Any], model: type, path: Path) -> dict[str, Any]:

@@ -227,7 +227,6 @@ class Scratch:
     deallocate_requires_context_guard = False
 
     def __init__(self, device: wp.Device) -> None:
-        """Start empty."""
         self._device = device
         self._free: dict[tuple[int, int], list[int]] = defaultdict(list)
         self._owner: dict[int, int] = {}

@@ -23,7 +23,6 @@ class Usage:
     """
 
     def __init__(self, model: mujoco.MjModel, nworld: int, device: torch.device) -> None:
-        """Allocate the counters."""
         self._counts = torch.zeros((5, nworld), dtype=torch.int32, device=device)
         self._steps = torch.zeros(nworld, dtype=torch.int64, device=device)
         pool = torch.zeros(3, dtype=torch.int32, device=device)

@@ -16,7 +16,7 @@ from torch.optim import Optimizer
 from mjstack.config.schema import Config
 from mjstack.episodes.stage import Stage
 from mjstack.errors import MjstackError
-from mjstack.interrupt import check_interrupt
+from mjstack.interrupt import check_interrupt, interrupted
 from mjstack.policy import Policy, save_policy
 from mjstack.policy.checkpoint import write_state
 from mjstack.train.trainer import BEST, LAST, STATE
@@ -76,7 +76,8 @@ class Learner(ABC):
                 if saves:
                     self._save()
                 if saves or self.done % self._look_every == 0:
-                    self._ranks.stop_together()
+                    if self._ranks.any(interrupted()):  # one alone would leave the others waiting
+                        raise KeyboardInterrupt
                     self._show()
                     check_interrupt()
         except KeyboardInterrupt:
