@@ -67,15 +67,14 @@ def draw_seen(
     looks = {name: values[world : world + 1] for name, values in sim.fields.items()}
     queried = np.arange(len(qpos)) * stride // policy.execute * policy.execute // stride
     frames, rows = np.unique(queried, return_inverse=True)
-    drawn: dict[str, list[np.ndarray]] = {}
     cameras = list(policy.network.vision.sizes)
+    images: dict[str, list[np.ndarray]] = {name: [] for name in cameras}
     with closing(stage.color_renderer(1, list(looks), cameras)) as renderer:
         for state in torch.from_numpy(np.nan_to_num(qpos[frames])):
-            for name, image in renderer.draw(state[None], looks).items():
-                drawn.setdefault(name.removeprefix("images."), []).append(
-                    image[0].cpu().numpy().copy()
-                )
-    return {name: np.stack(images)[rows] for name, images in drawn.items()}
+            buffers = renderer.draw(state[None], looks)
+            for name in cameras:
+                images[name].append(buffers[f"images.{name}"][0].cpu().numpy().copy())
+    return {name: np.stack(part)[rows] for name, part in images.items()}
 
 
 def show_batch(

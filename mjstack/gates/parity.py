@@ -111,16 +111,16 @@ def compare_states(run: Run, mjwarp: Simulation, result: GateResult) -> list[str
             for field, least in largest.items():
                 allowed = least + _RANGES * ranges.get(field, torch.zeros_like(apart[field]))
                 worst = int((apart[field] / allowed.clamp(min=1e-30)).argmax())
-                found, limit = float(apart[field][worst]), float(allowed[worst])
+                error, limit = float(apart[field][worst]), float(allowed[worst])
                 key = f"step{steps}.{field}"
-                result.metrics[f"{name}.{key}"] = found
+                result.metrics[f"{name}.{key}"] = error
                 result.thresholds[key if limit == least else f"{name}.{key}"] = limit
-                if not found <= limit:
+                if not error <= limit:
                     owner = _owner(native.model, field, worst)
-                    text = f"{field} of {owner} differs by {found:.2g}, limit {limit:.2g}"
+                    text = f"{field} of {owner} differs by {error:.2g}, limit {limit:.2g}"
                     problems.append(f"{name}, {steps} steps: {text}")
-                    if limit and not found / limit <= farthest:
-                        farthest, look = found / limit, owner
+                    if limit and not error / limit <= farthest:
+                        farthest, look = error / limit, owner
     if near is not None:
         near.close()
     if look:

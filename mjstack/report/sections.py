@@ -179,10 +179,10 @@ def _beside_limits(
     for name, value in metrics.items():
         limits = _limits_of(name, thresholds)
         cell = " to ".join(with_unit(limit, thresholds[limit]) for limit in limits)
-        found = with_unit(name, value)
+        measured = with_unit(name, value)
         names = {name, *(limit.removesuffix(unit_ending(limit)) for limit in limits)}
         grade = "" if broken.isdisjoint(names) else "bad"
-        rows.append([label(name), Marked(found, grade=grade), cell])
+        rows.append([label(name), Marked(measured, grade=grade), cell])
         required = {name: text for name, text in required.items() if name not in limits}
     rows += [[label(name), "", text] for name, text in required.items()]
     if rows:

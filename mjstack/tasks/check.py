@@ -313,9 +313,9 @@ class EpisodeCheck(ABC):
             wrong = failed & self.rules[name] != 0
             words = []
             for value, (low, high) in limits.items() if name in broken else ():
-                found = values[value]
-                if count := int(np.sum(wrong & ~((low <= found) & (found <= high)))):
-                    number = f"{found[0]:.4g} of {low:g}" if len(failed) == 1 else f"in {count}"
+                measured = values[value]
+                if count := int(np.sum(wrong & ~((low <= measured) & (measured <= high)))):
+                    number = f"{measured[0]:.4g} of {low:g}" if len(failed) == 1 else f"in {count}"
                     words.append(f"{value.rpartition('.')[2]} {number}")
                     beyond.append(value)
             if words and len(limits) > 1:
