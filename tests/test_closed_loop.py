@@ -13,7 +13,7 @@ from compositions import load_config, make_env
 from environments import at_double_speed, on_cuda
 
 from mjstack.drivers.closed_loop import ClosedLoopDriver, make_expert
-from mjstack.drivers.feedback import FeedbackDriver
+from mjstack.drivers.feedback import FeedbackDriver, measure_planar
 from mjstack.drivers.state_based import StateBasedDriver
 from mjstack.drivers.tilt import _keeps, _places
 from mjstack.envs import Env, driven_config
@@ -341,3 +341,30 @@ def test_a_phase_has_a_width_of_its_own() -> None:
     widths = {phase.name: phase.width for phase in build_phases(cfg)}
     assert widths["above_red"] is None
     assert (widths["grasp_red"], widths["lift_red"], widths["above_blue"]) == (0.04, 0.03, 0.04)
+
+
+def test_an_object_that_lies_askew_in_the_hand_is_aligned(drive: Drive) -> None:
+    """Red is grasped 8 mm off its middle, and blue is turned: with ``align`` red arrives all the
+    same.
+    """
+    phases = "controller.phases"
+    askew = [f"{phases}.{name}.offset=[0.008,0,0]" for name in ("descend_red", "grasp_red")]
+    left = {}
+    for align in (False, True):
+        options = [f"{phases}.{name}.align={align}" for name in ("above_blue", "place_stack")]
+        env, controller = drive(*askew, *options, nworld=2)
+        red, blue = env.index.object_qpos
+        yaw = torch.tensor([0.3, -0.3], dtype=torch.float64)
+        env.sim.qpos[:, blue + 3] = torch.cos(yaw / 2)
+        env.sim.qpos[:, blue + 6] = torch.sin(yaw / 2)
+        for _ in range(controller.phases[5].stop):
+            env.step(controller.command())
+        off = env.sim.qpos[:, red : red + 2] - env.sim.qpos[:, blue : blue + 2]
+        poses = [measure_planar(env, name)[:, 2] for name in ("red", "blue")]
+        turn = torch.rad2deg(poses[0] - poses[1])
+        turn = (torch.remainder(turn + 45.0, 90.0) - 45.0).abs()
+        left[align] = (off.norm(dim=1).max(), turn.max())
+    assert left[False][0] > 0.005
+    assert left[False][1] > 8.0
+    assert left[True][0] < 0.002, left
+    assert left[True][1] < 3.0, left

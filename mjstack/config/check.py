@@ -230,6 +230,8 @@ def _phases(cfg: Config) -> Checks:
         wrong = phase.level == "on_top" and not grasped
         yield f"{key}.level", wrong, "center or table, as no phase before grasps"
         grasped = grasped or phase.grasps is not None
+        wrong = phase.align and (not grasped or phase.grasps is not None or phase.anchor is None)
+        yield f"{key}.align", wrong, "false: no object is in the hand, or the phase has no anchor"
         if phase.retry is not None:
             expected = f"null, or {key}.grasps=OBJECT, whose empty grasp is tried again"
             yield f"{key}.retry", phase.grasps is None, expected

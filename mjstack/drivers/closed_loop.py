@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mjstack.drivers.feedback import STAY, FeedbackDriver
+from mjstack.drivers.feedback import STAY, FeedbackDriver, measure_planar
 from mjstack.drivers.open_loop import OpenLoopPlanner, smoothstep
 from mjstack.envs import Env
 from mjstack.managers.view import EnvView
@@ -19,6 +19,8 @@ from mjstack.tasks.check import make_check
 
 _QUARTER = 0.5 * math.pi
 _ROLL_STEP = 0.05  # rad per step
+_ALIGN = 0.1  # share of a held object's turn that is left, per step
+_OFF = 0.03  # m: so far off the grasp point, a held object is made up for
 _DONE = 1e-3  # steps: a phase is over this much before its last step would be
 
 
@@ -115,6 +117,9 @@ class ClosedLoopDriver(FeedbackDriver):
         self._observe(fresh[:, None] | entering[:, None] & self._observes[phase])
         holds = self._holds[phase][:, None]
         target = torch.where(holds, self._to[:, :3], self._aim(phase))
+        if self._any_align:
+            off = (self._to[:, :2] - self._held()[:, :2]).clamp(-_OFF, _OFF)
+            target[:, :2] += off * self._alignment[phase][:, None]
         home = torch.cat((target, self._home_grip.expand(len(target), -1)), dim=1)
         _put(self._from, entering, torch.where(fresh[:, None], home, self._to))
         _put(self._to, entering, torch.cat((target, self._grip[phase]), dim=1))
@@ -159,7 +164,19 @@ class ClosedLoopDriver(FeedbackDriver):
         step = self._cfg.controller.yaw_alignment * goal - self._roll
         step = step.clamp(-_ROLL_STEP, _ROLL_STEP)
         self._roll += step * self._turns_jaws[self.phase]
+        if self._any_align:
+            off = yaw - self._held()[:, 2]
+            off = _ALIGN * self._roll_sign * (off - _QUARTER * torch.round(off / _QUARTER))
+            self._roll += off.clamp(-_ROLL_STEP, _ROLL_STEP) * self._turns_held[self.phase]
         command[:, self._roll_column] = column + self._roll
+
+    def _held(self) -> Tensor:
+        """x, y [m] and yaw [rad] of the object that each world carries, shape
+        ``(nworld, 3)``.
+        """
+        poses = [measure_planar(self._env, name) for name in self._cfg.scene.objects]
+        carried = self._carried[self.phase]
+        return torch.stack(poses, dim=1)[self._worlds, carried]
 
     def _build_timetable(self) -> None:
         """Make tensors of when and how the phases follow each other, a row per phase."""
@@ -185,6 +202,10 @@ class ClosedLoopDriver(FeedbackDriver):
         self._observes = column(
             [s.observe and name in (s.anchor, s.toward) for name in objects] for s in specs
         )
+        self._alignment = column(float(s.align) for s in specs)
+        self._any_align = any(s.align for s in specs)
+        self._turns_held = column(p.spec.align and objects[p.carried] in with_faces for p in phases)
+        self._carried = column(max(phase.carried, 0) for phase in phases)
         self._numbers = torch.arange(len(objects), device=self.phase.device)
         window = 0 if cfg.task.check is None else make_check(cfg).settle_steps
         self._rest = window + math.ceil(cfg.controller.rest_seconds / cfg.timing.step_dt)

@@ -114,10 +114,7 @@ class FeedbackDriver(Driver):
         """
         objects = self._cfg.scene.objects
         for number, name in enumerate(objects):
-            pose = pose_w(self._env, name).float()
-            w, x, y, z = pose[:, 3:].unbind(1)
-            yaw = atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-            seen = torch.cat((pose[:, :2], yaw[:, None]), dim=1)
+            seen = measure_planar(self._env, name)
             last = self._seen[:, number]
             last.copy_(torch.where(due[:, number, None], seen, last))
         for number, name in enumerate(self._cfg.scene.places, start=len(objects)):
@@ -171,6 +168,14 @@ class FeedbackDriver(Driver):
             closing.append(self._ik.forward(command)[1][0].double().cpu())
         (x0, y0, _), (x1, y1, _) = closing
         return column, math.copysign(1.0, float(x0 * y1 - y0 * x1))
+
+
+def measure_planar(env: EnvView, name: str) -> Tensor:
+    """x, y [m] and yaw [rad] of an object, shape ``(nworld, 3)``, float32."""
+    pose = pose_w(env, name).float()
+    w, x, y, z = pose[:, 3:].unbind(1)
+    yaw = atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return torch.cat((pose[:, :2], yaw[:, None]), dim=1)
 
 
 def servo_lag(model: mujoco.MjModel, actuators: Sequence[int]) -> float:

@@ -107,6 +107,9 @@ class PhaseCfg:
     """With controller=closed_loop: measure anchor and ``toward`` anew when the phase begins."""
     grasps: str | None = None
     """Object on which the jaws must press when the phase ends."""
+    align: bool = False
+    """With controller=closed_loop: bring the grasped object to the target, not the grasp point: by
+    how it lies in the hand when the phase begins, and turned to a face of the anchor."""
     retry: str | None = None
     """With controller=closed_loop: phase to go back to if they do not."""
 
