@@ -278,6 +278,8 @@ def _parse(args: list[str]) -> Namespace:
 
     parser = get_args_parser()  # Hydra has no public one
     parser.error = refuse  # type: ignore[method-assign]
+    parser._optionals.conflict_handler = "resolve"
+    parser.add_argument("--config-dir", "-cd", action="append", default=[])  # several add up
     known = set(parser._option_string_actions) - _OTHER_CONFIG
     for arg in args:
         if arg.startswith("-") and arg.partition("=")[0] not in known:

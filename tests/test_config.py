@@ -11,7 +11,9 @@ from pathlib import Path
 import pytest
 from check_cases import limits
 from compositions import checked, refusal
+from doc_blocks import ROOT
 
+import mjstack
 from mjstack.config import load_config
 from mjstack.config.help import list_keys
 from mjstack.config.schema import Backend, CloneJobCfg, Config
@@ -278,6 +280,52 @@ def test_bad_input_is_one_line(overrides: list[str], words: str) -> None:
 def test_null_is_no_name_to_put_into_a_list() -> None:
     message = refusal(lambda: load_config(["gates=null"]))
     assert message == "gates=null: expected a list of names."
+
+
+@pytest.mark.parametrize(
+    ("overrides", "starts"),
+    [
+        ([], "randomized"),
+        (["gate.success.reset=jitter"], "jitter"),
+        (["gates=[success]", "reset=jitter"], "jitter"),
+        (["job=compare", "reset=nominal"], "nominal"),
+        (["gates=[success]", "reset=jitter", "gate.success.reset=nominal"], "nominal"),
+        (["gates=[batch,success]", "reset=jitter"], "randomized"),
+    ],
+)
+def test_how_the_success_gate_starts(overrides: list[str], starts: str) -> None:
+    reset = mjstack.load_config(overrides).gate.success.reset
+    assert reset == mjstack.load_config([f"reset={starts}"]).reset
+
+
+def test_choices_by_key() -> None:
+    message = refusal(lambda: mjstack.load_config(["gate.success.reset=jiter"]))
+    assert "'jiter' does not exist. Did you mean 'jitter'?" in message
+    job = mjstack.load_config(["job=train", "job.observation=state"]).job
+    assert job.observation == mjstack.load_config(["job=train", "observation=state"]).observation  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("task", "folder", "seconds"),
+    [
+        ("stack", None, 12.0),
+        ("box", None, 40.0),
+        ("reach", None, 3.0),
+        ("push", "examples/push/conf", 8.0),
+        ("tower", "examples/tower/conf", 25.0),
+    ],
+)
+def test_a_task_has_any_rate(task: str, folder: str | None, seconds: float) -> None:
+    for timing, hz in (("fine", 50.0), ("hz30", 30.0)):
+        cfg = mjstack.load_config(
+            [f"task={task}", f"timing={timing}"], config_dir=folder and ROOT / folder
+        )
+        assert cfg.task.control_hz == hz
+        assert cfg.task.episode_steps == round(seconds * hz)
+        assert cfg.task.check
+        assert cfg.task.check["window"] == round(hz)  # one second
+    message = refusal(lambda: mjstack.load_config(["task.control_hz=50", "timing=hz30"]))
+    assert "expected 0.02 s, because task.control_hz=50. Change both together" in message
 
 
 REFUSED_BY_THE_CHECK = [

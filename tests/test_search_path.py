@@ -101,8 +101,18 @@ def test_the_search_path_is_an_override_too(lean: Path) -> None:
     with search_path([lean]):
         assert search_path_args() == ["--config-dir", str(lean)]
         with search_path([second]):
-            (override,) = search_path_args()
-    assert load_config([override, "task=lean"]).task.name == "lean"
+            assert search_path_args() == ["--config-dir", str(lean), "--config-dir", str(second)]
+    both = f"hydra.searchpath=['{lean}',\"{second}\"]"
+    assert load_config([both, "task=lean"]).task.name == "lean"
+
+
+def test_several_folders_add_up(lean: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    second = lean.parent / "second"
+    (second / "reward").mkdir(parents=True)
+    (second / "reward" / "none.yaml").write_text("{}\n")
+    flags = ["--config-dir", str(lean), f"--config-dir={second}"]
+    assert run([*flags, "task=lean", "reward=none", "--cfg", "job", "-p", "reward"]) == 0
+    assert "height" in capsys.readouterr().out
 
 
 @pytest.mark.full

@@ -83,9 +83,8 @@ def _run(cfg: Config) -> Checks:
         raise ConfigError(
             "timing.physics_dt x timing.decimation",
             f"{cfg.timing.step_dt:g}",
-            f"{step_dt:g} s, because task '{cfg.task.name}' is controlled at"
-            f" {cfg.task.control_hz:g} Hz",
-            "Change both together",
+            f"{step_dt:g} s, because task.control_hz={cfg.task.control_hz:g}",
+            "Change both together, with timing.control_hz; a task that works at any rate sets none",
         )
     wrong = cfg.world is not None and not _WORLD.fullmatch(cfg.world)
     yield "world", wrong, "a world such as 17, a seed and a world such as 3:17, or failing"

@@ -43,8 +43,10 @@ for _name, _node in (JOB_SCHEMAS | TRAINER_SCHEMAS).items():
     ConfigStore.instance().store(name=f"{_name}_schema", node=_node, provider="mjstack")
 
 
-def _control_steps(seconds: float, *, _root_: DictConfig) -> int:
-    """Control steps of a time [s], which ``${steps:SECONDS}`` stands for."""
+def _control_steps(seconds: float | None, *, _root_: DictConfig) -> int:
+    """Control steps of a time [s], which ``${steps:SECONDS}`` stands for; null: of all phases."""
+    if seconds is None:
+        seconds = sum(phase.seconds for phase in _root_.controller.phases.values())
     step_dt = _root_.timing.physics_dt * _root_.timing.decimation
     return round(seconds / step_dt) if step_dt > 0.0 else 1  # what is wrong is told later
 
@@ -64,6 +66,9 @@ def _by_device(cuda: Any, cpu: Any, *, _root_: DictConfig) -> Any:
 def _is_native(root: DictConfig) -> bool:
     return root.sim.backend == Backend.native
 
+
+# Overrides by the key where a choice of a group goes, such as gate.success.reset=jitter
+_CHOICE = re.compile(r"^(?:gate\.\w+\.|job\.)(reset|observation)=(?!null$)[\w,]+$")
 
 # Interpolations: ${NAME:ARGUMENT,...} is the value of a function of these and of the configuration.
 _RESOLVERS: dict[str, Callable] = {
@@ -92,27 +97,38 @@ def load_config(
     Raises:
         MjstackError: An override does not fit; the message says which and what would.
     """
-    with extended_search_path(overrides, config_dir) as composed, hydra_session():
+    folders = [] if config_dir is None else [config_dir]
+    with extended_search_path(overrides, folders) as composed, hydra_session():
         return to_config(compose(composed))
 
 
 @contextmanager
 def extended_search_path(
-    overrides: Sequence[str], config_dir: str | os.PathLike | None
+    overrides: Sequence[str], folders: Sequence[str | os.PathLike]
 ) -> Iterator[list[str]]:
-    """Add a folder, and those of overrides of ``hydra.searchpath``, to the search path of every
+    """Add folders, and those of overrides of ``hydra.searchpath``, to the search path of every
     composition inside.
 
     Yields:
-        The other overrides, and what the policy that they name was trained for.
+        The other overrides, starts and observations that they choose by a key as choices of their
+        group, and what the policy that they name was trained for.
     """
-    entries = [] if config_dir is None else [str(config_dir)]
+    entries = list(map(str, folders))
     remaining = [o for o in overrides if not o.lstrip("+").startswith("hydra.searchpath=")]
     for override in [override for override in overrides if override not in remaining]:
         value = parse(override).value()
         entries += map(str, value if isinstance(value, list) else [value])
     with search_path(entries):
-        yield [*remaining, *_policy_choices(remaining)]
+        remaining = [_CHOICE.sub(r"\1@\g<0>", o) for o in remaining]
+        yield [*remaining, *_starts_alone(remaining), *_policy_choices(remaining)]
+
+
+def _starts_alone(overrides: Sequence[str]) -> list[str]:
+    """Let gate *success*, where it alone plays, start worlds as ``reset`` says."""
+    alone = {"gates=[success]", "job=compare"} & set(overrides)
+    given = any(o.startswith("reset@gate.success.reset=") for o in overrides)
+    chosen = [o for o in overrides if re.fullmatch(r"reset=(?!starts_file)\w+", o)]
+    return [f"reset@gate.success.{o}" for o in chosen if alone and not given]
 
 
 def _policy_choices(overrides: Sequence[str]) -> list[str]:

@@ -88,9 +88,7 @@ def search_path(entries: Sequence[str | os.PathLike]) -> Iterator[None]:
 def search_path_args(folders: Sequence[Path] | None = None) -> list[str]:
     """Arguments of a command that adds folders; those of the current search path if None."""
     folders = _added.get() if folders is None else folders
-    if len(folders) < 2:
-        return [arg for folder in folders for arg in ("--config-dir", str(folder))]
-    return [f"hydra.searchpath=[{','.join(map(quoted, folders))}]"]
+    return [arg for folder in folders for arg in ("--config-dir", str(folder))]
 
 
 def quoted(path: Path) -> str:

@@ -64,10 +64,12 @@ class TaskCfg:
     """Name of the task."""
     instruction: str | None = None
     """The task in words, for datasets; null: its name."""
-    control_hz: float = spec(unit="Hz", gt=0.0, le=1e6)
-    """Control steps per second."""
-    episode_steps: int = spec(unit="steps", ge=1, le=1_000_000)
-    """Length of an episode of the environment."""
+    control_hz: float = spec("${timing.control_hz}", unit="Hz", gt=0.0, le=1e6)
+    """Control steps per second; a number only for a task that works at no other rate."""
+    episode_seconds: float | None = spec(None, unit="s", gt=0.0)
+    """Length of an episode of the environment; null: that of the phases."""
+    episode_steps: int = spec("${steps:${task.episode_seconds}}", unit="steps", ge=1, le=1_000_000)
+    """The same in control steps."""
     params: dict[str, Any] = field(default_factory=dict)
     """Numbers that several terms of the task share, as ``${task.params.NAME}``."""
     check: dict[str, Any] | None = None
