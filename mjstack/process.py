@@ -48,7 +48,6 @@ class Child(subprocess.Popen[bytes]):
         *,
         env: Mapping[str, str] | None = None,
         cores: Collection[int] = (),
-        folder: Path | None = None,
     ) -> None:
         """Start it.
 
@@ -57,7 +56,6 @@ class Child(subprocess.Popen[bytes]):
             log: Gets its output.
             env: Environment variables, besides those of this process.
             cores: The cores that it may use; all if empty.
-            folder: Its working folder; by default that of this process.
         """
         self._began = time.monotonic()
         super().__init__(
@@ -66,7 +64,6 @@ class Child(subprocess.Popen[bytes]):
             stdout=log,
             stderr=subprocess.STDOUT,
             env=os.environ | dict(env or {}),
-            cwd=folder,
             start_new_session=True,  # Ctrl-C of the terminal comes through this process
         )
         if cores:

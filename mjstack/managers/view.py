@@ -141,10 +141,8 @@ def zero_rows(mask: Tensor, *buffers: Tensor) -> None:
         buffer.masked_fill_(mask[:, None], 0.0)
 
 
-def episode_draw(
-    env: EnvView, name: str, size: int, low: float = -1.0, high: float = 1.0
-) -> Tensor:
+def episode_draw(env: EnvView, name: str, size: int) -> Tensor:
     """Random numbers of every world that stay the same all episode: every term that names them sees
-    the same, and the next episode has others. Arguments and result as of `random_uniform`.
+    the same, and the next episode has others. From -1 to 1, shape ``(nworld, size)``.
     """
-    return random_uniform(env, f"episode.{name}", size, low, high)
+    return random_uniform(env, f"episode.{name}", size)

@@ -84,15 +84,14 @@ class Policy:
         trained = _requirements(self.config, cameras)
         self._compare(trained, _requirements(config_content(cfg), cameras))
 
-    def check_widths(self, widths: Mapping[str, int], action: int | None = None) -> None:
-        """Check how many numbers an action, unless None, and each term of its group have in the
-        worlds that it is to drive.
+    def check_widths(self, widths: Mapping[str, int], action: int) -> None:
+        """Check how many numbers an action and each term of its group have in the worlds that it
+        is to drive.
 
         Raises:
             FolderError: One has another number.
         """
-        if action is not None:
-            self._compare({"action.width": self.network.width}, {"action.width": action})
+        self._compare({"action.width": self.network.width}, {"action.width": action})
         key = f"observation.{self.group}.terms.{{}}.width"
         self._compare(
             *({key.format(name): terms[name] for name in terms} for terms in (self.widths, widths))

@@ -5,7 +5,6 @@ fixed.
 import itertools
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -178,14 +177,9 @@ def _trials(size: int) -> Tensor:
     return uniform(0, 0, world, zero, None, size)
 
 
-class _Boxes(NamedTuple):
-    """Upright boxes: centres and half sizes, shape ``(n, 3)`` each; radius around them, and cosine
-    and sine of their yaw, shape ``(n, 3)``.
-    """
-
-    centers: np.ndarray
-    halves: np.ndarray
-    turned: np.ndarray
+_Boxes = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Upright boxes: centres and half sizes, shape ``(n, 3)`` each; radius around them, and cosine and
+sine of their yaw, ``(n, 3)``."""
 
 
 def _around(thing: ObjectCfg, top: float, boxes: _Boxes, clear: float) -> np.ndarray:
@@ -219,7 +213,7 @@ def _fixed_boxes(data: mujoco.MjData, geoms: np.ndarray) -> _Boxes:
     disc = upright & np.isin(model.geom_type[geoms], discs)
     turned[disc, 0] = halves[disc, 0]
     halves[disc, :2] = 0.0
-    return _Boxes(centers, halves, turned)
+    return centers, halves, turned
 
 
 def _arm_boxes(cfg: Config, data: mujoco.MjData, geoms: np.ndarray, noise: float) -> _Boxes:
@@ -240,7 +234,7 @@ def _arm_boxes(cfg: Config, data: mujoco.MjData, geoms: np.ndarray, noise: float
         # the longest lever.
         lever = np.linalg.norm(data.xanchor[joints][None] - corners[:, None], axis=2).max()
         halves[k] += moved + 0.5 * (noise * len(joints)) ** 2 * lever
-    return _Boxes(centers, halves, np.tile([0.0, 1.0, 0.0], (len(geoms), 1)))
+    return centers, halves, np.tile([0.0, 1.0, 0.0], (len(geoms), 1))
 
 
 def world_boxes(
