@@ -16,7 +16,6 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from comparison import assert_same_run
 from compositions import load_config
 from numpy.typing import ArrayLike
 
@@ -272,6 +271,16 @@ def play(env: Env, moves: list[torch.Tensor], before: Callable[[int], None] | No
         row |= {name: getattr(env, name).clone() for name in ("episode", "episode_step")}
         trace.append(row)
     return trace
+
+
+def assert_same_run(a: torch.Tensor, b: torch.Tensor, backend: str) -> None:
+    """Bit for bit on the CPU backends. CUDA sums in no fixed order: there two runs agree to
+    rounding (docs/design.md).
+    """
+    if backend.endswith("cuda"):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-3)
+    else:
+        assert torch.equal(a, b)
 
 
 def assert_rows(

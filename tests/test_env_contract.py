@@ -8,13 +8,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-from comparison import assert_same_run
 from environments import (
     COUNTS,
     POSES,
     STATE,
     actions,
     assert_rows,
+    assert_same_run,
     assert_traces,
     configure,
     mask_of,

@@ -385,24 +385,22 @@ def test_regions_stay_inside_what_is_reached() -> None:
 
 @pytest.mark.full
 def test_the_tool_maps_the_table(
-    robot: str,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    region = ["scene.random_xy=[0.12,0.05]"] if robot == "so101" else []
-    options = [f"robot={robot}", *region, "--step=0.04", f"--folder={tmp_path}"]
+    options = ["scene.random_xy=[0.12,0.05]", "--step=0.04", f"--folder={tmp_path}"]
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.setattr(sys, "argv", ["reachability", *options])
     runpy.run_path(str(Path(reachability.__file__)), run_name="__main__")
     out = capsys.readouterr().out
     assert "largest square" in out
     (red,) = (line for line in out.splitlines() if line.startswith("│ red "))
-    assert ("not reached" in red) is (robot == "so101")
+    assert "not reached" in red
     assert (tmp_path / "reachability.png").stat().st_size > 10_000
 
     # Heights are the driver's
-    cfg = load_config([f"robot={robot}"])
+    cfg = load_config()
     approach = pytest.approx(cfg.robot.approach_height + 0.022)
     carry = pytest.approx(cfg.robot.approach_height + 0.022 + 0.09)
     levels = {"grasp": (pytest.approx(0.022), "open"), "approach": (approach, "open")}

@@ -10,9 +10,8 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from comparison import assert_same_run, assert_worlds_step_alone
 from compositions import load_config, refusal
-from environments import POSES, STATE, on_backend, start_moving
+from environments import POSES, STATE, assert_same_run, on_backend, start_moving
 
 from mjstack.config.schema import Backend
 from mjstack.episodes.stage import Stage
@@ -177,12 +176,6 @@ def test_reset_world_goes_on_as_a_fresh_one(backend: str, make_sim: Make) -> Non
     sim.step(10)
     assert_same_run(sim.qpos[1], expected[1], backend)
     assert not torch.equal(sim.qpos[0], expected[0])
-
-
-def test_world_k_of_n_is_world_k_of_one(backend: str, make_sim: Make, get_stage: GetStage) -> None:
-    many = make_sim(backend, N)
-    start_moving(many, get_stage("so101"))
-    assert_worlds_step_alone(many, make_sim(backend, 1), backend)
 
 
 def test_forward_writes_every_derived_number(

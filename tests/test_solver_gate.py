@@ -50,18 +50,6 @@ def test_a_variant_beside_the_configured_solver(changes: str, tmp_path: Path) ->
 
 
 @pytest.mark.full
-def test_contact_rows_of_variants(tmp_path: Path) -> None:
-    """A contact of the gripper has 6 rows as modelled, 3 with condim 3, and 10 with a pyramidal
-    cone.
-    """
-    peaks = [
-        measure(tmp_path / str(number), changes).metrics["peak_rows"]
-        for number, changes in enumerate(["gripper_condim:3", "", "cone:pyramidal"])
-    ]
-    assert peaks == sorted(set(peaks))
-
-
-@pytest.mark.full
 def test_a_simulation_that_breaks_is_a_failure_and_the_other_is_closed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
