@@ -291,11 +291,13 @@ def test_null_is_no_name_to_put_into_a_list() -> None:
         (["job=compare", "reset=nominal"], "nominal"),
         (["gates=[success]", "reset=jitter", "gate.success.reset=nominal"], "nominal"),
         (["gates=[batch,success]", "reset=jitter"], "randomized"),
+        (["gates=[success]", "cameras=front", "looks=randomized"], "randomized looks=randomized"),
     ],
 )
 def test_how_the_success_gate_starts(overrides: list[str], starts: str) -> None:
     reset = mjstack.load_config(overrides).gate.success.reset
-    assert reset == mjstack.load_config([f"reset={starts}"]).reset
+    alone = [o for o in overrides if o.startswith("cameras")]
+    assert reset == mjstack.load_config([*f"reset={starts}".split(), *alone]).reset
 
 
 def test_choices_by_key() -> None:

@@ -124,11 +124,17 @@ def extended_search_path(
 
 
 def _starts_alone(overrides: Sequence[str]) -> list[str]:
-    """Let gate *success*, where it alone plays, start worlds as ``reset`` says."""
-    alone = {"gates=[success]", "job=compare"} & set(overrides)
-    given = any(o.startswith("reset@gate.success.reset=") for o in overrides)
-    chosen = [o for o in overrides if re.fullmatch(r"reset=(?!starts_file)\w+", o)]
-    return [f"reset@gate.success.{o}" for o in chosen if alone and not given]
+    """Let gate *success*, where it alone plays, start worlds as ``reset`` and ``looks`` say."""
+    if not {"gates=[success]", "job=compare"} & set(overrides):
+        return []
+    chosen = []
+    for prefix, choice in (("", r"reset=(?!starts_file)\w+"), ("+", r"looks=(?!null)\w+")):
+        group, _ = choice.split("=", 1)
+        key = f"{prefix}{group}@gate.success.reset="
+        values = [o.partition("=")[2] for o in overrides if re.fullmatch(choice, o)]
+        if not any(o.startswith(key) for o in overrides):
+            chosen += [key + value for value in values]
+    return chosen
 
 
 def _policy_choices(overrides: Sequence[str]) -> list[str]:

@@ -118,7 +118,7 @@ class ClosedLoopDriver(FeedbackDriver):
         holds = self._holds[phase][:, None]
         target = torch.where(holds, self._to[:, :3], self._aim(phase))
         if self._any_align:
-            off = (self._to[:, :2] - self._held()[:, :2]).clamp(-_OFF, _OFF)
+            off = (self._to[:, :2] - self._carried_pose()[:, :2]).clamp(-_OFF, _OFF)
             target[:, :2] += off * self._alignment[phase][:, None]
         home = torch.cat((target, self._home_grip.expand(len(target), -1)), dim=1)
         _put(self._from, entering, torch.where(fresh[:, None], home, self._to))
@@ -165,12 +165,12 @@ class ClosedLoopDriver(FeedbackDriver):
         step = step.clamp(-_ROLL_STEP, _ROLL_STEP)
         self._roll += step * self._turns_jaws[self.phase]
         if self._any_align:
-            off = yaw - self._held()[:, 2]
+            off = yaw - self._carried_pose()[:, 2]
             off = _ALIGN * self._roll_sign * (off - _QUARTER * torch.round(off / _QUARTER))
             self._roll += off.clamp(-_ROLL_STEP, _ROLL_STEP) * self._turns_held[self.phase]
         command[:, self._roll_column] = column + self._roll
 
-    def _held(self) -> Tensor:
+    def _carried_pose(self) -> Tensor:
         """x, y [m] and yaw [rad] of the object that each world carries, shape
         ``(nworld, 3)``.
         """
