@@ -322,7 +322,11 @@ def test_jaws_close_as_far_as_an_object_is_wide(robot: str, get_stage: GetStage)
 
 
 @pytest.mark.parametrize(
-    ("robot", "expert", "half"), [("so101", "closed_loop", 0.016), ("rebot", "open_loop", 0.012)]
+    ("robot", "expert", "half"),
+    [
+        ("so101", "closed_loop", 0.016),
+        pytest.param("rebot", "open_loop", 0.012, marks=pytest.mark.full),
+    ],
 )
 def test_a_narrow_peg_is_lifted(robot: str, expert: str, half: float) -> None:
     peg = f"scene.objects.red.size=[{half},{half},0.022]"

@@ -27,14 +27,14 @@ needs_franka = pytest.mark.skipif(
 @cache
 def arguments(example: str, robot: str) -> tuple[str, ...]:
     """A command line on native MuJoCo, with phases of half their time; but reBot's servos are too
-    slow to meet a slot in that.
+    slow to meet a slot or a hole in that.
     """
     folder = EXAMPLES / example / "conf"
     task = "stack" if example in ("scara", "panda") else example
     model = "menagerie" if example == "panda" else "builtin"
     chosen = (f"robot={robot}", f"task={task}", f"model={model}")
     cfg = load_config(chosen, config_dir=folder)
-    speed = 1 if (example, robot) == ("slot", "rebot") else 2
+    speed = 1 if example in ("slot", "peg") and robot == "rebot" else 2
     return (
         f"--config-dir={folder}",
         *chosen,
@@ -70,6 +70,8 @@ def play_gates(example: str, robot: str, folder: Path, *overrides: str) -> dict[
         ("scara", "scara", "baseline,batch,success"),
         ("slot", "so101", "batch"),
         pytest.param("slot", "rebot", "baseline,batch", marks=pytest.mark.full),
+        ("peg", "so101", "batch"),
+        pytest.param("peg", "rebot", "baseline,batch", marks=pytest.mark.full),
         pytest.param("panda", "panda", "baseline,batch", marks=needs_franka),
     ],
 )
@@ -102,7 +104,8 @@ def test_a_dataset_and_a_replay(tmp_path: Path) -> None:
     [
         ("push", "within=1e-6", ["AT_GOAL"]),
         ("tower", "xy_err=1e-6", ["RED", "GREEN"]),
-        ("slot", "depth=0.05", ["DEPTH"]),
+        pytest.param("slot", "depth=0.05", ["DEPTH"], marks=pytest.mark.full),
+        pytest.param("peg", "within=1e-6", ["IN_HOLE"], marks=pytest.mark.full),
     ],
 )
 def test_what_nothing_can_meet_fails_by_its_own_rule(
@@ -139,7 +142,8 @@ def test_worlds_that_are_not_driven_fail(example: str, rules: list[str]) -> None
 
 
 @pytest.mark.parametrize(
-    ("example", "most"), [("push", 120), ("tower", 80), ("scara", 40), ("panda", 40), ("slot", 130)]
+    ("example", "most"),
+    [("push", 120), ("tower", 80), ("scara", 40), ("panda", 40), ("slot", 130), ("peg", 130)],
 )
 def test_an_example_is_short(example: str, most: int) -> None:
     folder = EXAMPLES / example
