@@ -22,8 +22,9 @@ if TYPE_CHECKING:
     from mjstack.config import Config, load_config
     from mjstack.envs import Env, make_env
     from mjstack.errors import MjstackError
+    from mjstack.jobs.runner import verify
 
-__all__ = ["Config", "Env", "MjstackError", "load_config", "make_env"]
+__all__ = ["Config", "Env", "MjstackError", "load_config", "make_env", "verify"]
 __version__ = "0.2.0.dev0"
 
 _HOMES = {
@@ -32,6 +33,7 @@ _HOMES = {
     "Env": "mjstack.envs",
     "make_env": "mjstack.envs",
     "MjstackError": "mjstack.errors",
+    "verify": "mjstack.jobs.runner",
 }
 
 if not TYPE_CHECKING:  # a type checker would take any name for one of these

@@ -9,6 +9,7 @@ import numpy as np
 
 from mjstack.config.schema import Backend, Config
 from mjstack.episodes.motion import draw_seen
+from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.recorder import Snapshots, WorldRecorder
 from mjstack.episodes.rollout import NOMINAL, Episode, Observer, State
 from mjstack.episodes.stage import Stage, TextHook
@@ -76,6 +77,7 @@ class Run:
         record: Gets each result as soon as there is one.
         viewers: Look on at the one-world episode that is shown.
         artifacts: Products of gates.
+        records: The episodes of *batch* and *success*, by gate, a record for each seed.
         page: What the run shows besides its results.
     """
 
@@ -86,6 +88,7 @@ class Run:
     record: Callable[[GateResult], None] = lambda result: None
     viewers: Sequence[Observer] = ()
     artifacts: Artifacts = field(default_factory=Artifacts)
+    records: dict[str, list[EpisodeRecord]] = field(default_factory=dict)
     page: Page = field(default_factory=Page)
 
     @property

@@ -67,6 +67,7 @@ def play_seeds(
         path=None if folder is None else folder / name,
         replayed=cfg.job.name == "gates",
     )
+    run.records[gate] = tally.records
     with closing(run.stage.batch_simulation(len(run.stage.worlds))) as sim:
         tally.notes = {
             "backend": sim.description,

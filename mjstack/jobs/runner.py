@@ -3,8 +3,10 @@
 import gc
 import hashlib
 import logging
+import os
 import re
 import socket
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -15,9 +17,11 @@ import numpy as np
 import torch
 from rich.markup import escape
 
+from mjstack.config import load_config
 from mjstack.config.fingerprint import config_content, config_hash, differences
 from mjstack.config.functions import find_object
 from mjstack.config.schema import Backend, Config
+from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Progress, Stage
 from mjstack.errors import ConfigError, MjstackError
@@ -270,6 +274,49 @@ def check_job(cfg: Config, overrides: Sequence[str] = ()) -> CheckedJob:
     if cfg.video and "true" not in job.views:
         raise ConfigError("video", True, f"false with job={cfg.job.name}", "Leave it out")
     return job.check(cfg, overrides) if job.overrides else job.check(cfg)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Verification:
+    """What the gates found.
+
+    Attributes:
+        status: ``pass`` if no gate failed and one passed, else ``fail``.
+        gates: The results in their order: each with ``status``, ``reason``, ``metrics`` and
+            ``thresholds``.
+        records: The episodes of *batch* and *success*, by gate, a record for each seed.
+    """
+
+    status: Status
+    gates: dict[str, GateResult]
+    records: dict[str, list[EpisodeRecord]]
+
+    @property
+    def messages(self) -> list[str]:
+        """The gates' lines, as the command line prints them."""
+        return [f"{gate.status} {gate.name}: {gate.reason}" for gate in self.gates.values()]
+
+
+def verify(
+    overrides: Sequence[str] = (), *, config_dir: str | os.PathLike | None = None
+) -> Verification:
+    """Run the gates as the command line would. Nothing is printed, and no file is left.
+
+    Args:
+        overrides: Such as ``["task=lift", "nworld=64", "gates=[baseline,batch]"]``.
+        config_dir: A folder with more choices, as of `make_env`.
+
+    Raises:
+        MjstackError: An override cannot be used, or this machine cannot do what is asked for.
+    """
+    checked = check_job(load_config(overrides, config_dir=config_dir))
+    report = Report(folder=Path())
+    run = Run(checked.stage, record=report.gates.append)
+    with tempfile.TemporaryDirectory() as folder:  # a file of starts is copied before it is read
+        checked.work(run, Path(folder))
+    report.conclude()
+    gates = {gate.name: gate for gate in report.gates}
+    return Verification(status=report.status, gates=gates, records=run.records)
 
 
 def run_provenance(stage: Stage) -> Provenance:

@@ -1,0 +1,38 @@
+"""The gates from Python."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import mjstack
+
+REACH = ["task=reach", "sim=native", "nworld=2"]
+
+
+def test_results_and_records_come_back_and_nothing_is_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    found = mjstack.verify([*REACH, "gates=[baseline,batch,success]", "gate.success.seeds=2"])
+    assert found.status == "pass"
+    assert list(found.gates) == ["baseline", "batch", "success"]
+    assert found.gates["batch"].metrics["success_rate"] == 1.0
+    assert found.gates["baseline"].metrics["distance_m"] <= 0.02
+    assert [message.split(":")[0] for message in found.messages] == [
+        *("pass baseline", "pass batch", "pass success")
+    ]
+    assert [record.seed for record in found.records["success"]] == [0, 1]
+    assert found.records["batch"][0].succeeded.tolist() == [True, True]
+    assert list(tmp_path.iterdir()) == []
+    assert capsys.readouterr() == ("", "")
+
+
+def test_what_fails_is_said() -> None:
+    found = mjstack.verify([*REACH, "gates=[baseline]", "task.check.distance=1e-6"])
+    assert found.status == "fail"
+    assert found.messages == ["fail baseline: failed: grasp point not above red"]
+    assert found.gates["baseline"].beyond == ["reached_steps"]
+    with pytest.raises(mjstack.MjstackError, match=r"nworld=0: expected"):
+        mjstack.verify(["nworld=0"])
