@@ -1,17 +1,81 @@
-"""The driver of a policy that LeRobot has trained."""
+"""The driver of a policy that LeRobot has trained, and worlds in LeRobot's names and units."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from mjstack.config.schema import Config
-from mjstack.drivers.driver import Driver, require_actions
+from mjstack.drivers.driver import Driver
 from mjstack.drivers.policy import QueryImages
 from mjstack.envs.env import Env
-from mjstack.errors import FolderError
+from mjstack.errors import ArgumentError, FolderError
 from mjstack.managers.observation import ObservationManager
-from mjstack.policy.lerobot import IMAGES, SEEN, STATE, LerobotPolicy
+from mjstack.policy.lerobot import IMAGES, SEEN, STATE
 from mjstack.robots.units import LerobotUnits
+
+GROUP = "policy"  # the observation group that is LeRobot's environment_state
+
+
+class LerobotWords:
+    """Observations and joint targets of an environment as LeRobot has them.
+
+    Attributes:
+        begins: Whether the next targets are the first ones of an episode.
+    """
+
+    def __init__(
+        self,
+        env: Env,
+        observations: ObservationManager,
+        images: Mapping[str, Tensor],
+        *,
+        si: bool = False,
+    ) -> None:
+        """Take what there is to see; ``si``: joint values are rad and m."""
+        self._env = env
+        self._observations = observations
+        self._images = images
+        self._joints = env.index.on(env.device, env.sim.qpos.dtype).qpos
+        self._units = None if si else LerobotUnits(env.index.n_arm, env.index.ctrl_range)
+        self.begins = True
+
+    def from_si(self, values: np.ndarray) -> np.ndarray:
+        """Joint values in LeRobot's units, float32."""
+        return values.astype(np.float32) if self._units is None else self._units.from_si(values)
+
+    def observe(self) -> dict[str, np.ndarray]:
+        """What there is to see, by LeRobot's names. What is not finite is 0: the check fails its
+        world.
+        """
+        positions = self._joints.read(self._env.sim.qpos)
+        numbers = {STATE: self.from_si(positions.cpu().numpy())}
+        for group in self._observations.groups.values():
+            numbers[SEEN] = group.float().cpu().numpy()
+        seen = {name: np.nan_to_num(part, posinf=0.0, neginf=0.0) for name, part in numbers.items()}
+        for name, image in self._images.items():
+            seen[f"observation.{name}"] = image.to("cpu", copy=True).numpy()
+        return seen
+
+    def targets(self, actions: np.ndarray) -> Tensor:
+        """Joint targets [rad, m], shape ``(nworld, joints)``, float32, of such actions.
+
+        Raises:
+            ArgumentError: They have another width, or are radians where degrees are due.
+        """
+        shape = (self._env.nworld, len(self._env.index.ctrl))
+        if actions.shape != shape:
+            expected = f"shape {shape}, a target for each joint"
+            raise ArgumentError("action", f"shape {actions.shape}", expected)
+        if self._units is not None:
+            if self.begins:
+                self._units.check_commands(actions, self.observe()[STATE])
+            actions = self._units.to_si(actions)
+        self.begins = False
+        return torch.tensor(actions, device=self._env.device)
 
 
 class LerobotDriver(Driver):
@@ -21,56 +85,48 @@ class LerobotDriver(Driver):
     of the configuration without noise as ``environment_state``.
     """
 
-    def __init__(self, env: Env, policy: LerobotPolicy, cfg: Config) -> None:
+    def __init__(self, env: Env, loaded: tuple[Any, Any, Any], cfg: Config) -> None:
         """Check what the policy needs, and allocate for the environment's worlds.
 
         Args:
             env: The environment, its worlds started.
-            policy: The policy.
+            loaded: The policy and its processors, as of `load_lerobot`.
             cfg: The configuration with its cameras and observations.
 
         Raises:
             MjstackError: The scene does not have what the policy needs.
         """
-        require_actions(env.cfg, cfg.controller.action, "joint targets, as LeRobot's policies")
         super().__init__(env.nworld, cfg.task.episode_steps, env.device)
-        self._env = env
-        self._policy = policy
-        self._task = cfg.task.instruction or cfg.task.name
-        self._units = LerobotUnits(env.index.n_arm, env.index.ctrl_range)
-        self._joints = env.index.on(env.device, env.sim.qpos.dtype).qpos
-        groups = {"policy": cfg.observation["policy"]} if SEEN in policy.inputs else {}
-        for group in groups.values():
-            group.noise = False
-        self._observations = ObservationManager(env, groups)
-        names = [key.removeprefix(f"{IMAGES}.") for key in policy.inputs if IMAGES in key]
+        self._policy, self._before, self._after = loaded
+        self._task = [cfg.task.instruction or cfg.task.name] * env.nworld
+        config = self._policy.config
+        inputs = {name: tuple(part.shape) for name, part in config.input_features.items()}
+        group = replace(cfg.observation[GROUP], noise=False)
+        self._observations = ObservationManager(env, {GROUP: group} if SEEN in inputs else {})
         cameras = cfg.scene.cameras
-        here: dict[str, tuple[int, ...]] = {STATE: (len(env.index.ctrl),)}
-        here |= {f"{IMAGES}.{name}": (3, *camera.size) for name, camera in cameras.items()}
-        for width in self._observations.group_dims.values():
-            here[SEEN] = (width,)
-        for key, shape in policy.inputs.items():
-            if here.get(key) != shape:
+        names = [name for name in cameras if f"{IMAGES}.{name}" in inputs]
+        period = getattr(config, "n_action_steps", 1) if config.n_obs_steps == 1 else 1
+        self._images = QueryImages(env, cameras, names, period)
+        images = {f"images.{name}": image for name, image in self._images.images.items()}
+        self._words = LerobotWords(env, self._observations, images)
+        here = {name: part.shape[1:] for name, part in self._words.observe().items()}
+        for name, shape in inputs.items():
+            if here.get(name) not in (shape, (*shape[1:], *shape[:1])):  # images are (…, 3) here
                 raise FolderError(
-                    f"policy={policy.folder}: takes {key} of shape {shape}, and here it is"
-                    f" {here.get(key, 'missing')}: expected the same",
+                    f"policy={cfg.policy}: takes {name} of shape {shape}, and here it is"
+                    f" {here.get(name, 'missing')}: expected the same",
                     "Set cameras, scene.cameras.NAME.size and observation as in its training",
                 )
-        self._images = QueryImages(env, cameras, names, policy.period)
-        policy.reset()
-        self._first = True
+        self._policy.reset()
 
     def command(self) -> Tensor:
         """Joint targets of the next step [rad, m], shape ``(nworld, joints)``, float32."""
-        env = self._env
         self._images.draw()
-        positions = self._units.from_si(self._joints.read(env.sim.qpos).cpu().numpy())
-        seen: dict[str, np.ndarray | Tensor] = {STATE: np.nan_to_num(positions)}
-        for values in self._observations.compute().values():
-            seen[SEEN] = values.nan_to_num().float().cpu()
-        seen |= {f"{IMAGES}.{name}": image for name, image in self._images.images.items()}
-        targets = self._policy.act(seen, self._task)
-        if self._first:
-            self._units.check_commands(targets, positions)
-            self._first = False
-        return torch.from_numpy(self._units.to_si(targets)).to(env.device)
+        self._observations.compute()
+        batch: dict[str, Any] = {"task": self._task}
+        for name, part in self._words.observe().items():
+            tensor = torch.from_numpy(part)
+            batch[name] = tensor.permute(0, 3, 1, 2) / 255 if name.startswith(IMAGES) else tensor
+        with torch.inference_mode():
+            actions = self._after(self._policy.select_action(self._before(batch)))
+        return self._words.targets(actions.float().cpu().numpy())

@@ -34,7 +34,7 @@ from mjstack.errors import ConfigError
 from mjstack.managers.episode import required_fields
 from mjstack.mdp.geometry import source_xy
 from mjstack.policy import Policy, load_policy
-from mjstack.policy.lerobot import PREFIX, LerobotPolicy
+from mjstack.policy.lerobot import PREFIX, load_lerobot
 from mjstack.scene import SceneIndex, build_model
 from mjstack.scene.phases import Phase
 from mjstack.sim import (
@@ -108,16 +108,16 @@ class Assets:
         return load_policy(Path(self.cfg.policy))
 
     @cached_property
-    def lerobot_policy(self) -> LerobotPolicy | None:
-        """The policy of ``policy=lerobot:FOLDER``, None if it is another.
+    def lerobot_policy(self) -> tuple[Any, Any, Any] | None:
+        """That of ``policy=lerobot:FOLDER``, as of `load_lerobot`; None if the policy is ours.
 
         Raises:
             MjstackError: It cannot be loaded.
         """
-        if not (self.cfg.policy or "").startswith(PREFIX):
+        name = self.cfg.policy or ""
+        if not name.startswith(PREFIX):
             return None
-        joints = len(self.cfg.robot.joints)
-        return LerobotPolicy(str(self.cfg.policy), resolve_backend(self.cfg)[1], joints)
+        return load_lerobot(name, resolve_backend(self.cfg)[1])
 
 
 @dataclass(eq=False)

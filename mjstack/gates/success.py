@@ -106,14 +106,8 @@ def run_success(run: Run) -> list[GateResult]:
 
 
 def find_doubts(distinct: int, episodes: int, successes: int, lost: int, rate: float) -> list[str]:
-    """What keeps an evaluation from showing the rate that it seems to show, a line each.
-
-    Args:
-        distinct: How many of its starts differ.
-        episodes: How many episodes it has.
-        successes: How many of them succeeded, at their end.
-        lost: How many reached the goal and lost it again.
-        rate: The rate that is claimed.
+    """What keeps an evaluation from showing a rate, a line each: how many of its starts differ, how
+    many of its episodes succeeded at their end, and how many reached the goal and lost it again.
     """
     doubts = []
     if distinct < episodes:

@@ -2,6 +2,7 @@
 MuJoCo; or the policy as a folder of LeRobot's.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -46,18 +47,18 @@ def check_export(cfg: Config) -> CheckedJob:
 def export_policy(stage: Stage, folder: Path) -> list[GateResult]:
     """Write all files, or none."""
     policy = stage.assets.policy
-    main = POLICY
-    if stage.cfg.job.format == "lerobot":
+    lerobot = stage.cfg.job.format == "lerobot"
+    files: Mapping[str, str | bytes]
+    if lerobot:
         files = lerobot_files(policy, stage.index.ctrl_range)
-        main = next(iter(files))
     else:
         onnx = to_onnx(policy.network, export_facts(stage))
         files = {MODEL: model_bytes(stage.model), POLICY: onnx}
     try:
         for name, content in files.items():
             write_atomic(folder / name, content)
-        if main != POLICY:
-            save_policy(folder, policy)  # the environment takes its observation from there
+        if lerobot:
+            save_policy(folder, policy)
     except OSError as error:
         for name in files:
             (folder / name).unlink(missing_ok=True)
@@ -72,8 +73,7 @@ def export_policy(stage: Stage, folder: Path) -> list[GateResult]:
         GateResult(
             name=NAME,
             status=Status.passed,
-            reason=f"{folder / main}: {width} numbers observed, {shape};"
-            f" {', '.join(name for name in files if name != main)}",
+            reason=f"{folder}: {', '.join(files)}: {width} numbers observed, {shape}",
             metrics={"inputs": width, **sizes},
             notes={"policy": str(policy.folder)},
         )

@@ -19,18 +19,15 @@ from mjstack.adapters.lerobot.robot import MjstackFollower  # noqa: E402
 __all__ = ["LerobotVectorEnv", "MjstackConfig", "MjstackEnv", "MjstackFollower", "MjstackPolicy"]
 
 
-def _print_error(
-    kind: type[BaseException], error: BaseException, traceback: TracebackType | None
-) -> None:
+def _print_error(kind: type, error: BaseException, trace: TracebackType | None) -> None:
     """Print an error of ours in one line, also where LeRobot wraps it."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, MjstackError):
         cause = cause.__cause__
     if cause is None:
-        _print_others(kind, error, traceback)
+        _print_others(kind, error, trace)
     else:
         print(f"error: {describe_error(cause)}", file=sys.stderr)
 
 
-_print_others = sys.excepthook
-sys.excepthook = _print_error
+_print_others, sys.excepthook = sys.excepthook, _print_error

@@ -15,18 +15,20 @@ from lerobot.envs.configs import EnvConfig
 
 from mjstack.config import load_config
 from mjstack.config.schema import Config
+from mjstack.drivers.lerobot import GROUP, LerobotWords
 from mjstack.envs import Env, driven_config
 from mjstack.episodes.rollout import reset_worlds
 from mjstack.episodes.stage import Stage
-from mjstack.errors import ArgumentError, ConfigError, UnknownName
+from mjstack.errors import ConfigError, UnknownName
 from mjstack.policy import load_policy
-from mjstack.robots.units import LEROBOT, LerobotUnits
+from mjstack.policy.lerobot import SEEN, STATE
+from mjstack.robots.units import LEROBOT
 from mjstack.sim import StateRenderer
 from mjstack.sim.cameras import with_outputs
 from mjstack.sim.sizes import resolve_env_sizes
 from mjstack.tasks.check import make_check
 
-GROUP = "policy"  # the observation group that is LeRobot's environment_state
+SEEN_HERE = SEEN.removeprefix("observation.")
 TIMINGS = {30: "hz30", 50: "default"}  # by control rate [Hz]
 _ENDLESS = 1 << 30  # control steps
 _FILMED = 10  # worlds that are drawn at a time
@@ -46,7 +48,6 @@ class MjstackEnv(EnvConfig):
         observation_height: Pixels of their images.
         observation_width: The same.
         units: ``lerobot``: degrees, and 0 to 100 for the gripper; ``si``: rad and m.
-        device: ``auto``, ``cpu`` or ``cuda:N``.
         overrides: More overrides of mjstack's configuration, which win.
         config_dir: A folder with more choices, such as ``push/conf``.
         policy: Folder of a policy of mjstack's, or of its export, whose observation is then
@@ -60,7 +61,6 @@ class MjstackEnv(EnvConfig):
     observation_height: int = 128
     observation_width: int = 128
     units: str = LEROBOT
-    device: str = "auto"
     overrides: list[str] = field(default_factory=list)
     config_dir: str | None = None
     policy: str | None = None
@@ -84,7 +84,6 @@ class MjstackEnv(EnvConfig):
             "task": self.task,
             "robot": self.robot,
             "timing": TIMINGS[self.fps],
-            "sim.device": self.device,
             "observation": "state",
             "reset": "randomized",
         }
@@ -115,22 +114,14 @@ class MjstackEnv(EnvConfig):
             policy.check_fit(cfg)
             cfg = replace(cfg, observation={GROUP: policy.observation})
         worlds = LerobotVectorEnv(cfg, n_envs, units=self.units, film=film)
-        boxes: Any = worlds.single_observation_space
-        state, seen = (boxes[name].shape for name in ("agent_pos", "environment_state"))
-        self.features = {
-            "action": PolicyFeature(FeatureType.ACTION, worlds.single_action_space.shape),
-            "agent_pos": PolicyFeature(FeatureType.STATE, state),
-            "environment_state": PolicyFeature(FeatureType.ENV, seen),
-        }
-        self.features_map = {
-            "action": "action",
-            "agent_pos": "observation.state",
-            "environment_state": "observation.environment_state",
-        }
-        for name in self.cameras:
-            shape = boxes["pixels"][name].shape
-            self.features[f"observation.images.{name}"] = PolicyFeature(FeatureType.VISUAL, shape)
-            self.features_map[f"observation.images.{name}"] = f"observation.images.{name}"
+        kinds = {STATE: ("agent_pos", FeatureType.STATE), SEEN: (SEEN_HERE, FeatureType.ENV)}
+        width = len(cfg.robot.joints)
+        self.features = {"action": PolicyFeature(FeatureType.ACTION, (width,))}
+        self.features_map = {"action": "action"}
+        for name, part in worlds.words.observe().items():
+            key, kind = kinds.get(name, (name, FeatureType.VISUAL))
+            self.features[key] = PolicyFeature(kind, part.shape[1:])
+            self.features_map[key] = name
         return {self.type: {0: worlds}}
 
 
@@ -143,6 +134,7 @@ class LerobotVectorEnv(VectorEnv):
 
     Attributes:
         inner: The environment.
+        words: Its observations and targets in LeRobot's names and units.
     """
 
     def __init__(
@@ -160,33 +152,27 @@ class LerobotVectorEnv(VectorEnv):
             cfg: The configuration. Its action terms, rewards and terminations do not count.
             nworld: How many worlds.
             units: As of `MjstackEnv`.
-            film: The same scene with a camera that `render` draws, where ``cfg`` has none.
+            film: The same scene with a camera for `draw`, where ``cfg`` has none.
             endless: Whether episodes go on, and nothing judges them.
 
         Raises:
             MjstackError: The configuration cannot be used.
         """
-        if cfg.task.check is None:
-            raise ConfigError("task", cfg.task.name, "a task with a check, which judges episodes")
         if GROUP not in cfg.observation:
             raise UnknownName("observation group", GROUP, cfg.observation)
         if units == LEROBOT and not cfg.robot.lerobot_type:
             expected = "a robot that LeRobot has a follower of (robot.lerobot_type)"
             raise ConfigError("robot", cfg.robot.name, expected, "Set units=si, or robot=so101")
         stage = Stage(cfg)
-        cameras = with_outputs(cfg.scene.cameras, ["rgb"])
         played = replace(
             driven_config(cfg),
             observation={GROUP: replace(cfg.observation[GROUP], noise=False)},
-            scene=replace(cfg.scene, cameras=cameras),
-        )
-        sim = stage.simulation(nworld, *stage.backend, sizes=resolve_env_sizes(cfg))
-        self.inner = env = Env(sim, stage.index, played, check_faults=False)
-        self._joints = env.index.on(env.device, env.sim.qpos.dtype).qpos
-        self._units = (
-            LerobotUnits(env.index.n_arm, env.index.ctrl_range) if units == LEROBOT else None
+            scene=replace(cfg.scene, cameras=with_outputs(cfg.scene.cameras, ["rgb"])),
         )
         self._check = make_check(played)
+        sim = stage.simulation(nworld, *stage.backend, sizes=resolve_env_sizes(cfg))
+        self.inner = env = Env(sim, stage.index, played, check_faults=False)
+        self.words = LerobotWords(env, env.observation_manager, env.images, si=units != LEROBOT)
         self._phase = torch.zeros(nworld, dtype=torch.int64, device=env.device)
         self._steps = _ENDLESS if endless else cfg.task.episode_steps
         self._left = 0  # control steps of the episode
@@ -195,27 +181,9 @@ class LerobotVectorEnv(VectorEnv):
 
         # Gymnasium's and LeRobot's attributes
         self.num_envs = nworld
-        self.metadata = {
-            "autoreset_mode": AutoresetMode.DISABLED,
-            "render_modes": ["rgb_array"],
-            "render_fps": round(cfg.task.control_hz),
-        }
-        low, high = env.index.ctrl_range.T
-        if self._units is not None:
-            low, high = self._units.from_si(low), self._units.from_si(high)
-        self.single_action_space = spaces.Box(low.astype(np.float32), high.astype(np.float32))
-        width = env.observation_manager.group_dims[GROUP]
-        boxes: dict[str, spaces.Space] = {
-            "agent_pos": spaces.Box(-np.inf, np.inf, low.shape, np.float32),
-            "environment_state": spaces.Box(-np.inf, np.inf, (width,), np.float32),
-        }
-        if cameras:
-            images = {name: (*camera.size, 3) for name, camera in cameras.items()}
-            boxes["pixels"] = spaces.Dict(
-                {name: spaces.Box(0, 255, shape, np.uint8) for name, shape in images.items()}
-            )
-        self.single_observation_space = spaces.Dict(boxes)
-        self.observation_space = batch_space(self.single_observation_space, nworld)
+        fps = round(cfg.task.control_hz)
+        self.metadata = {"autoreset_mode": AutoresetMode.DISABLED, "render_fps": fps}
+        self.single_action_space = spaces.Box(*self.words.from_si(env.index.ctrl_range.T))
         self.action_space = batch_space(self.single_action_space, nworld)
         self._shared = {
             "_max_episode_steps": cfg.task.episode_steps,
@@ -239,14 +207,10 @@ class LerobotVectorEnv(VectorEnv):
             env.reset()
             env.sim.forward()
         else:
-            if isinstance(seed, int):
-                seed = range(seed, seed + self.num_envs)
-            numbers = list(seed)
-            if len(numbers) != self.num_envs:
-                expected = f"a number for each of {self.num_envs} worlds"
-                raise ArgumentError("seed", f"{len(numbers)} numbers", expected)
+            numbers = range(seed, seed + self.num_envs) if isinstance(seed, int) else seed
             reset_worlds(env, env.cfg.seed, numbers)
         self._left = self._steps
+        self.words.begins = True
         self._check.start(env, self._left, [])
         return self._observe(), {}
 
@@ -261,18 +225,10 @@ class LerobotVectorEnv(VectorEnv):
         Raises:
             MjstackError: The actions have another width, are not finite or in other units.
         """
-        env = self.inner
-        commands = np.asarray(actions, np.float32)
-        if commands.shape != self.action_space.shape:
-            expected = f"shape {self.action_space.shape}, a target for each joint"
-            raise ArgumentError("action", f"shape {commands.shape}", expected)
+        targets = self.words.targets(np.asarray(actions, np.float32))
         success = np.zeros(self.num_envs, bool)
         if self._left:
-            if self._units is not None:
-                if self._left == self._steps:
-                    self._units.check_commands(commands, self._observe()["agent_pos"])
-                commands = self._units.to_si(commands)
-            env.step(torch.tensor(commands, device=env.device))
+            self.inner.step(targets)
             self._check.update(self._phase)
             self._left -= 1
             if not self._left:
@@ -300,12 +256,9 @@ class LerobotVectorEnv(VectorEnv):
             raise AttributeError(name)
         return (self._shared[name],) * self.num_envs
 
-    def render(self) -> tuple[np.ndarray, ...]:
-        """A picture of every world, each ``(height, width, 3)``, uint8."""
-        return tuple(self.draw(range(self.num_envs)))
-
     def draw(self, worlds: Sequence[int]) -> Iterator[np.ndarray]:
-        """Draw some worlds: the first camera's images, or those of ``film``.
+        """Pictures of some worlds, each ``(height, width, 3)``, uint8: the first camera's images,
+        or those of ``film``.
 
         Raises:
             MjstackError: This machine cannot draw.
@@ -332,21 +285,11 @@ class LerobotVectorEnv(VectorEnv):
         self.inner.close()
 
     def _observe(self) -> dict[str, Any]:
-        """Observations of the current state. What is not finite is 0: the check fails its world."""
-        env = self.inner
-        positions = self._joints.read(env.sim.qpos).cpu().numpy()
-        if self._units is not None:
-            positions = self._units.from_si(positions)
-        group = env.observation_manager.groups[GROUP].cpu().numpy()
-        seen: dict[str, Any] = {
-            name: np.nan_to_num(values.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
-            for name, values in (("agent_pos", positions), ("environment_state", group))
-        }
-        if env.images:
-            seen["pixels"] = {
-                name.removeprefix("images."): image.to("cpu", copy=True).numpy()
-                for name, image in env.images.items()
-            }
+        """Observations by the names that LeRobot expects of an environment."""
+        images = self.words.observe()
+        seen: dict[str, Any] = {"agent_pos": images.pop(STATE), SEEN_HERE: images.pop(SEEN)}
+        if images:
+            seen["pixels"] = {name.rpartition(".")[2]: image for name, image in images.items()}
         return seen
 
 
@@ -359,8 +302,8 @@ class _Pictures(Sequence[np.ndarray]):
     def __len__(self) -> int:
         return self._worlds.num_envs
 
-    def __getitem__(self, index: int | slice) -> Any:
+    def __getitem__(self, index: Any) -> Any:
         numbers = range(len(self))[index]
-        if isinstance(numbers, int):
-            return next(self._worlds.draw([numbers]))
-        return list(self._worlds.draw(numbers))
+        if isinstance(index, slice):
+            return list(self._worlds.draw(numbers))
+        return next(self._worlds.draw([numbers]))

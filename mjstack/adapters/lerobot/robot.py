@@ -9,7 +9,6 @@ from lerobot.motors import MotorCalibration
 from lerobot.robots import Robot, RobotConfig
 
 from mjstack.adapters.lerobot.env import LerobotVectorEnv, MjstackEnv
-from mjstack.errors import ArgumentError
 
 _TICKS = 4095 / (2.0 * np.pi)  # of a servo's encoder [1/rad]
 
@@ -23,16 +22,15 @@ class MjstackCameraConfig(CameraConfig):
 @RobotConfig.register_subclass("mjstack_follower")
 @dataclass(kw_only=True)
 class MjstackFollowerConfig(RobotConfig):
-    """The world; fields as of `MjstackEnv`.
+    """The world: the SO-101 at 30 Hz, unless overrides say otherwise.
 
     Attributes:
         seed: Number of the start.
         cameras: As of a real arm, of type ``mjstack``.
+        overrides: As of `MjstackEnv`.
+        config_dir: Likewise.
     """
 
-    task: str | None = None
-    robot: str = "so101"
-    fps: int = 30
     seed: int = 0
     cameras: dict[str, CameraConfig] = field(default_factory=dict)
     overrides: list[str] = field(default_factory=list)
@@ -42,34 +40,29 @@ class MjstackFollowerConfig(RobotConfig):
 class MjstackFollower(Robot):
     """An arm that moves by one control step with each action, as fast as LeRobot sends them.
 
-    It has names, units and features of the real follower, and its ``robot_type``.
+    It has names, units and features of the real follower, and its ``robot_type``. Its zeros are the
+    middles of its joints' ranges, so it always is calibrated.
     """
 
     config_class = MjstackFollowerConfig
     name = "so_follower"  # its recordings are to be merged with those of the real one
+    is_calibrated = True
 
     def __init__(self, config: MjstackFollowerConfig) -> None:
         """Compose the world, which `connect` makes.
 
         Raises:
-            MjstackError: It cannot be composed, or there is no follower of such a robot.
+            MjstackError: It cannot be composed.
         """
         super().__init__(config)
-        self.config = config
         self.cameras = config.cameras
-        sizes = [
-            f"scene.cameras.{name}.size=[{camera.height},{camera.width}]"
-            for name, camera in config.cameras.items()
-        ]
+        sizes = [f"scene.cameras.{k}.size=[{c.height},{c.width}]" for k, c in self.cameras.items()]
+        overrides = ["sim=native", *sizes, *config.overrides]
         world = MjstackEnv(
-            task=config.task,
-            robot=config.robot,
-            fps=config.fps,
-            cameras=[*config.cameras],
-            overrides=["sim=native", *sizes, *config.overrides],
-            config_dir=config.config_dir,
+            cameras=[*self.cameras], overrides=overrides, config_dir=config.config_dir
         )
         self._cfg = world.compose()
+        self._seed = config.seed
         self._world: LerobotVectorEnv | None = None
         self._seen: dict[str, Any] = {}
 
@@ -89,22 +82,14 @@ class MjstackFollower(Robot):
         """Whether there is a world."""
         return self._world is not None
 
-    @property
-    def is_calibrated(self) -> bool:
-        """Always: its zeros are the middles of its joints' ranges."""
-        return True
-
     def connect(self, calibrate: bool = True) -> None:
-        """Make the world, and start it."""
-        self._world = world = LerobotVectorEnv(self._cfg, 1, endless=True)
-        self._seen, _ = world.reset(seed=self.config.seed)
-        self.calibrate()
+        """Make the world, and start it.
 
-    def calibrate(self) -> None:
-        """Say what a calibration of these joints would have found. A file of a real arm's, which
-        may have the same ``id``, is not touched.
+        Raises:
+            MjstackError: There is no follower of such a robot, or no such world.
         """
-        assert self._world is not None
+        self._world = LerobotVectorEnv(self._cfg, 1, endless=True)
+        self._seen, _ = self._world.reset(seed=self._seed)
         half = 0.5 * _TICKS * np.diff(self._world.inner.index.ctrl_range)[:, 0]
         self.calibration = {
             name: MotorCalibration(k, 0, 0, round(2047.5 - ticks), round(2047.5 + ticks))
@@ -112,7 +97,11 @@ class MjstackFollower(Robot):
         }
 
     def configure(self) -> None:
-        """Nothing: ``actuator`` among the overrides chooses the servos."""
+        """Nothing: overrides choose servos, and files of a real arm's calibration stay as they are,
+        though they may have the same ``id``.
+        """
+
+    calibrate = configure
 
     def get_observation(self) -> dict[str, Any]:
         """The joints in degrees, the gripper from 0 to 100, and images."""
@@ -125,11 +114,8 @@ class MjstackFollower(Robot):
         Raises:
             ArgumentError: A joint is missing, or the targets are radians.
         """
+        targets = {name: float(action[name]) for name in self.action_features if name in action}
         assert self._world is not None
-        if missing := self.action_features.keys() - action.keys():
-            expected = f"a target for each of {', '.join(self.action_features)}"
-            raise ArgumentError("action", f"none for {', '.join(sorted(missing))}", expected)
-        targets = {name: float(action[name]) for name in self.action_features}
         self._seen, *_ = self._world.step(np.array([[*targets.values()]], np.float32))
         return targets
 
