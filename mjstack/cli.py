@@ -85,7 +85,11 @@ def run(args: list[str]) -> int:
 def _dispatch(flags: Namespace, overrides: list[str]) -> int:
     """Do what the flags ask for, on the current search path."""
     with hydra_session() as hydra:
-        if flags.help:
+        if overrides[:1] == ["new"]:
+            from mjstack.config.new import write_new  # it loads MuJoCo
+
+            print("\n".join(map(str, write_new(overrides[1:]))))
+        elif flags.help:
             _print_help(overrides)
         elif flags.hydra_help:
             hydra.hydra_help(CONFIG_NAME, args_parser=get_args_parser(), args=flags)

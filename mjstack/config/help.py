@@ -23,6 +23,7 @@ mjstack: a task of a robot arm, from native MuJoCo to thousands of MuJoCo Warp w
  verified in gates.
 
 Usage: mjstack [group=choice ...] [key=value ...] [flags]
+       mjstack new task NAME | new robot NAME FILE.xml: a folder of your own to go on from
 In a checkout: python scripts/run.py ...
 
 Examples:

@@ -1,0 +1,74 @@
+"""``mjstack new``: the folder of a task or robot of one's own."""
+
+import os
+import re
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+
+import mujoco
+
+from mjstack.config.session import CONFIG_FOLDER, list_choices
+from mjstack.errors import MjstackError, first_line
+
+_GRIPPER = re.compile("grip|finger|jaw|thumb|left|right", re.IGNORECASE)
+
+
+def write_new(args: Sequence[str]) -> list[Path]:
+    """Write the files of ``task NAME`` or of ``robot NAME FILE.xml`` into a new folder NAME.
+
+    Raises:
+        MjstackError: The arguments are others, NAME is taken, or MuJoCo cannot compile the file.
+    """
+    kind, name = (*args, "", "")[:2]
+    if (kind, len(args)) not in (("task", 2), ("robot", 3)):
+        expected = "'task NAME' or 'robot NAME FILE.xml', such as mjstack new task lift"
+        raise MjstackError(f"new {' '.join(args)}: expected {expected}.")
+    folder = Path(name)
+    taken = folder.exists() or name in list_choices()[kind] or find_spec(name) is not None
+    if taken or not re.fullmatch(r"[a-z][a-z0-9_]*", name):
+        raise MjstackError(
+            f"new {kind} {name}: expected small letters, digits and _, and no folder, {kind} or"
+            " Python module of that name. Choose another name."
+        )
+    words = {"NAME": name} | (_read_robot(Path(args[2]), folder) if kind == "robot" else {})
+    text = (CONFIG_FOLDER / "new" / f"{kind}.txt").read_text(encoding="utf-8")
+    _, *parts = re.split(r"(?m)^=== (.+)\n", re.sub("@([A-Z]+)@", lambda m: words[m[1]], text))
+    paths = [folder / path for path in parts[::2]]
+    for path, content in zip(paths, parts[1::2], strict=True):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(content, encoding="utf-8")
+    return paths
+
+
+def _read_robot(file: Path, folder: Path) -> dict[str, str]:
+    """What an MJCF file tells about a robot, as YAML has it."""
+    try:
+        model = mujoco.MjModel.from_xml_path(str(file))
+    except ValueError as error:
+        raise MjstackError(f"{file}: expected an MJCF file: {first_line(error)}.") from error
+    joints = [model.joint(number) for number in range(model.njnt)]
+    gripper = [joint for joint in joints if _GRIPPER.search(joint.name)] or joints[-1:]
+    joints = [joint for joint in joints if joint not in gripper] + gripper
+    jaws = [int(joint.bodyid[0]) for joint in gripper]
+    if len(jaws) == 1:
+        jaws.insert(0, int(model.body_parentid[jaws[0]]))
+    names = {jaw: ["fill_in"] for jaw in jaws}
+    for site in map(model.site, range(model.nsite)):
+        names.get(int(site.bodyid[0]), []).append(site.name)
+    sites = [
+        max(on_jaw[1:] or on_jaw, key=lambda name: "grasp" in name) for on_jaw in names.values()
+    ]
+    qpos = model.key_qpos[0] if model.nkey else model.qpos0
+    home = [min(max(float(qpos[j.qposadr[0]]), j.range[0]), j.range[1]) for j in joints]
+    values = {
+        "FILE": os.path.relpath(file, folder / "conf" / "robot"),
+        "ARM": [joint.name for joint in joints[: -len(gripper)]],
+        "GRIPPER": [joint.name for joint in gripper],
+        "JAWS": [model.body(body).name for body in jaws],
+        "SITES": sites[:2],
+        "HOME": [round(float(value), 4) for value in home],
+        "OPEN": [round(float(joint.range[1]), 4) for joint in gripper],
+        "CLOSED": [round(float(joint.range.mean()), 4) for joint in gripper],
+    }
+    return {key: str(value).replace("'", "") for key, value in values.items()}

@@ -1,0 +1,77 @@
+"""``mjstack new``: a task and a robot of one's own, from templates."""
+
+from __future__ import annotations
+
+import runpy
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from doc_blocks import ROOT
+
+import mjstack
+from mjstack.cli import run
+
+GATES = "gates=[baseline,parity,capacity,batch]"
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_a_task_passes_as_it_is_written(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["new", "task", "fresh_task"]) == 0
+    files = ["conf/task/fresh_task.yaml", "fresh_task.py", "test_fresh_task.py"]
+    assert capsys.readouterr().out.split() == [f"fresh_task/{file}" for file in files]
+    overrides = ["task=fresh_task", "sim=native", "nworld=2", "gates=[baseline,batch]"]
+    result = mjstack.verify(overrides, config_dir=here / "fresh_task" / "conf")
+    assert result.status == "pass", result.messages
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("arm", ["so101", "rebot"])
+def test_it_passes_the_gates_with_both_robots(arm: str, here: Path) -> None:
+    assert run(["new", "task", f"fresh_{arm}"]) == 0
+    folder = here / f"fresh_{arm}"
+    overrides = [f"task=fresh_{arm}", f"robot={arm}", "nworld=4", "gate.capacity.cpu_nworld=2"]
+    result = mjstack.verify([*overrides, GATES], config_dir=folder / "conf")
+    assert result.status == "pass", result.messages
+    if arm == "rebot":
+        runpy.run_path(str(folder / f"test_fresh_{arm}.py"))["test_the_gates_pass"]()
+
+
+def test_a_robot_is_read_from_its_file(here: Path) -> None:
+    """What the example's own YAML says, as far as the XML tells."""
+    assert run(["new", "robot", "fresh_scara", str(ROOT / "examples/scara/scara.xml")]) == 0
+    folder = here / "fresh_scara" / "conf"
+    robot = mjstack.load_config(["robot=fresh_scara"], config_dir=folder).robot
+    example = mjstack.load_config(["robot=scara"], config_dir=ROOT / "examples/scara/conf").robot
+    for key in ("file", "arm_joints", "gripper_joints", "jaw_bodies", "grasp_sites"):
+        assert getattr(robot, key) == getattr(example, key), key
+    assert robot.gripper_open == [0.05, 0.05]
+    assert robot.home == [0.0, 0.1, 0.0, 0.0, 0.0, 0.0]  # within the elbow's range
+    assert run(["new", "robot", "fresh_arm", str(ROOT / "mjstack/robots/so101.xml")]) == 0
+    arm = mjstack.load_config(["robot=fresh_arm"], config_dir=here / "fresh_arm" / "conf").robot
+    builtin = mjstack.load_config().robot
+    for key in ("arm_joints", "gripper_joints", "jaw_bodies", "grasp_sites"):
+        assert getattr(arm, key) == getattr(builtin, key), key
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("new", "new : expected 'task NAME' or 'robot NAME FILE.xml'"),
+        ("new task", "new task: expected 'task NAME'"),
+        ("new robot arm", "new robot arm: expected 'task NAME' or 'robot NAME FILE.xml'"),
+        ("new task Lift", "new task Lift: expected small letters, digits and _"),
+        ("new task stack", "and no folder, task or Python module of that name. Choose another"),
+        ("new task json", "Python module of that name"),
+        ("new robot arm nope.xml", "nope.xml: expected an MJCF file: "),
+    ],
+)
+def test_a_name_that_is_taken_is_refused(
+    words: str, message: str, here: Path, refused: Callable[..., str]
+) -> None:
+    assert message in refused(*words.split())
