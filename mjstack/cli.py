@@ -24,7 +24,7 @@ from omegaconf import DictConfig, OmegaConf
 import mjstack
 from mjstack.cli_sweep import check_jobs, claim_sweep, expand, hydra_path, print_sweep
 from mjstack.config.explain import own_overrides
-from mjstack.config.help import help_text, key_help
+from mjstack.config.help import help_text, key_help, list_text
 from mjstack.config.load import compose, extended_search_path, to_config
 from mjstack.config.session import (
     CONFIG_NAME,
@@ -85,7 +85,9 @@ def run(args: list[str]) -> int:
 def _dispatch(flags: Namespace, overrides: list[str]) -> int:
     """Do what the flags ask for, on the current search path."""
     with hydra_session() as hydra:
-        if overrides[:1] == ["new"]:
+        if overrides[:1] == ["list"]:
+            print(list_text(overrides[1:]), flush=True)
+        elif overrides[:1] == ["new"]:
             from mjstack.config.new import write_new  # it loads MuJoCo
 
             print("\n".join(map(str, write_new(overrides[1:]))))

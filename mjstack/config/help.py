@@ -3,26 +3,35 @@
 Groups and choices are those of the search path; units, ranges and words are those of the fields.
 """
 
+import inspect
 import json
 import re
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
+from importlib import import_module
 from typing import Any, NamedTuple
 
 from mjstack.config.complete import typed
 from mjstack.config.fields import accepted, field_docs
-from mjstack.config.functions import offered
+from mjstack.config.functions import find_object, offered
 from mjstack.config.schema import Config
-from mjstack.config.session import CONFIG_FOLDER, list_choices
+from mjstack.config.session import CONFIG_FOLDER, config_folders, list_choices
 from mjstack.errors import UnknownName
 
 _GROUP = re.compile(r"^  - (\w+): (\[.*\]|\S+) # (.+)$", re.MULTILINE)  # name, default, words
+_LISTED = {  # the group of each, if it is one
+    **{"tasks": "task", "robots": "robot", "terms": "", "conditions": ""},
+    **{"gates": "gate", "trainers": "trainer"},
+}
+_TERMS = ("action", "observation", "reward", "reset", "termination", "looks")
+_RANGE = re.compile(r"(?:typing\.)?Annotated\[(\w+), Range\(.*?\)\]")
 _TEXT = """\
 mjstack: a task of a robot arm, from native MuJoCo to thousands of MuJoCo Warp worlds,\
  verified in gates.
 
 Usage: mjstack [group=choice ...] [key=value ...] [flags]
+       mjstack list [tasks|robots|terms|conditions|gates|trainers]: what there is to choose
        mjstack new task NAME | new robot NAME FILE.xml: a folder of your own to go on from
 In a checkout: python scripts/run.py ...
 
@@ -186,3 +195,52 @@ def _wrapped(row: str, width: int) -> list[str]:
     """A row as lines; the second column of a table is wrapped."""
     column = re.match(r"  \S.*?  +", row)
     return textwrap.wrap(row, width, subsequent_indent=" " * len(column[0] if column else ""))
+
+
+def list_text(kinds: Sequence[str]) -> str:
+    """What there is to choose from, of mjstack and of the search path, with a line each; of terms
+    alone also their parameters. Without kinds, all of them.
+
+    Raises:
+        UnknownName: There is no such kind.
+    """
+    for kind in set(kinds) - set(_LISTED):
+        raise UnknownName("list", kind, _LISTED)
+    lines = []
+    for kind in kinds or _LISTED:
+        named = _files(_LISTED[kind]) if _LISTED[kind] else _functions(kind, len(kinds) == 1)
+        lines += [f"{kind}:", *(f"  {name:<12} {words}".rstrip() for name, words in named)]
+    return "\n".join(lines)
+
+
+def _files(group: str) -> Iterator[tuple[str, str]]:
+    """Choices of a group, and the comments that their files begin with."""
+    for folder in (CONFIG_FOLDER, *config_folders()):
+        for path in sorted(folder.glob(f"{group}/*.yaml")):
+            comment = re.search("(?m)^# (?!@)(.+)", path.read_text(encoding="utf-8"))
+            yield path.stem, comment[1] if comment else ""
+
+
+def _functions(kind: str, with_parameters: bool) -> Iterator[tuple[str, str]]:
+    """Terms or conditions by their dotted names, and what their docstrings begin with."""
+    modules = ["mjstack.tasks.parts"]
+    if kind == "terms":
+        modules = [f"mjstack.mdp.{name}" for name in _TERMS]
+    names = [f"{m}.{name}" for m in modules for name in vars(import_module(m)) if name[0] != "_"]
+    if kind == "terms":  # those that the search path's files name
+        files = [path for folder in config_folders() for path in sorted(folder.rglob("*.yaml"))]
+        names += [
+            name for path in files for name in re.findall(r"func: ([\w.]+)", path.read_text())
+        ]
+    for name in dict.fromkeys(names):
+        func: Any = find_object("list", name)
+        if getattr(func, "__module__", "") != name.rpartition(".")[0] or not callable(func):
+            continue
+        doc = inspect.getdoc(func) or ""
+        yield name, " ".join(doc.partition("\n\n")[0].split()).partition(". ")[0]
+        called = func.__init__ if inspect.isclass(func) else func
+        notes = dict(re.findall(r"(?m)^ +(\w+): (.+)$", inspect.getdoc(called) or ""))
+        for option in inspect.signature(func).parameters.values() if with_parameters else ():
+            if option.kind is option.KEYWORD_ONLY:
+                text = _RANGE.sub(r"\1", str(option))
+                yield "", f"{text}. {notes.get(option.name, '')}"
