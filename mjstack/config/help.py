@@ -31,8 +31,8 @@ mjstack: a task of a robot arm, from native MuJoCo to thousands of MuJoCo Warp w
  verified in gates.
 
 Usage: mjstack [group=choice ...] [key=value ...] [flags]
-       mjstack list [tasks|robots|terms|conditions|gates|trainers]: what there is to choose
-       mjstack new task NAME | new robot NAME FILE.xml: a folder of your own to go on from
+       mjstack list [tasks|robots|terms|conditions|gates|trainers]
+       mjstack new task NAME | robot NAME FILE.xml    a folder of your own
 In a checkout: python scripts/run.py ...
 
 Examples:

@@ -18,15 +18,15 @@ def write_new(args: Sequence[str]) -> list[Path]:
     """Write the files of ``task NAME`` or of ``robot NAME FILE.xml`` into a new folder NAME.
 
     Raises:
-        MjstackError: The arguments are others, NAME is taken, or MuJoCo cannot compile the file.
+        MjstackError: The arguments are others, NAME is exists, or MuJoCo cannot compile the file.
     """
     kind, name = (*args, "", "")[:2]
     if (kind, len(args)) not in (("task", 2), ("robot", 3)):
         expected = "'task NAME' or 'robot NAME FILE.xml', such as mjstack new task lift"
         raise MjstackError(f"new {' '.join(args)}: expected {expected}.")
     folder = Path(name)
-    taken = folder.exists() or name in list_choices()[kind] or find_spec(name) is not None
-    if taken or not re.fullmatch(r"[a-z][a-z0-9_]*", name):
+    exists = folder.exists() or name in list_choices()[kind] or find_spec(name) is not None
+    if exists or not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         raise MjstackError(
             f"new {kind} {name}: expected small letters, digits and _, and no folder, {kind} or"
             " Python module of that name. Choose another name."

@@ -71,9 +71,8 @@ class Config:
     """Capture the step as a CUDA graph: auto, require or off. Ignored on native MuJoCo; on Warp's
     CPU device, of physics alone."""
     view: str = spec(choices=("false", "true", "web"))
-    """true: open MuJoCo's viewer on the parity world; gates without parity: the baseline world;
-    job=play: every world. web: serve the same, the worlds of batch and success, and training to a
-    browser."""
+    """true: MuJoCo's viewer on the parity world, or without that gate the baseline world; job=play:
+    every world. web: the same, worlds of batch and success, and training, in a browser."""
     video: bool = spec()
     """Write a video of the same; job=play without view does so."""
     web: WebCfg = field(default_factory=WebCfg)
@@ -87,11 +86,11 @@ class Config:
     run: str | None = spec(None)
     """job=replay: the folder of an earlier run."""
     resume: str | None = spec(None)
-    """job=gates: the folder of an earlier run of this configuration; seeds that batch and success
-    have finished there are read back, and the others are played."""
+    """job=gates: the folder of an earlier run of this configuration, whose finished seeds of batch
+    and success are read back."""
     devices: str | None = spec(None)
     """GPUs that share the job's worlds, a process for each: all, or how many. null: as torchrun
     has it, or one."""
     world: str | None = spec(None)
-    """job=replay: a world of it, such as 17, or 3:17 for world 17 of seed 3; success:3:17 where
-    batch ran too; failing for all that failed."""
+    """job=replay: a world of it, 17; of seed 3, 3:17; success:3:17 where batch ran too; failing:
+    all that failed."""
