@@ -115,7 +115,7 @@ def test_broken_controller_fails_by_rule_and_phase(tmp_path: Path) -> None:
     broken = ("failed.LIFT", "failed.CARRY", "failed.STACKED")
     assert counts(gate["metrics"], *broken) == [2] * 3
     (table,) = [table for table in gate["tables"] if "first sign of failure" in table["header"]]
-    assert table["rows"] == [["grasp_red: grasp empty, and not tried again", "2", "0, 1"]]
+    assert table["rows"] == [["grasp_red: grasp empty at the last try", "2", "0, 1"]]
     for world, row in enumerate(rows_of(folder / FAILING)):
         expected = {"world": str(world), "sign": "EMPTY", "phase": "grasp_red", "retries": "1"}
         assert row.items() >= expected.items()

@@ -29,7 +29,7 @@ class Sign(IntEnum):
 _TEXTS = (  # of each sign
     "no sign before the result",
     "physics lost",
-    "grasp empty, and not tried again",
+    "grasp empty at the last try",
     "held object lost its load",
     "not in place when let go",
     "left its place",

@@ -171,7 +171,9 @@ def _prepare_joint(spec: mujoco.MjSpec, name: str) -> None:
     """
     low, high = spec.joint(name).range
     if not low < high:
-        raise ConfigError(f"range of joint {name}", [low, high], "a range in the robot's file")
+        raise ConfigError(
+            f"range of joint {name}", [float(low), float(high)], "a range in the robot's file"
+        )
     servos = [a for a in spec.actuators if a.target == name]
     positions = [a for a in servos if a.gainprm[0] and a.biasprm[1] == -a.gainprm[0]]
     if len(servos) != 1 or not positions:
