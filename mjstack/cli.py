@@ -88,7 +88,7 @@ def _dispatch(flags: Namespace, overrides: list[str]) -> int:
         if overrides[:1] == ["list"]:
             print(list_text(overrides[1:]), flush=True)
         elif overrides[:1] == ["new"]:
-            from mjstack.config.new import write_new  # it loads MuJoCo
+            from mjstack.robots.new import write_new  # it loads MuJoCo
 
             print("\n".join(map(str, write_new(overrides[1:]))))
         elif flags.help:
