@@ -1,19 +1,37 @@
-"""MkDocs hooks: the reference of the configuration, generated from its fields in each build."""
+"""MkDocs hooks: the reference of the configuration, generated from its fields in each build;
+and the pictures of the examples, which lie outside of the folder of the pages.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from mjstack.config import load_config
 from mjstack.config.fields import field_docs
 from mjstack.config.help import Key, list_groups, list_keys
 from mjstack.config.schema import JOB_SCHEMAS, Config
 
+if TYPE_CHECKING:  # the reference is made where MkDocs is not, too
+    from mkdocs.config.defaults import MkDocsConfig
+    from mkdocs.structure.files import Files
+
 MARKER = "<!-- reference -->"
 
 
+def on_files(files: Files, config: MkDocsConfig, **_: Any) -> Files:
+    """Add the examples' pictures."""
+    from mkdocs.structure.files import File
+
+    for picture in sorted(Path(config.docs_dir).parent.glob("examples/*/*.png")):
+        files.append(File(picture.name, str(picture.parent), config.site_dir, False))
+    return files
+
+
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Put the reference in place of its marker."""
+    """Put the reference in place of its marker, and have pictures of examples beside the pages."""
+    markdown = re.sub(r"\.\./examples/\w+/(\w+\.png)", r"\1", markdown)
     return markdown.replace(MARKER, reference_markdown()) if MARKER in markdown else markdown
 
 
