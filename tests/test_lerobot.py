@@ -61,6 +61,8 @@ def test_a_number_is_a_start_wherever_it_stands(four: LerobotVectorEnv) -> None:
     assert torch.equal(four.inner.sim.qpos[[0, 3]], first[[0, 3]])
     four.reset()
     assert len(np.unique(torch.cat((first, four.inner.sim.qpos)).numpy(), axis=0)) == 7
+    with pytest.raises(ArgumentError, match=r"seed: found 1 numbers, expected one for each of 4"):
+        four.reset(seed=[1])
 
 
 def test_success_counts_in_the_last_step_alone_and_then_worlds_stand(

@@ -19,7 +19,7 @@ from mjstack.drivers.lerobot import GROUP, LerobotWords
 from mjstack.envs import Env, driven_config
 from mjstack.episodes.rollout import reset_worlds
 from mjstack.episodes.stage import Stage
-from mjstack.errors import ConfigError, UnknownName
+from mjstack.errors import ArgumentError, ConfigError, UnknownName
 from mjstack.policy import load_policy
 from mjstack.policy.lerobot import SEEN, STATE
 from mjstack.robots.units import LEROBOT
@@ -207,7 +207,12 @@ class LerobotVectorEnv(VectorEnv):
             env.reset()
             env.sim.forward()
         else:
-            numbers = range(seed, seed + self.num_envs) if isinstance(seed, int) else seed
+            n = self.num_envs
+            numbers = seed if isinstance(seed, Sequence) else range(int(seed), int(seed) + n)
+            if len(numbers) != n:  # a single one would be the start of every world
+                raise ArgumentError(
+                    "seed", f"{len(numbers)} numbers", f"one for each of {n} worlds"
+                )
             reset_worlds(env, env.cfg.seed, numbers)
         self._left = self._steps
         self.words.begins = True

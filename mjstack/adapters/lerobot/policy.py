@@ -1,6 +1,5 @@
 """LeRobot's policy ``mjstack``: one that ``job=export job.format=lerobot`` has written."""
 
-import copy
 from collections import deque
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -61,8 +60,8 @@ class MjstackPolicy(PreTrainedPolicy):
     def __init__(self, config: MjstackConfig, policy: Policy) -> None:
         """Take the policy."""
         super().__init__(config)
-        self.network = policy.network
-        self._exact = copy.deepcopy(policy.network).double()  # as PolicyDriver has it on a CPU
+        # As PolicyDriver has it
+        self.network = policy.network if "cuda" in config.device else policy.network.double()
         self._execute = policy.execute
         self._seen = STATE if STATE in config.input_features else SEEN
         robot = policy.config["robot"]
@@ -91,7 +90,7 @@ class MjstackPolicy(PreTrainedPolicy):
             ArgumentError: The observation has another width.
         """
         seen = batch[self._seen]
-        network = self.network if seen.is_cuda else self._exact
+        network = self.network
         width = len(network.observation_mean)
         if seen.shape[-1] != width:
             expected = f"{width}, as the policy was trained"
