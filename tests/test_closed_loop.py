@@ -20,6 +20,7 @@ from mjstack.envs import Env, driven_config
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ArgumentError
 from mjstack.managers.episode import required_fields
+from mjstack.math import quat_to_matrix
 from mjstack.scene.index import gripper_targets
 from mjstack.scene.phases import build_phases
 from mjstack.sim import make_simulation
@@ -372,3 +373,44 @@ def test_an_object_that_lies_askew_in_the_hand_is_aligned(drive: Drive) -> None:
     assert left[False][1] > 8.0
     assert left[True][0] < 0.002, left
     assert left[True][1] < 3.0, left
+
+
+@pytest.mark.parametrize("expert", [ClosedLoopDriver, StateBasedDriver])
+@pytest.mark.parametrize(
+    "shape",
+    [
+        ["size=[0.035,0.014,0.02]"],
+        ["size=[0.014,0.035,0.02]"],
+        ["shape=cylinder", "size=[0.014,0.035]", "quat=[0.7071068,0.7071068,0,0]"],
+    ],
+    ids=["brick", "turned_brick", "lying_cylinder"],
+)
+def test_jaws_close_across_what_is_oblong(
+    expert: type[FeedbackDriver], shape: list[str], drive: Drive, get_stage: GetStage
+) -> None:
+    """Across the narrower side, at any yaw, and by half a turn at most, within the joint's
+    range.
+    """
+    red = [f"scene.objects.red.{text}" for text in shape]
+    env, _ = drive(*red, "controller.yaw_alignment=0", nworld=6)
+    start = env.index.object_qpos[0] + 3
+    nominal = np.array(env.cfg.scene.objects["red"].turned)  # of the model's cube, too
+    for world, yaw in enumerate(np.linspace(-1.5, 1.5, 6)):
+        turned = np.empty(4)
+        mujoco.mju_mulQuat(turned, np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]), nominal)
+        env.sim.qpos[world, start : start + 4] = torch.from_numpy(turned)
+    env.sim.forward()
+    controller = expert(env, get_stage("so101").planner.nominal)
+    for _ in range(60):  # before the jaws meet it
+        env.step(controller.command())
+    state = controller._measure()
+    across = measure_planar(env, "red")[:, 2]
+    off = torch.atan2(state.closing[:, 1], state.closing[:, 0]) - across
+    off = torch.rad2deg((torch.remainder(off + torch.pi / 2, torch.pi) - torch.pi / 2).abs())
+    limit = 6.0 if expert is ClosedLoopDriver else 15.0  # deg: SO-101's roll may end before
+    assert off.max() < limit, off
+    size = env.cfg.scene.objects["red"].size
+    axes = quat_to_matrix(env.sim.qpos[:, start : start + 4])
+    long = axes[:, :2, 2 if len(size) == 2 else int(np.argmax(size))].float()
+    apart = (long * state.closing[:, :2]).sum(1).abs()  # of the long axis along the closing one
+    assert apart.max() < np.sin(np.radians(limit))

@@ -153,15 +153,18 @@ class ClosedLoopDriver(FeedbackDriver):
         _, closing, approach = self._ik.forward(command)
         yaw = self._last_seen(self._source, self.phase)[:, 2]
         off = yaw - atan2(closing[:, 1], closing[:, 0])
-        off = off - _QUARTER * torch.round(off / _QUARTER)
-        # Two faces are in question, a quarter turn apart; what has been turned so far counts for
-        # its own.
-        faces = torch.stack((off, off - torch.copysign(torch.full_like(off, _QUARTER), off)))
+        oblong = self._oblong_anchor[self.phase]
+        apart = torch.where(oblong, 2.0 * _QUARTER, _QUARTER)
+        off = off - apart * torch.round(off / apart)
+        # Two faces are in question, a quarter turn apart, or half a turn; what has been turned so
+        # far counts for its own.
+        faces = torch.stack((off, off - torch.copysign(apart, off)))
         upright = (-approach[:, 2]).clamp(min=0.2)
         rolls = self._roll + self._roll_sign * atan2(torch.sin(faces), torch.cos(faces) * upright)
         cost = (rolls - STAY * self._roll).abs()
+        cost = cost + oblong * (self._beyond(rolls) + self._detour(rolls, self._roll))
         goal = torch.where(cost[0] <= cost[1], rolls[0], rolls[1])
-        step = self._cfg.controller.yaw_alignment * goal - self._roll
+        step = torch.where(oblong, 1.0, self._cfg.controller.yaw_alignment) * goal - self._roll
         step = step.clamp(-_ROLL_STEP, _ROLL_STEP)
         self._roll += step * self._turns_jaws[self.phase]
         if self._any_align:
@@ -199,6 +202,8 @@ class ClosedLoopDriver(FeedbackDriver):
         self._turns_jaws = column(
             s.observe and s.gripper == "open" and s.anchor in with_faces for s in specs
         )
+        long = [name for name, oblong in zip(objects, self._oblong.tolist(), strict=True) if oblong]
+        self._oblong_anchor = column(s.anchor in long for s in specs)
         self._observes = column(
             [s.observe and name in (s.anchor, s.toward) for name in objects] for s in specs
         )

@@ -21,6 +21,8 @@ from mjstack.mdp.geometry import gripper_opening, objects_in_hand, place_xy, pos
 from mjstack.scene.index import gripper_targets
 from mjstack.scene.phases import Phase, build_phases, source_names
 
+_BEYOND = 10.0  # what a roll beyond the joint's range costs, per rad
+_BACK = 3.0  # rad: what a roll counts that leads back over the nominal one
 STAY = 0.3  # how much a roll made so far weighs against the face that is nearer
 
 
@@ -101,8 +103,14 @@ class FeedbackDriver(Driver):
         self._tilt: CarryTilt | None = None
         if c.approach_gain > 0.0 and carries:
             self._tilt = CarryTilt(env.sim.model, cfg, self._plan, self._ik, self._nominal)
-        self._aligns = c.yaw_alignment > 0.0
+        # Jaws turn to a face, and to the narrower side of what is oblong in any case.
+        grasped = {phase.grasps for phase in c.phases.values()}
+        oblong = [thing.oblong and name in grasped for name, thing in cfg.scene.objects.items()]
+        self._oblong = torch.tensor(oblong, device=device)
+        self._aligns = c.yaw_alignment > 0.0 or (any(oblong) and bool(cfg.robot.roll_joint))
         self._roll_column, self._roll_sign = self._find_roll() if self._aligns else (0, 1.0)
+        rolls = robot(env).ctrl_range[self._roll_column].float()
+        self._rolls = (rolls - self._nominal[0, self._roll_column]).unbind(0)
 
         # Buffers: x, y and yaw of objects and places, and the last command
         self._seen = torch.zeros((env.nworld, len(source_names(cfg.scene)), 3), device=device)
@@ -150,6 +158,17 @@ class FeedbackDriver(Driver):
             in_hand=objects_in_hand(env.index, env.sim),
         )
 
+    def _beyond(self, rolls: Tensor) -> Tensor:
+        """What rolls cost that are beyond the joint's range, from the nominal one [rad]."""
+        low, high = self._rolls
+        return _BEYOND * ((low - rolls).clamp(min=0.0) + (rolls - high).clamp(min=0.0))
+
+    def _detour(self, rolls: Tensor, roll: Tensor) -> Tensor:
+        """What rolls cost that lead back over the nominal one: without it, a roll at the end of the
+        range would go to and fro.
+        """
+        return _BACK * (rolls * roll < -0.01)
+
     def _keep_finite(self, command: Tensor) -> Tensor:
         """Keep the command for the next step. A world whose state is not finite keeps its last one,
         and the check fails it.
@@ -171,10 +190,18 @@ class FeedbackDriver(Driver):
 
 
 def measure_planar(env: EnvView, name: str) -> Tensor:
-    """x, y [m] and yaw [rad] of an object, shape ``(nworld, 3)``, float32."""
+    """x, y [m] of an object, and the heading of a face of it, or of the narrower side if it is
+    oblong [rad], shape ``(nworld, 3)``, float32.
+    """
     pose = pose_w(env, name).float()
     w, x, y, z = pose[:, 3:].unbind(1)
-    yaw = atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    axis, turn = env.cfg.scene.objects[name].heading
+    if axis == 0:
+        yaw = atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)) + turn
+    elif axis == 1:
+        yaw = atan2(1.0 - 2.0 * (x * x + z * z), 2.0 * (x * y - w * z)) + turn
+    else:
+        yaw = atan2(2.0 * (y * z - w * x), 2.0 * (x * z + w * y)) + turn
     return torch.cat((pose[:, :2], yaw[:, None]), dim=1)
 
 

@@ -25,7 +25,6 @@ _SLOWING = 0.5  # largest share of the distance that is left, in one step,
 _PUSH_SLOWING = 0.4  # and with an object before the jaws
 _JOINT = 0.25  # rad, m: largest lead of a joint
 _ROLL = 0.1  # rad: largest lead of the roll
-_BEYOND = 10.0  # what a roll beyond the joint's range costs, per rad
 _UPRIGHT = 1e-3  # horizontal part of an approach axis that points straight down
 _FLIPPED = 0.3  # cosine of the angle between the approach axis and the desired one
 _GRIP = 0.3  # largest lead of the gripper, of its opening
@@ -146,8 +145,6 @@ class StateBasedDriver(FeedbackDriver):
         locked = cfg.robot.locked.items()
         self._locked = [(names.index(name), value) for name, value in locked if name != aligned]
         tensors = robot(env)
-        rolls = tensors.ctrl_range[self._roll_column].float()
-        self._rolls = (rolls - self._nominal[0, self._roll_column]).unbind(0)
         self._quarters = 0.5 * math.pi * torch.arange(4, device=device)[:, None]
         self._grip_lead = _GRIP * (tensors.gripper_open - tensors.gripper_closed).abs().float()
         lag = servo_lag(env.sim.model, env.index.ctrl[: self._n_arm].tolist())
@@ -354,10 +351,13 @@ class StateBasedDriver(FeedbackDriver):
         change = there - now
         change = -self._roll_sign * atan2(torch.sin(change), torch.cos(change))
         rolls = roll + change
-        low, high = self._rolls
-        beyond = (low - rolls).clamp(min=0.0) + (rolls - high).clamp(min=0.0)
-        nearest = ((rolls - STAY * roll).abs() + _BEYOND * beyond).argmin(0, keepdim=True)
-        goal = self._cfg.controller.yaw_alignment * rolls.gather(0, nearest)[0]
+        cost = (rolls - STAY * roll).abs() + self._beyond(rolls)
+        oblong = self._oblong[thing]
+        cost += oblong * self._detour(rolls, roll)
+        cost[1::2].masked_fill_(oblong, math.inf)
+        nearest = cost.argmin(0, keepdim=True)
+        share = torch.where(oblong, 1.0, self._cfg.controller.yaw_alignment)
+        goal = share * rolls.gather(0, nearest)[0]
         return goal * (self._has_faces[thing] & ~pushes) - roll
 
     def _gap(self, state: State) -> Tensor:

@@ -183,6 +183,25 @@ class ObjectCfg(ShapeCfg):
         return 2.0 * self.half[self.level_axes[0]]
 
     @property
+    def oblong(self) -> bool:
+        """Whether jaws fit it across its narrower side alone, as it starts."""
+        if self.parts or self.file:
+            return False
+        narrow, wide = (self.half[axis] for axis in self.level_axes)
+        return wide - narrow > 1e-6
+
+    @property
+    def heading(self) -> tuple[int, float]:
+        """Number of its axis whose heading is its yaw, and the turn from there to the way the jaws
+        close [rad].
+        """
+        if not self.oblong:
+            return (0 if self.upright else self.level_axes[0]), 0.0
+        narrow, wide = self.level_axes
+        axis = 2 if self.shape == "cylinder" else wide  # it rolls about that one
+        return axis, 0.0 if axis == narrow else 0.5 * math.pi
+
+    @property
     def radius(self) -> float:
         """Radius of the sphere around its centre that holds it [m]."""
         if self.shape == "capsule":
