@@ -132,6 +132,17 @@ def test_the_task_of_the_guide_passes_its_gates(
         assert f"pass {gate}" in capsys.readouterr().out
 
 
+def test_the_slot_of_the_guide_is_the_example(folder: Path) -> None:
+    write_files((DOCS / "own_tasks.md").read_text(encoding="utf-8"), folder)
+    lines = []
+    for name in ("conf/task/slot.yaml", "slot.py"):
+        text = (folder / "slot" / name).read_text(encoding="utf-8")
+        assert text == (ROOT / "examples" / "slot" / name).read_text(encoding="utf-8")
+        lines += text.splitlines()
+    assert len(lines) <= 110
+    assert max(map(len, lines)) <= 100
+
+
 def train(block: str, capsys: pytest.CaptureFixture[str]) -> list[float]:
     """Runs the training block and returns the mean return of every iteration."""
     # One thread is enough for these small networks, and several wait for each other where cores are

@@ -37,7 +37,7 @@ class SlotCheck(EpisodeCheck):
         self.objects = ["peg"]
         w = self.t.window
         return [
-            InWindow("DEPTH", "peg not in the slot", self.placed, w, measure=self.trace),
+            InWindow("DEPTH", "peg not in the slot", self.placed, w),
             InWindow("STANDS", "peg does not stand", on_table("peg", gap=0.002), w),
             InWindow("RELEASED", "peg not released", released("peg", open_fraction=0.8), w),
             AtRest(w, speed=0.05, position=0.005, rotation_deg=3.0),
@@ -45,9 +45,5 @@ class SlotCheck(EpisodeCheck):
 
     def placed(self, step: Step) -> torch.Tensor:
         """Whether the peg is between the walls and deep enough, shape ``(nworld, 1)``."""
-        x, y, _ = to_slot(step.view.env).unbind(1)
-        return ((-x >= self.t.depth) & (y.abs() <= 0.002))[:, None]
-
-    def trace(self, step: Step) -> dict[str, torch.Tensor]:
-        """Values for a replay."""
-        return {"depth_m": -to_slot(step.view.env)[:, 0]}
+        away = to_slot(step.view.env)
+        return (-away[:, :1] >= self.t.depth) & (away[:, 1:2].abs() <= 0.002)
