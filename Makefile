@@ -9,7 +9,7 @@ READY_DEV := $(VENV)/.installed-dev
 READY_DOCS := $(VENV)/.installed-docs
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt
 
-.PHONY: run test test-rest test-all fuzz docs setup clean
+.PHONY: run test test-rest test-all test-lerobot fuzz docs setup clean
 
 run: $(READY)
 	$(BIN)/python scripts/run.py robot=so101 nworld=32 $(ARGS)
@@ -36,6 +36,10 @@ test-all: test test-rest
 fuzz: $(READY_DEV)
 	$(BIN)/python tests/test_fuzz.py commands 0-999
 	$(BIN)/python tests/test_fuzz.py folders 0-499
+
+# In an environment of its own with LeRobot, which it makes: some 6 GB, and Python 3.12 or 3.13.
+test-lerobot:
+	PYTHON=$(PYTHON) tools/check_lerobot.sh $(ARGS)
 
 # build/site/index.html opens from the disk. The build fetches nothing.
 docs: $(READY_DOCS)
