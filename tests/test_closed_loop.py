@@ -21,6 +21,7 @@ from mjstack.episodes.stage import Stage
 from mjstack.errors import ArgumentError
 from mjstack.managers.episode import required_fields
 from mjstack.math import quat_to_matrix
+from mjstack.mdp.geometry import jaw_forces
 from mjstack.scene.index import gripper_targets
 from mjstack.scene.phases import build_phases
 from mjstack.sim import make_simulation
@@ -414,3 +415,28 @@ def test_jaws_close_across_what_is_oblong(
     long = axes[:, :2, 2 if len(size) == 2 else int(np.argmax(size))].float()
     apart = (long * state.closing[:, :2]).sum(1).abs()  # of the long axis along the closing one
     assert apart.max() < np.sin(np.radians(limit))
+
+
+def test_a_phase_ends_on_its_condition_or_after_its_time(drive: Drive) -> None:
+    """Near its target, or when the jaws press; a condition that nothing meets changes nothing."""
+    met = ["above_red.until_within=0.01", "grasp_red.until_force=3"]
+    never = ["above_red.until_within=1e-6", "grasp_red.until_force=1000"]
+    entered = []
+    for conditions in ([], met, never):
+        env, controller = drive(*(f"controller.phases.{text}" for text in conditions), nworld=2)
+        steps = torch.full((2, 4), -1)
+        for step in range(controller.phases[2].stop + 1):
+            command = controller.command()
+            fresh = (steps.gather(1, controller.phase[:, None].clamp(max=3)) < 0)[:, 0]
+            steps[fresh, controller.phase[fresh].clamp(max=3)] = step
+            if bool(fresh.any()) and conditions is met and int(controller.phase.min()) == 3:
+                force = jaw_forces(env.index, env.sim, "red")
+                assert ((force > 3.0) & (force < 30.0)).all()
+            env.step(command)
+        entered.append(steps)
+    free, early, late = entered
+    assert torch.equal(free, late)
+    grasp = controller.phases[2].stop - controller.phases[2].start
+    assert (early[:, 1] < free[:, 1] - 5).all()
+    took = early[:, 3] - early[:, 2]
+    assert ((took > 5) & (took < grasp - 5)).all()

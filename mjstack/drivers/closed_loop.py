@@ -14,7 +14,7 @@ from mjstack.drivers.open_loop import OpenLoopPlanner, smoothstep
 from mjstack.envs import Env
 from mjstack.managers.view import EnvView
 from mjstack.math import atan2
-from mjstack.mdp.geometry import objects_in_hand, robot
+from mjstack.mdp.geometry import jaw_forces, objects_in_hand, robot
 from mjstack.tasks.check import make_check
 
 _QUARTER = 0.5 * math.pi
@@ -58,6 +58,7 @@ class ClosedLoopDriver(FeedbackDriver):
         # Grasp point and gripper at both ends of the phase
         self._from = zeros(3 + len(self._cfg.robot.gripper_joints))
         self._to = torch.zeros_like(self._from)
+        self._at = torch.zeros_like(self._from)  # what the last command led to
         self._roll = zeros()
 
     def command(self) -> Tensor:
@@ -78,6 +79,7 @@ class ClosedLoopDriver(FeedbackDriver):
         posture = self._nominal[self.phase]
         start = torch.where(fresh[:, None], posture, self._command)
         start[:, self._n_arm :] = torch.lerp(self._from[:, 3:], self._to[:, 3:], s)
+        self._at.copy_(torch.cat((target, start[:, self._n_arm :]), dim=1))
         if self._aligns:
             self._turn(start, fresh)
         approach = None
@@ -98,6 +100,10 @@ class ClosedLoopDriver(FeedbackDriver):
         """
         length = self._length[self.phase]
         over = (self._time >= length - _DONE) & (self.phase < len(self.phases) - 1) & ~fresh
+        if self._any_until:  # a phase that has met its condition ends where it is
+            early = self._has_met() & (self.phase < len(self.phases) - 1) & ~fresh & ~over
+            _put(self._to, early, self._at)
+            over = over | early
         retry, rate = self._judge_grasp(over)
         phase = torch.where(retry, self._retry_to[self.phase], self.phase + over)
         phase.masked_fill_(fresh, 0)
@@ -123,6 +129,16 @@ class ClosedLoopDriver(FeedbackDriver):
         home = torch.cat((target, self._home_grip.expand(len(target), -1)), dim=1)
         _put(self._from, entering, torch.where(fresh[:, None], home, self._to))
         _put(self._to, entering, torch.cat((target, self._grip[phase]), dim=1))
+
+    def _has_met(self) -> Tensor:
+        """Worlds whose phase has met a condition that ends it, ``(nworld,)`` bool."""
+        env = self._env
+        force = [jaw_forces(env.index, env.sim, name).amin(1) for name in self._cfg.scene.objects]
+        pressing = torch.stack(force, dim=1)[self._worlds, self._handled[self.phase]]
+        point = self._ik.forward(robot(env).qpos.read(env.sim.qpos).float())[0]
+        left = torch.linalg.vector_norm(point - self._to[:, :3], dim=1)
+        near = left <= self._until_within[self.phase]
+        return near | (pressing >= self._until_force[self.phase])
 
     def _judge_grasp(self, over: Tensor) -> tuple[Tensor, Tensor]:
         """Worlds that try their grasp again, ``(nworld,)`` bool, and how fast they go on,
@@ -211,6 +227,10 @@ class ClosedLoopDriver(FeedbackDriver):
         self._any_align = any(s.align for s in specs)
         self._turns_held = column(p.spec.align and objects[p.carried] in with_faces for p in phases)
         self._carried = column(max(phase.carried, 0) for phase in phases)
+        self._any_until = any(s.until_force or s.until_within for s in specs)
+        self._until_force = column(s.until_force or math.inf for s in specs)
+        self._until_within = column(s.until_within or -1.0 for s in specs)
+        self._handled = column(max(phase.grasped, phase.carried, 0) for phase in phases)
         self._numbers = torch.arange(len(objects), device=self.phase.device)
         window = 0 if cfg.task.check is None else make_check(cfg).settle_steps
         self._rest = window + math.ceil(cfg.controller.rest_seconds / cfg.timing.step_dt)

@@ -112,6 +112,11 @@ class PhaseCfg:
     align: bool = False
     """With controller=closed_loop: bring the grasped object to the target, not the grasp point: by
     how it lies in the hand when the phase begins, and turned to a face of the anchor."""
+    until_force: float | None = spec(None, unit="N", gt=0.0)
+    """With controller=closed_loop: the phase ends before its time once every jaw presses with that
+    force on the object that it grasps or carries."""
+    until_within: float | None = spec(None, unit="m", gt=0.0)
+    """The same once the grasp point, as measured, is so near the target."""
     retry: str | None = None
     """With controller=closed_loop: phase to go back to if they do not."""
 
