@@ -22,6 +22,7 @@ from mjstack.episodes import batches as gate_module
 from mjstack.episodes.rollout import Episode, Hook, play_episode
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
+from mjstack.episodes.tally import EpisodeTally
 from mjstack.errors import ConfigError
 from mjstack.gates.batch import run_batch
 from mjstack.gates.runner import run_guarded
@@ -156,6 +157,18 @@ def test_batch_gate_refuses_identical_worlds(new_run: Callable[..., Run]) -> Non
     assert batch.status is Status.failed
     assert batch.metrics["distinct_final_states"] == 1
     assert "reset=jitter" in batch.reason
+
+
+def test_batch_gate_takes_worlds_that_start_apart_and_end_alike(
+    new_run: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    array = EpisodeTally.array
+    monkeypatch.setattr(
+        EpisodeTally, "array", lambda tally, name: array(tally, name) * (name != "end")
+    )
+    (batch,) = run_batch(new_run("sim=native", "nworld=2", *at_double_speed()))
+    assert batch.metrics["distinct_final_states"] == 1
+    assert batch.status is Status.passed
 
 
 @pytest.mark.parametrize(

@@ -193,7 +193,7 @@ class BatchGateCfg(GateFuncCfg):
     failed_worlds: int = spec(unit="worlds", ge=0)
     """Worlds that may fail, over all seeds."""
     distinct_fraction: float = spec(ge=0.0, le=1.0)
-    """Smallest share of distinct final states."""
+    """Smallest share of distinct starts, or of distinct final states."""
 
 
 @dataclass(slots=True)
