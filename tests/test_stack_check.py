@@ -277,8 +277,8 @@ def test_altered_recording(name: str, altered: Altered) -> None:
     ("name", "rule", "words"),
     [
         ("xy_err", "STACKED", " (xy_err 0 of 50)"),
-        ("dz_min", "STACKED", " (dz_min 0 of 50)"),
-        ("dz_max", "STACKED", " (dz_max 0 of 50)"),
+        ("dz_min", "STACKED", " (dz 0 of 50)"),
+        ("dz_max", "STACKED", " (dz 0 of 50)"),
         ("gap_above", "SUPPORTED", " (gap 0 of 50)"),
         ("open_fraction", "RELEASED", " (open_fraction 6 of 50)"),
         ("carry_distance", "CARRY", " (carry_m 0.05 of 0.05)"),

@@ -7,6 +7,8 @@ A condition is a function of a `Step` that returns a bool tensor, shape ``(nworl
 import math
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, field
+from functools import reduce
+from operator import and_
 
 import torch
 from torch import Tensor
@@ -29,15 +31,24 @@ class AllOf:
 
     Attributes:
         names: Those of the thresholds.
-        parts: Whether each part holds, shape ``(nworld, n, parts)`` or ``(nworld, parts)``, bool.
+        parts: Whether each part holds, each ``(nworld, n)`` or ``(nworld,)``, bool; or one tensor
+            of all, in its last dimension.
     """
 
     names: tuple[str, ...]
-    parts: Condition
+    parts: Callable[[Step], Tensor | tuple[Tensor, ...]]
 
     def __call__(self, step: Step) -> Tensor:
         """Shape ``(nworld, n)`` or ``(nworld,)``, bool."""
-        return self.parts(step).all(-1)
+        holds = self.parts(step)  # in as few calls of torch as there are
+        return holds.all(-1) if isinstance(holds, Tensor) else reduce(and_, holds)
+
+    def apart(self, step: Step) -> Tensor:
+        """Whether each part holds, shape ``(nworld, n, parts)`` or ``(nworld, parts)``, bool."""
+        holds = self.parts(step)
+        if isinstance(holds, Tensor):
+            return holds
+        return torch.stack(torch.broadcast_tensors(*holds), dim=-1)
 
 
 def airborne(*objects: str, height: float) -> Condition:
@@ -63,9 +74,9 @@ def released(*objects: str, open_fraction: float) -> Condition:
     from 0 (closed) to 1 (open).
     """
 
-    def parts(step: Step) -> Tensor:
-        untouched = step.view.columns(objects).read(step.untouched)
-        return torch.stack(torch.broadcast_tensors(untouched, step.narrowest >= open_fraction), -1)
+    def parts(step: Step) -> tuple[Tensor, ...]:
+        open_wide = step.narrowest >= open_fraction
+        return step.view.columns(objects).read(step.untouched), open_wide
 
     return AllOf(("untouched", "open_fraction"), parts)
 
@@ -75,11 +86,11 @@ def on_top(object: str, onto: str, *, xy_err: float, dz_min: float, dz_max: floa
     heights [m].
     """
 
-    def parts(step: Step) -> Tensor:
+    def parts(step: Step) -> tuple[Tensor, ...]:
         apart, dz = offset(step, object, onto)
-        return torch.stack((apart <= xy_err, dz >= dz_min, dz <= dz_max), dim=-1)
+        return apart <= xy_err, dz.clamp(dz_min, dz_max) == dz
 
-    return AllOf(("xy_err", "dz_min", "dz_max"), parts)
+    return AllOf(("xy_err", "dz"), parts)
 
 
 def offset(step: Step, object: str, onto: str) -> tuple[Tensor, Tensor]:
@@ -286,8 +297,8 @@ class InWindow(Rule):
 
     @override
     def update(self, step: Step) -> None:
-        parted = getattr(self.condition, "parts", None)
-        holds = parted(step) if parted else self.condition(step)[..., None]
+        rule = self.condition
+        holds = rule.apart(step) if isinstance(rule, AllOf) else rule(step)[..., None]
         self.length.add_(1.0).mul_(holds if holds.dim() == 2 else holds.all(1))
 
     @override
