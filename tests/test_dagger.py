@@ -63,6 +63,7 @@ def test_rounds_leave_a_policy_and_go_on_bit_for_bit(tmp_path: Path) -> None:
         assert rows[name].tolist() == other[name].tolist()
 
 
+@pytest.mark.full
 def test_the_report_of_a_training_that_fails(tmp_path: Path) -> None:
     """Success by round with its interval, the rules that failed, times, and failing worlds."""
     sizes = ["job.alone=0.5", "job.batches=1", "gate.success.rate=1"]

@@ -173,7 +173,7 @@ def test_robots(args: tuple[str, ...], device: str) -> None:
     ("boxes", "off"),
     [
         (0, ""),
-        (4, ""),  # more than 32 degrees of freedom
+        pytest.param(4, "", marks=pytest.mark.full),  # more than 32 degrees of freedom
         (1, "GRAVITY CLAMPCTRL"),
         *(
             pytest.param(0, off, marks=pytest.mark.full)

@@ -143,7 +143,10 @@ def test_a_reward_without_stages_rises_along_the_experts_way(task: str, robot: s
 
 
 @pytest.mark.parametrize("gamma", [0.99, 0.995])
-@pytest.mark.parametrize(("task", "opens"), [("stack", "release"), ("box", "open_blue")])
+@pytest.mark.parametrize(
+    ("task", "opens"),
+    [("stack", "release"), pytest.param("box", "open_blue", marks=pytest.mark.full)],
+)
 def test_a_release_is_worth_more_than_holding_for_ever(
     task: str, opens: str, gamma: float, robot: str
 ) -> None:

@@ -163,6 +163,7 @@ def test_jobs_of_a_sweep_may_not_share_a_folder(
     assert contents(Path()) == {}
 
 
+@pytest.mark.full
 def test_an_experiment_names_the_jobs_of_a_sweep_and_their_folder(
     begin: Callable[..., int], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -181,6 +182,7 @@ def test_an_experiment_names_the_jobs_of_a_sweep_and_their_folder(
     assert "mine has another sweep, whose job 0 is seed=1" in capsys.readouterr().err
 
 
+@pytest.mark.full
 def test_an_interrupted_sweep_leaves_a_summary(begin: Callable[..., int]) -> None:
     def work(stage: object, folder: Path) -> None:
         if folder.name == "1":

@@ -78,6 +78,7 @@ def test_a_training_leaves_policies_a_curve_and_a_judgement(
     assert_drives(out / "last", tmp_path / "gates", "task=reach", nworld=3)
 
 
+@pytest.mark.full
 def test_a_training_goes_on_where_it_was_interrupted(tmp_path: Path) -> None:
     """Bit for bit as one that was not."""
     whole = tmp_path / "whole"
@@ -91,6 +92,7 @@ def test_a_training_goes_on_where_it_was_interrupted(tmp_path: Path) -> None:
     np.testing.assert_allclose(curve(whole)["loss"], curve(parts)["loss"], rtol=1e-5)
 
 
+@pytest.mark.full
 def test_numbers_that_are_not_finite(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """An episode with one is left out; a network with one is not saved, and ends the training."""
     (tmp_path / "conf").mkdir()
@@ -208,6 +210,7 @@ def test_headings_are_those_of_a_quarter_turn() -> None:
     assert torch.equal(headings(env, objects=["blue"]), found[:, 2:])
 
 
+@pytest.mark.full
 def test_a_folder_belongs_to_one_training(tmp_path: Path) -> None:
     out = tmp_path / "out"
     assert run([*REACH, f"job.folder={out}"]) == 0
