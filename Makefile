@@ -9,7 +9,7 @@ READY_DEV := $(VENV)/.installed-dev
 READY_DOCS := $(VENV)/.installed-docs
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt
 
-.PHONY: run test test-rest test-all test-lerobot fuzz docs setup clean
+.PHONY: run test test-rest test-long test-all test-lerobot fuzz docs setup clean
 
 run: $(READY)
 	$(BIN)/python scripts/run.py robot=so101 nworld=32 $(ARGS)
@@ -24,13 +24,17 @@ test: $(READY_DEV)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(PYTEST) -m "not full"
+	$(PYTEST) -m "not full and not long"
 
 # The tests that `make test` leaves out.
 test-rest: $(READY_DEV)
 	$(PYTEST) -m full
 
-test-all: test test-rest
+# Trainings that take minutes.
+test-long: $(READY_DEV)
+	$(PYTEST) -m long
+
+test-all: test test-rest test-long
 
 # Odd command lines and damaged folders, many more than test-rest tries.
 fuzz: $(READY_DEV)

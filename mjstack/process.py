@@ -48,6 +48,7 @@ class Child(subprocess.Popen[bytes]):
         *,
         env: Mapping[str, str] | None = None,
         cores: Collection[int] = (),
+        folder: Path | None = None,
     ) -> None:
         """Start it.
 
@@ -56,10 +57,12 @@ class Child(subprocess.Popen[bytes]):
             log: Gets its output.
             env: Environment variables, besides those of this process.
             cores: The cores that it may use; all if empty.
+            folder: Its working folder; by default that of this process.
         """
         self._began = time.monotonic()
         super().__init__(
             own_command(args),
+            cwd=folder,
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=subprocess.STDOUT,

@@ -367,7 +367,7 @@ def test_a_bad_value_is_one_line(override: str, parts: list[str]) -> None:
         ("~controller.phases.settle_blue", ["task.check", "settle_blue"]),
         ("scene.places.red_slot.xy=null", ["red_slot"]),
         ("scene.box.heigth=1", ["scene.box.heigth"]),
-        ("timing=default timing.decimation=11", ["50 Hz"]),
+        ("timing=default timing.decimation=11", ["task.control_hz=50"]),
         ("observation.policy.terms.red_to_slot.params.object=red_cub", ["red_to_slot", "red_cub"]),
         ("reward.progress.params.scale=0", ["reward.progress.params.scale=0", "above 0"]),
         ("task=stack observation=box", ["box"]),

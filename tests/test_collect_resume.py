@@ -65,7 +65,11 @@ def patch_all(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         collect_plan,
         "config_content",
-        lambda cfg: copy.deepcopy(_content(cfg.job.keep_failures)),
+        lambda cfg, without: {
+            key: copy.deepcopy(value)
+            for key, value in _content(cfg.job.keep_failures).items()
+            if key not in without
+        },
     )
 
 

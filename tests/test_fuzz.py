@@ -277,7 +277,7 @@ def _preload() -> None:
 
     matplotlib.use("Agg")
     torch.set_num_threads(1)  # a forked child waits for ever for OpenMP's threads of its parent
-    for module in pkgutil.walk_packages(mjstack.__path__, "mjstack."):
+    for module in pkgutil.walk_packages(mjstack.__path__, "mjstack.", onerror=lambda name: None):
         if not re.search(r"__main__|adapters|bench", module.name):
             importlib.import_module(module.name)
     read = yaml.load

@@ -297,7 +297,7 @@ def success_rate(overrides: Sequence[str], folder: Path) -> float:
     return report(folder)["success"]["metrics"]["success_rate"]
 
 
-@pytest.mark.full
+@pytest.mark.long
 def test_two_cores_train_reach_from_pixels(tmp_path: Path) -> None:
     """One camera of 48 x 48 pixels, from 64 unseen starts: some two minutes."""
     overrides = ["job=train", "experiment=pixels", "task=reach", "sim=mjwarp", "sim.device=cpu"]

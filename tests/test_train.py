@@ -166,7 +166,7 @@ def test_a_process_may_come_when_the_first_one_has_begun(
     assert check_train(cfg).folder == tmp_path
 
 
-@pytest.mark.full
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("overrides", "rate"),
     [(["trainer=clone", "task=reach"], 0.99), (["reset=jitter"], 62 / 64)],
