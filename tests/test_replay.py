@@ -384,7 +384,7 @@ def test_mjwarp_world_is_played_on_both_engines(tmp_path: Path) -> None:
     assert (warp["name"], native["name"]) == ("replay_mjwarp", "replay_native")
     assert warp["reason"].startswith("failed: red not carried (carry_m 0 of 0.05")
     assert warp["reason"].endswith("; as recorded, and it ends bit for bit where it did")
-    assert native["reason"].startswith("failed: red not carried; ")
+    assert native["reason"].startswith("failed: red not carried (carry_m 0 of 0.05")
     assert native["reason"].endswith("; that run's mjwarp world had the same result")
     with (
         np.load(tmp_path / "out" / "trajectory.npz") as ours,
