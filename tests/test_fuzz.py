@@ -43,7 +43,7 @@ from fuzz_cases import CHOSEN, QUICK, Make, command_lines, damaged_folders, is_s
 from mjstack.config.load import compose
 from mjstack.config.session import hydra_session
 
-COUNTS = {"commands": 100, "folders": 250}  # `make fuzz` tries 1,000 and 500
+COUNTS = {"commands": 100, "folders": 150}  # `make fuzz` tries 1,000 and 500
 REAL = 20  # folders that commands in a process of their own are given
 CASES = {"commands": command_lines, "folders": damaged_folders}
 UNTOUCHED = ("policy", "run")  # what is only read
