@@ -28,7 +28,7 @@ class MjstackFollowerConfig(RobotConfig):
         seed: Number of the start.
         cameras: As of a real arm, of type ``mjstack``.
         overrides: As of `MjstackEnv`.
-        config_dir: Likewise.
+        config_dir: A folder with more choices, as of `MjstackEnv`.
     """
 
     seed: int = 0
