@@ -20,6 +20,7 @@ def make_parser(text: str | None) -> argparse.ArgumentParser:
     )
     words = "as for run.py, such as robot=rebot nworld=1024 (default nworld=256)"
     parser.add_argument("overrides", nargs="*", help=words)
+    parser.add_argument("--config-dir", help="a folder with more choices")
     return parser
 
 
@@ -36,7 +37,7 @@ def run(parser: argparse.ArgumentParser, work: Work) -> None:
     args = parser.parse_intermixed_args()
     console = Console(soft_wrap=True)
     try:
-        cfg = load_config(["nworld=256", *args.overrides])
+        cfg = load_config(["nworld=256", *args.overrides], config_dir=args.config_dir)
         with console.status("preparing") as status:
 
             def advance(part: str, done: int, total: int) -> None:
