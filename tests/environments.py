@@ -273,12 +273,14 @@ def play(env: Env, moves: list[torch.Tensor], before: Callable[[int], None] | No
     return trace
 
 
-def assert_same_run(a: torch.Tensor, b: torch.Tensor, backend: str) -> None:
+def assert_same_run(a: torch.Tensor, b: torch.Tensor, backend: str, forces: bool = False) -> None:
     """Bit for bit on the CPU backends. CUDA sums in no fixed order: there two runs agree to
-    rounding (docs/design.md).
+    rounding (docs/design.md), and forces as well as a solver's do: to 1e-3 of the largest one in
+    99 % of states (docs/benchmarks.md, the fused solver).
     """
     if backend.endswith("cuda"):
-        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-3)
+        atol = 1e-3 * max(1.0, float(b.abs().max())) if forces else 1e-3
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=atol)
     else:
         assert torch.equal(a, b)
 
@@ -295,7 +297,7 @@ def assert_rows(
     assert a.keys() == b.keys()
     for name, x in a.items():
         try:
-            assert_same_run(x[rows], b[name][other], backend)
+            assert_same_run(x[rows], b[name][other], backend, name == "sensordata")
         except AssertionError as error:
             raise AssertionError(f"{where} {name}: {x[rows]} is not {b[name][other]}") from error
 

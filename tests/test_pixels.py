@@ -237,6 +237,30 @@ def test_images_of_a_round_come_again(backend: str, tmp_path: Path) -> None:
         assert first.flatten(1).float().std(1).min() > 5.0
 
 
+def test_it_learns_to_tell_where_objects_are(tmp_path: Path) -> None:
+    """What it estimates is recorded in every step, and no part of what the policy sees."""
+    stage = Stage(load_config([*TINY, "job.rounds=0", "job.batches=300", "job.learning_rate=0.01"]))
+    pool = ImagePool(vision_of(stage.cfg, stage.cfg.job).sizes, 1000, "cpu")
+    played = make_round(stage, tmp_path, None, 0, pool)
+    truth = played.estimated
+    assert truth is not None
+    assert truth.shape == (4 * 70, 2 * (3 + 3 + 2))  # offset, position, heading of two cubes
+    assert list(played.widths) == ["joint_pos"]
+    with closing(CloneLearner(stage, played, tmp_path, pool)) as learner:
+        rows = pool.rows()
+        images = [part[rows].float() for part in pool.images.values()]
+
+        @torch.no_grad()
+        def error() -> float:
+            features = learner._network.encode(images)
+            estimate, scaled = learner._estimator(features, truth[pool.steps[rows]])
+            return float((estimate - scaled).abs().mean())
+
+        before = error()
+        learner.learn()
+        assert error() < 0.5 * before
+
+
 def test_augmentation_shifts_and_tints() -> None:
     pool = [torch.randint(0, 256, (5, 9, 12, 3), dtype=torch.uint8) for _ in range(2)]
     rows = torch.tensor([4, 0, 0, 2])

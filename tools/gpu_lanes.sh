@@ -7,23 +7,24 @@
 set -u
 out=${1:?a folder}
 shift
+sizes() { echo "scene.cameras.front.size=[$1,$1] scene.cameras.wrist.size=[$1,$1]"; }
 pixels="experiment=pixels nworld=2048"
 ppo="trainer=ppo nworld=4096 job.iterations=null gate.success.rate=0.0001"
 declare -A lanes=(
   [ppo_lift]="--config-dir ${LIFT:-lift/conf} task=lift $ppo job.minutes=10"
   [hz10]="nworld=2048 job.chunk=5 job.execute=5 job.beta_decay=1 gate.success.seeds=2"
   [delay]="nworld=2048 trainer=clone timing.command_delay=5 gate.success.seeds=2"
-  [pixels_rebot]="$pixels robot=rebot"
-  [pixels_looks]="$pixels looks=randomized"
-  [pixels_wrist]="$pixels cameras=wrist"
-  [pixels_front]="$pixels cameras=front"
+  [pixels_rebot]="$pixels $(sizes 96) robot=rebot"
+  [pixels_looks]="$pixels $(sizes 96) looks=randomized"
+  [pixels_wrist]="$pixels cameras=wrist scene.cameras.wrist.size=[96,96]"
+  [pixels_front]="$pixels cameras=front scene.cameras.front.size=[96,96]"
 )
 for seed in 0 1 2; do
   lanes[ppo_stack_$seed]="$ppo reset=expert_states job.minutes=20 seed=$seed"
-  lanes[pixels_$seed]="$pixels seed=$seed"
+  lanes[pixels_$seed]="$pixels $(sizes 96) seed=$seed"
 done
-for size in 64 160; do
-  lanes[pixels_$size]="$pixels scene.cameras.front.size=[$size,$size] scene.cameras.wrist.size=[$size,$size]"
+for size in 64 128 160; do
+  lanes[pixels_$size]="$pixels $(sizes $size)"
 done
 for name; do
   [[ -n ${lanes[$name]:-} ]] || { echo "no lane $name: there are ${!lanes[*]}" >&2; exit 2; }

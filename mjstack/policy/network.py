@@ -20,7 +20,8 @@ class Vision:
 
     Attributes:
         sizes: Height and width of each camera's images, by its name.
-        channels: Channels of each convolution. Each halves height and width.
+        channels: Channels of each convolution. The first one leaves a quarter of height and width,
+            each other one a half.
         features: Numbers that the perceptron gets from each image.
     """
 
@@ -38,10 +39,11 @@ class ImageEncoder(nn.Module):
         layers: list[nn.Module] = []
         height, width = size
         for before, after in pairwise([3, *channels]):
-            kernel = 5 if not layers else 3
-            layers += [nn.Conv2d(before, after, kernel, stride=2, padding=kernel // 2), nn.ELU()]
-            height = -(-height // 2)
-            width = -(-width // 2)
+            # Most of the time goes into the largest images, so the first convolution leaves less.
+            kernel, stride = (3, 2) if layers else (7, 4)
+            layers += [nn.Conv2d(before, after, kernel, stride, kernel // 2), nn.ELU()]
+            height = -(-height // stride)
+            width = -(-width // stride)
         flat = channels[-1] * height * width
         self.layers = nn.Sequential(*layers, nn.Flatten(), nn.Linear(flat, features), nn.ELU())
 
@@ -113,11 +115,16 @@ class PolicyNetwork(nn.Module):
         self.action_low.copy_(low)
         self.action_high.copy_(high)
 
-    def normalized(self, observation: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
-        """Normalised actions, shape ``(n, chunk, width)``."""
+    def encode(self, images: Sequence[Tensor]) -> list[Tensor]:
+        """Features of each camera's images, each ``(n, features)``."""
+        return [encode(image) for encode, image in zip(self.encoders, images, strict=True)]
+
+    def normalized(self, observation: Tensor, features: Sequence[Tensor] = ()) -> Tensor:
+        """Normalised actions, shape ``(n, chunk, width)``, from an observation and the features of
+        its images.
+        """
         scaled = (observation - self.observation_mean) / self.observation_std
         scaled = scaled.clamp(-FARTHEST, FARTHEST)
-        features = [enc(image) for enc, image in zip(self.encoders, images, strict=True)]
         scaled = torch.cat([scaled, *(part.to(scaled.dtype) for part in features)], dim=1)
         return self.layers(scaled).unflatten(1, (self.chunk, self.width))
 
@@ -132,5 +139,7 @@ class PolicyNetwork(nn.Module):
         Returns:
             Shape ``(n, chunk, width)``.
         """
-        actions = self.action_mean + self.action_std * self.normalized(observation, images)
+        actions = self.action_mean + self.action_std * self.normalized(
+            observation, self.encode(images)
+        )
         return torch.minimum(torch.maximum(actions, self.action_low), self.action_high)

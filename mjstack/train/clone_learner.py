@@ -17,7 +17,7 @@ from mjstack.config.schema import CloneJobCfg
 from mjstack.episodes.stage import Stage
 from mjstack.policy import Policy, PolicyNetwork
 from mjstack.sim.graph import StepGraph
-from mjstack.train.clone_network import input_noise, make_network
+from mjstack.train.clone_network import Estimator, input_noise, make_network
 from mjstack.train.demonstrations import Demonstrations
 from mjstack.train.images import Augmentation, ImagePool
 from mjstack.train.learner import Learner
@@ -65,10 +65,16 @@ class CloneLearner(Learner):
         self._network = make_network(cfg, demonstrations, ranks).to(device)
         self._average = copy.deepcopy(self._network).requires_grad_(False)
         self._networks = nn.ModuleDict({"network": self._network, "average": self._average})
+        self._trained: list[nn.Parameter] = list(self._network.parameters())
+        self._estimator: Estimator | None = None
+        if demonstrations.estimated is not None:
+            self._estimator = Estimator(cfg, demonstrations.estimated, ranks).to(device)
+            self._networks["estimator"] = self._estimator
+            self._trained += self._estimator.parameters()
         self.process(demonstrations)
         # What a batch depends on lies in tensors, so that a graph can hold the batch.
         self._optimizer = torch.optim.AdamW(
-            self._network.parameters(),
+            self._trained,
             lr=torch.tensor(job.learning_rate, device=device),
             weight_decay=job.weight_decay,
             fused=True,
@@ -107,6 +113,7 @@ class CloneLearner(Learner):
         self._average.set_range(low.amin(0), high.amax(0))
         self._seen = demonstrations.seen
         self._labels = demonstrations.labels
+        self._estimated = demonstrations.estimated
         episode = demonstrations.episode()
         self._last = demonstrations.ends[episode] - 1  # steps of their episodes
         # Steps to learn from: those that the pool shows, or all; and their rows in the pool
@@ -122,7 +129,7 @@ class CloneLearner(Learner):
         self._validation = steps[validates]
         self._validation_rows = rows[validates]
         if not len(self._validation):  # of few episodes the expert may drive no chunk that is one
-            self._validation = self._training
+            self._validation, self._validation_rows = self._training, self._rows
 
     def learn(self, first: int = 0, total: int | None = None) -> None:
         """Make the missing batches; see `Learner`.
@@ -174,7 +181,7 @@ class CloneLearner(Learner):
 
     def _fit(self) -> None:
         """Learn from the drawn steps."""
-        weights = list(self._network.parameters())
+        weights = self._trained
         steps = self._training[self._chosen]
         images: Sequence[Tensor] = ()
         if self._pool is not None:
@@ -186,7 +193,7 @@ class CloneLearner(Learner):
         self._ranks.average_gradients(weights)
         self._optimizer.step()
         average = [p.data for p in self._average.parameters()]
-        change = torch._foreach_sub([p.data for p in weights], average)
+        change = torch._foreach_sub([p.data for p in self._network.parameters()], average)
         torch._foreach_mul_(change, self._replaced)
         torch._foreach_add_(average, change)
         self._sum += loss.detach()
@@ -215,9 +222,16 @@ class CloneLearner(Learner):
             enabled=steps.is_cuda and len(images) > 0,
             cache_enabled=False,
         )
+        error = _LOSSES[self._job.loss]
         with fast:
-            action = network.normalized(self._seen[steps] + noise, images)
-        return _LOSSES[self._job.loss](action.float(), target)
+            features = network.encode(images)
+            action = network.normalized(self._seen[steps] + noise, features)
+            loss = error(action.float(), target)
+            if self._estimator is not None and network is self._network:
+                assert self._estimated is not None
+                estimate, truth = self._estimator(features, self._estimated[steps])
+                loss += self._job.vision.estimate * error(estimate.float(), truth)
+        return loss
 
     @torch.no_grad()
     def _validate(self) -> float:

@@ -1,11 +1,11 @@
 """The network of a clone with the scale of its demonstrations, and the noise on what it sees."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import cast
 
 import mujoco
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from mjstack.config.schema import CloneJobCfg, Config, ObservationTermCfg
 from mjstack.distributed import Ranks
@@ -14,6 +14,7 @@ from mjstack.policy import PolicyNetwork, Vision
 from mjstack.train.demonstrations import Demonstrations
 
 _LEAST = 0.1  # scale of a column, of the largest one of its term
+_CONSTANT = 1e-3  # a column of what is estimated that varies less has no scale
 
 
 def make_network(cfg: Config, demonstrations: Demonstrations, ranks: Ranks) -> PolicyNetwork:
@@ -36,6 +37,34 @@ def make_network(cfg: Config, demonstrations: Demonstrations, ranks: Ranks) -> P
     std = torch.cat([torch.maximum(part, _LEAST * part.amax()) for part in parts])
     network.set_scale("observation", mean.cpu(), std.cpu())
     return network
+
+
+class Estimator(nn.Module):
+    """Estimates, from the features of a step's images, what the policy does not see.
+
+    It makes the convolutions learn where objects are, which the actions alone teach them slowly.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, cfg: Config, estimated: Tensor, ranks: Ranks) -> None:
+        """Make the layer by the configured seed, on the CPU, with the scale of ``estimated``, shape
+        ``(steps, n)``, of all ranks.
+        """
+        super().__init__()
+        job: CloneJobCfg = cfg.job
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(cfg.seed)
+            width = job.vision.features * len(job.vision.cameras)
+            self.layer = nn.Linear(width, estimated.shape[1])
+        mean, std = _moments(estimated, ranks)
+        self.register_buffer("mean", mean.cpu())
+        self.register_buffer("std", torch.where(std > _CONSTANT, std, 1.0).cpu())
+
+    def forward(self, features: Sequence[Tensor], truth: Tensor) -> tuple[Tensor, Tensor]:
+        """The estimate and the truth, shape ``(steps, n)``, both normalised."""
+        return self.layer(torch.cat(list(features), dim=1)), (truth - self.mean) / self.std
 
 
 def input_noise(cfg: Config, model: mujoco.MjModel, widths: Mapping[str, int]) -> Tensor:

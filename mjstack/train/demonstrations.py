@@ -16,8 +16,9 @@ from mjstack.config.schema import CloneJobCfg
 from mjstack.episodes.batches import Batch
 from mjstack.episodes.stage import Stage
 from mjstack.train.images import AT_ONCE, ImagePool
+from mjstack.train.trainer import ESTIMATED
 
-_ROWS = ("seen", "labels", "driven", "qpos")
+_ROWS = ("seen", "labels", "driven", "qpos", "estimated")
 _SUMS = ("played", "judged", "succeeded", "seconds")
 
 
@@ -40,6 +41,8 @@ class Demonstrations:
         source: Where they come from, in words.
         qpos: Positions before each step, from which images can be rendered, shape ``(steps of all
             episodes, nq)``, in the backend's precision; None where there are no images.
+        estimated: What a policy learns to estimate from its images, shape ``(steps of all
+            episodes, n)``; None if nothing.
         fields: Model fields of the episodes' worlds by name, each ``(episodes, ...)``.
     """
 
@@ -55,6 +58,7 @@ class Demonstrations:
     seconds: float = 0.0
     source: str = ""
     qpos: Tensor | None = None
+    estimated: Tensor | None = None
     fields: Mapping[str, Tensor] = field(default_factory=dict)
 
     @classmethod
@@ -85,7 +89,8 @@ class Demonstrations:
 
         pool.add(part.usable(job), len(part.seen), read)
         fields = {name: values[worlds] for name, values in batch.env.sim.fields.items()}
-        return replace(part, qpos=before("qpos"), fields=fields)
+        estimated = before(ESTIMATED) if ESTIMATED in rows else None
+        return replace(part, qpos=before("qpos"), estimated=estimated, fields=fields)
 
     @classmethod
     def join(cls, parts: Sequence["Demonstrations"]) -> "Demonstrations":

@@ -100,6 +100,8 @@ class Augmentation:
         self._shift = settings.shift
         self._color = settings.color
         self._moves = torch.zeros((cameras, count, 2), dtype=torch.int64, device=device)
+        # Bytes are whole numbers in bfloat16 too, in which CUDA convolves
+        self._dtype = torch.bfloat16 if device.type == "cuda" else torch.float32
         self._tints = torch.zeros((cameras, count, 2, 4), device=device)
 
     def draw(self, generator: torch.Generator) -> None:
@@ -108,8 +110,8 @@ class Augmentation:
         self._tints.uniform_(-1.0, 1.0, generator=generator)
 
     def __call__(self, pool: Iterable[Tensor], rows: Tensor) -> list[Tensor]:
-        """Augmented images of some rows of a pool, each ``(n, height, width, 3)``, float32, 0 to
-        255. What a shift leaves open repeats the border.
+        """Augmented images of some rows of a pool, each ``(n, height, width, 3)``, 0 to 255,
+        bfloat16 on CUDA, else float32. What a shift leaves open repeats the border.
         """
         out = []
         for images, moves, tints in zip(pool, self._moves, self._tints, strict=True):
@@ -120,10 +122,10 @@ class Augmentation:
             )
             # Pixels are gathered as bytes
             pixels = (rows[:, None, None] * height + y[:, :, None]) * width + x[:, None, :]
-            picked = images.view(-1, 3).index_select(0, pixels.flatten()).float()
+            picked = images.view(-1, 3).index_select(0, pixels.flatten()).to(self._dtype)
             picked = picked.view(*pixels.shape, 3)
             # Of all colours, and of each
-            change = 0.5 * self._color * (tints[..., :1] + tints[..., 1:])
+            change = (0.5 * self._color * (tints[..., :1] + tints[..., 1:])).to(self._dtype)
             gain = 1.0 + change[:, None, None, 0]
             offset = 127.5 * change[:, None, None, 1]
             out.append(picked.mul_(gain).add_(offset).clamp_(0.0, 255.0))

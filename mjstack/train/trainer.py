@@ -18,6 +18,8 @@ from mjstack.policy.checkpoint import read_state
 LAST = "last"
 BEST = "best"
 STATE = "training.safetensors"
+ESTIMATED = "estimated"
+"""Group of the observation that a policy learns to estimate from its images, and does not see."""
 FAILED = "failed."  # a column of the curve: judged episodes that broke the rule of this name
 
 
@@ -82,9 +84,14 @@ def observed_group(job: CloneJobCfg | PpoJobCfg) -> ObservationGroupCfg:
 
 
 def with_observation(cfg: Config) -> Config:
-    """The configuration, with the observation group of a new policy in place of its groups."""
+    """The configuration, with the observation group of a new policy in place of its groups, and
+    what it learns to estimate from images.
+    """
     job: CloneJobCfg = cfg.job
-    return replace(cfg, observation={job.group: observed_group(job)})
+    groups = {job.group: observed_group(job)}
+    if ESTIMATED in job.observation and job.vision.cameras:
+        groups[ESTIMATED] = job.observation[ESTIMATED]
+    return replace(cfg, observation=groups)
 
 
 def training_config(stage: Stage) -> Config:

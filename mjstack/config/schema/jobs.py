@@ -104,6 +104,9 @@ class VisionCfg:
     """Largest shift of an image in training, up, down and to the sides."""
     color: float = spec(0.2, ge=0.0, le=1.0)
     """Largest change of brightness and of each colour in training, as a share."""
+    estimate: float = spec(0.0, ge=0.0)
+    """Weight of the error with which it estimates the group *estimated* of its observation from the
+    images, beside that of the actions."""
     pool: int | None = spec(None, unit="steps", ge=1)
     """Steps whose images are kept on the device, of all rounds; null: as many as half of its free
     memory has place for."""
