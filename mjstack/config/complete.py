@@ -1,5 +1,6 @@
 """Complete a composed configuration: terms as dataclasses, and what follows from other values."""
 
+import copy
 import re
 from dataclasses import fields
 from functools import cache, reduce
@@ -39,6 +40,7 @@ _TERMS = {
 
 
 _schema = cache(OmegaConf.structured)  # made once: terms are many
+_values: dict[tuple[type, str], Any] = {}  # of terms by their content: most are in any composition
 
 
 def complete(cfg: Config) -> None:
@@ -90,6 +92,8 @@ def typed(key: str, node: Any, kind: type) -> Any:
     for name in node:
         if name not in items:
             raise UnknownName(f"{key}: key", str(name), items)
+    if (content := (kind, repr(node))) in _values:
+        return copy.deepcopy(_values[content])
     try:
         typed = OmegaConf.merge(_schema(kind), node)
     except OmegaConfBaseException as error:
@@ -100,6 +104,7 @@ def typed(key: str, node: Any, kind: type) -> Any:
         raise TermError(key, f"'{missing[0]}' is missing: set {key}.{missing[0]}")
     value = OmegaConf.to_object(typed)
     check_fields(key, value)
+    _values[content] = copy.deepcopy(value)
     return value
 
 
