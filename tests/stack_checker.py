@@ -1,45 +1,26 @@
-"""The rules of the check of the stack task for one recorded world, in plain NumPy and simple loops.
+"""The rules of the check of the stack task for one recorded world, in plain NumPy.
 
 Written from the rules' text, not from `mjstack.tasks.stack`: the two have to agree because both are
 right."""
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import numpy as np
+from box_checker import corners_of
 from check_cases import BLUE, RED, Outcome, Recording, counted
 
 from mjstack.config.schema import Config
 from mjstack.tasks.check import make_check
 
 
-def rotation_matrix(quat: np.ndarray) -> np.ndarray:
-    """Rotates the unit vectors one by one: v + 2 w (u x v) + 2 u x (u x v)."""
-    w = quat[0]
-    u = quat[1:]
-    columns = [v + 2.0 * w * np.cross(u, v) + 2.0 * np.cross(u, np.cross(u, v)) for v in np.eye(3)]
-    return np.array(columns).T
-
-
-def lowest_corner(pose: np.ndarray, half: float) -> float:
-    """Smallest world z of the eight corners."""
-    turn = rotation_matrix(pose[3:])
-    return min(
-        float((pose[:3] + turn @ (half * np.array(s)))[2])
-        for s in itertools.product((-1.0, 1.0), repeat=3)
-    )
-
-
-def rotation_between(a: np.ndarray, b: np.ndarray) -> float:
-    """Angle between two orientations: the chord between quaternions, the nearer of the
-    two signs.
+def rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angles between two orientations: from the chord between quaternions, the nearer of the two
+    signs.
     """
-    chord = (
-        min(np.linalg.norm(a - b), np.linalg.norm(a + b)) if np.isfinite(a + b).all() else math.nan
-    )
-    return 4.0 * math.asin(min(1.0, 0.5 * chord)) if math.isfinite(chord) else math.nan
+    chord = np.minimum(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1))
+    return 4.0 * np.arcsin(np.minimum(1.0, 0.5 * chord))
 
 
 def check_world(rec: Recording, cfg: Config) -> Outcome:
@@ -54,7 +35,8 @@ def check_world(rec: Recording, cfg: Config) -> Outcome:
     steps = len(pose)
     failed = counted(rec, cfg)
 
-    airborne = [lowest_corner(p[RED], half) - top > rules.airborne_height for p in pose]
+    corners = [corners_of(pose[:, cube], velocity[:, cube], half)[0] for cube in (RED, BLUE)]
+    airborne = list(corners[RED][..., 2].min(1) - top > rules.airborne_height)
 
     pressed = np.linalg.norm(rec.jaw_force[:, RED], axis=-1) > 1e-5
     before = range(steps - rules.window)
@@ -81,8 +63,8 @@ def check_world(rec: Recording, cfg: Config) -> Outcome:
     for step in carrying:
         run_steps = [*run_steps, step] if airborne[step] else []
         if run_steps:
-            start = pose[run_steps[0], RED, :2]
-            far = max(float(np.linalg.norm(pose[f, RED, :2] - start)) for f in run_steps)
+            way = pose[run_steps, RED, :2] - pose[run_steps[0], RED, :2]
+            far = np.linalg.norm(way, axis=1).max()
             carried = carried or (
                 len(run_steps) >= rules.carry_steps and far >= rules.carry_distance
             )
@@ -97,7 +79,7 @@ def check_world(rec: Recording, cfg: Config) -> Outcome:
         dz = float(red[2] - blue[2])
         if not (xy <= rules.xy_err and rules.dz_min <= dz <= rules.dz_max):
             failed.add("STACKED")
-        gap = abs(lowest_corner(blue, half) - top)
+        gap = abs(corners[BLUE][step, :, 2].min() - top)
         inside = all(
             abs(blue[i] - scene.table_center[i]) <= scene.table_half[i] - half for i in (0, 1)
         )
@@ -114,17 +96,17 @@ def check_world(rec: Recording, cfg: Config) -> Outcome:
     peaks = []
     distances = []
     angles = []
+    pairs = tuple(np.triu_indices(rules.window, 1))
     for cube in (RED, BLUE):
-        speeds = []
-        for step in window:
-            v = velocity[step, cube, :3]
-            w = velocity[step, cube, 3:]
-            speeds.append(float(np.linalg.norm(v) + math.sqrt(3.0) * half * np.linalg.norm(w)))
-        rms.append(math.sqrt(sum(s * s for s in speeds) / len(speeds)))
-        peaks.append(np.max(speeds))
-        for a, b in itertools.combinations(window, 2):
-            distances.append(float(np.linalg.norm(pose[a, cube, :3] - pose[b, cube, :3])))
-            angles.append(rotation_between(pose[a, cube, 3:], pose[b, cube, 3:]))
+        at = pose[window, cube]
+        v = np.linalg.norm(velocity[window, cube, :3], axis=1)
+        w = np.linalg.norm(velocity[window, cube, 3:], axis=1)
+        speeds = v + math.sqrt(3.0) * half * w
+        rms.append(math.sqrt(np.square(speeds).mean()))
+        peaks.append(speeds.max())
+        first, second = (at[index] for index in pairs)
+        distances.append(np.linalg.norm(first[:, :3] - second[:, :3], axis=1).max())
+        angles.append(rotation_between(first[:, 3:], second[:, 3:]).max())
     rest_speed = float(np.max(rms))
     rest_position = float(np.max(distances))
     rest_rotation = float(np.max(angles))

@@ -11,8 +11,8 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from box_checker import corners_of
 from environments import configure, on_shared_sim
-from stack_checker import rotation_matrix
 
 import mjstack
 from mjstack.config.schema import Backend, Config
@@ -30,8 +30,7 @@ def start_of(cfg: Config, seed: int = 0) -> Env:
 
 
 def corners(pose: np.ndarray, half: float) -> np.ndarray:
-    signs = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, 8)
-    return (pose[:3, None] + rotation_matrix(pose[3:]) @ (half * signs)).T
+    return corners_of(pose[None], np.zeros((1, 6)), half)[0][0]
 
 
 # Half-widths of a region in which cubes overlap, leave the table or hit the arm unless each is

@@ -13,9 +13,9 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from box_checker import corners_of
 from check_cases import BLUE, RED, limits
 from environments import StubViews, actions, configure, on_shared_sim, returned, zeros
-from stack_checker import lowest_corner
 
 from mjstack.config.schema import Config
 from mjstack.envs import Env
@@ -278,10 +278,11 @@ def test_rewards_of_a_scripted_episode(
         name: rec.values[..., i].double().numpy() / (cfg.reward[name].weight * dt)
         for i, name in enumerate(names)
     }
-    pose, _ = cubes_of(rec, rec.qpos, rec.qvel)
+    pose, velocity = cubes_of(rec, rec.qpos, rec.qvel)
     half = cfg.scene.objects["red"].half_height
-    top = table_top(cfg)
-    low = np.array([[lowest_corner(p[RED], half) - top for p in step] for step in pose])
+    red = pose[:, :, RED], velocity[:, :, RED]
+    corners = [corners_of(*(part[:, world] for part in red), half)[0] for world in range(3)]
+    low = np.stack([points[..., 2].min(1) for points in corners], axis=1) - table_top(cfg)
     action = rec.action.double().numpy()
     change = np.diff(action, axis=0, prepend=np.zeros_like(action[:1]))
     qvel = rec.qvel[..., torch.from_numpy(rec.index.robot_qvel)].numpy()
