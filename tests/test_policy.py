@@ -27,6 +27,7 @@ from safetensors.torch import load, save
 import mjstack
 import mjstack.jobs.showing as showing
 from mjstack.cli import run
+from mjstack.config.load import extended_search_path
 from mjstack.config.schema import ObservationTermCfg
 from mjstack.drivers.policy import PolicyDriver
 from mjstack.envs import Env, driven_config
@@ -191,9 +192,15 @@ MISFITS = [
 ]
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_policy(tmp_path_factory.mktemp("whole") / "policy", configure())
+
+
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    return write_policy(tmp_path / "mine", configure())
+def folder(whole: Path, tmp_path: Path) -> Path:
+    """A copy of a policy."""
+    return Path(shutil.copytree(whole, tmp_path / "mine"))
 
 
 def test_robot_task_and_cameras_follow_the_policy(tmp_path: Path) -> None:
@@ -211,14 +218,15 @@ def test_robot_task_and_cameras_follow_the_policy(tmp_path: Path) -> None:
     facts["observation"]["images"] = {"wrist": [8, 8], "front": [8, 8]}
     path.write_text(json.dumps(facts))
     assert list(mjstack.load_config(named).scene.cameras) == ["wrist", "front"]
-    assert list(mjstack.load_config([*named, "cameras=top"]).scene.cameras) == ["top"]
-    own = mjstack.load_config([*named, "robot=so101", "task=stack"])
-    assert (own.robot.name, own.task.name) == ("so101", "stack")
+    other = mjstack.load_config([*named, "cameras=top", "robot=so101", "task=stack"])
+    assert list(other.scene.cameras) == ["top"]
+    assert (other.robot.name, other.task.name) == ("so101", "stack")
 
     # What is no choice here, or no policy, chooses nothing: the check of the policy says so.
     for damage in ('{"config": [], "observation": {}}', "[" * 100_000, "", "\0"):
         path.write_text(damage)
-        assert mjstack.load_config(named).task.name == "stack"
+        with extended_search_path(named, []) as composed:
+            assert composed == named
     facts["config"]["task"]["name"] = "../task/reach"
     path.write_text(json.dumps(facts))
     found = mjstack.load_config(named)
@@ -397,15 +405,9 @@ STRANGE: dict[str, tuple[Callable[[Path], object], str]] = {
 }
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_policy(tmp_path_factory.mktemp("whole") / "policy", configure())
-
-
 @pytest.mark.parametrize("case", STRANGE)
-def test_a_strangers_policy_is_refused_in_one_line(whole: Path, tmp_path: Path, case: str) -> None:
+def test_a_strangers_policy_is_refused_in_one_line(folder: Path, case: str) -> None:
     """Before its sizes take memory."""
-    folder = Path(shutil.copytree(whole, tmp_path / "policy"))
     damage, says = STRANGE[case]
     damage(folder)
     refusal(lambda: load_policy(folder), says, kind=FolderError)
@@ -425,14 +427,24 @@ def test_nothing_is_written_where_a_policy_is_refused(
     assert line.startswith("mjstack: policy=")
 
 
-def test_every_gate_takes_a_policy(folder: Path, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def played(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The folders of a run of the gates, and of its policy, which fails. The last test of them
+    writes the policy anew.
+    """
+    home = tmp_path_factory.mktemp("played")
+    policy = Path(shutil.copytree(whole, home / "policy"))
+    driven = ["controller=policy", f"policy={policy}", "sim=native", "nworld=5"]
+    gates = ["gates=[baseline,batch,throughput,success]", "gate.success.seeds=1"]
+    gates.append("gate.throughput.measurements=[physics,episode]")
+    short = [*SHORT, "task.episode_steps=60", "web.episode=false"]
+    assert run([*short, *driven, *gates, f"hydra.run.dir={home}/run"]) == 1
+    return home / "run", policy
+
+
+def test_every_gate_takes_a_policy(played: tuple[Path, Path], tmp_path: Path) -> None:
     """A policy that fails is judged in every world, and a replay ends bit for bit where it did."""
-    out = tmp_path / "run"
-    policy = ["controller=policy", f"policy={folder}"]
-    options = ["task.episode_steps=60", "sim=native", "nworld=5", "video=false"]
-    asked = ["gates=[baseline,batch,throughput,success]", "gate.success.seeds=1"]
-    asked.append("gate.throughput.measurements=[physics,episode]")
-    assert run([*SHORT, *policy, *options, *asked, f"hydra.run.dir={out}"]) == 1
+    out, _ = played
     gates = report(out)
     assert {"baseline", "batch", "throughput", "success"} <= set(gates)
     assert "not lifted" in gates["baseline"]["reason"]
@@ -442,12 +454,9 @@ def test_every_gate_takes_a_policy(folder: Path, tmp_path: Path) -> None:
         assert gates[gate]["metrics"]["failed.LIFT"] == 5
     assert "no figure" in gates["throughput"]["reason"]  # an episode that fails has no speed
     assert np.load(out / "success_seed0.npz")["phase_names"].size == 0
-
-    for world in ("batch:3", "success:2"):
-        again = tmp_path / f"replay_{world.replace(':', '_')}"
-        status = run(["job=replay", f"run={out}", f"world={world}", f"hydra.run.dir={again}"])
-        assert status == 1
-        assert "bit for bit where it did" in report(again)["replay_native"]["reason"]
+    again = tmp_path / "replay"
+    assert run(["job=replay", f"run={out}", "world=success:2", f"hydra.run.dir={again}"]) == 1
+    assert "bit for bit where it did" in report(again)["replay_native"]["reason"]
 
 
 def test_a_policy_that_succeeds_is_timed_and_shown(
@@ -497,14 +506,15 @@ def test_mjwarp_plays_a_policy_as_native_does(folder: Path, tmp_path: Path) -> N
     assert gates["parity"]["reason"] == words
 
 
-def test_a_replay_names_a_policy_that_was_written_anew(folder: Path, tmp_path: Path) -> None:
-    out = tmp_path / "run"
-    policy = ["controller=policy", f"policy={folder}", "task.episode_steps=60"]
-    run([*SHORT, *policy, "sim=native", "nworld=2", "gates=[batch]", f"hydra.run.dir={out}"])
-    write_policy(folder, configure(), seed=9)
-    again = tmp_path / "again"
-    run(["job=replay", f"run={out}", "world=1", f"hydra.run.dir={again}"])
-    assert any("written anew" in line for line in report(again)["replay_native"]["details"])
+def test_a_replay_names_a_policy_that_was_written_anew(
+    played: tuple[Path, Path], tmp_path: Path
+) -> None:
+    out, policy = played
+    write_policy(policy, configure(), seed=9)
+    run(["job=replay", f"run={out}", "world=batch:3", f"hydra.run.dir={tmp_path}/again"])
+    assert any(
+        "written anew" in line for line in report(tmp_path / "again")["replay_native"]["details"]
+    )
 
 
 @pytest.mark.full
