@@ -87,6 +87,7 @@ def curve(folder: Path) -> np.ndarray:
 def assert_drives(policy: Path, out: Path, *overrides: str, nworld: int = 2) -> None:
     """A policy drives gate *batch*, in which every world may fail."""
     drive = ["controller=policy", f"policy={policy}", "gates=[batch]", "sim=native"]
+    drive.append("web.episode=false")
     limits = [f"nworld={nworld}", f"gate.batch.failed_worlds={nworld}"]
     assert run([*drive, *limits, *overrides, f"hydra.run.dir={out}"]) == 0
 

@@ -376,15 +376,19 @@ def test_an_object_that_lies_askew_in_the_hand_is_aligned(drive: Drive) -> None:
     assert left[True][1] < 3.0, left
 
 
-@pytest.mark.parametrize("expert", [ClosedLoopDriver, StateBasedDriver])
+BRICK = ["size=[0.035,0.014,0.02]"]
+TURNED = ["size=[0.014,0.035,0.02]"]
+LYING = ["shape=cylinder", "size=[0.014,0.035]", "quat=[0.7071068,0.7071068,0,0]"]
+
+
 @pytest.mark.parametrize(
-    "shape",
+    ("expert", "shape"),
     [
-        ["size=[0.035,0.014,0.02]"],
-        ["size=[0.014,0.035,0.02]"],
-        ["shape=cylinder", "size=[0.014,0.035]", "quat=[0.7071068,0.7071068,0,0]"],
+        (ClosedLoopDriver, LYING),
+        (StateBasedDriver, TURNED),
+        *(pytest.param(ClosedLoopDriver, s, marks=pytest.mark.full) for s in (BRICK, TURNED)),
+        *(pytest.param(StateBasedDriver, s, marks=pytest.mark.full) for s in (BRICK, LYING)),
     ],
-    ids=["brick", "turned_brick", "lying_cylinder"],
 )
 def test_jaws_close_across_what_is_oblong(
     expert: type[FeedbackDriver], shape: list[str], drive: Drive, get_stage: GetStage

@@ -154,6 +154,7 @@ def test_names_of_a_history_and_of_a_strange_term() -> None:
     assert feature.units[feature.names.index("count")] == "unknown"
 
 
+@pytest.mark.full
 def test_lerobot_units_are_those_of_the_real_arm(demos: SimpleNamespace) -> None:
     """The same episodes in degrees and 0 to 100, in the columns of a follower's recordings."""
     with contextlib.chdir(demos.cwd):

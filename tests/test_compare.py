@@ -153,7 +153,8 @@ def test_other_sides_are_refused_in_one_line(overrides: list[str], problem: str)
 def test_starts_that_turn_out_unequal_fail(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compare, "_start_of_first_world", lambda stage: {"start": np.zeros(1)})
     region = ['job.against=["gate.success.region=[0.01,0.01]"]']
-    assert run([*TINY, *region, f"hydra.run.dir={tmp_path}/out"]) == 1
+    few = ["nworld=2", "gate.success.seeds=1", "web.episode=false"]
+    assert run([*TINY, *region, *few, f"hydra.run.dir={tmp_path}/out"]) == 1
     assert "a and b did not start alike" in report(tmp_path / "out")["compare"]["reason"]
 
 

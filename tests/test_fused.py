@@ -152,7 +152,7 @@ def solved_alike(worlds: Worlds) -> dict[str, np.ndarray]:
         ("elliptic", 1, 2),
         pytest.param("elliptic", 3, 2, marks=pytest.mark.full),
         pytest.param("elliptic", 6, 8, marks=pytest.mark.full),
-        ("pyramidal", 3, 3),
+        pytest.param("pyramidal", 3, 3, marks=pytest.mark.full),
         pytest.param("pyramidal", 6, 5, marks=pytest.mark.full),
     ],
 )
@@ -171,8 +171,17 @@ def test_every_kind_of_row(cone: str, condim: int, boxes: int, device: str) -> N
     assert states >= {0, 1, 2, 3} | ({4} if contact == 7 else set())
 
 
-@pytest.mark.parametrize("njmax", [300, 16])
-@pytest.mark.parametrize("condim", [1, 3, 6])
+@pytest.mark.parametrize(
+    ("condim", "njmax"),
+    [
+        (3, 300),
+        (6, 16),
+        *(
+            pytest.param(*sizes, marks=pytest.mark.full)
+            for sizes in ((1, 300), (1, 16), (3, 16), (6, 300))
+        ),
+    ],
+)
 def test_contact_rows(condim: int, njmax: int, device: str) -> None:
     """All that MJWarp writes of a row, also where the buffer ends within a contact. On CUDA the
     order of contacts is another in every run, so there rows are compared by contact.

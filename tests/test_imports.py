@@ -10,6 +10,8 @@ import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
+from environments import at_double_speed
+
 import mjstack
 
 ROOT = Path(mjstack.__file__).parent
@@ -227,10 +229,15 @@ report("step")
 env.close()
 import mjstack.jobs.gates
 report("jobs")
-report(run(["gates=[baseline]", "sim=native", "web.episode=false", "hydra.run.dir=run"]))
+args = ["gates=[baseline]", "sim=native", "web.episode=false", "hydra.run.dir=run"]
+report(run([*args, *sys.argv[1:]]))
 """
     done = subprocess.run(
-        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=120
+        [sys.executable, "-c", program, *at_double_speed()],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=120,
     )
     assert done.stderr.splitlines() == ["step []", "jobs []", "0 ['matplotlib']"]
 

@@ -167,7 +167,10 @@ def test_worlds_pause_step_and_are_chosen(
     assert view.aside > 0.3
 
 
-@pytest.mark.parametrize("backend", [pytest.param("native", marks=GL), "mjwarp"])
+@pytest.mark.parametrize(
+    "backend",
+    [pytest.param("native", marks=GL), pytest.param("mjwarp", marks=pytest.mark.full)],
+)
 def test_a_driven_episode_shows_cameras_and_rewards(server: Any, backend: str) -> None:
     """Its environment draws nothing; the images are those that one with cameras would have, in
     the looks of the world. Without the view the episode has no rewards."""

@@ -35,7 +35,7 @@ from mjstack.train.ppo_learner import PpoLearner
 TINY = (
     *("job=train", "trainer=ppo", "sim=native", "nworld=4", "job.iterations=4"),
     *("job.save_every=2", "job.hidden=[16]", "job.horizon=4", "job.epochs=2"),
-    *("job.minibatches=2", "gate.success.rate=0.0"),
+    *("job.minibatches=2", "gate.success.rate=0.0", "web.episode=false"),
 )
 REACH = (*TINY, "task=reach", "termination.time_out.params.steps=30")
 

@@ -105,7 +105,8 @@ def test_rebot_passes(new_run: Callable[..., Run], tmp_path: Path) -> None:
 def test_broken_controller_fails_by_rule_and_phase(tmp_path: Path) -> None:
     """A gripper that never closes: the grasp is empty, is tried again, and is empty again."""
     folder = tmp_path / "broken"
-    assert command(folder, "sim=native", "nworld=2", "robot.gripper_closed=[0.7]") == 1
+    never = ["robot.gripper_closed=[0.7]", "web.episode=false"]
+    assert command(folder, "sim=native", "nworld=2", *never) == 1
     gate = gate_of(folder)
     assert gate["status"] == "fail"
     rate = "0 of 2 episodes succeeded (0 %, 95 % interval 0 to 65.76 %), 99 % wanted"

@@ -45,7 +45,7 @@ PAYLOAD = "open('PWNED', 'w').close()\nfrom shutil import rmtree\ndef X(env): ..
 def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a run."""
     folder = tmp_path_factory.mktemp("own") / "run"
-    args = ["gates=[batch]", "sim=native", "nworld=2", *one_second_episode()]
+    args = ["gates=[batch]", "sim=native", "nworld=2", "web.episode=false", *one_second_episode()]
     assert run([*args, f"hydra.run.dir={folder}"]) == 1
     return folder
 
@@ -122,7 +122,7 @@ DOERS = {
 }
 
 
-@pytest.mark.parametrize("name", DOERS)
+@pytest.mark.parametrize("name", others_full([*DOERS], *list(DOERS)[2:5]))
 def test_a_policy_names_terms_alone(name: str, tmp_path: Path) -> None:
     victim = tmp_path / "victim"
     victim.write_text("precious")
@@ -143,7 +143,10 @@ def test_a_policy_names_terms_alone(name: str, tmp_path: Path) -> None:
     assert victim.read_text() == "precious"
 
 
-@pytest.mark.parametrize("name", [n for n in DOERS if not n.endswith(("ExpertStates", "Runner"))])
+IN_RUNS = [name for name in DOERS if not name.endswith(("ExpertStates", "Runner"))]
+
+
+@pytest.mark.parametrize("name", others_full(IN_RUNS, IN_RUNS[0]))
 @pytest.mark.parametrize("term", ["evil", "evil-2"])
 def test_a_run_names_terms_alone(name: str, term: str, stranger: Path) -> None:
     edit(stranger, f"reset.{term}", {"func": name, "params": DOERS[name]})
