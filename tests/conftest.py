@@ -115,11 +115,7 @@ def device(request: pytest.FixtureRequest) -> str:
     return request.param
 
 
-BACKENDS = [
-    "native",
-    "mjwarp",
-    pytest.param("mjwarp-cuda", marks=CUDA),
-]
+BACKENDS = ["native", "mjwarp", pytest.param("mjwarp-cuda", marks=CUDA)]
 
 
 @pytest.fixture(params=BACKENDS)

@@ -99,10 +99,7 @@ def at_double_speed(robot: str = "so101", task: str = "stack") -> tuple[str, ...
 def one_second_episode() -> tuple[str, ...]:
     """Overrides of an episode that is over, and has failed, after a second."""
     phases = configure().controller.phases
-    return (
-        "task.check.window=5",
-        *(f"controller.phases.{name}.seconds=0.1" for name in phases),
-    )
+    return ("task.check.window=5", *(f"controller.phases.{name}.seconds=0.1" for name in phases))
 
 
 def on_backend(backend: str) -> dict[str, Any]:

@@ -79,11 +79,7 @@ def _patched(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def collection_at(
-    home: Path,
-    *overrides: str,
-    nworld: int = 9,
-    episodes: int = 10,
-    keep_failures: bool = False,
+    home: Path, *overrides: str, nworld: int = 9, episodes: int = 10, keep_failures: bool = False
 ) -> Collection:
     """A collection, ready to play."""
     cfg = configure(*COMMAND, *overrides)

@@ -137,10 +137,7 @@ def test_equal_sides(tmp_path: Path) -> None:
         (['job.against=["robot=rebot"]'], "(robot=rebot, expected so101)"),
         (['job.against=["gate.success.seeds=3"]'], "(gate.success.seeds=3, expected 2)"),
         (['job.against=["task.check.distance=0.5"]'], "(task.check.distance=0.5, expected 0.02)"),
-        (
-            ['job.against=["gate.success.region=[0.01,0.01]"]'],
-            "expected equal starts, which",
-        ),
+        (['job.against=["gate.success.region=[0.01,0.01]"]'], "expected equal starts, which"),
         (['job.against=["controller=policy","policy=nowhere/last"]'], "nowhere/last"),
         (['job.against=["graph=off"]', "view=web"], "expected false with job=compare"),
     ],

@@ -265,10 +265,7 @@ BAD = [
     ),
     (["+nworld=4"], "An item is already at 'nworld'."),
     (["~nworld"], "~nworld: expected a term of"),
-    (
-        ["~gate.batch.seeds"],
-        "~gate.batch.seeds: expected an integer of at least 1 [seeds].",
-    ),
+    (["~gate.batch.seeds"], "~gate.batch.seeds: expected an integer of at least 1 [seeds]."),
 ]
 
 

@@ -481,18 +481,12 @@ def test_another_configuration_is_refused(tmp_path: Path) -> None:
         ),
         ({"fps": 25}, "has fps=50, expected 25"),
         ({"robot_type": "rebot"}, "has robot_type=so101, expected rebot"),
-        (
-            with_feature("action", vector("shoulder", "hand")),
-            r"has features\.action\.names=.*jaw",
-        ),
+        (with_feature("action", vector("shoulder", "hand")), r"has features\.action\.names=.*jaw"),
         (
             with_feature("next.success", vector("s")),
             r"has .*features\.next\.success\.dtype=missing",
         ),
-        (
-            with_feature("action", vector("shoulder", "jaw", unit="m")),
-            r"has units\.action=",
-        ),
+        (with_feature("action", vector("shoulder", "jaw", unit="m")), r"has units\.action="),
         ({"values": {}}, "has values"),
     ]
     for changes, message in others:

@@ -220,10 +220,7 @@ def test_a_task_that_brings_a_controller_takes_a_policy(
 
 
 def test_bad_input_is_one_line(
-    exported: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    error_line: Callable[[], str],
+    exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error_line: Callable[[], str]
 ) -> None:
     policy = exported / "policy"
     assert export(policy, tmp_path / "out", "task=stack") == 2

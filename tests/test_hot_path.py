@@ -18,7 +18,7 @@ CASTS = {"bool", "int", "float"}
 # The code that runs within a step, by file and class, "" for functions; None for all of a file.
 PATHS: dict[str, dict[str, str] | None] = {
     "envs/env.py": {
-        "Env": "advance _step_physics _evaluate _reset_ended _start_worlds _reset_managers",
+        "Env": "advance _step_physics _evaluate _reset_ended _start_worlds _reset_managers"
     },
     "envs/command_delay.py": {"CommandDelay": "late reset"},
     "envs/faults.py": {"FaultLatch": "record"},
@@ -54,10 +54,7 @@ PATHS: dict[str, dict[str, str] | None] = {
         "JointNoise JointZeros JitterObjects RandomizeObjects": "__call__",
         "ObjectMass ObjectFriction ActuatorGains": "read write",
     },
-    "mdp/starts/randomization.py": {
-        "Randomized": "__call__",
-        "Elements": "read write scale",
-    },
+    "mdp/starts/randomization.py": {"Randomized": "__call__", "Elements": "read write scale"},
     "mdp/starts/starts_file.py": {"FromStartsFile": "__call__"},
     "mdp/starts/expert_states.py": {"ExpertStates": "__call__"},
     "episodes/recorder.py": {"Recorder": "update", "": "_read_world read_commands _read_state"},
@@ -99,7 +96,7 @@ PATHS: dict[str, dict[str, str] | None] = {
     "drivers/state_based.py": {
         "StateBasedDriver": (
             "command _decide _find_delivered _lead_point _tilted _turn_left _point _grasp_offsets"
-        ),
+        )
     },
     "train/rounds.py": {"MixedDriver": "command"},
     "policy/network.py": {"PolicyNetwork": "normalized forward"},

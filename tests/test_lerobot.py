@@ -274,10 +274,7 @@ def test_gate_success_judges_act_with_its_interval_and_failing_rules(
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (
-            ["cameras=front", "scene.cameras.front.size=[32,32]"],
-            r"images\.front of shape",
-        ),
+        (["cameras=front", "scene.cameras.front.size=[32,32]"], r"images\.front of shape"),
         (["cameras=wrist"], r"images\.front of shape \(3, 64, 64\), .* missing"),
         ([*SCENE, "observation=real"], r"_state of shape \(28,\), and here it is \(22,\)"),
     ],

@@ -168,8 +168,7 @@ def test_worlds_pause_step_and_are_chosen(
 
 
 @pytest.mark.parametrize(
-    "backend",
-    [pytest.param("native", marks=GL), pytest.param("mjwarp", marks=pytest.mark.full)],
+    "backend", [pytest.param("native", marks=GL), pytest.param("mjwarp", marks=pytest.mark.full)]
 )
 def test_a_driven_episode_shows_cameras_and_rewards(server: Any, backend: str) -> None:
     """Its environment draws nothing; the images are those that one with cameras would have, in

@@ -149,11 +149,7 @@ def test_fields_keep_their_address(backend: str, make_fields: Make) -> None:
 @pytest.mark.full
 @pytest.mark.parametrize("kind", ["native", "mjwarp"])
 @pytest.mark.parametrize(
-    ("name", "nearest"),
-    [
-        ("geom_frictoin", "geom_friction"),
-        ("dof_M0", None),
-    ],
+    ("name", "nearest"), [("geom_frictoin", "geom_friction"), ("dof_M0", None)]
 )
 def test_a_field_that_is_unknown_or_cannot_differ_is_refused(
     kind: str, get_stage: GetStage, name: str, nearest: str | None

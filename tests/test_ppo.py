@@ -13,14 +13,7 @@ import numpy as np
 import pytest
 import torch
 from environments import at_double_speed, configure, mask_of, on_cuda, on_new_sim
-from policies import (
-    assert_drives,
-    curve,
-    interrupted,
-    report,
-    run_as_torchrun,
-    same,
-)
+from policies import assert_drives, curve, interrupted, report, run_as_torchrun, same
 from rsl_rl.algorithms import PPO
 
 import mjstack.mdp.starts.expert_states as expert_states

@@ -251,11 +251,7 @@ def with_wall(
     z = cfg.scene.table_top + 0.0275
     quat = [math.cos(0.5 * euler), 0.0, 0.0, math.sin(0.5 * euler)]
     spec.worldbody.add_geom(
-        name="wall",
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        pos=[*xy, z],
-        size=[*half, 0.0275],
-        quat=quat,
+        name="wall", type=mujoco.mjtGeom.mjGEOM_BOX, pos=[*xy, z], size=[*half, 0.0275], quat=quat
     )
     return build_scene(spec, cfg)
 
@@ -385,9 +381,7 @@ def test_regions_stay_inside_what_is_reached() -> None:
 
 @pytest.mark.full
 def test_the_tool_maps_the_table(
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     options = ["scene.random_xy=[0.12,0.05]", "--step=0.04", f"--folder={tmp_path}"]
     monkeypatch.setenv("COLUMNS", "200")

@@ -16,14 +16,7 @@ import numpy as np
 import pytest
 from check_cases import rules_of
 from compositions import load_config, put, refusal
-from environments import (
-    at_double_speed,
-    has_gl,
-    on_cuda,
-    one_second_episode,
-    record_of,
-    two_starts,
-)
+from environments import at_double_speed, has_gl, on_cuda, one_second_episode, record_of, two_starts
 from omegaconf import OmegaConf
 
 from mjstack.cli import run
@@ -238,10 +231,7 @@ def test_what_is_promised_of_another_end(
 
 @pytest.mark.full
 def test_a_start_that_is_not_the_recorded_one_is_refused(
-    earlier: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    error_line: Callable[[], str],
+    earlier: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error_line: Callable[[], str]
 ) -> None:
     """Such as after random numbers have changed."""
     folder = copy_of(earlier, tmp_path)
@@ -314,10 +304,7 @@ def test_a_run_from_a_file_replays_from_its_own_copy(
     ids=["lost", "edited", "damaged"],
 )
 def test_another_layout_is_refused(
-    edit: Callable[[Path], None],
-    says: str,
-    from_file: Path,
-    tmp_path: Path,
+    edit: Callable[[Path], None], says: str, from_file: Path, tmp_path: Path
 ) -> None:
     folder = copy_of(from_file, tmp_path)
     edit(folder / "starts_played.npz")

@@ -528,9 +528,7 @@ def assert_success(
 
 
 @pytest.mark.full
-def test_stack_success_is_rules_four_to_six(
-    scripted: Callable[[str], SimpleNamespace],
-) -> None:
+def test_stack_success_is_rules_four_to_six(scripted: Callable[[str], SimpleNamespace]) -> None:
     """Step by step, over the recorded episodes and altered ends of the first, some of whose worlds
     start anew in between.
     """

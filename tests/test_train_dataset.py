@@ -73,9 +73,7 @@ def as_lerobot(info: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize(
-    "change",
-    [None, pytest.param(as_lerobot, marks=pytest.mark.full)],
-    ids=["ours", "LeRobot's"],
+    "change", [None, pytest.param(as_lerobot, marks=pytest.mark.full)], ids=["ours", "LeRobot's"]
 )
 def test_a_policy_learns_from_a_dataset(
     change: Callable[[dict], None] | None, dataset: Path, tmp_path: Path
