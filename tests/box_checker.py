@@ -3,8 +3,6 @@
 Written from the rules' text, not from `mjstack.tasks.box`: the two have to agree because both are
 right."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass
 from typing import Any

@@ -2,8 +2,6 @@
 a recording that succeeded, each with the rules that it has to break.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field

@@ -2,8 +2,6 @@
 in a copy of it, as Hydra sets them. A composition takes half a second.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Sequence
 from functools import cache

@@ -2,8 +2,6 @@
 pytest's temporary folder.
 """
 
-from __future__ import annotations
-
 import gc
 import os
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Holds a whole dataset to what its files say of each other, in NumPy, beside the writer."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

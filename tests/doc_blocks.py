@@ -4,8 +4,6 @@ A block with a title, such as `yaml title="lift/conf/task/lift.yaml"`, is a file
 without one is a part of the page's program.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

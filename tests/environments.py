@@ -2,8 +2,6 @@
 time.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -130,7 +128,7 @@ def fused_sim(
     *,
     fields: Sequence[str] = (),
     edit: Callable[[mujoco.MjModel], None] | None = None,
-) -> MjwarpSimulation:
+) -> "MjwarpSimulation":
     """A simulation on MJWarp with room for random actions, of a model that is edited before."""
     from mjstack.sim.mjwarp import MjwarpSimulation  # loads Warp
 

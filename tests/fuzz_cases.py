@@ -1,7 +1,5 @@
 """Cases of the fuzz: odd command lines, and command lines on damaged folders."""
 
-from __future__ import annotations
-
 import json
 import random
 import re

@@ -1,7 +1,5 @@
 """An arm with kinematics by native MuJoCo, to hold batched inverse kinematics against."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import mujoco

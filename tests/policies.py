@@ -2,8 +2,6 @@
 what trainings leave, interrupted ones and ones in two processes.
 """
 
-from __future__ import annotations
-
 import os
 import socket
 import subprocess

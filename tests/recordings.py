@@ -2,8 +2,6 @@
 the task or for alterations.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -124,7 +122,7 @@ class World:
     overflow: int = 0
 
     @classmethod
-    def of(cls, rec: SimpleNamespace, k: int = 0) -> World:
+    def of(cls, rec: SimpleNamespace, k: int = 0) -> "World":
         arrays = {n: getattr(rec, n)[k].copy() for n in (*STATE, "phase", "xpos", "xquat")}
         counts = {name: int(getattr(rec, name)[k]) for name in ("step_count", "overflow")}
         return cls(stage=rec.stage, **counts, **arrays)

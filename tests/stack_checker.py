@@ -3,8 +3,6 @@
 Written from the rules' text, not from `mjstack.tasks.stack`: the two have to agree because both are
 right."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

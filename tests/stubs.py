@@ -1,7 +1,5 @@
 """Demonstrations that nobody played: steps and results by seed and world, in no time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import SimpleNamespace

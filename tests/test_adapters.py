@@ -1,7 +1,5 @@
 """The adapters: Gymnasium's checker and conventions, and what rsl_rl's runners rely on."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import warnings

@@ -2,8 +2,6 @@
 what a failure leaves.
 """
 
-from __future__ import annotations
-
 import csv
 import os
 import tracemalloc

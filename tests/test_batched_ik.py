@@ -1,7 +1,5 @@
 """Batched inverse kinematics against native MuJoCo's forward kinematics, and against mink."""
 
-from __future__ import annotations
-
 import gc
 import os
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The box scene and what a policy needs of the task: geometry, starts, success, rewards."""
 
-from __future__ import annotations
-
 import copy
 import math
 from functools import cache

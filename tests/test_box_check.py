@@ -2,8 +2,6 @@
 checker, world by world.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import cache, partial

@@ -1,7 +1,5 @@
 """Cameras: images as observations on both backends, when they are drawn, and what cannot be."""
 
-from __future__ import annotations
-
 import math
 import os
 import subprocess

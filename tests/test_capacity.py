@@ -2,8 +2,6 @@
 uses them.
 """
 
-from __future__ import annotations
-
 import math
 import weakref
 from collections.abc import Callable, Iterator

@@ -5,8 +5,6 @@ Some cheats are driven, by joint targets of the expert that are changed a little
 would take long to drive, are written into a recorded episode.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 from types import SimpleNamespace

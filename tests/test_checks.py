@@ -1,7 +1,5 @@
 """A check of one's own, made of parts; and thresholds."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import pytest

@@ -1,7 +1,5 @@
 """The command line: exit statuses, what it writes, and that it writes nothing for bad input."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os

@@ -1,7 +1,5 @@
 """The closed-loop driver: phases, looks, turns, retries and restarts of every world by itself."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 
 import mujoco

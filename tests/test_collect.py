@@ -2,8 +2,6 @@
 is lost or there twice.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """job=compare: McNemar's test, known differences of two drivers, and sides that it refuses."""
 
-from __future__ import annotations
-
 import csv
 import math
 from fractions import Fraction

@@ -2,8 +2,6 @@
 one line.
 """
 
-from __future__ import annotations
-
 import runpy
 from itertools import zip_longest
 from pathlib import Path

@@ -2,8 +2,6 @@
 and no other world is.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """trainer=dagger: rounds of a small training, what it refuses, and how it goes on."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

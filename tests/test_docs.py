@@ -1,7 +1,5 @@
 """The pages in docs/: what they show in Python runs, offline and without a GPU."""
 
-from __future__ import annotations
-
 import re
 import runpy
 import shlex

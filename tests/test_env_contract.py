@@ -1,7 +1,5 @@
 """The promises of an environment on every backend, for both tasks and both robots."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Tests of the environment that need a GPU."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

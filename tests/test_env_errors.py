@@ -2,8 +2,6 @@
 and says what to do.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable
 from functools import partial

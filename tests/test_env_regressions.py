@@ -1,7 +1,5 @@
 """Mistakes that were made once: each of these failed before it was mended."""
 
-from __future__ import annotations
-
 import signal
 import threading
 import time

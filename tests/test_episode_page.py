@@ -1,7 +1,5 @@
 """The 3-D page of a run's worlds: geometry and poses are MuJoCo's, and a browser shows them."""
 
-from __future__ import annotations
-
 import io
 import json
 import re

@@ -1,7 +1,5 @@
 """The examples, each from its own folder: the gates pass, and a check fails what it must."""
 
-from __future__ import annotations
-
 import json
 import os
 from functools import cache

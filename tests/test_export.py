@@ -2,8 +2,6 @@
 program without mjstack drives native MuJoCo as PolicyDriver does.
 """
 
-from __future__ import annotations
-
 import ast
 import json
 import runpy

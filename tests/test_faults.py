@@ -2,8 +2,6 @@
 named, and the others end as in a run without them. On CUDA every step is a captured graph.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 

@@ -1,7 +1,5 @@
 """Contact rows and the solver as one kernel each end where MJWarp's own do."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 

@@ -1,7 +1,5 @@
 """Smooth dynamics in three kernels end where MJWarp's own stages do."""
 
-from __future__ import annotations
-
 import math
 
 import mujoco

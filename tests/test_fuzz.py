@@ -8,8 +8,6 @@ The cases run in forked children of a process of their own, whose modules are lo
 ``python tests/test_fuzz.py commands 17 200-220`` runs these cases and prints what they say.
 """
 
-from __future__ import annotations
-
 import copy
 import gc
 import hashlib

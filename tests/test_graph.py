@@ -2,8 +2,6 @@
 captured anew.
 """
 
-from __future__ import annotations
-
 import logging
 from functools import partial
 

@@ -2,8 +2,6 @@
 is checked.
 """
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Batched inverse kinematics of any chain of hinges and slides, and what it refuses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import mujoco

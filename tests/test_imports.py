@@ -1,7 +1,5 @@
 """Who may import whom: packages in layers, and one home for each third-party package."""
 
-from __future__ import annotations
-
 import ast
 import re
 import subprocess

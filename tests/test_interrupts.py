@@ -4,8 +4,6 @@ as in test_fuzz.py, and of a script that steps an environment.
 ``python tests/test_interrupts.py gates 250`` interrupts 250 runs and prints how they ended.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

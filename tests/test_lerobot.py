@@ -2,8 +2,6 @@
 an environment with it and runs these; elsewhere they are skipped.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """``mjstack list``: what there is to choose from."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 

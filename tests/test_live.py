@@ -1,7 +1,5 @@
 """The live view: worlds of a running environment in a browser, with pause, step and choice."""
 
-from __future__ import annotations
-
 import contextlib
 import inspect
 import signal

@@ -1,7 +1,5 @@
 """Managers: on any object of an environment's shape, their tables, and what overrides change."""
 
-from __future__ import annotations
-
 import itertools
 import sys
 from types import FrameType

@@ -2,8 +2,6 @@
 Where they are not, see docs/design.md, "A new release of MuJoCo Warp".
 """
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 import inspect

@@ -1,7 +1,5 @@
 """Model fields that differ from world to world."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable
 from functools import partial

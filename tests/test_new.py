@@ -1,7 +1,5 @@
 """``mjstack new``: a task and a robot of one's own, from templates."""
 
-from __future__ import annotations
-
 import runpy
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Scenes of a stranger: any number of objects of any shape, and places drawn per episode."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable

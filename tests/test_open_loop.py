@@ -1,7 +1,5 @@
 """The scripted plan against kinematics of its own, on the whole scene."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """The page of a run: it needs nothing but itself, reads like tables, and trusts no text."""
 
-from __future__ import annotations
-
 import re
 from html.parser import HTMLParser
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Gate *parity*: what it lets pass, and differences that are put into MJWarp's model."""
 
-from __future__ import annotations
-
 import copy
 import math
 import re

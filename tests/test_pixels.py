@@ -1,7 +1,5 @@
 """Policies that see images: what they learn from, what they see, and what is refused."""
 
-from __future__ import annotations
-
 import io
 import json
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """job=play: worlds with a policy or the expert, in MuJoCo's viewer or as a video."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path

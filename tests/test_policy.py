@@ -2,8 +2,6 @@
 line, and every gate takes a policy.
 """
 
-from __future__ import annotations
-
 import importlib.metadata
 import json
 import math

@@ -2,8 +2,6 @@
 worlds it repeats them. Both do the same.
 """
 
-from __future__ import annotations
-
 import pytest
 import torch
 from environments import actions, configure, on_new_sim, on_shared_sim, state_of

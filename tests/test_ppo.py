@@ -2,8 +2,6 @@
 expert's states.
 """
 
-from __future__ import annotations
-
 import shutil
 import sys
 from collections.abc import Callable

@@ -9,8 +9,6 @@ examples/push) is one stage. Costs (`action_rate`, `joint_vel`) are left out: th
 With them the weighted sum of all rewards rises from the end of each stage to that of the next.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from pathlib import Path

@@ -2,8 +2,6 @@
 on with in another number of ranks.
 """
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import os

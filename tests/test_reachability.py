@@ -2,8 +2,6 @@
 of the tool.
 """
 
-from __future__ import annotations
-
 import csv
 import math
 import runpy

@@ -1,7 +1,5 @@
 """The README: its Python runs, its links lead somewhere, and it stays short."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The report file: whole or not at all, always JSON, and what its status means."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

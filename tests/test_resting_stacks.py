@@ -2,8 +2,6 @@
 convex one some never do.
 """
 
-from __future__ import annotations
-
 import math
 
 import mujoco_warp as mjw

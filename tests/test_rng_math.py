@@ -1,7 +1,5 @@
 """Random numbers against Random123's known answers, and rotations against MuJoCo."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -2,8 +2,6 @@
 kinematics of an arm with a slide against MuJoCo's.
 """
 
-from __future__ import annotations
-
 import re
 import shutil
 from dataclasses import replace

@@ -2,8 +2,6 @@
 keep the same command from going on.
 """
 
-from __future__ import annotations
-
 import csv
 import gc
 import json

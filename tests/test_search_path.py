@@ -1,7 +1,5 @@
 """Configuration from a folder of one's own: on the command line, in a sweep, and in Python."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

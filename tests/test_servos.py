@@ -1,7 +1,5 @@
 """Servos of the group ``actuator``: published figures in the compiled model; what is refused."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from compositions import load_config, refusal

@@ -1,7 +1,5 @@
 """One contract for every backend."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from functools import partial

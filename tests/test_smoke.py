@@ -1,7 +1,5 @@
 """Does it work at all: both robots, an environment step and an episode."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The solver gate: what it measures, and that its settings reach the physics."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

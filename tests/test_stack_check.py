@@ -1,7 +1,5 @@
 """The batched check on the device against the plain checker, world by world."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """How worlds start: on the table, within the ranges of their terms, each on its own."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Sequence

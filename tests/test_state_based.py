@@ -1,7 +1,5 @@
 """The state-based expert: accepted without phases, and a function of the state alone."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The rearranged physics step is MJWarp's own."""
 
-from __future__ import annotations
-
 import mujoco
 import pytest
 import torch

@@ -2,8 +2,6 @@
 both backends.
 """
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Callable
 from contextlib import closing

@@ -1,7 +1,5 @@
 """The table and the picture of a sweep, and the experiment on throughput that is one."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import math

@@ -1,7 +1,5 @@
 """Sweeps whose jobs run in processes: a queue over GPUs or cores, and Slurm."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

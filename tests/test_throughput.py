@@ -1,7 +1,5 @@
 """The throughput gate: its measurements, and what voids their figures."""
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Callable

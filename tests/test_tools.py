@@ -1,7 +1,5 @@
 """The developers' tools: each does its work once, on a small scale."""
 
-from __future__ import annotations
-
 import json
 import runpy
 import subprocess

@@ -1,7 +1,5 @@
 """job=train: small trainings on native MuJoCo, what they leave, and how they go on."""
 
-from __future__ import annotations
-
 import resource
 import time
 from pathlib import Path

@@ -1,7 +1,5 @@
 """trainer=clone from a dataset: what it reads, and which datasets it refuses."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Trainings that are refused in one line, by the check before anything is written."""
 
-from __future__ import annotations
-
 import pytest
 from compositions import load_config, refusal
 from test_pixels import SMALL

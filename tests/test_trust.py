@@ -1,7 +1,5 @@
 """Nothing that a stranger's folder names is run or followed, and no damage in it is a traceback."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import os

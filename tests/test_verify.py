@@ -1,7 +1,5 @@
 """The gates from Python."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

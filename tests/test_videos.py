@@ -1,7 +1,5 @@
 """Datasets with images: what is decoded is what was drawn, and nothing is half-written."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
