@@ -1,6 +1,5 @@
 """job=export: onnxruntime gives torch's numbers, the metadata is all that a program needs, and a
-program without mjstack drives native MuJoCo as PolicyDriver does.
-"""
+program without mjstack drives native MuJoCo as PolicyDriver does."""
 
 import ast
 import json
@@ -255,8 +254,7 @@ def test_a_full_disk_leaves_neither_file(
 
 def test_lerobots_folder_has_its_own_files_and_the_weights(tmp_path: Path) -> None:
     """LeRobot itself loads it in test_lerobot.py. One that sees measured joints alone takes a real
-    arm's.
-    """
+    arm's."""
     for observation, key in (("state", "environment_state"), ("pixels", "state")):
         policy = write_noiseless(tmp_path / observation, configure(f"observation={observation}"))
         out = tmp_path / f"{observation}_out"

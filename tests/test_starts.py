@@ -247,8 +247,7 @@ def test_starts_in_the_box_scene_are_uniform_over_the_pairs_that_fit(robot: str)
 
 def test_joint_zeros_move_the_arm_and_no_measured_joint() -> None:
     """The arm stands as the model does with each joint turned by its world's angle; both backends
-    have the same frames.
-    """
+    have the same frames."""
     width = 0.17
     zeros = f"+reset.zeros={{func: mjstack.mdp.reset.JointZeros, params: {{arm: {width}}}}}"
     cfg = configure(zeros, "reset=randomized", "action=joint_absolute")

@@ -1,6 +1,5 @@
 """Starts files: the same worlds again, on both backends, and one line for whatever is wrong with a
-file.
-"""
+file."""
 
 import re
 from collections.abc import Callable
