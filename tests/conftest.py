@@ -10,7 +10,17 @@ from types import SimpleNamespace
 
 import pytest
 from compositions import load_config
-from environments import CUDA, DEVICES, on_backend
+from environments import (
+    CUDA,
+    DEVICES,
+    Capture,
+    GetStage,
+    MakeSim,
+    NewRun,
+    Patch,
+    Refused,
+    on_backend,
+)
 from recordings import recording
 
 from mjstack.config.schema import Config
@@ -36,7 +46,7 @@ def _outside_the_checkout(tmp_path_factory: pytest.TempPathFactory) -> Iterator[
 
 
 @pytest.fixture(scope="session")
-def get_stage() -> Callable[..., Stage]:
+def get_stage() -> GetStage:
     """Configuration, model, index and planner of a robot under some overrides, each made once in
     the session."""
     made: dict[tuple[str, ...], Stage] = {}
@@ -51,7 +61,7 @@ def get_stage() -> Callable[..., Stage]:
 
 
 @pytest.fixture(scope="session")
-def new_run(get_stage: Callable[..., Stage]) -> Callable[..., Run]:
+def new_run(get_stage: GetStage) -> NewRun:
     """A run of its own for some overrides that change neither scene nor, but for its
     phases, plan: both are shared."""
 
@@ -64,7 +74,7 @@ def new_run(get_stage: Callable[..., Stage]) -> Callable[..., Run]:
 
 
 @pytest.fixture(scope="session")
-def make_sim(get_stage: Callable[[str], Stage]) -> Callable[..., Simulation]:
+def make_sim(get_stage: GetStage) -> MakeSim:
     """Simulations by (backend, nworld, overrides), reset and shared by all tests: MJWarp's are slow
     to build."""
     made: dict[tuple, Simulation] = {}
@@ -82,9 +92,7 @@ def make_sim(get_stage: Callable[[str], Stage]) -> Callable[..., Simulation]:
 
 
 @pytest.fixture(scope="session")
-def recorded(
-    get_stage: Callable[[str], Stage], make_sim: Callable[..., Simulation]
-) -> Callable[[str], SimpleNamespace]:
+def recorded(get_stage: GetStage, make_sim: MakeSim) -> Callable[[str], SimpleNamespace]:
     """A native episode of four jittered worlds per robot."""
 
     @cache
@@ -120,7 +128,7 @@ def backend(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.fixture
-def error_line(capsys: pytest.CaptureFixture[str]) -> Callable[[], str]:
+def error_line(capsys: Capture) -> Callable[[], str]:
     """The line that a command has written to standard error, and no other."""
 
     def read() -> str:
@@ -131,9 +139,7 @@ def error_line(capsys: pytest.CaptureFixture[str]) -> Callable[[], str]:
 
 
 @pytest.fixture
-def refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error_line: Callable[[], str]
-) -> Callable[..., str]:
+def refused(tmp_path: Path, monkeypatch: Patch, error_line: Callable[[], str]) -> Refused:
     """The line in which a command is refused, before it writes anything."""
 
     def refuse(*args: str) -> str:

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from mjstack.config.schema import Backend, Config
 from mjstack.envs import Env
 from mjstack.episodes.record import EpisodeRecord
+from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
 from mjstack.managers import required_fields
 from mjstack.scene import SceneIndex, build_model
@@ -46,6 +47,13 @@ COUNTS = (
 )
 VIEWS = (*STATE, *POSES, "qfrc_actuator", "sensordata", *COUNTS)
 Trace = list[dict[str, torch.Tensor]]
+# Types of fixtures
+Patch = pytest.MonkeyPatch
+Capture = pytest.CaptureFixture[str]
+GetStage = Callable[..., Stage]
+MakeSim = Callable[..., Simulation]
+NewRun = Callable[..., Run]
+Refused = Callable[..., str]
 
 _model = cache(lambda robot: build_model(configure(robot=robot)))
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from compositions import load_config
-from environments import configure, report_of
+from environments import Patch, configure, report_of
 
 import mjstack.interrupt as interrupt
 from mjstack.cli import run
@@ -99,7 +99,7 @@ def same(a: Path, b: Path) -> bool:
     return all(torch.equal(value, first[name]) for name, value in weights(b).items())
 
 
-def interrupt_in_step(patch: pytest.MonkeyPatch, learner: type[Learner], number: int) -> None:
+def interrupt_in_step(patch: Patch, learner: type[Learner], number: int) -> None:
     """Let Ctrl-C come in a step of a training, which looks for it after each."""
     step = learner._step
 

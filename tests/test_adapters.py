@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from compositions import make_env
+from environments import Patch
 from gymnasium.spaces import Box
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
@@ -370,9 +371,7 @@ def test_import_of_mjstack_loads_no_adapter() -> None:
     ("adapter", "library"),
     [("gymnasium", "gymnasium"), ("rsl_rl", "rsl_rl"), ("rsl_rl", "tensordict")],
 )
-def test_missing_extra_is_one_line(
-    adapter: str, library: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_missing_extra_is_one_line(adapter: str, library: str, monkeypatch: Patch) -> None:
     for name in [name for name in sys.modules if f"{name}.".startswith(f"{library}.")]:
         monkeypatch.setitem(sys.modules, name, None)  # as if it could not be found
     monkeypatch.delitem(sys.modules, f"mjstack.adapters.{adapter}")

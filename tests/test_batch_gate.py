@@ -13,7 +13,7 @@ import pytest
 import torch
 from check_cases import rules_of
 from compositions import load_config
-from environments import at_double_speed, one_second_episode, record_of
+from environments import NewRun, Patch, at_double_speed, one_second_episode, record_of
 
 from mjstack.drivers.open_loop import JointTrajectory
 from mjstack.episodes import batches
@@ -67,7 +67,7 @@ def play(run: Run, folder: Path | None) -> GateResult:
 
 @pytest.fixture(scope="module")
 def two_seeds(
-    new_run: Callable[..., Run], tmp_path_factory: pytest.TempPathFactory
+    new_run: NewRun, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, GateResult, list[str]]:
     """A native batch of seven worlds under seeds 0 and 1, some of which fail, its folder, and what
     it said."""
@@ -120,9 +120,7 @@ def test_failing_worlds_are_a_table(two_seeds: tuple[Path, GateResult, list[str]
             assert float(row[name]) == pytest.approx(values[world], rel=1e-5)
 
 
-def test_the_table_is_written_once(
-    new_run: Callable[..., Run], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_the_table_is_written_once(new_run: NewRun, monkeypatch: Patch, tmp_path: Path) -> None:
     """Once after each seed would take quadratic time."""
     written: list[int] = []
 
@@ -176,11 +174,7 @@ GATES: dict[str, Callable[[Run], list[GateResult]]] = {"batch": run_batch, "succ
     ],
 )
 def test_what_stops_the_second_seed_keeps_the_first(
-    gate: str,
-    error: BaseException,
-    new_run: Callable[..., Run],
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
+    gate: str, error: BaseException, new_run: NewRun, monkeypatch: Patch, tmp_path: Path
 ) -> None:
     file = tmp_path / ("worlds_seed0.npz" if gate == "batch" else "success_seed0.npz")
 
@@ -208,7 +202,7 @@ def test_what_stops_the_second_seed_keeps_the_first(
 @pytest.mark.full
 @pytest.mark.parametrize("gate", GATES)
 def test_full_disk_takes_no_verdict_back(
-    gate: str, new_run: Callable[..., Run], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    gate: str, new_run: NewRun, monkeypatch: Patch, tmp_path: Path
 ) -> None:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
@@ -236,7 +230,7 @@ def test_damaged_record_is_one_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.full
-def test_no_trajectory_is_kept(new_run: Callable[..., Run], tmp_path: Path) -> None:
+def test_no_trajectory_is_kept(new_run: NewRun, tmp_path: Path) -> None:
     """A trajectory of qpos alone would take 48 kB a world on the host. The 3-D page has its own
     bound, of 64 worlds."""
 
@@ -254,9 +248,7 @@ def test_no_trajectory_is_kept(new_run: Callable[..., Run], tmp_path: Path) -> N
     assert (peak(12) - peak(2)) / 10 < 15_000
 
 
-def test_a_further_seed_keeps_its_record_without_final_positions(
-    new_run: Callable[..., Run],
-) -> None:
+def test_a_further_seed_keeps_its_record_without_final_positions(new_run: NewRun) -> None:
     """The record's other arrays, and 8 bytes a world for the hash of its final positions."""
     check = new_run("sim=native").stage.check
     options = {"noun": "worlds", "several": True, "path": None, "replayed": False}

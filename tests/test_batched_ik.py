@@ -12,7 +12,7 @@ import pytest
 import torch
 import warp as wp
 from compositions import load_config
-from environments import CUDA
+from environments import CUDA, GetStage, Patch
 from ik_arm import Arm, results, tensors
 from test_robot_models import REPO, upstream
 
@@ -20,8 +20,6 @@ from mjstack.episodes.stage import Stage
 from mjstack.kinematics.mink_ik import GraspIk
 from mjstack.robots import robot_spec
 from mjstack.sim.warp_setup import torch_stream_scope
-
-GetStage = Callable[[str], Stage]
 
 MINK = 300  # targets that mink solves, one after the other
 TOLERANCE = 0.0005  # m, as the driver's
@@ -399,7 +397,7 @@ def test_a_goal_that_is_not_finite_stays_in_its_world(
 @pytest.mark.full
 @pytest.mark.parametrize("source", ["builtin", "menagerie"])
 def test_the_approach_axis_leads_from_the_wrist_to_the_grasp_point(
-    robot: str, source: str, monkeypatch: pytest.MonkeyPatch
+    robot: str, source: str, monkeypatch: Patch
 ) -> None:
     """It is the axis about which the last arm joint rolls, away from the wrist, and across the way
     the jaws close."""

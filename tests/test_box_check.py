@@ -4,6 +4,7 @@ checker, world by world."""
 import math
 from collections.abc import Callable
 from functools import cache, partial
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,6 +16,7 @@ from compositions import load_config
 from environments import CUDA, at_double_speed
 from recordings import World, faster_stage, feed, put_cube, recording
 
+from mjstack.cli import run
 from mjstack.config.schema import Backend
 from mjstack.envs import Env
 from mjstack.episodes.failures import Sign
@@ -74,6 +76,11 @@ def scripted() -> SimpleNamespace:
     (rec,) = recordings
     rec.gate = result
     return rec
+
+
+def test_the_rebots_baseline_passes(tmp_path: Path) -> None:
+    box = ["task=box", "robot=rebot", "gates=[baseline]", "web.episode=false"]
+    assert run([*box, f"hydra.run.dir={tmp_path}"]) == 0
 
 
 def test_recorded_episodes() -> None:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 from compositions import load_config, make_env, refusal
-from environments import CUDA, at_double_speed, has_gl, no_host_reads, on_cuda, zeros
+from environments import CUDA, Patch, at_double_speed, has_gl, no_host_reads, on_cuda, zeros
 from gymnasium.utils.env_checker import check_env
 
 from mjstack.adapters.gymnasium import GymnasiumEnv, GymnasiumVectorEnv
@@ -421,7 +421,7 @@ def test_agreement_of_images() -> None:
     assert agree("c", painted(0, 200), other, labels, 100).color == np.inf
 
 
-def test_images_that_compare_too_little_fail(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_that_compare_too_little_fail(monkeypatch: Patch) -> None:
     """A cube wholly elsewhere, of too few pixels for an intersection over union: with nothing else
     to compare but the background, and beside a robot that agrees."""
     labels = ["table", "red", "gripper"]
@@ -580,9 +580,7 @@ def test_a_bad_value_is_one_line(overrides: str, message: str) -> None:
 
 
 @pytest.mark.parametrize("backend", ["native", "mjwarp"])
-def test_images_that_do_not_fit_into_memory_are_one_line(
-    backend: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_images_that_do_not_fit_into_memory_are_one_line(backend: str, monkeypatch: Patch) -> None:
     monkeypatch.setattr(sim_cameras, "free_memory", lambda device: 10**9)
     monkeypatch.setattr(gates, "require_offscreen", lambda model: None)
     config = [f"sim={backend}", "gates=[baseline]", "cameras=front"]
@@ -601,7 +599,7 @@ def test_images_that_do_not_fit_into_memory_are_one_line(
     [("cuda:0", "4", 1, 5), ("cuda:2", "4", 4, 5), ("cuda:1", "null", 2, 9), ("cpu", "2", 1, 17)],
 )
 def test_a_gpu_needs_room_for_the_images_of_its_rank(
-    device: str, devices: str, size: int, nworld: int, monkeypatch: pytest.MonkeyPatch
+    device: str, devices: str, size: int, nworld: int, monkeypatch: Patch
 ) -> None:
     found: list[int] = []
     monkeypatch.setattr("torch.cuda.device_count", lambda: 4)

@@ -11,7 +11,15 @@ import numpy as np
 import pytest
 import torch
 from compositions import load_config
-from environments import at_double_speed, on_cuda, one_second_episode
+from environments import (
+    GetStage,
+    MakeSim,
+    NewRun,
+    Patch,
+    at_double_speed,
+    on_cuda,
+    one_second_episode,
+)
 
 import mjstack
 from mjstack.config.schema import Backend
@@ -35,9 +43,6 @@ from mjstack.gates.capacity import run_capacity
 from mjstack.report.record import GateResult, Status
 from mjstack.sim import BatchSizes, Overflow, Simulation, make_simulation, resolve_sizes
 from mjstack.sim.sizes import apply_configured, resolve_env_sizes, resolve_measuring_sizes
-
-Make = Callable[..., Simulation]
-NewRun = Callable[..., Run]
 
 
 def peaks(
@@ -63,9 +68,7 @@ def start(sim: Simulation, stage: Stage) -> None:
 
 
 @pytest.mark.full
-def test_peaks_survive_masked_resets(
-    backend: str, make_sim: Make, get_stage: Callable[[str], Stage]
-) -> None:
+def test_peaks_survive_masked_resets(backend: str, make_sim: MakeSim, get_stage: GetStage) -> None:
     sim = make_sim(backend, 3)
     start(sim, get_stage("so101"))
     sim.step(10)
@@ -88,9 +91,7 @@ def test_peaks_survive_masked_resets(
 
 
 @pytest.mark.full
-def test_a_peak_after_a_reset_counts(
-    backend: str, make_sim: Make, get_stage: Callable[[str], Stage]
-) -> None:
+def test_a_peak_after_a_reset_counts(backend: str, make_sim: MakeSim, get_stage: GetStage) -> None:
     sim = make_sim(backend, 2)
     sim.step(1)
     quiet = sim.lasting_peaks()[1]
@@ -138,7 +139,7 @@ def test_peaks_join() -> None:
 
 
 def tried(
-    monkeypatch: pytest.MonkeyPatch, lost: Callable[[BatchSizes], int]
+    monkeypatch: Patch, lost: Callable[[BatchSizes], int]
 ) -> tuple[list[BatchSizes], Workload]:
     """The sizes that a workload is tried in, and its last run; some of them lose physics."""
     made: list[BatchSizes] = []
@@ -157,7 +158,7 @@ def tried(
 
 @pytest.mark.full
 def test_room_to_measure_in_grows_where_it_is_too_little_but_not_for_ever(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: Patch,
 ) -> None:
     made, run = tried(
         monkeypatch,
@@ -209,7 +210,7 @@ def test_what_is_set_wins() -> None:
 @pytest.mark.full
 @pytest.mark.parametrize(("nccdmax", "room"), [(40, 16), (5, 5), (None, 16)])
 def test_convex_room_is_within_the_pool(
-    nccdmax: int | None, room: int, get_stage: Callable[[str], Stage]
+    nccdmax: int | None, room: int, get_stage: GetStage
 ) -> None:
     """MJWarp refuses more, and one world of parity has less than thousands."""
     sizes = BatchSizes(nconmax=16, njmax=8, nccdmax=nccdmax)
@@ -224,7 +225,7 @@ def test_convex_room_is_within_the_pool(
 
 
 @pytest.fixture(scope="module")
-def first_steps(get_stage: Callable[[str], Stage]) -> Iterator[Callable[[BatchSizes], Peaks]]:
+def first_steps(get_stage: GetStage) -> Iterator[Callable[[BatchSizes], Peaks]]:
     """The first steps of two MJWarp worlds, in which SO-101 needs the most rows."""
     stage = get_stage("so101")
 
@@ -324,7 +325,7 @@ def test_sizes_were_tried_with_the_same_outcome(
 
 @pytest.mark.full
 def test_memory_is_that_of_the_arrays(
-    too_small: tuple[Run, GateResult, list[str]], get_stage: Callable[[str], Stage]
+    too_small: tuple[Run, GateResult, list[str]], get_stage: GetStage
 ) -> None:
     from mjstack.sim.usage import array_bytes, data_bytes
 
@@ -351,7 +352,7 @@ def test_defaults_too_small_for_environments_fail(new_run: NewRun) -> None:
 
 @pytest.mark.full
 def test_native_tells_what_it_cannot_know_and_a_layout_out_of_reach_leaves_the_rest(
-    new_run: NewRun, monkeypatch: pytest.MonkeyPatch
+    new_run: NewRun, monkeypatch: Patch
 ) -> None:
     play = Stage.play_task
 
@@ -413,7 +414,7 @@ def test_a_second_run_that_differs(again: dict, on_cpu: str, on_cuda: str) -> No
 @pytest.mark.full
 @pytest.mark.parametrize("device", ["cpu", "cuda:0"])
 def test_each_workload_is_played_again_and_a_flip_fails_where_runs_repeat(
-    device: str, new_run: NewRun, monkeypatch: pytest.MonkeyPatch
+    device: str, new_run: NewRun, monkeypatch: Patch
 ) -> None:
     run = new_run("sim=mjwarp", "sim.device=cpu", "nworld=2")
     run.stage.backend = (Backend.mjwarp, device)  # the runs are made up: no device is used
@@ -455,7 +456,7 @@ def test_each_workload_is_played_again_and_a_flip_fails_where_runs_repeat(
 
 @pytest.mark.full
 def test_the_gate_recommends_nothing_from_motion_that_lost_physics(
-    new_run: NewRun, monkeypatch: pytest.MonkeyPatch
+    new_run: NewRun, monkeypatch: Patch
 ) -> None:
     said: list[str] = []
     run = new_run("sim=mjwarp", "sim.device=cpu", "nworld=2", "batch=auto")
@@ -519,7 +520,7 @@ def test_environment_is_sized_by_a_probe() -> None:
 
 
 @pytest.mark.full
-def test_a_probe_that_lost_physics_makes_no_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_probe_that_lost_physics_makes_no_environment(monkeypatch: Patch) -> None:
     small = BatchSizes(nconmax=128, njmax=4)  # and 32 after the last growth
     monkeypatch.setattr("mjstack.envs.buffers.resolve_measuring_sizes", lambda _: small)
     made: list[weakref.ref[Env]] = []
@@ -543,7 +544,7 @@ def test_a_probe_that_lost_physics_makes_no_environment(monkeypatch: pytest.Monk
 
 @pytest.mark.full
 def test_gates_get_no_sizes_from_a_task_that_lost_physics(
-    new_run: NewRun, monkeypatch: pytest.MonkeyPatch
+    new_run: NewRun, monkeypatch: Patch
 ) -> None:
     lost = workload(peaks=peaks(nworld=2, overflow=np.array([int(Overflow.NEFC), 0])))
     monkeypatch.setattr(Stage, "play_task", lambda *_: lost)
@@ -555,7 +556,7 @@ def test_gates_get_no_sizes_from_a_task_that_lost_physics(
 
 
 @pytest.mark.full
-def test_native_environment_measures_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_native_environment_measures_nothing(monkeypatch: Patch) -> None:
     monkeypatch.setattr("mjstack.envs.buffers.play_workload", lambda *_: pytest.fail("measured"))
     mjstack.make_env(["batch=auto", "sim=native"], nworld=1).reset(seed=0)
 

@@ -12,13 +12,12 @@ import numpy as np
 import pytest
 import torch
 from check_cases import BLUE, RED, rules_of
+from environments import GetStage, MakeSim
 from recordings import Recorder, World, feed
 
 from mjstack.drivers.driver import Driver
 from mjstack.episodes.recorder import CommandRecorder
 from mjstack.episodes.rollout import play_episode
-from mjstack.episodes.stage import Stage
-from mjstack.sim import Simulation
 
 RULES = rules_of("stack")
 NWORLD = 4
@@ -36,9 +35,7 @@ class Targets(Driver):
 
 
 @pytest.fixture(scope="module")
-def drive(
-    get_stage: Callable[[str], Stage], make_sim: Callable[..., Simulation]
-) -> Callable[..., list[set[str]]]:
+def drive(get_stage: GetStage, make_sim: MakeSim) -> Callable[..., list[set[str]]]:
     """Drives jittered native worlds without phases by the expert's joint targets, changed; the
     broken rules of each world, on which the plain checker agrees."""
 

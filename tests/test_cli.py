@@ -9,19 +9,17 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
 import pytest
-from environments import at_double_speed, has_gl
+from environments import Capture, GetStage, Patch, at_double_speed, has_gl
 
 import mjstack
 from mjstack import cli
 from mjstack.cli import run
 from mjstack.config import load_config
 from mjstack.config.session import CONFIG_FOLDER
-from mjstack.episodes.stage import Stage
 from mjstack.errors import MjstackError
 from mjstack.jobs import CheckedJob
 
@@ -31,7 +29,7 @@ PROVENANCE |= {"config_sha256", "model_sha256"}
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path: Path, monkeypatch: Patch) -> Path:
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -52,9 +50,7 @@ def in_a_process(folder: Path, *command: str | Path) -> subprocess.CompletedProc
     )
 
 
-def test_torchrun_is_for_one_job(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_torchrun_is_for_one_job(folder: Path, monkeypatch: Patch, capsys: Capture) -> None:
     monkeypatch.setenv("WORLD_SIZE", "2")
     assert run(["-m", "job=train", "seed=1,2", "sim=native"]) == 2
     assert "torchrun: expected" in capsys.readouterr().err
@@ -127,7 +123,7 @@ CASES = [
 
 @pytest.mark.parametrize(("args", "words"), CASES)
 def test_bad_input_exits_2_in_one_line_and_writes_nothing(
-    args: str, words: str, folder: Path, capsys: pytest.CaptureFixture[str]
+    args: str, words: str, folder: Path, capsys: Capture
 ) -> None:
     (folder / "afile").write_text("")
     assert run(shlex.split(args)) == 2
@@ -149,10 +145,7 @@ UNEXPECTED = (
 
 @pytest.mark.parametrize("error", UNEXPECTED, ids=repr)
 def test_any_error_of_the_check_is_a_line(
-    error: BaseException,
-    folder: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    error: BaseException, folder: Path, capsys: Capture, monkeypatch: Patch
 ) -> None:
     def fail(*_: object) -> None:
         raise error
@@ -177,10 +170,10 @@ def test_any_error_of_the_check_is_a_line(
 def test_any_error_of_the_run_is_a_line(
     error: BaseException,
     folder: Path,
-    capsys: pytest.CaptureFixture[str],
+    capsys: Capture,
     caplog: pytest.LogCaptureFixture,
-    monkeypatch: pytest.MonkeyPatch,
-    get_stage: Callable[..., Stage],
+    monkeypatch: Patch,
+    get_stage: GetStage,
 ) -> None:
     def work(*_: object) -> None:
         raise error
@@ -267,7 +260,7 @@ def test_packages_are_there_after_a_plain_import() -> None:
 
 @pytest.mark.full
 def test_help_says_what_there_is_to_choose(
-    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    folder: Path, capsys: Capture, monkeypatch: Patch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "79")
     assert run(["robot=rebot", "--help"]) == 0
@@ -295,7 +288,7 @@ def test_help_may_be_cut_off_by_its_reader() -> None:
     assert done.stdout.startswith("mjstack: ")
 
 
-def test_version(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_version(folder: Path, capsys: Capture) -> None:
     assert run(["--version"]) == 0
     assert capsys.readouterr().out == f"mjstack {mjstack.__version__}\n"
     assert everything(folder) == []
@@ -309,7 +302,7 @@ def test_version(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     ],
 )
 def test_cfg_prints_and_writes_nothing(
-    args: list[str], line: str, folder: Path, capsys: pytest.CaptureFixture[str]
+    args: list[str], line: str, folder: Path, capsys: Capture
 ) -> None:
     assert run(args) == 0
     assert line in capsys.readouterr().out

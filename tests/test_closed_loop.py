@@ -8,7 +8,7 @@ import pytest
 import torch
 from check_cases import limits
 from compositions import load_config, make_env
-from environments import at_double_speed, on_cuda
+from environments import GetStage, at_double_speed, on_cuda
 
 from mjstack.drivers.closed_loop import ClosedLoopDriver, make_expert
 from mjstack.drivers.feedback import FeedbackDriver, measure_planar
@@ -24,7 +24,6 @@ from mjstack.scene.index import gripper_targets
 from mjstack.scene.phases import build_phases
 from mjstack.sim import make_simulation
 
-GetStage = Callable[[str], Stage]
 Drive = Callable[..., tuple[Env, ClosedLoopDriver]]
 
 

@@ -17,7 +17,7 @@ import pytest
 import torch
 from compositions import load_config, put
 from dataset_checker import check_dataset, contents
-from environments import at_double_speed, on_cuda, report_of, two_starts
+from environments import Capture, Patch, Refused, at_double_speed, on_cuda, report_of, two_starts
 from stubs import episodes_of, fake_batches, pairs
 
 from mjstack.cli import run
@@ -259,9 +259,7 @@ def test_what_is_left_beside_the_dataset(demos: SimpleNamespace) -> None:
 
 
 @pytest.mark.full
-def test_the_same_command_again_does_nothing(
-    demos: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_same_command_again_does_nothing(demos: SimpleNamespace, monkeypatch: Patch) -> None:
     monkeypatch.chdir(demos.cwd)
 
     def none(stage: Stage, plans: Iterable[BatchPlan], *_: object, **__: object) -> Iterator[Batch]:
@@ -297,7 +295,7 @@ def test_another_configuration_is_refused(
     demos: SimpleNamespace,
     changes: list[str],
     keys: str,
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: Patch,
     error_line: Callable[[], str],
 ) -> None:
     monkeypatch.chdir(demos.cwd)
@@ -309,7 +307,7 @@ def test_another_configuration_is_refused(
 
 @pytest.mark.full
 def test_a_dataset_that_is_being_written_is_refused(
-    demos: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, error_line: Callable[[], str]
+    demos: SimpleNamespace, monkeypatch: Patch, error_line: Callable[[], str]
 ) -> None:
     monkeypatch.chdir(demos.cwd)
     with native_env(demos.cfg) as env:
@@ -323,7 +321,7 @@ JOINT_POS = "{func: mjstack.mdp.observation.joint_pos}"
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path: Path, monkeypatch: Patch) -> Path:
     monkeypatch.chdir(tmp_path)
     return tmp_path / "outputs" / "demos"
 
@@ -338,9 +336,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (["job.folder=taken"], "taken cannot be written"),
     ],
 )
-def test_bad_input_is_one_line(
-    args: list[str], words: str, folder: Path, refused: Callable[..., str]
-) -> None:
+def test_bad_input_is_one_line(args: list[str], words: str, folder: Path, refused: Refused) -> None:
     Path("taken").write_text("")
     assert words in refused(*COMMAND, *args)
 
@@ -389,7 +385,7 @@ PlayNothing = Callable[..., None]
 
 
 @pytest.fixture
-def play_nothing(monkeypatch: pytest.MonkeyPatch) -> PlayNothing:
+def play_nothing(monkeypatch: Patch) -> PlayNothing:
     """Batches that nobody plays: every world succeeds, unless it *fails*."""
 
     def use(fails: Fails = lambda seed, world: False, *args: Any, **options: bool) -> None:
@@ -449,7 +445,7 @@ FROM_LAYOUT = [
 
 @pytest.mark.full
 def test_a_layout_counts_by_its_content(
-    folder: Path, play_nothing: PlayNothing, capsys: pytest.CaptureFixture[str]
+    folder: Path, play_nothing: PlayNothing, capsys: Capture
 ) -> None:
     play_nothing()
     first = Path("worlds.npz")
@@ -539,8 +535,8 @@ def test_finished_batches_are_kept(
     code: int,
     folder: Path,
     play_nothing: PlayNothing,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    monkeypatch: Patch,
+    capsys: Capture,
 ) -> None:
     """The second batch ends in the middle of its episodes. What goes on is in
     test_collect_resume.py."""
@@ -567,7 +563,7 @@ def test_finished_batches_are_kept(
 
 @pytest.mark.full
 def test_a_full_device_is_one_line(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, error_line: Callable[[], str]
+    folder: Path, monkeypatch: Patch, error_line: Callable[[], str]
 ) -> None:
     def full(*_: object, **__: object) -> None:
         raise RuntimeError("CUDA out of memory. Tried to allocate 9 GiB")
@@ -580,7 +576,7 @@ def test_a_full_device_is_one_line(
 
 @pytest.mark.full
 def test_brackets_in_names_are_printed(
-    folder: Path, play_nothing: PlayNothing, capsys: pytest.CaptureFixture[str]
+    folder: Path, play_nothing: PlayNothing, capsys: Capture
 ) -> None:
     play_nothing()
     names = ("robot.title='Arm [/b]'", "job.folder='outputs/[b]'")
@@ -592,7 +588,7 @@ def test_brackets_in_names_are_printed(
 
 @pytest.mark.full
 def test_damaged_notes_are_one_line(
-    folder: Path, play_nothing: PlayNothing, capsys: pytest.CaptureFixture[str]
+    folder: Path, play_nothing: PlayNothing, capsys: Capture
 ) -> None:
     play_nothing()
     assert collect("nworld=2", "job.episodes=1") == 0
@@ -622,7 +618,7 @@ def test_the_buffer_bounds_the_worlds() -> None:
             CollectPlan.of(stage, Path(), env)
 
 
-def test_steps_come_to_the_host_in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_steps_come_to_the_host_in_chunks(monkeypatch: Patch) -> None:
     stage = Stage(load_config(COMMAND))
     rows = {"observation.state": torch.randn(6, 7, 3), "action": torch.randn(5, 7, 1)}
     spec = SimpleNamespace(config_sha256="", features=rows)

@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from dataset_checker import check_dataset
-from environments import configure, on_cuda, one_second_episode
+from environments import Patch, configure, on_cuda, one_second_episode
 from stubs import episodes_of, fake_batches, pairs
 
 from mjstack.cli import run
@@ -52,7 +52,7 @@ _content = cache(
 )
 
 
-def patch_all(monkeypatch: pytest.MonkeyPatch) -> None:
+def patch_all(monkeypatch: Patch) -> None:
     """No world is played; a data file has room for four episodes, so that a batch has several;
     what is slow is made once."""
     monkeypatch.setattr(lerobot, "DATA_MB", 1)
@@ -70,7 +70,7 @@ def patch_all(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(autouse=True)
-def _patched(monkeypatch: pytest.MonkeyPatch) -> None:
+def _patched(monkeypatch: Patch) -> None:
     patch_all(monkeypatch)
 
 
@@ -149,7 +149,7 @@ CTRL_C = KeyboardInterrupt()
 FULL_DISK = OSError(28, "No space left on device")
 
 
-def break_write(call: int, error: BaseException, monkeypatch: pytest.MonkeyPatch) -> None:
+def break_write(call: int, error: BaseException, monkeypatch: Patch) -> None:
     """Something goes wrong as the n-th episode is written."""
     write = PartWriter.write
     calls = []
@@ -195,7 +195,7 @@ def test_a_batch_is_kept_as_a_whole(
 
 @successes_alone
 def test_a_kill_between_any_two_files(
-    whole: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    whole: dict[str, Any], tmp_path: Path, monkeypatch: Patch
 ) -> None:
     """What a kill would have left is copied before and after each file takes its place, and gone on
     with."""
@@ -233,7 +233,7 @@ def test_a_kill_between_any_two_files(
 @successes_alone
 @pytest.mark.parametrize("call", [1, 2])
 def test_no_room_for_the_record(
-    call: int, whole: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    call: int, whole: dict[str, Any], tmp_path: Path, monkeypatch: Patch
 ) -> None:
     write = job.write_atomic
     calls = []
@@ -254,9 +254,7 @@ def test_no_room_for_the_record(
 
 
 @pytest.mark.parametrize("world", [0, 1])
-def test_what_is_not_finite_is_left_out(
-    world: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_not_finite_is_left_out(world: int, tmp_path: Path, monkeypatch: Patch) -> None:
     """In a world that succeeded, where a term's number is not finite, and in one that failed."""
     assert some_fail(0, world) is bool(world)
 
@@ -302,7 +300,7 @@ def test_a_dataset_that_was_removed(tmp_path: Path) -> None:
     assert (result.metrics["worlds_played"], result.metrics["succeeded"]) == (3, 2)
 
 
-def test_real_worlds_are_the_same_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_real_worlds_are_the_same_again(tmp_path: Path, monkeypatch: Patch) -> None:
     """No pretence: both worlds are played again after Ctrl-C in the second one's episode."""
     monkeypatch.setattr(job, "play_batches", play_batches)
     quick = one_second_episode()
@@ -315,7 +313,7 @@ def test_real_worlds_are_the_same_again(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 @on_cuda
-def test_ctrl_c_on_cuda(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_on_cuda(tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(job, "play_batches", play_batches)
     monkeypatch.setattr(collect_plan, "config_content", config_content)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from compositions import load_config, refusal
+from environments import Patch
 from policies import report
 
 import mjstack.jobs.compare as compare
@@ -63,9 +64,7 @@ class Faulty(Driver):
         return torch.where(self._still, self._start, self._driver.command().float())
 
 
-def test_two_drivers_that_differ_in_known_worlds(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_drivers_that_differ_in_known_worlds(tmp_path: Path, monkeypatch: Patch) -> None:
     made = Stage.driver
 
     def driver(stage: Stage, env: Env) -> Driver:
@@ -145,7 +144,7 @@ def test_other_sides_are_refused_in_one_line(overrides: list[str], problem: str)
     refusal(lambda: check_job(load_config(args), args), problem)
 
 
-def test_starts_that_turn_out_unequal_fail(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_starts_that_turn_out_unequal_fail(tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.setattr(compare, "_start_of_first_world", lambda stage: {"start": np.zeros(1)})
     region = ['job.against=["gate.success.region=[0.01,0.01]"]']
     few = ["nworld=2", "gate.success.seeds=1", "web.episode=false"]
@@ -155,7 +154,7 @@ def test_starts_that_turn_out_unequal_fail(tmp_path: Path, monkeypatch: pytest.M
 
 @pytest.mark.parametrize(("device", "code"), [("cpu", 1), ("cuda:0", 0)])
 def test_starts_may_differ_by_rounding_on_another_device(
-    device: str, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    device: str, code: int, tmp_path: Path, monkeypatch: Patch
 ) -> None:
     def backend(stage: Stage) -> tuple[Backend, str]:
         return Backend.native, device if stage.cfg.graph == "off" else "cpu"

@@ -10,6 +10,7 @@ import pytest
 from check_cases import limits
 from compositions import checked, refusal
 from doc_blocks import ROOT
+from environments import Patch
 
 import mjstack
 from mjstack.config import load_config
@@ -345,7 +346,7 @@ REFUSED_BY_THE_CHECK = [
     ("overrides", "words"), REFUSED_BY_THE_CHECK, ids=[" ".join(o) for o, _ in REFUSED_BY_THE_CHECK]
 )
 def test_the_whole_job_is_checked_before_its_folder_exists(
-    overrides: list[str], words: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    overrides: list[str], words: str, monkeypatch: Patch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("MENAGERIE_ROOT", str(tmp_path))
     refusal(lambda: check_machine(load_config(["gates=[baseline]", *overrides])), words)

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 from check_cases import rules_of
-from environments import at_double_speed
+from environments import GetStage, MakeSim, NewRun, Patch, at_double_speed
 
 from mjstack import interrupt
 from mjstack.config import Config
@@ -46,7 +46,7 @@ def rules(bits: torch.Tensor) -> list[set[str]]:
 
 
 @pytest.mark.full
-def test_native(get_stage: Callable[[str], Stage], make_sim: Callable[..., Simulation]) -> None:
+def test_native(get_stage: GetStage, make_sim: MakeSim) -> None:
     stage = get_stage("so101")
     sim = make_sim("native", 6)
     push = teleport(stage, 1)
@@ -84,9 +84,7 @@ def crowd(stage: Stage, sim: Simulation, world: int) -> None:
 
 
 @pytest.mark.full
-def test_overflow_in_exactly_the_crowded_world(
-    get_stage: Callable[[str], Stage], make_sim: Callable[..., Simulation]
-) -> None:
+def test_overflow_in_exactly_the_crowded_world(get_stage: GetStage, make_sim: MakeSim) -> None:
     stage = get_stage("so101")
     # Any world needs up to 144 rows in the first steps, the crowded one 192.
     sim = make_sim("mjwarp", 3, "batch.njmax=160")
@@ -111,7 +109,7 @@ def test_overflow_in_exactly_the_crowded_world(
 
 @pytest.mark.full
 def test_batch_gate_names_world_and_rule_and_voids_throughput(
-    new_run: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
+    new_run: NewRun, monkeypatch: Patch
 ) -> None:
     short = ("nworld=4", "gate.throughput.steps=2", "gate.throughput.repetitions=1")
     run = new_run("sim=native", "gates=[batch,throughput]", *short, *at_double_speed())
@@ -148,7 +146,7 @@ def test_batch_gate_names_world_and_rule_and_voids_throughput(
     assert cuda.name == "throughput_cuda"
 
 
-def test_batch_gate_refuses_identical_worlds(new_run: Callable[..., Run]) -> None:
+def test_batch_gate_refuses_identical_worlds(new_run: NewRun) -> None:
     (batch,) = run_batch(new_run("sim=native", "nworld=2", "reset=nominal", *at_double_speed()))
     assert batch.status is Status.failed
     assert batch.metrics["distinct_final_states"] == 1
@@ -156,7 +154,7 @@ def test_batch_gate_refuses_identical_worlds(new_run: Callable[..., Run]) -> Non
 
 
 def test_batch_gate_takes_worlds_that_start_apart_and_end_alike(
-    new_run: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
+    new_run: NewRun, monkeypatch: Patch
 ) -> None:
     array = EpisodeTally.array
     monkeypatch.setattr(
@@ -187,9 +185,7 @@ def test_memory_that_runs_out_is_said(error: Exception, so101_cfg: Config) -> No
     assert result.reason.startswith(f"out of memory ({error}). Run fewer worlds")
 
 
-def test_worlds_that_do_not_fit_are_refused(
-    new_run: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_worlds_that_do_not_fit_are_refused(new_run: NewRun, monkeypatch: Patch) -> None:
     assert 0 < gates.available_memory() < 2**44
     monkeypatch.setattr(gates, "available_memory", lambda: 10**9)
     with pytest.raises(ConfigError, match=r"not enough memory .* GiB needed") as caught:
@@ -200,7 +196,7 @@ def test_worlds_that_do_not_fit_are_refused(
         gates._check_memory(new_run("sim=native", f"nworld={int(most) + 1}").stage)
 
 
-def test_an_interrupt_fails_no_gate(so101_cfg: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupt_fails_no_gate(so101_cfg: Config, monkeypatch: Patch) -> None:
     """Also where it breaks something that would have gone on otherwise."""
 
     def gate(run: Run) -> list[GateResult]:

@@ -20,6 +20,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from dataset_checker import check_dataset, contents, with_column
+from environments import Patch
 
 from mjstack.datasets import (
     DatasetSpec,
@@ -267,9 +268,7 @@ def test_tasks_keep_their_indices(tmp_path: Path) -> None:
     assert rows == {0: 0, 1: 1, 2: 2, 3: 1}
 
 
-def test_a_full_file_is_committed_and_chunks_follow(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_file_is_committed_and_chunks_follow(tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.setattr(lerobot, "CHUNK", 2)
     monkeypatch.setattr(lerobot, "DATA_MB", 1)
     with DatasetWriter(tmp_path, SPEC) as writer:
@@ -307,9 +306,7 @@ def test_frames_are_not_held(tmp_path: Path) -> None:
 
 
 @pytest.mark.full
-def test_a_kill_at_any_moment_keeps_what_was_committed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_kill_at_any_moment_keeps_what_was_committed(tmp_path: Path, monkeypatch: Patch) -> None:
     """What one would have left is copied before each file of the second commit takes its place:
     data, tasks, episodes, statistics, info; and after."""
     whole = tmp_path / "whole"
@@ -344,7 +341,7 @@ def test_a_kill_at_any_moment_keeps_what_was_committed(
 class FullDisk:
     """Files that take so many bytes in all, and then say that there is no room."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, room: int) -> None:
+    def __init__(self, monkeypatch: Patch, room: int) -> None:
         self.room = room
         fdopen = os.fdopen
         monkeypatch.setattr(os, "fdopen", lambda *args: self.wrap(fdopen(*args)))
@@ -419,9 +416,7 @@ def test_a_full_disk_keeps_what_was_committed(tmp_path: Path) -> None:
     assert failed == 13
 
 
-def test_ctrl_c_in_a_script_keeps_what_is_committed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ctrl_c_in_a_script_keeps_what_is_committed(tmp_path: Path, monkeypatch: Patch) -> None:
     """It comes in the middle of the second of three, of which the first was committed."""
     add = PartWriter.write
     calls = []
@@ -575,9 +570,7 @@ def test_a_spec_that_cannot_be_is_refused(change: dict[str, Any], message: str) 
         replace(SPEC, **change)
 
 
-def test_without_pyarrow_one_line_says_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_pyarrow_one_line_says_what_to_install(tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     for use in (lambda: DatasetWriter(tmp_path / "new", SPEC), lambda: read_dataset(tmp_path)):
         with pytest.raises(MissingExtra, match=re.escape("pip install 'mjstack[datasets]'")):

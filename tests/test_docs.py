@@ -12,6 +12,7 @@ import pytest
 import torch
 import warp as wp
 from doc_blocks import PAGES, ROOT, TRAINS, python_blocks, python_lines, write_files
+from environments import Capture, Patch
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
@@ -34,7 +35,7 @@ def test_lines_keep_their_numbers() -> None:
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def folder(tmp_path: Path, monkeypatch: Patch) -> Iterator[Path]:
     """An empty working folder; modules that a page imports from it are forgotten afterwards."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
@@ -116,9 +117,7 @@ def compose_together(commands: list[dict[str, str]]) -> None:
 
 
 @pytest.mark.full
-def test_the_task_of_the_guide_passes_its_gates(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_task_of_the_guide_passes_its_gates(folder: Path, capsys: Capture) -> None:
     text = (DOCS / "own_tasks.md").read_text(encoding="utf-8")
     write_files(text, folder)
     commands = re.findall(r"(?m)^\$ mjstack (--config-dir lift/conf .* sim=native)$", text)
@@ -138,7 +137,7 @@ def test_the_slot_of_the_guide_is_the_example(folder: Path) -> None:
     assert max(map(len, lines)) <= 100
 
 
-def train(block: str, capsys: pytest.CaptureFixture[str]) -> list[float]:
+def train(block: str, capsys: Capture) -> list[float]:
     """Runs the training block and returns the mean return of every iteration."""
     # One thread is enough for these small networks, and several wait for each other where cores are
     # busy.
@@ -155,7 +154,7 @@ def train(block: str, capsys: pytest.CaptureFixture[str]) -> list[float]:
 
 
 @pytest.mark.full
-def test_training_block_learns(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_training_block_learns(folder: Path, capsys: Capture) -> None:
     """Without learning (a learning rate of 0) the return stays at 0.4 and varies by 0.1; with it,
     it passes 1.5.
 

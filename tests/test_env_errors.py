@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from compositions import load_config, put
-from environments import assert_rows, configure, mask_of, on_shared_sim, returned, zeros
+from environments import Patch, assert_rows, configure, mask_of, on_shared_sim, returned, zeros
 
 from mjstack import make_env
 from mjstack.config.schema import (
@@ -277,7 +277,7 @@ def test_module_of_a_user(
     text: str,
     words: list[str],
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: Patch,
     request: pytest.FixtureRequest,
 ) -> None:
     """By name: what is wrong in it is said, in a line."""

@@ -3,18 +3,16 @@
 import signal
 import threading
 import time
-from collections.abc import Callable
 
 import mujoco
 import pytest
 import torch
 from compositions import make_env
-from environments import zeros
+from environments import GetStage, Patch, zeros
 
 import mjstack
 from mjstack.config.schema import ObservationTermCfg, TermCfg
 from mjstack.envs import Env, build_env
-from mjstack.episodes.stage import Stage
 from mjstack.errors import ArgumentError, FaultError, MjstackError, TermError
 
 pytestmark = pytest.mark.full
@@ -68,9 +66,7 @@ def test_an_overflow_names_the_size_that_is_in_force() -> None:
         env.faults.raise_first()
 
 
-def test_ctrl_c_leaves_no_thread_at_work(
-    get_stage: Callable[[str], Stage], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ctrl_c_leaves_no_thread_at_work(get_stage: GetStage, monkeypatch: Patch) -> None:
     from mjstack.sim import native
 
     monkeypatch.setattr(native, "available_cores", lambda: 2)
@@ -90,7 +86,7 @@ def test_ctrl_c_leaves_no_thread_at_work(
     sim.close()
 
 
-def test_torch_has_its_threads_back_after_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_torch_has_its_threads_back_after_a_step(monkeypatch: Patch) -> None:
     env = native()
     env.reset(seed=0)
     inside = []

@@ -4,7 +4,7 @@ import io
 import json
 import re
 import urllib.parse
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,17 +13,15 @@ import mujoco
 import numpy as np
 import pytest
 from browser import EXECUTABLE, Tab, browse, messages
-from environments import one_second_episode
+from environments import Capture, GetStage, MakeSim, Patch, one_second_episode
 
 import mjstack.report.web as web
 from mjstack.cli import run
 from mjstack.episodes.motion import motion_recorder
 from mjstack.episodes.rollout import Hook
-from mjstack.episodes.stage import Stage
 from mjstack.report.geometry import Shapes
 from mjstack.report.page import World, frame_stride
 from mjstack.report.web import choose_worlds, save_episode
-from mjstack.sim import Simulation
 
 PRIMITIVES = """
 <mujoco>
@@ -86,7 +84,7 @@ def test_shapes_are_mujocos() -> None:
     assert np.allclose(turns[0, 1], model.qpos0[3:])
 
 
-def motion(get_stage: Callable[..., Stage], worlds: int, frames: int) -> list[World]:
+def motion(get_stage: GetStage, worlds: int, frames: int) -> list[World]:
     """Worlds whose first cube rises and whose arm turns."""
     model = get_stage("so101").assets.visual_model
     qpos = np.repeat(model.qpos0[None], frames, 0)
@@ -96,7 +94,7 @@ def motion(get_stage: Callable[..., Stage], worlds: int, frames: int) -> list[Wo
     return [World(label=str(w), qpos=qpos.copy(), failed=w == 0) for w in range(worlds)]
 
 
-def test_a_page_holds_every_frame(get_stage: Callable[..., Stage], tmp_path: Path) -> None:
+def test_a_page_holds_every_frame(get_stage: GetStage, tmp_path: Path) -> None:
     path = tmp_path / "episode.html"
     worlds = motion(get_stage, 3, 5)
     worlds[2].qpos[3:] = np.nan  # it diverged
@@ -161,7 +159,7 @@ def test_sixty_four_worlds_are_shared_by_the_gates() -> None:
 
 
 def test_the_recorder_takes_frames_from_the_start_on(
-    get_stage: Callable[..., Stage], make_sim: Callable[..., Simulation]
+    get_stage: GetStage, make_sim: MakeSim
 ) -> None:
     stage = get_stage("so101")
     sim = make_sim("native", 3)
@@ -178,7 +176,7 @@ def test_the_recorder_takes_frames_from_the_start_on(
 
 @pytest.mark.full
 def test_without_viser_a_run_says_how_to_have_the_page(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: Patch, capsys: Capture
 ) -> None:
     monkeypatch.setattr(web, "find_spec", lambda name: None)
     out = tmp_path / "out"
@@ -268,9 +266,7 @@ def colored(tab: Tab) -> dict[str, int]:
 
 
 @pytest.mark.full
-def test_a_browser_plays_the_episode(
-    get_stage: Callable[..., Stage], tmp_path: Path, tab: Tab
-) -> None:
+def test_a_browser_plays_the_episode(get_stage: GetStage, tmp_path: Path, tab: Tab) -> None:
     """It loads without an error, asks for nothing else, and shows the arm and the cubes."""
     path = tmp_path / "episode.html"
     save_episode(path, get_stage("so101").assets.visual_model, motion(get_stage, 2, 250), 0.04)

@@ -14,7 +14,7 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
-from environments import configure, has_gl
+from environments import Patch, configure, has_gl
 from policies import make_policy, write_policy
 
 import mjstack
@@ -203,7 +203,7 @@ def test_actions_of_a_policys_own_are_described(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("job", ["export", "play"])
 def test_a_task_that_brings_a_controller_takes_a_policy(
-    job: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    job: str, tmp_path: Path, monkeypatch: Patch
 ) -> None:
     conf = EXAMPLE.parent / "push" / "conf"
     write_policy(tmp_path / "policy", load_config(["task=push"], config_dir=conf))
@@ -217,7 +217,7 @@ def test_a_task_that_brings_a_controller_takes_a_policy(
 
 
 def test_bad_input_is_one_line(
-    exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error_line: Callable[[], str]
+    exported: Path, tmp_path: Path, monkeypatch: Patch, error_line: Callable[[], str]
 ) -> None:
     policy = exported / "policy"
     assert export(policy, tmp_path / "out", "task=stack") == 2
@@ -233,7 +233,7 @@ def test_bad_input_is_one_line(
 
 
 def test_a_full_disk_leaves_neither_file(
-    exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    exported: Path, tmp_path: Path, monkeypatch: Patch
 ) -> None:
     import mjstack.jobs.export as module
 
@@ -280,9 +280,7 @@ def test_lerobots_robots_take_joint_targets_alone(tmp_path: Path) -> None:
         lerobot_files(load_policy(tmp_path / "policy"), limits)
 
 
-def test_a_missing_lerobot_and_another_version_are_one_line(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_missing_lerobot_and_another_version_are_one_line(monkeypatch: Patch) -> None:
     monkeypatch.setattr(lerobot, "version", lambda name: "0.5.0")
     with pytest.raises(MjstackError, match=r"LeRobot 0.5.0 is installed, expected 0\.6\.x"):
         lerobot.require_lerobot("policy")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from environments import configure, fused_sim
+from environments import Patch, configure, fused_sim
 
 from mjstack.sim.fused import smooth
 from mjstack.sim.mujoco_warp import mjw
@@ -283,7 +283,7 @@ def test_callbacks_and_many_bodies_are_left_to_mjwarp() -> None:
         assert "bytes of shared memory" in smooth.why_not(mjw.put_model(crowded))
 
 
-def test_a_later_step_reads_nothing_back(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_later_step_reads_nothing_back(monkeypatch: Patch) -> None:
     """And it makes no kernel. A graph could not be captured."""
     sim = fused_sim(configure("graph=off"), 2)
     sim.step(1)

@@ -1,16 +1,15 @@
 """``mjstack list``: what there is to choose from."""
 
 import re
-from collections.abc import Callable
 
-import pytest
 from doc_blocks import ROOT
+from environments import Capture, Refused
 
 from mjstack.cli import run
 from mjstack.config.session import list_choices
 
 
-def test_everything_has_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_everything_has_a_line(capsys: Capture) -> None:
     """Of a folder of one's own too: its task, and the terms that it names."""
     assert run(["--config-dir", str(ROOT / "examples/push/conf"), "list"]) == 0
     text = capsys.readouterr().out
@@ -27,9 +26,7 @@ def test_everything_has_a_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert max(map(len, text.splitlines())) < 250
 
 
-def test_terms_have_parameters(
-    capsys: pytest.CaptureFixture[str], refused: Callable[..., str]
-) -> None:
+def test_terms_have_parameters(capsys: Capture, refused: Refused) -> None:
     assert run(["list", "terms"]) == 0
     lines = [line.strip() for line in capsys.readouterr().out.splitlines()]
     term = next(n for n, line in enumerate(lines) if line.startswith("mjstack.mdp.reward.reach "))

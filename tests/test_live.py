@@ -25,7 +25,7 @@ import viser
 import viser.infra._infra
 from browser import EXECUTABLE, browse
 from compositions import load_config, refusal
-from environments import configure, has_gl
+from environments import GetStage, Patch, configure, has_gl
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
@@ -86,7 +86,7 @@ def wait_until(condition: Callable[[], bool]) -> None:
 
 
 @pytest.fixture
-def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+def server(monkeypatch: Patch) -> Iterator[Any]:
     """A server at which somebody looks."""
     opened = start_server("127.0.0.1", 0)
     monkeypatch.setattr(opened, "get_clients", lambda: {0: None})
@@ -95,7 +95,7 @@ def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 
 
 def test_worlds_pause_step_and_are_chosen(
-    server: Any, get_stage: Callable[..., Stage], monkeypatch: pytest.MonkeyPatch
+    server: Any, get_stage: GetStage, monkeypatch: Patch
 ) -> None:
     stage = get_stage("so101")
     env = build_env(configure("task=reach", "reset=randomized"), nworld=5)
@@ -199,7 +199,7 @@ def test_a_driven_episode_shows_cameras_and_rewards(server: Any, backend: str) -
 
 
 def test_without_a_browser_nothing_is_drawn(
-    server: Any, get_stage: Callable[..., Stage], monkeypatch: pytest.MonkeyPatch
+    server: Any, get_stage: GetStage, monkeypatch: Patch
 ) -> None:
     env = build_env(configure("task=reach"), nworld=2)
     env.reset()
@@ -227,7 +227,7 @@ def test_without_a_browser_nothing_is_drawn(
 
 @pytest.mark.full
 def test_a_paused_run_goes_on_when_the_last_browser_leaves(
-    server: Any, get_stage: Callable[..., Stage], monkeypatch: pytest.MonkeyPatch
+    server: Any, get_stage: GetStage, monkeypatch: Patch
 ) -> None:
     """Not at once: a page that is loaded anew leaves and comes back."""
     env = build_env(configure("task=reach"), nworld=2)
@@ -384,7 +384,7 @@ def test_viser_has_what_the_guard_uses() -> None:
         assert source.count(text) == 1
 
 
-def test_a_viser_that_cannot_be_guarded_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_viser_that_cannot_be_guarded_is_refused(monkeypatch: Patch) -> None:
     class Server:
         def __init__(self, **_: object) -> None: ...
         def stop(self) -> None: ...
@@ -394,9 +394,7 @@ def test_a_viser_that_cannot_be_guarded_is_refused(monkeypatch: pytest.MonkeyPat
         start_server("127.0.0.1", 0)
 
 
-def test_texts_are_plain_and_short(
-    server: Any, get_stage: Callable[..., Stage], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_texts_are_plain_and_short(server: Any, get_stage: GetStage, monkeypatch: Patch) -> None:
     """No markdown or HTML shows what a browser has sent or a configuration names."""
     env = build_env(configure("task=reach"), nworld=2)
     env.reset()
@@ -429,7 +427,7 @@ def test_bad_input_is_one_line(args: list[str], says: str) -> None:
     assert says in refusal_of(*args)
 
 
-def test_without_viser_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_viser_it_says_what_to_install(monkeypatch: Patch) -> None:
     monkeypatch.setattr(web, "find_spec", lambda name: None)
     line = refusal_of("view=web")
     assert "view=web needs viser, which is not installed: run pip install 'mjstack[web]'" in line
@@ -456,9 +454,7 @@ JOBS: dict[str, tuple[tuple[str, ...], set[str]]] = {
 
 @pytest.mark.full
 @pytest.mark.parametrize("job", JOBS)
-def test_jobs_serve_the_live_view(
-    job: str, tmp_path: Path, port: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_jobs_serve_the_live_view(job: str, tmp_path: Path, port: int, monkeypatch: Patch) -> None:
     """A page on this machine shows the worlds of each part; after the end there is none."""
     command, parts = JOBS[job]
     looked: dict[str, str] = {}

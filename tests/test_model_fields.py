@@ -1,7 +1,6 @@
 """Model fields that differ from world to world."""
 
 import copy
-from collections.abc import Callable
 from functools import partial
 
 import mujoco
@@ -9,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from compositions import load_config
-from environments import CUDA, on_backend, start_moving
+from environments import CUDA, GetStage, MakeSim, on_backend, start_moving
 
 from mjstack.episodes.stage import Stage
 from mjstack.errors import MjstackError, UnknownName
@@ -21,8 +20,6 @@ FIELDS = (
     *("body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0"),
     *("dof_damping", "geom_friction", "actuator_gainprm", "actuator_biasprm"),
 )
-Make = Callable[..., Simulation]
-GetStage = Callable[[str], Stage]
 
 
 def simulate(
@@ -32,7 +29,7 @@ def simulate(
 
 
 @pytest.fixture(scope="module")
-def make_fields(get_stage: GetStage) -> Make:
+def make_fields(get_stage: GetStage) -> MakeSim:
     """Simulations of the SO-101 scene with fields, reset and with the model's values, shared by the
     tests of this file."""
     made: dict[tuple, Simulation] = {}
@@ -79,7 +76,7 @@ def randomise(sim: Simulation, stage: Stage) -> None:
 
 @pytest.mark.full
 def test_every_field_has_mujocos_shape_and_values(
-    backend: str, make_fields: Make, get_stage: GetStage
+    backend: str, make_fields: MakeSim, get_stage: GetStage
 ) -> None:
     sim = make_fields(backend, N, FIELD_NAMES)
     m = get_stage("so101").model
@@ -95,7 +92,7 @@ def test_every_field_has_mujocos_shape_and_values(
 
 @pytest.mark.full
 def test_the_models_values_change_nothing(
-    backend: str, make_fields: Make, make_sim: Make, get_stage: GetStage
+    backend: str, make_fields: MakeSim, make_sim: MakeSim, get_stage: GetStage
 ) -> None:
     # On CUDA sums have no fixed order: in a few steps their rounding has no time to grow.
     steps = 5 if backend == "mjwarp-cuda" else 20
@@ -109,7 +106,7 @@ def test_the_models_values_change_nothing(
 
 
 @pytest.mark.full
-def test_the_names_are_those_that_mjwarp_batches(make_fields: Make) -> None:
+def test_the_names_are_those_that_mjwarp_batches(make_fields: MakeSim) -> None:
     make_fields("mjwarp")  # sets Warp up
     from dataclasses import fields as dataclass_fields
 
@@ -127,7 +124,7 @@ def test_the_names_are_those_that_mjwarp_batches(make_fields: Make) -> None:
 
 
 @pytest.mark.full
-def test_fields_keep_their_address(backend: str, make_fields: Make) -> None:
+def test_fields_keep_their_address(backend: str, make_fields: MakeSim) -> None:
     sim = make_fields(backend)
     before = {name: field.data_ptr() for name, field in sim.fields.items()}
     sim.step(5)
@@ -158,7 +155,9 @@ def test_a_field_that_is_unknown_or_cannot_differ_is_refused(
     assert caught.value.exit_code == 2
 
 
-def test_a_heavy_cube_is_slowed_less(backend: str, make_fields: Make, get_stage: GetStage) -> None:
+def test_a_heavy_cube_is_slowed_less(
+    backend: str, make_fields: MakeSim, get_stage: GetStage
+) -> None:
     """Damping c stops mass m as exp(-c t / m): the implicit integrator divides the speed by 1 + c
     dt / m in every step."""
     stage = get_stage("so101")
@@ -188,7 +187,7 @@ def test_a_heavy_cube_is_slowed_less(backend: str, make_fields: Make, get_stage:
 
 @pytest.mark.full
 def test_friction_stops_a_cube_in_one_world_only(
-    backend: str, make_fields: Make, get_stage: GetStage
+    backend: str, make_fields: MakeSim, get_stage: GetStage
 ) -> None:
     stage = get_stage("so101")
     _, q, v = cube(stage)
@@ -252,7 +251,7 @@ def test_static_geoms_follow_their_fields(backend: str) -> None:
 
 
 @pytest.mark.full
-def test_reset_leaves_fields(backend: str, make_fields: Make, get_stage: GetStage) -> None:
+def test_reset_leaves_fields(backend: str, make_fields: MakeSim, get_stage: GetStage) -> None:
     sim = make_fields(backend)
     randomise(sim, get_stage("so101"))
     before = {name: field.clone() for name, field in sim.fields.items()}
@@ -264,7 +263,7 @@ def test_reset_leaves_fields(backend: str, make_fields: Make, get_stage: GetStag
 
 
 @pytest.mark.full
-def test_reset_starts_from_the_worlds_own_qpos0(backend: str, make_fields: Make) -> None:
+def test_reset_starts_from_the_worlds_own_qpos0(backend: str, make_fields: MakeSim) -> None:
     sim = make_fields(backend, N, ("qpos0",))
     expected = sim.qpos.clone()
     sim.fields["qpos0"][1, 0] += 0.25
@@ -274,7 +273,7 @@ def test_reset_starts_from_the_worlds_own_qpos0(backend: str, make_fields: Make)
 
 
 @pytest.mark.parametrize("mjwarp", ["mjwarp", pytest.param("mjwarp-cuda", marks=CUDA)])
-def test_backends_agree(make_fields: Make, get_stage: GetStage, mjwarp: str) -> None:
+def test_backends_agree(make_fields: MakeSim, get_stage: GetStage, mjwarp: str) -> None:
     finals = []
     for backend in ("native", mjwarp):
         sim = make_fields(backend)

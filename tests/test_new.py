@@ -1,11 +1,11 @@
 """``mjstack new``: a task and a robot of one's own, from templates."""
 
 import runpy
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from doc_blocks import ROOT
+from environments import Capture, Patch, Refused
 
 import mjstack
 from mjstack.cli import run
@@ -14,12 +14,12 @@ GATES = "gates=[baseline,parity,capacity,batch]"
 
 
 @pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def here(tmp_path: Path, monkeypatch: Patch) -> Path:
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
-def test_a_task_passes_as_it_is_written(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_task_passes_as_it_is_written(here: Path, capsys: Capture) -> None:
     assert run(["new", "task", "fresh_task"]) == 0
     files = ["conf/task/fresh_task.yaml", "fresh_task.py", "test_fresh_task.py"]
     assert capsys.readouterr().out.split() == [f"fresh_task/{file}" for file in files]
@@ -70,6 +70,6 @@ def test_a_robot_is_read_from_its_file(here: Path) -> None:
     ],
 )
 def test_a_name_that_is_taken_is_refused(
-    words: str, message: str, here: Path, refused: Callable[..., str]
+    words: str, message: str, here: Path, refused: Refused
 ) -> None:
     assert message in refused(*words.split())

@@ -6,14 +6,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from environments import GetStage
 from ik_arm import Arm
 
 from mjstack.drivers.open_loop import JointTrajectory
 from mjstack.episodes.stage import Stage
 from mjstack.errors import Unreachable
 from mjstack.scene.phases import nominal_xy
-
-GetStage = Callable[[str], Stage]
 
 # Anchor, approach heights, offset [m] and gripper of each phase, from the task's definition.
 PHASES = {

@@ -12,7 +12,7 @@ import pytest
 import torch
 from browser import messages
 from compositions import load_config, make_env
-from environments import has_gl, on_cuda
+from environments import Capture, has_gl, on_cuda
 from PIL import Image
 from policies import interrupted, report, same
 
@@ -133,7 +133,7 @@ def test_a_video_has_what_the_policy_saw_in_a_corner(trained: Path, tmp_path: Pa
         assert abs(corner[:, left : left + width] - first).mean() < 12
 
 
-def test_other_cameras_are_refused(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_other_cameras_are_refused(trained: Path, capsys: Capture) -> None:
     base = [*SMALL[:4], *SHORT, "controller=policy", f"policy={trained}/last", "gates=[batch]"]
     for cameras, says in (
         (["cameras=[]"], "with scene.cameras.front.size=[16, 24], and here it is missing"),

@@ -1,14 +1,14 @@
 """job=play: worlds with a policy or the expert, in MuJoCo's viewer or as a video."""
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 from compositions import load_config, refusal
-from environments import configure, gate_of, has_gl
+from environments import Patch, Refused, configure, gate_of, has_gl
 from PIL import Image, ImageSequence
 from policies import write_policy
 
@@ -28,7 +28,7 @@ REACH = ("job=play", "task=reach", "task.episode_steps=60", "sim=native")
 
 
 @pytest.fixture
-def saved(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
+def saved(monkeypatch: Patch) -> list[np.ndarray]:
     """States of videos, none of which is drawn."""
     videos: list[np.ndarray] = []
 
@@ -65,7 +65,7 @@ def test_a_policy_plays_worlds_as_a_batch_starts_them(
 
 
 def test_the_expert_plays_without_a_policy_in_the_viewer(
-    saved: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    saved: list[np.ndarray], tmp_path: Path, monkeypatch: Patch
 ) -> None:
     """Every step of every world is shown; a video is written on request alone."""
     shown: list[int] = []
@@ -169,9 +169,7 @@ def test_a_loop_lasts_as_long_as_the_episode(ending: str, tmp_path: Path) -> Non
             assert shown.mean((0, 1)) == pytest.approx((50, 10, 0), abs=5)
 
 
-def test_without_a_writer_nothing_is_written(
-    refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_a_writer_nothing_is_written(refused: Refused, monkeypatch: Patch) -> None:
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     says = "needs imageio-ffmpeg, which is not installed: run pip install 'mjstack[video]'"
     assert says in refused("job=play", "task=reach", "job.format=mp4")
@@ -202,9 +200,7 @@ def test_a_task_without_phases_needs_a_policy() -> None:
         play.check_play(cfg)
 
 
-def test_without_gl_nothing_is_written(
-    refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_gl_nothing_is_written(refused: Refused, monkeypatch: Patch) -> None:
     def fail(*args: object) -> None:
         raise AttributeError("no GL")
 
@@ -214,9 +210,7 @@ def test_without_gl_nothing_is_written(
     assert line.endswith("Set MUJOCO_GL=egl or osmesa.")
 
 
-def test_without_a_display_nothing_is_written(
-    refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_a_display_nothing_is_written(refused: Refused, monkeypatch: Patch) -> None:
     """MuJoCo's viewer would end the process."""
     monkeypatch.setenv("DISPLAY", ":98765")
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
@@ -225,7 +219,7 @@ def test_without_a_display_nothing_is_written(
 
 
 def test_a_video_that_cannot_be_written_fails_the_job(
-    saved: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    saved: list[np.ndarray], tmp_path: Path, monkeypatch: Patch
 ) -> None:
     def full(*args: object, **named: object) -> None:
         raise OSError(28, "No space left on device")

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 from compositions import load_config, refusal
-from environments import configure, on_new_sim, one_second_episode
+from environments import Patch, Refused, configure, on_new_sim, one_second_episode
 from policies import hold_above_red, make_policy, report, write_policy
 from safetensors.torch import load, save
 
@@ -69,9 +69,7 @@ def test_a_saved_policy_gives_the_same_bits(tmp_path: Path) -> None:
     assert {"mjstack", "mujoco", "torch"} == set(loaded.versions)
 
 
-def test_a_checkout_that_is_not_installed_saves(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_checkout_that_is_not_installed_saves(tmp_path: Path, monkeypatch: Patch) -> None:
     def nothing(name: str) -> str:
         raise importlib.metadata.PackageNotFoundError(name)
 
@@ -81,9 +79,7 @@ def test_a_checkout_that_is_not_installed_saves(
     assert load_policy(tmp_path).versions["mjstack"] == mjstack.__version__
 
 
-def test_a_second_policy_replaces_the_first_at_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_second_policy_replaces_the_first_at_once(tmp_path: Path, monkeypatch: Patch) -> None:
     """Whatever write fails, the folder still has the first policy."""
     import mjstack.policy.checkpoint as module
 
@@ -416,9 +412,7 @@ def test_a_policy_needs_its_controller(folder: Path) -> None:
         check_machine(load_config(["controller=policy", "gates=[baseline]"]))
 
 
-def test_nothing_is_written_where_a_policy_is_refused(
-    folder: Path, refused: Callable[..., str]
-) -> None:
+def test_nothing_is_written_where_a_policy_is_refused(folder: Path, refused: Refused) -> None:
     line = refused(*SHORT, "robot=rebot", "controller=policy", f"policy={folder}")
     assert line.startswith("mjstack: policy=")
 
@@ -454,9 +448,7 @@ def test_every_gate_takes_a_policy(played: tuple[Path, Path], tmp_path: Path) ->
     assert "bit for bit where it did" in report(again)["replay_native"]["reason"]
 
 
-def test_a_policy_that_succeeds_is_timed_and_shown(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_policy_that_succeeds_is_timed_and_shown(tmp_path: Path, monkeypatch: Patch) -> None:
     """The episode has a figure, and the video shows the policy's world of *baseline*."""
     shown: list[np.ndarray] = []
 

@@ -3,7 +3,7 @@ worlds it repeats them. Both do the same."""
 
 import pytest
 import torch
-from environments import actions, configure, on_new_sim, on_shared_sim, state_of
+from environments import Patch, actions, configure, on_new_sim, on_shared_sim, state_of
 from policies import make_policy
 
 from mjstack.adapters.rsl_rl import RslRlVecEnv
@@ -44,7 +44,7 @@ def test_a_held_action_is_that_action_again_and_again() -> None:
 
 @pytest.mark.parametrize(("history", "calls"), [(1, 1), (2, HELD)])
 def test_held_steps_are_observed_for_a_history_alone(
-    history: int, calls: int, monkeypatch: pytest.MonkeyPatch
+    history: int, calls: int, monkeypatch: Patch
 ) -> None:
     term = "observation.policy.terms.grasp_point_to_goal"
     env = on_new_sim("native", 2, held(f"{term}.history={history}"))

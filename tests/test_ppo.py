@@ -3,13 +3,12 @@ expert's states."""
 
 import shutil
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from environments import at_double_speed, configure, mask_of, on_cuda, on_new_sim
+from environments import Patch, Refused, at_double_speed, configure, mask_of, on_cuda, on_new_sim
 from policies import assert_drives, curve, interrupted, report, run_as_torchrun, same
 from rsl_rl.algorithms import PPO
 
@@ -74,9 +73,7 @@ def test_a_task_may_have_one_observation_group(tmp_path: Path) -> None:
     assert load_policy(out / "last").training["iteration"] == 1
 
 
-def test_networks_that_are_not_finite_end_the_training(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_networks_that_are_not_finite_end_the_training(tmp_path: Path, monkeypatch: Patch) -> None:
     """In the iteration in which they become so; the folder keeps the policy before it."""
     update = PPO.update
     calls = []
@@ -146,7 +143,7 @@ def states_file(path: Path, env: Env, count: int = 3) -> Path:
 
 @pytest.mark.parametrize("masked", [False, True], ids=["by row", "as on CUDA"])
 def test_worlds_start_in_an_experts_states(
-    masked: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    masked: bool, tmp_path: Path, monkeypatch: Patch
 ) -> None:
     """By seed, world and episode, a falling share of them, with fresh counters; the others as they
     would without."""
@@ -260,9 +257,7 @@ def test_states_of_another_scene_are_refused(tmp_path: Path) -> None:
         )
 
 
-def test_a_missing_extra_is_one_line(
-    monkeypatch: pytest.MonkeyPatch, refused: Callable[..., str]
-) -> None:
+def test_a_missing_extra_is_one_line(monkeypatch: Patch, refused: Refused) -> None:
     for name in list(sys.modules):
         if name.startswith(("rsl_rl", "mjstack.train.ppo", "mjstack.adapters.rsl_rl")):
             monkeypatch.delitem(sys.modules, name)

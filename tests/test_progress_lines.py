@@ -3,6 +3,7 @@
 import io
 
 import pytest
+from environments import Patch
 from rich.console import Console
 
 from mjstack.jobs import progress
@@ -20,7 +21,7 @@ class Clock:
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+def clock(monkeypatch: Patch) -> Clock:
     clock = Clock()
     monkeypatch.setattr(progress, "time", clock)
     return clock

@@ -19,7 +19,7 @@ import pytest
 import torch
 from compositions import load_config, refusal
 from dataset_checker import check_dataset
-from environments import one_second_episode, report_of
+from environments import Patch, one_second_episode, report_of
 from policies import run_as_torchrun
 
 import mjstack
@@ -385,7 +385,7 @@ def test_devices_is_a_number_or_all(value: str) -> None:
         load_config([f"devices={value}"])
 
 
-def test_more_devices_than_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_devices_than_there_are(monkeypatch: Patch) -> None:
     def cfg(value: str) -> Config:
         return load_config(["sim=native", f"devices={value}"])
 
@@ -401,7 +401,7 @@ def test_more_devices_than_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
         count_devices(cfg("3"))
 
 
-def test_two_ranks_on_one_gpu_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_ranks_on_one_gpu_are_refused(monkeypatch: Patch) -> None:
     monkeypatch.setattr(Stage, "backend", ON_CUDA)
     monkeypatch.setattr("mjstack.jobs.runner.cuda_uuid", lambda device: "GPU-7")
     monkeypatch.setattr(Others, "change", {}, raising=False)

@@ -5,7 +5,6 @@ import csv
 import math
 import runpy
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,18 +15,15 @@ import pytest
 import reachability
 import torch
 from compositions import load_config, make_env
-from environments import configure, on_shared_sim
+from environments import Capture, GetStage, Patch, configure, on_shared_sim
 
 import mjstack
 from mjstack.config.schema import Config
-from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, ParameterError
 from mjstack.kinematics.mink_ik import GraspIk
 from mjstack.kinematics.reach import PointReach
 from mjstack.mdp.starts.placement import Placement
 from mjstack.scene import SceneIndex, build_model
-
-GetStage = Callable[[str], Stage]
 
 
 def points_over(cfg: Config, n: int, seed: int = 0) -> np.ndarray:
@@ -375,9 +371,7 @@ def test_regions_stay_inside_what_is_reached() -> None:
 
 
 @pytest.mark.full
-def test_the_tool_maps_the_table(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_tool_maps_the_table(tmp_path: Path, capsys: Capture, monkeypatch: Patch) -> None:
     options = ["scene.random_xy=[0.12,0.05]", "--step=0.04", f"--folder={tmp_path}"]
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.setattr(sys, "argv", ["reachability", *options])

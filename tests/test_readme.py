@@ -3,15 +3,13 @@
 import re
 from pathlib import Path
 
-import pytest
 from doc_blocks import ROOT, python_blocks, write_files
+from environments import Capture, Patch
 
 README = ROOT / "README.md"
 
 
-def test_python_blocks_run(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_python_blocks_run(capsys: Capture, tmp_path: Path, monkeypatch: Patch) -> None:
     write_files(README.read_text(), tmp_path)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)

@@ -13,7 +13,17 @@ import numpy as np
 import pytest
 from check_cases import rules_of
 from compositions import load_config, put, refusal
-from environments import at_double_speed, has_gl, on_cuda, one_second_episode, record_of, two_starts
+from environments import (
+    NewRun,
+    Patch,
+    Refused,
+    at_double_speed,
+    has_gl,
+    on_cuda,
+    one_second_episode,
+    record_of,
+    two_starts,
+)
 from omegaconf import OmegaConf
 
 from mjstack.cli import run
@@ -24,7 +34,6 @@ from mjstack.episodes.earlier_run import COPY, archive_starts, played_starts
 from mjstack.episodes.record import EpisodeRecord, record_name
 from mjstack.episodes.replay import simulate_alone
 from mjstack.episodes.rollout import snapshot
-from mjstack.episodes.run import Run
 from mjstack.files import write_npz
 from mjstack.jobs import check_job
 from mjstack.jobs.replay import _compare
@@ -120,9 +129,7 @@ def test_an_accepted_world_of_another_seed(earlier: Path, tmp_path: Path) -> Non
     assert (played.seed, played.task.check.xy_err) == (1, 0.00134)
 
 
-def test_trajectory_holds_the_episode(
-    failing: tuple[Path, int, dict], new_run: Callable[..., Run]
-) -> None:
+def test_trajectory_holds_the_episode(failing: tuple[Path, int, dict], new_run: NewRun) -> None:
     run = new_run("sim=native", "task.check.xy_err=0.00134", *at_double_speed())
     sim = run.stage.batch_simulation(5)
     controller = run.stage.driver(run.stage.start(sim, run.cfg.reset))
@@ -195,13 +202,7 @@ CARRY_BIT = RULES["CARRY"]
     ],
 )
 def test_what_is_promised_of_another_end(
-    bits: int,
-    moved: float,
-    device: str,
-    changes: list[str],
-    kept: bool,
-    says: str,
-    new_run: Callable[..., Run],
+    bits: int, moved: float, device: str, changes: list[str], kept: bool, says: str, new_run: NewRun
 ) -> None:
     """Bit for bit, but on CUDA, with other versions, and where the contact pool was too small."""
     run = new_run("sim=native")
@@ -227,7 +228,7 @@ def test_what_is_promised_of_another_end(
 
 @pytest.mark.full
 def test_a_start_that_is_not_the_recorded_one_is_refused(
-    earlier: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error_line: Callable[[], str]
+    earlier: Path, tmp_path: Path, monkeypatch: Patch, error_line: Callable[[], str]
 ) -> None:
     """Such as after random numbers have changed."""
     folder = copy_of(earlier, tmp_path)
@@ -268,7 +269,7 @@ def from_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.full
 @pytest.mark.parametrize("gate", ["batch", "success"])
 def test_a_run_from_a_file_replays_from_its_own_copy(
-    gate: str, from_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    gate: str, from_file: Path, tmp_path: Path, monkeypatch: Patch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert (from_file / "starts_played.npz").read_bytes() == carry()
@@ -394,7 +395,7 @@ def test_cuda_world_ends_near_where_it_did(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("nworld", "nconmax"), [(64, 80), (2, 40)])
 def test_a_world_alone_has_its_room(
-    nworld: int, nconmax: int, new_run: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
+    nworld: int, nconmax: int, new_run: NewRun, monkeypatch: Patch
 ) -> None:
     """A world may have taken more than its share of the pool, but never more than the pool."""
     sizes = ["batch.nconmax=20", "batch.njmax=100"]
@@ -438,7 +439,7 @@ BAD = [
 @pytest.mark.full
 @pytest.mark.parametrize(("args", "says"), BAD, ids=[" ".join(args) for args, _ in BAD])
 def test_bad_input_is_one_line_and_writes_nothing(
-    args: list[str], says: str, earlier: Path, refused: Callable[..., str]
+    args: list[str], says: str, earlier: Path, refused: Refused
 ) -> None:
     job = ["job=replay"] if len(args) > 1 else []  # keys of replay belong to replay
     assert says in refused(*job, *(arg.format(run=earlier) for arg in args))

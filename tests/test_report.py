@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from environments import Patch
 
 from mjstack.files import write_atomic
 from mjstack.report import formats
@@ -35,7 +36,7 @@ def strict_json(path: Path) -> dict:
 @pytest.mark.parametrize("function", ["replace", "fsync"])
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
 def test_failed_write_leaves_the_old_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, function: str, error: BaseException
+    tmp_path: Path, monkeypatch: Patch, function: str, error: BaseException
 ) -> None:
     path = tmp_path / "report.json"
     write_atomic(path, "old")
@@ -50,7 +51,7 @@ def test_failed_write_leaves_the_old_file(
     assert os.listdir(tmp_path) == ["report.json"]
 
 
-def test_file_appears_complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_file_appears_complete(tmp_path: Path, monkeypatch: Patch) -> None:
     path = tmp_path / "report.json"
     seen = []
     replace = os.replace
@@ -80,7 +81,7 @@ def test_numbers_that_are_not_finite_stay_json(tmp_path: Path) -> None:
 
 
 def test_a_format_is_a_function_of_sections_and_takes_no_result_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: Patch
 ) -> None:
     def broken(sections: Sequence[Section]) -> str:
         raise ValueError

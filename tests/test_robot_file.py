@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from compositions import refusal
+from environments import Patch
 from ik_arm import Arm
 
 from mjstack import load_config
@@ -48,7 +49,7 @@ def test_the_file_is_relative_to_the_yaml_that_names_it() -> None:
 
 @pytest.mark.full
 def test_the_file_can_be_absolute_or_relative_to_the_working_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: Patch
 ) -> None:
     shutil.copy(SCARA / "scara.xml", tmp_path / "arm.xml")
     monkeypatch.chdir(tmp_path)

@@ -19,6 +19,7 @@ from types import SimpleNamespace
 import hydra.core.utils
 import pytest
 from compositions import load_config
+from environments import Capture, Patch
 
 import mjstack
 from mjstack import cli
@@ -53,9 +54,7 @@ def checked() -> CheckedJob:
 
 
 @pytest.fixture
-def begin(
-    checked: CheckedJob, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Callable[..., int]:
+def begin(checked: CheckedJob, tmp_path: Path, monkeypatch: Patch) -> Callable[..., int]:
     """Run a command line at noon with that job, or a variant of it."""
     monkeypatch.chdir(tmp_path)
     noon = SimpleNamespace(now=lambda: datetime(2026, 11, 21, 12, 0, 0))
@@ -152,7 +151,7 @@ def test_sweeps_of_one_hour_have_a_folder_each(begin: Callable[..., int]) -> Non
 
 @pytest.mark.parametrize("subdir", ["", "same", "x/../same"])
 def test_jobs_of_a_sweep_may_not_share_a_folder(
-    subdir: str, begin: Callable[..., int], capsys: pytest.CaptureFixture[str]
+    subdir: str, begin: Callable[..., int], capsys: Capture
 ) -> None:
     assert begin("-m", "seed=1,2", f"hydra.sweep.subdir={subdir}") == 2
     err = capsys.readouterr().err
@@ -162,7 +161,7 @@ def test_jobs_of_a_sweep_may_not_share_a_folder(
 
 @pytest.mark.full
 def test_an_experiment_names_the_jobs_of_a_sweep_and_their_folder(
-    begin: Callable[..., int], capsys: pytest.CaptureFixture[str]
+    begin: Callable[..., int], capsys: Capture
 ) -> None:
     """The same command goes on with it, and the command line goes before its values."""
     text = "# @package _global_\nhydra: {sweeper: {params: {seed: '1,2'}}, sweep: {dir: mine}}\n"
@@ -196,7 +195,7 @@ def test_an_interrupted_sweep_leaves_a_summary(begin: Callable[..., int]) -> Non
 @pytest.mark.full
 @pytest.mark.parametrize("what", ["a closed output", "a signal after the last step"])
 def test_a_run_that_is_done_ends_with_its_status(
-    what: str, begin: Callable[..., int], monkeypatch: pytest.MonkeyPatch
+    what: str, begin: Callable[..., int], monkeypatch: Patch
 ) -> None:
     def whole_command(_: int) -> int:
         if what == "a closed output":
@@ -216,7 +215,7 @@ def test_a_run_that_is_done_ends_with_its_status(
 
 @pytest.mark.parametrize("link", [".hydra", ".hydra/overrides.yaml", "run.log"])
 def test_a_folder_with_links_is_refused(
-    link: str, begin: Callable[..., int], capsys: pytest.CaptureFixture[str]
+    link: str, begin: Callable[..., int], capsys: Capture
 ) -> None:
     precious = Path("precious")
     (precious if link == ".hydra" else Path("elsewhere")).mkdir()
@@ -262,7 +261,7 @@ def test_a_given_folder_of_another_run_is_refused(
     args: list[str],
     changes: dict[str, object],
     begin: Callable[..., int],
-    capsys: pytest.CaptureFixture[str],
+    capsys: Capture,
 ) -> None:
     put(Path("given"), files)
     before = contents(Path())
@@ -303,9 +302,7 @@ def test_a_job_goes_on_in_its_folder(
     assert "job:\n" in Path("given", ".hydra", "config.yaml").read_text()
 
 
-def test_the_second_of_two_writes_nothing(
-    begin: Callable[..., int], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_second_of_two_writes_nothing(begin: Callable[..., int], capsys: Capture) -> None:
     """Both have passed their checks; the first has begun and has written nothing yet."""
     with claim_folder(Path("given"), "collect"):
         assert begin("job=collect", **COLLECTING) == 2
@@ -316,9 +313,7 @@ def test_the_second_of_two_writes_nothing(
     assert begin("job=collect", **COLLECTING) == 0
 
 
-def test_a_failed_claim_removes_what_it_made_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_claim_removes_what_it_made_alone(tmp_path: Path, monkeypatch: Patch) -> None:
     with pytest.raises(KeyboardInterrupt), claim_folder(tmp_path / "a" / "run"):
         raise KeyboardInterrupt
     assert contents(tmp_path) == {}
@@ -380,7 +375,7 @@ DENIED: dict[str, tuple[Callable[[Path], object], list[str]]] = {
 @pytest.mark.full
 @pytest.mark.parametrize("what", ["nothing", *DENIED])
 def test_no_permission_is_a_line(
-    what: str, begin: Callable[..., int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    what: str, begin: Callable[..., int], tmp_path: Path, monkeypatch: Patch
 ) -> None:
     """As another user, who owns everything there but for what a case takes away."""
     with tempfile.TemporaryDirectory() as home:  # pytest's own is its user's alone

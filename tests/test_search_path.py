@@ -4,10 +4,11 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from environments import Capture, Patch, Refused
 
 import mjstack
 from mjstack.cli import run
@@ -65,7 +66,7 @@ limit: 1.0
 
 
 @pytest.fixture
-def lean(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def lean(tmp_path: Path, monkeypatch: Patch) -> Iterator[Path]:
     """A folder with a task and, beside it, the module of its reward."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
@@ -104,7 +105,7 @@ def test_the_search_path_is_an_override_too(lean: Path) -> None:
     assert load_config([both, "task=lean"]).task.name == "lean"
 
 
-def test_several_folders_add_up(lean: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_several_folders_add_up(lean: Path, capsys: Capture) -> None:
     second = lean.parent / "second"
     (second / "reward").mkdir(parents=True)
     (second / "reward" / "none.yaml").write_text("{}\n")
@@ -114,9 +115,7 @@ def test_several_folders_add_up(lean: Path, capsys: pytest.CaptureFixture[str]) 
 
 
 @pytest.mark.full
-def test_help_and_cfg_see_the_folder(
-    lean: Path, capsys: pytest.CaptureFixture[str], refused: Callable[..., str]
-) -> None:
+def test_help_and_cfg_see_the_folder(lean: Path, capsys: Capture, refused: Refused) -> None:
     assert run(["--config-dir", str(lean), "--help"]) == 0
     assert "stack, box, lean, reach" in " ".join(capsys.readouterr().out.split())
     assert run([f"--config-dir={lean}", "task=lean", "--cfg", "job", "-p", "task.name"]) == 0
@@ -136,7 +135,7 @@ def test_help_and_cfg_see_the_folder(
     ],
 )
 def test_a_file_that_does_not_fit_is_named(
-    text: str, part: str, lean: Path, refused: Callable[..., str]
+    text: str, part: str, lean: Path, refused: Refused
 ) -> None:
     file = lean / "task" / "lean.yaml"
     file.write_text(f"{TASK.partition('task:')[0]}{text}\n")
@@ -168,9 +167,7 @@ def test_a_sweep_and_a_replay(lean: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.full
-def test_a_gate_of_one_s_own(
-    lean: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], refused: Callable[..., str]
-) -> None:
+def test_a_gate_of_one_s_own(lean: Path, tmp_path: Path, capsys: Capture, refused: Refused) -> None:
     flags = ["--config-dir", str(lean), "gates=[upright]"]
     assert run([*flags, "hydra.run.dir=a"]) == 0
     report = json.loads((tmp_path / "a" / "report.json").read_text())
@@ -189,7 +186,7 @@ def test_a_gate_of_one_s_own(
     assert "Available: baseline" in refused("gates=[upright]")
 
 
-def test_a_bad_folder_is_refused(lean: Path, refused: Callable[..., str]) -> None:
+def test_a_bad_folder_is_refused(lean: Path, refused: Refused) -> None:
     assert f"Name {lean}." in refused("--config-dir", str(lean.parent))
     missing = refused("task=lean")
     assert missing.startswith("mjstack: task=lean: 'lean' does not exist. Available: ")
@@ -225,9 +222,7 @@ def test_an_installed_package_registers_its_configuration(lean: Path) -> None:
         check_term("", "leaning.height", "observation term", Path("config.yaml"))
 
 
-def test_only_modules_beside_the_folder_are_trusted(
-    lean: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_modules_beside_the_folder_are_trusted(lean: Path, monkeypatch: Patch) -> None:
     monkeypatch.chdir(lean.parent)  # a built-in module has no file: it is not beside the folder
     with search_path([lean]):
         assert in_search_path("lean.height", Path("config.yaml"))

@@ -9,10 +9,18 @@ import numpy as np
 import pytest
 import torch
 from compositions import load_config, refusal
-from environments import POSES, STATE, assert_same_run, on_backend, start_moving
+from environments import (
+    POSES,
+    STATE,
+    GetStage,
+    MakeSim,
+    Patch,
+    assert_same_run,
+    on_backend,
+    start_moving,
+)
 
 from mjstack.config.schema import Backend
-from mjstack.episodes.stage import Stage
 from mjstack.errors import MjstackError
 from mjstack.scene import build_model
 from mjstack.sim import Simulation, SolverLimit, make_simulation
@@ -20,8 +28,6 @@ from mjstack.sim import Simulation, SolverLimit, make_simulation
 N = 3
 VIEWS = (*STATE, *POSES, "qfrc_actuator", "sensordata")
 COUNTS = ("contact_count", "constraint_count", "peak_contacts", "peak_constraints", "overflow")
-Make = Callable[..., Simulation]
-GetStage = Callable[[str], Stage]
 
 
 # An arm with an activation and sensors, and a ball: what the robots' scenes lack.
@@ -59,7 +65,7 @@ def sensing() -> Callable[[str], Simulation]:
     return get
 
 
-def test_shapes_types_and_device(backend: str, make_sim: Make, get_stage: GetStage) -> None:
+def test_shapes_types_and_device(backend: str, make_sim: MakeSim, get_stage: GetStage) -> None:
     sim = make_sim(backend, N)
     m = get_stage("so101").model
     poses = [(m.nbody, 3), (m.nbody, 4), (m.nsite, 3), (m.ngeom, 3)]
@@ -77,7 +83,7 @@ def test_shapes_types_and_device(backend: str, make_sim: Make, get_stage: GetSta
     assert sim.backend == backend.partition("-")[0]
 
 
-def test_views_keep_their_address(backend: str, make_sim: Make) -> None:
+def test_views_keep_their_address(backend: str, make_sim: MakeSim) -> None:
     sim = make_sim(backend, N)
 
     def addresses() -> dict[str, int]:
@@ -96,7 +102,7 @@ def test_views_keep_their_address(backend: str, make_sim: Make) -> None:
 
 
 @pytest.mark.parametrize("name", [*VIEWS, *COUNTS, "step_count", "fields"])
-def test_views_cannot_be_rebound(backend: str, make_sim: Make, name: str) -> None:
+def test_views_cannot_be_rebound(backend: str, make_sim: MakeSim, name: str) -> None:
     sim = make_sim(backend, N)
     view = getattr(sim, name)
     with pytest.raises(MjstackError) as caught:
@@ -118,7 +124,7 @@ def test_views_cannot_be_rebound(backend: str, make_sim: Make, name: str) -> Non
         ([True] * N, "a list"),
     ],
 )
-def test_a_wrong_mask_is_refused(backend: str, make_sim: Make, mask: object, found: str) -> None:
+def test_a_wrong_mask_is_refused(backend: str, make_sim: MakeSim, mask: object, found: str) -> None:
     sim = make_sim(backend, N)
     sim.step(1)
     if isinstance(mask, torch.Tensor) and mask.device.type == "cpu":
@@ -129,7 +135,7 @@ def test_a_wrong_mask_is_refused(backend: str, make_sim: Make, mask: object, fou
     assert sim.step_count.tolist() == [1] * N
 
 
-def test_step_counts(backend: str, make_sim: Make) -> None:
+def test_step_counts(backend: str, make_sim: MakeSim) -> None:
     sim = make_sim(backend, N)
     assert sim.step_count.tolist() == [0] * N
     sim.step(10)
@@ -142,7 +148,7 @@ def test_step_counts(backend: str, make_sim: Make) -> None:
     assert sim.step_count.tolist() == [23, 10, 23]
 
 
-def test_masked_reset(backend: str, make_sim: Make, get_stage: GetStage) -> None:
+def test_masked_reset(backend: str, make_sim: MakeSim, get_stage: GetStage) -> None:
     sim = make_sim(backend, N)
     stage = get_stage("so101")
     fresh = {name: getattr(sim, name).clone() for name in ("qpos", "qvel", "ctrl")}
@@ -163,7 +169,7 @@ def test_masked_reset(backend: str, make_sim: Make, get_stage: GetStage) -> None
         assert torch.equal(getattr(sim, name)[~mask], before[name][~mask]), name
 
 
-def test_reset_world_goes_on_as_a_fresh_one(backend: str, make_sim: Make) -> None:
+def test_reset_world_goes_on_as_a_fresh_one(backend: str, make_sim: MakeSim) -> None:
     """Warm starts and whatever else a step leaves behind are reset too."""
     sim = make_sim(backend, N)
     sim.step(10)
@@ -177,7 +183,7 @@ def test_reset_world_goes_on_as_a_fresh_one(backend: str, make_sim: Make) -> Non
 
 
 def test_forward_writes_every_derived_number(
-    backend: str, make_sim: Make, get_stage: GetStage
+    backend: str, make_sim: MakeSim, get_stage: GetStage
 ) -> None:
     sim = make_sim(backend, N)
     m = get_stage("so101").model
@@ -233,7 +239,7 @@ def test_activations_and_sensors(backend: str, sensing: Callable[[str], Simulati
 
 
 def test_kinematics_belongs_to_the_last_state(
-    backend: str, make_sim: Make, get_stage: GetStage
+    backend: str, make_sim: MakeSim, get_stage: GetStage
 ) -> None:
     sim = make_sim(backend, N)
     start_moving(sim, get_stage("so101"))
@@ -257,7 +263,9 @@ def test_kinematics_belongs_to_the_last_state(
     assert sim.step_count.tolist() == [20] * N
 
 
-def test_kinematics_changes_no_physics(backend: str, make_sim: Make, get_stage: GetStage) -> None:
+def test_kinematics_changes_no_physics(
+    backend: str, make_sim: MakeSim, get_stage: GetStage
+) -> None:
     if backend == "mjwarp-cuda":
         pytest.skip("CUDA repeats no run bit for bit")
     finals = []
@@ -276,7 +284,9 @@ def test_kinematics_changes_no_physics(backend: str, make_sim: Make, get_stage: 
 
 
 @pytest.mark.full
-def test_native_kinematics_visits_masked_worlds_only(make_sim: Make, get_stage: GetStage) -> None:
+def test_native_kinematics_visits_masked_worlds_only(
+    make_sim: MakeSim, get_stage: GetStage
+) -> None:
     sim = make_sim("native", N)
     start_moving(sim, get_stage("so101"))
     sim.forward()
@@ -290,7 +300,7 @@ def test_native_kinematics_visits_masked_worlds_only(make_sim: Make, get_stage: 
         assert torch.isnan(getattr(sim, name)[2]).all(), name
 
 
-def test_forward_agrees_with_mujoco(backend: str, make_sim: Make, get_stage: GetStage) -> None:
+def test_forward_agrees_with_mujoco(backend: str, make_sim: MakeSim, get_stage: GetStage) -> None:
     sim = make_sim(backend, N)
     stage = get_stage("so101")
     start_moving(sim, stage)
@@ -307,7 +317,7 @@ def test_forward_agrees_with_mujoco(backend: str, make_sim: Make, get_stage: Get
         assert int(sim.contact_count[k]) == data.ncon
 
 
-def test_options_as_uploaded(backend: str, make_sim: Make) -> None:
+def test_options_as_uploaded(backend: str, make_sim: MakeSim) -> None:
     options = make_sim(backend, N).option_values()
     names = {"integrator": "mjINT_IMPLICITFAST", "cone": "mjCONE_ELLIPTIC", "box_box": "primitive"}
     numbers = {"impratio": 100.0, "tolerance": 1e-6, "iterations": 100, "ls_iterations": 50}
@@ -329,7 +339,7 @@ def test_worlds_whose_solver_stops_at_its_limit_are_told() -> None:
     assert told == [[0, 0], 2 * [int(SolverLimit.ITERATIONS)]]
 
 
-def test_captured_and_uncaptured_steps_agree(make_sim: Make, get_stage: GetStage) -> None:
+def test_captured_and_uncaptured_steps_agree(make_sim: MakeSim, get_stage: GetStage) -> None:
     finals = []
     for overrides in ((), ("graph=off",)):
         sim = make_sim("mjwarp", N, *overrides)
@@ -341,7 +351,7 @@ def test_captured_and_uncaptured_steps_agree(make_sim: Make, get_stage: GetStage
         assert torch.equal(a, b)
 
 
-def test_native_does_not_reset_a_diverged_world(make_sim: Make, get_stage: GetStage) -> None:
+def test_native_does_not_reset_a_diverged_world(make_sim: MakeSim, get_stage: GetStage) -> None:
     """MuJoCo would put it back to qpos0, which looks like a world that never moved."""
     sim = make_sim("native", N)
     start_moving(sim, get_stage("so101"))
@@ -370,9 +380,7 @@ CROWD = """
 
 
 @pytest.mark.parametrize("most", [4096, 4])
-def test_native_worlds_that_mujoco_warns_of_take_every_step(
-    most: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_native_worlds_that_mujoco_warns_of_take_every_step(most: int, monkeypatch: Patch) -> None:
     """Many steps in one call of MuJoCo's, and in calls of few worlds each, are as many single ones,
     also for worlds that overflow or diverge."""
     from mjstack.sim import native
@@ -395,7 +403,7 @@ def test_native_worlds_that_mujoco_warns_of_take_every_step(
         assert torch.equal(one.nan_to_num(7.0), other.nan_to_num(7.0))
 
 
-def test_native_threads_do_not_matter(get_stage: GetStage, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_native_threads_do_not_matter(get_stage: GetStage, monkeypatch: Patch) -> None:
     from mjstack.sim import native
 
     finals = []
@@ -438,7 +446,7 @@ def test_an_unsupported_model_is_refused_in_one_line(
     assert re.search(rf"{message}.*\.$", refusal(partial(make, device="cpu")))
 
 
-def test_twice_the_same_run(backend: str, make_sim: Make, get_stage: GetStage) -> None:
+def test_twice_the_same_run(backend: str, make_sim: MakeSim, get_stage: GetStage) -> None:
     finals = []
     for _ in range(2):
         sim = make_sim(backend, N)

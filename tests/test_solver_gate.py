@@ -1,6 +1,5 @@
 """The solver gate: what it measures, and that its settings reach the physics."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import mujoco
@@ -8,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from compositions import load_config, put
-from environments import at_double_speed
+from environments import MakeSim, Patch, Refused, at_double_speed
 
 from mjstack.bench.timing import describe_lost, lost_worlds
 from mjstack.config.schema import Backend, Config
@@ -49,7 +48,7 @@ def test_a_variant_beside_the_configured_solver(changes: str, tmp_path: Path) ->
 
 @pytest.mark.full
 def test_a_simulation_that_breaks_is_a_failure_and_the_other_is_closed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: Patch
 ) -> None:
     simulations: list[Simulation] = []
     closed = []
@@ -84,9 +83,7 @@ def test_limits_are_no_lost_physics() -> None:
 
 
 @pytest.mark.full
-def test_no_time_for_worlds_that_diverged(
-    make_sim: Callable[..., Simulation], backend: str
-) -> None:
+def test_no_time_for_worlds_that_diverged(make_sim: MakeSim, backend: str) -> None:
     sim = make_sim(backend, 2)
     sim.step(10)
     assert describe_lost(lost_worlds(sim, 10)) == ""
@@ -96,9 +93,7 @@ def test_no_time_for_worlds_that_diverged(
 
 
 @pytest.mark.full
-def test_a_variant_without_its_steps_has_no_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_variant_without_its_steps_has_no_time(tmp_path: Path, monkeypatch: Patch) -> None:
     play = solver.HeldPhysics._play
     monkeypatch.setattr(solver.HeldPhysics, "_play", lambda self, steps: play(self, steps - 1))
     result = measure(tmp_path, "")
@@ -165,6 +160,6 @@ BAD = [
 @pytest.mark.full
 @pytest.mark.parametrize(("overrides", "says"), BAD, ids=[" ".join(o) for o, _ in BAD])
 def test_bad_input_is_one_line_and_nothing_is_written(
-    overrides: list[str], says: str, refused: Callable[..., str]
+    overrides: list[str], says: str, refused: Refused
 ) -> None:
     assert says in refused(*overrides, "nworld=2", "sim=native")

@@ -2,7 +2,6 @@
 file."""
 
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,9 @@ import pytest
 import torch
 from compositions import refusal
 from environments import (
+    Capture,
+    Patch,
+    Refused,
     at_double_speed,
     configure,
     mask_of,
@@ -313,7 +315,7 @@ def test_values_within_the_configured_ranges_alone(tmp_path: Path) -> None:
     ],
 )
 def test_the_command_line_refuses_before_anything_is_written(
-    args: str, message: str, tmp_path: Path, refused: Callable[..., str]
+    args: str, message: str, tmp_path: Path, refused: Refused
 ) -> None:
     np.savez(tmp_path / "worlds.npz", **plain_starts(configure()))
     assert message in refused(*args.split(), "gates=[batch]", "sim=native")
@@ -321,7 +323,7 @@ def test_the_command_line_refuses_before_anything_is_written(
 
 @pytest.mark.full
 def test_a_batch_plays_the_worlds_of_a_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: Patch, capsys: Capture
 ) -> None:
     monkeypatch.chdir(tmp_path)
     np.savez(tmp_path / "worlds.npz", **plain_starts(configure()))

@@ -8,6 +8,7 @@ import pytest
 import torch
 from compositions import load_config
 from doc_blocks import ROOT, write_files
+from environments import GetStage
 
 from mjstack import load_config as load_from
 from mjstack.cli import run
@@ -19,7 +20,6 @@ from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError
 from mjstack.scene.phases import build_phases
 
-GetStage = Callable[..., Stage]
 EXPERT = "controller=state_based"
 
 

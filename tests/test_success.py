@@ -2,7 +2,6 @@
 both backends."""
 
 import csv
-from collections.abc import Callable
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -13,7 +12,16 @@ import pytest
 import torch
 from check_cases import rules_of
 from compositions import load_config
-from environments import at_double_speed, configure, gate_of, on_cuda, one_second_episode
+from environments import (
+    NewRun,
+    Patch,
+    Refused,
+    at_double_speed,
+    configure,
+    gate_of,
+    on_cuda,
+    one_second_episode,
+)
 
 from mjstack.cli import run
 from mjstack.config.schema import Config
@@ -90,7 +98,7 @@ def test_small_region_passes(passed: Path) -> None:
 
 
 @pytest.mark.full
-def test_rebot_passes(new_run: Callable[..., Run], tmp_path: Path) -> None:
+def test_rebot_passes(new_run: NewRun, tmp_path: Path) -> None:
     run = new_run("sim=native", "nworld=4", *at_double_speed("rebot"), robot="rebot")
     result = play(run, tmp_path)
     assert result.status is Status.passed
@@ -123,7 +131,7 @@ def test_broken_controller_fails_by_rule_and_phase(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def hasty() -> Callable[..., Run]:
+def hasty() -> NewRun:
     """Runs of episodes that are over, and have failed, after a second."""
 
     def make(*overrides: str) -> Run:
@@ -134,7 +142,7 @@ def hasty() -> Callable[..., Run]:
 
 
 @pytest.mark.full
-def test_seeds_add_up_and_the_rate_decides(hasty: Callable[..., Run], tmp_path: Path) -> None:
+def test_seeds_add_up_and_the_rate_decides(hasty: NewRun, tmp_path: Path) -> None:
     """The threshold is on the rate itself; what fails is named all the same."""
     run = hasty("gates=[batch,success]", "gate.success.seeds=2", "gate.success.cell_episodes=2")
     lines: list[str] = []
@@ -192,7 +200,7 @@ BAD = [
 @pytest.mark.full
 @pytest.mark.parametrize(("args", "words"), BAD, ids=[args for args, _ in BAD])
 def test_bad_input_is_one_line_and_writes_nothing(
-    args: str, words: str, passed: Path, refused: Callable[..., str]
+    args: str, words: str, passed: Path, refused: Refused
 ) -> None:
     overrides = args.format(run=passed).split()
     line = refused("gates=[success]", "sim=native", "nworld=2", *overrides)
@@ -211,7 +219,7 @@ def test_region_is_the_gates_alone() -> None:
     assert cfg.controller.name == "open_loop"
 
 
-def test_tracker_against_a_plain_recount(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tracker_against_a_plain_recount(monkeypatch: Patch) -> None:
     """Made-up episodes of 300 worlds, in which anything may happen at any time; the recount goes
     world by world."""
     size = (90, 300)
@@ -243,7 +251,7 @@ def test_tracker_against_a_plain_recount(monkeypatch: pytest.MonkeyPatch) -> Non
 
 def monitor(
     cfg: Config,
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: Patch,
     phase: np.ndarray,
     in_hand: np.ndarray,
     placed: np.ndarray,
@@ -295,7 +303,7 @@ def recount(
 
 
 @pytest.mark.full
-def test_signs_in_real_episodes(new_run: Callable[..., Run]) -> None:
+def test_signs_in_real_episodes(new_run: NewRun) -> None:
     """Worlds that somebody interferes with: each shows its own sign, in its phase, and one is
     undisturbed."""
     base = new_run("sim=native", "nworld=6")
@@ -332,7 +340,7 @@ def test_signs_in_real_episodes(new_run: Callable[..., Run]) -> None:
 
 
 @pytest.mark.full
-def test_each_cube_of_the_box_has_its_own_release(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_cube_of_the_box_has_its_own_release(monkeypatch: Patch) -> None:
     """World by world: all well; red misses, blue does not; red is let go well and leaves under
     blue's approach; blue misses; blue leaves at the end."""
     cfg = load_config(["task=box"])
@@ -412,9 +420,7 @@ def test_worst_regions_of_made_up_episodes() -> None:
 
 @pytest.mark.full
 @on_cuda
-def test_steps_with_the_tracker_are_one_graph(
-    robot: str, new_run: Callable[..., Run], tmp_path: Path
-) -> None:
+def test_steps_with_the_tracker_are_one_graph(robot: str, new_run: NewRun, tmp_path: Path) -> None:
     device = ("sim=mjwarp", "sim.device=cuda:0", "nworld=64")
     base = new_run(*device, "graph=require", robot=robot)
     run = base.on(base.stage.with_config(success_config(base.cfg)))

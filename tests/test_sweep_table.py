@@ -14,6 +14,7 @@ from typing import IO, Any
 
 import pytest
 from compositions import load_config
+from environments import Capture, Patch
 from matplotlib.axes import Axes
 
 from mjstack.cli import run
@@ -35,7 +36,7 @@ TINY = [
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path: Path, monkeypatch: Patch) -> Path:
     """The folder of the experiment, below an empty one in which the test runs."""
     monkeypatch.chdir(tmp_path)
     return tmp_path / "outputs" / "sweeps" / "scaling-so101-stack"
@@ -72,7 +73,7 @@ def stamps(folder: Path) -> dict[str, int]:
 
 @pytest.mark.full
 def test_throughput_goes_on_and_leaves_table_and_plot(
-    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    folder: Path, capsys: Capture, monkeypatch: Patch
 ) -> None:
     """One of the jobs has more worlds than there is memory for: a gap, and the next one starts."""
     monkeypatch.setattr(sweep, "Child", InThisProcess)
@@ -167,9 +168,7 @@ def test_the_table_of_a_plain_sweep(tmp_path: Path) -> None:
     assert (tmp_path / "summary.png").stat().st_size > 5_000
 
 
-def test_a_picture_that_fails_takes_no_table_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_picture_that_fails_takes_no_table_back(tmp_path: Path, monkeypatch: Patch) -> None:
     def fail(*_: object, **__: object) -> None:
         raise RuntimeError("no fonts")
 
@@ -274,9 +273,7 @@ def test_crossover(
     assert text in describe_crossover(PLOT, rows)
 
 
-def test_a_job_that_failed_is_a_gap_even_with_figures(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_job_that_failed_is_a_gap_even_with_figures(tmp_path: Path, monkeypatch: Patch) -> None:
     """Of three jobs the middle one measured physics and then failed; its figure would move the
     crossover."""
     rows = rates({"mjwarp": {1: 1.0, 10: 99.0, 100: 100.0}, "native": {1: 10.0, 10: 10, 100: 10}})

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from environments import report_of
+from environments import Capture, Patch, report_of
 from test_ranks import SHORT, start
 from test_run_folder import contents
 
@@ -42,7 +42,7 @@ report = {"status": status, "resumes": "gates", "gates": [gate]}
 
 
 @pytest.fixture
-def stub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def stub(tmp_path: Path, monkeypatch: Patch) -> Path:
     """Jobs whose process writes a report at once."""
     (tmp_path / "stub.py").write_text(STUB)
     monkeypatch.setattr(
@@ -55,7 +55,7 @@ def jobs(folder: Path, *seeds: int) -> list[SweepJob]:
     return [SweepJob(n, folder / str(n), (f"seed={seed}",)) for n, seed in enumerate(seeds)]
 
 
-def test_a_queue(stub: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_queue(stub: Path, capsys: Capture) -> None:
     """Reports in the order of the jobs; a killed one says so, and it alone runs again."""
     sweep = jobs(stub, 1, 2, 9, 4)
     reports = run_jobs(stub, sweep)
@@ -75,7 +75,7 @@ def test_a_queue(stub: Path, capsys: pytest.CaptureFixture[str]) -> None:
         run_jobs(stub, other)
 
 
-def test_the_reason_is_not_an_earlier_processs(stub: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_reason_is_not_an_earlier_processs(stub: Path, monkeypatch: Patch) -> None:
     sweep = jobs(stub, 9)
     run_jobs(stub, sweep)
     monkeypatch.setenv("SILENT", "1")
@@ -83,7 +83,7 @@ def test_the_reason_is_not_an_earlier_processs(stub: Path, monkeypatch: pytest.M
     assert gate.reason == f"exit status 3 ({stub / '0' / LOG})"
 
 
-def test_failures_are_repeated_on_request(stub: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_failures_are_repeated_on_request(stub: Path, capsys: Capture) -> None:
     """Anew, and once in a call."""
     sweep = jobs(stub, 1, 2)
     run_jobs(stub, sweep)
@@ -192,7 +192,7 @@ def test_a_job_removes_no_file_that_it_did_not_write(stub: Path, what: str, list
     assert contents(stub.parent) == before
 
 
-def test_a_gpu_for_each_job(stub: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gpu_for_each_job(stub: Path, monkeypatch: Patch) -> None:
     """Two GPUs, of which another command has one: all jobs run on the free one."""
     monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,7")
@@ -235,9 +235,7 @@ def test_a_report_is_read_back(tmp_path: Path) -> None:
     assert read_report(tmp_path) == written
 
 
-def test_the_locks_of_gpus_are_the_users_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_locks_of_gpus_are_the_users_own(tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     locks = tmp_path / f"mjstack-gpus-{os.getuid()}"

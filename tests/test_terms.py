@@ -12,11 +12,10 @@ import pytest
 import torch
 from box_checker import corners_of
 from check_cases import BLUE, RED, limits
-from environments import StubViews, actions, configure, on_shared_sim, returned, zeros
+from environments import GetStage, StubViews, actions, configure, on_shared_sim, returned, zeros
 
 from mjstack.config.schema import Config
 from mjstack.envs import Env
-from mjstack.episodes.stage import Stage
 from mjstack.mdp import observation as observation_terms
 from mjstack.mdp import reset as reset_terms
 from mjstack.mdp import reward as reward_terms
@@ -27,7 +26,6 @@ from mjstack.tasks.stack import StackSuccess
 
 CUBES = ("red", "blue")
 OBJECT = {"object": "red"}
-GetStage = Callable[[str], Stage]
 
 
 def table_top(cfg: Config) -> float:

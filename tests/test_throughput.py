@@ -2,7 +2,6 @@
 
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -11,14 +10,13 @@ import numpy as np
 import pytest
 import torch
 from compositions import load_config
-from environments import at_double_speed, on_cuda
+from environments import MakeSim, NewRun, Patch, at_double_speed, on_cuda
 
 from mjstack.bench import env_step, episode, physics, timing
 from mjstack.bench.env_step import measure_env_step
 from mjstack.bench.timing import EnergyMeter, Measurement, steps_that_fit, timed
 from mjstack.envs import Env, build_env
 from mjstack.episodes.rollout import Episode, RolloutTiming, State
-from mjstack.episodes.run import Run
 from mjstack.gates import throughput
 from mjstack.gates.throughput import run_throughput
 from mjstack.report.record import GateResult, Status
@@ -46,19 +44,19 @@ def speeds(result: GateResult, measurement: str = "") -> list[str]:
     return [name for name in names if any(word in name for word in SPEEDS)]
 
 
-def measure(new_run: Callable[..., Run], *overrides: str) -> GateResult:
+def measure(new_run: NewRun, *overrides: str) -> GateResult:
     """The first result of the gate."""
     return run_throughput(new_run(*overrides))[0]
 
 
-def worlds(monkeypatch: pytest.MonkeyPatch, device: str, mode: str = "auto") -> tuple[Any, Any]:
+def worlds(monkeypatch: Patch, device: str, mode: str = "auto") -> tuple[Any, Any]:
     """Four worlds that have no memory and no graph, and their configuration."""
     monkeypatch.setattr(timing, "device_memory", lambda _: None)
     sim = SimpleNamespace(device=torch.device(device), nworld=4, graph_of=lambda *_, **__: None)
     return sim, SimpleNamespace(graph=mode, timing=SimpleNamespace(decimation=10))
 
 
-def test_rates_are_arithmetic(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rates_are_arithmetic(monkeypatch: Patch) -> None:
     measured = Measurement(name="m")
     some = worlds(monkeypatch, "cpu")
     measured.add_repetitions(*some, [2.0, 0.5, 1.0], 5, EnergyMeter("cpu"), captured=False)
@@ -89,7 +87,7 @@ ONE = ("sim=native", "nworld=1", *SHORT)
 
 
 @pytest.mark.full
-def test_native_measurements(new_run: Callable[..., Run]) -> None:
+def test_native_measurements(new_run: NewRun) -> None:
     result, cuda = run_throughput(new_run("sim=native", "nworld=2", *SHORT))
     assert result.status is Status.passed, result.reason
     assert cuda.status is Status.skipped or torch.cuda.is_available()
@@ -125,11 +123,7 @@ def test_native_measurements(new_run: Callable[..., Run]) -> None:
     [("mjwarp", 3, 2), ("mjwarp", 1, 1), ("native", 3, 2), ("native", 1, 0)],
 )
 def test_the_batch_gates_episode_is_the_first_repetition(
-    backend: str,
-    repetitions: int,
-    played: int,
-    new_run: Callable[..., Run],
-    monkeypatch: pytest.MonkeyPatch,
+    backend: str, repetitions: int, played: int, new_run: NewRun, monkeypatch: Patch
 ) -> None:
     run = new_run("sim=native", "nworld=4")
     sim, _ = worlds(monkeypatch, "cpu")
@@ -153,7 +147,7 @@ def test_the_batch_gates_episode_is_the_first_repetition(
 
 @pytest.mark.full
 def test_mjwarp_alternates_with_bare_steps_and_tells_warm_up_and_capture_apart(
-    new_run: Callable[..., Run],
+    new_run: NewRun,
 ) -> None:
     result = measure(new_run, *MJWARP, "gate.throughput.episodes=1")
     assert result.status is Status.passed, result.reason
@@ -185,7 +179,7 @@ def test_mjwarp_alternates_with_bare_steps_and_tells_warm_up_and_capture_apart(
     ],
 )
 def test_eager_work_is_void_where_it_should_be_captured(
-    device: str, mode: str, captured: bool, void: bool, monkeypatch: pytest.MonkeyPatch
+    device: str, mode: str, captured: bool, void: bool, monkeypatch: Patch
 ) -> None:
     measured = Measurement(name="m")
     some = worlds(monkeypatch, device, mode)
@@ -202,9 +196,7 @@ def test_eager_work_is_void_where_it_should_be_captured(
 
 @pytest.mark.full
 def test_bare_steps_play_the_same_trajectory(
-    new_run: Callable[..., Run],
-    make_sim: Callable[..., Simulation],
-    monkeypatch: pytest.MonkeyPatch,
+    new_run: NewRun, make_sim: MakeSim, monkeypatch: Patch
 ) -> None:
     """Warp's CPU device is bit-reproducible: whatever else an arranged step does, the physics of
     both is the same."""
@@ -223,9 +215,7 @@ def test_bare_steps_play_the_same_trajectory(
 
 @pytest.mark.full
 def test_bare_steps_that_lose_worlds_do_not_count(
-    new_run: Callable[..., Run],
-    make_sim: Callable[..., Simulation],
-    monkeypatch: pytest.MonkeyPatch,
+    new_run: NewRun, make_sim: MakeSim, monkeypatch: Patch
 ) -> None:
     """8 rows do not hold two cubes on a table. What bare steps lose is counted once, after them."""
     run = new_run("nworld=1")
@@ -240,7 +230,7 @@ def test_bare_steps_that_lose_worlds_do_not_count(
 
 
 @pytest.mark.full
-def test_worlds_that_fail_void_every_figure(new_run: Callable[..., Run]) -> None:
+def test_worlds_that_fail_void_every_figure(new_run: NewRun) -> None:
     tight = ("gate.throughput.repetitions=1", "task.check.xy_err=1e-7")
     result = measure(new_run, *NATIVE, *tight)
     assert result.status is Status.failed
@@ -251,9 +241,7 @@ def test_worlds_that_fail_void_every_figure(new_run: Callable[..., Run]) -> None
 
 
 @pytest.mark.full
-def test_steps_not_made_void_the_figure(
-    new_run: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_steps_not_made_void_the_figure(new_run: NewRun, monkeypatch: Patch) -> None:
     step = NativeSimulation.step
 
     def lazy(self: NativeSimulation, n: int = 1, *, kinematics: bool = False) -> None:
@@ -269,9 +257,7 @@ def test_steps_not_made_void_the_figure(
 
 
 @pytest.mark.full
-def test_broken_measurement_leaves_the_others(
-    new_run: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_broken_measurement_leaves_the_others(new_run: NewRun, monkeypatch: Patch) -> None:
     def out_of_memory(*_: object, **__: object) -> None:
         raise MemoryError("Unable to allocate 9 GiB")
 
@@ -285,9 +271,7 @@ def test_broken_measurement_leaves_the_others(
 
 
 @pytest.mark.full
-def test_broken_episode_does_not_verify_the_task(
-    new_run: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_broken_episode_does_not_verify_the_task(new_run: NewRun, monkeypatch: Patch) -> None:
     def broken(*_: object, **__: object) -> None:
         raise RuntimeError("bad")
 
@@ -304,7 +288,7 @@ def test_broken_episode_does_not_verify_the_task(
 
 
 @pytest.mark.full
-def test_a_task_without_a_check_is_not_asked_for_batch(new_run: Callable[..., Run]) -> None:
+def test_a_task_without_a_check_is_not_asked_for_batch(new_run: NewRun) -> None:
     overrides = ["task=reach", "task.check=null", "task.success=null", "sim=native", "nworld=1"]
     result = measure(new_run, *overrides, *FEW)
     assert result.status is Status.passed
@@ -313,7 +297,7 @@ def test_a_task_without_a_check_is_not_asked_for_batch(new_run: Callable[..., Ru
 
 
 @pytest.mark.full
-def test_no_time_for_an_episode_is_said(new_run: Callable[..., Run]) -> None:
+def test_no_time_for_an_episode_is_said(new_run: NewRun) -> None:
     result = measure(new_run, *NATIVE, "gate.throughput.cpu_max_seconds=1e-4")
     assert result.status is Status.passed
     assert "episode: not measured: an episode would take about" in result.reason
@@ -324,7 +308,7 @@ def test_no_time_for_an_episode_is_said(new_run: Callable[..., Run]) -> None:
 
 
 @pytest.mark.full
-def test_start_states_repeat_without_the_batch_gate(new_run: Callable[..., Run]) -> None:
+def test_start_states_repeat_without_the_batch_gate(new_run: NewRun) -> None:
     run = new_run("sim=native", "nworld=5", *SHORT, "gate.throughput.start_worlds=2")
     sim = run.stage.batch_simulation(5)
     state = physics.carry_start(run.stage, sim, None)
@@ -341,7 +325,7 @@ def test_start_states_repeat_without_the_batch_gate(new_run: Callable[..., Run])
 
 
 @pytest.mark.full
-def test_worlds_with_an_empty_grasp_are_counted(new_run: Callable[..., Run]) -> None:
+def test_worlds_with_an_empty_grasp_are_counted(new_run: NewRun) -> None:
     """Red beside the jaws in two of five worlds, then in three of them."""
     run = new_run("sim=native", "nworld=5", *SHORT, f"{ONLY}[physics]")
     sim = run.stage.batch_simulation(5)
@@ -362,7 +346,7 @@ def test_worlds_with_an_empty_grasp_are_counted(new_run: Callable[..., Run]) -> 
 
 
 @pytest.mark.full
-def test_the_parts_play_one_trajectory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_parts_play_one_trajectory(monkeypatch: Patch) -> None:
     """Physics alone ends where the whole step ended, except in worlds that were reset meanwhile, of
     which there are some."""
     cfg = load_config(["task=stack", "sim=native", "task.episode_steps=9"])
@@ -432,13 +416,13 @@ class FakeNvml:
         return self.millijoules
 
 
-def meter(monkeypatch: pytest.MonkeyPatch, nvml: FakeNvml | None) -> EnergyMeter:
+def meter(monkeypatch: Patch, nvml: FakeNvml | None) -> EnergyMeter:
     monkeypatch.setitem(sys.modules, "pynvml", nvml)  # None: an import error
     monkeypatch.setattr(timing, "cuda_uuid", lambda _: "GPU-1")
     return EnergyMeter("cuda:0")
 
 
-def test_energy_is_that_of_the_stretches_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_energy_is_that_of_the_stretches_alone(monkeypatch: Patch) -> None:
     """What passes between them, 500 J and a minute, does not count."""
     clock = iter([10.0, 14.0, 74.0, 80.0])
     monkeypatch.setattr(timing.time, "perf_counter", lambda: next(clock))
@@ -469,7 +453,7 @@ def test_the_meter_runs_while_the_work_does() -> None:
 
 
 @pytest.mark.full
-def test_the_meter_sees_an_episodes_replayed_steps(new_run: Callable[..., Run]) -> None:
+def test_the_meter_sees_an_episodes_replayed_steps(new_run: NewRun) -> None:
     run = new_run("sim=native", "nworld=1")
     seen = []
     sim = run.stage.batch_simulation(1)
@@ -489,9 +473,7 @@ def test_the_meter_sees_an_episodes_replayed_steps(new_run: Callable[..., Run]) 
         (FakeNvml(), "too short"),
     ],
 )
-def test_missing_power_says_why(
-    monkeypatch: pytest.MonkeyPatch, nvml: FakeNvml | None, why: str
-) -> None:
+def test_missing_power_says_why(monkeypatch: Patch, nvml: FakeNvml | None, why: str) -> None:
     energy = meter(monkeypatch, nvml)
     energy.start()
     energy.stop()
@@ -503,7 +485,7 @@ def test_missing_power_says_why(
 
 @pytest.mark.full
 @on_cuda
-def test_episode_costs_hardly_more_than_bare_steps(new_run: Callable[..., Run]) -> None:
+def test_episode_costs_hardly_more_than_bare_steps(new_run: NewRun) -> None:
     run = new_run(
         "sim=mjwarp",
         "nworld=2048",

@@ -14,7 +14,7 @@ import pytest
 import soak
 import verdicts
 from compositions import load_config
-from environments import one_second_episode
+from environments import Capture, Patch, one_second_episode
 from policies import hold_above_red
 from solver_states import FUSED, RANDOM, SCRIPTED, STOCK, Pipeline, Sample, record_states
 
@@ -73,7 +73,7 @@ def test_the_cost_is_mujocos(recorded: Recorded) -> None:
                 assert costs[world] == pytest.approx(expected, rel=2e-3, abs=1e-3)
 
 
-def test_a_wrong_solver_is_seen(recorded: Recorded, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_wrong_solver_is_seen(recorded: Recorded, monkeypatch: Patch) -> None:
     stage, pipeline, samples = recorded
     native = NativeSimulation(stage.model, NWORLD)
 
@@ -127,8 +127,8 @@ def test_a_benchmark_prints_its_table(
     name: str,
     options: list[str],
     expected: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    monkeypatch: Patch,
+    capsys: Capture,
     tmp_path: Path,
 ) -> None:
     monkeypatch.setenv("COLUMNS", "400")

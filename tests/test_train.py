@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from compositions import load_config
-from environments import at_double_speed, configure, on_new_sim
+from environments import Capture, Patch, at_double_speed, configure, on_new_sim
 from policies import assert_drives, curve, interrupted, report, same, weights
 from safetensors.torch import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -36,7 +36,7 @@ REACH = (*TINY, "task=reach")
 
 
 def test_a_training_leaves_policies_a_curve_and_a_judgement(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: Patch
 ) -> None:
     out = tmp_path / "training"
     assert run([*REACH, f"job.folder={out}"]) == 0
@@ -91,7 +91,7 @@ def test_a_training_goes_on_where_it_was_interrupted(tmp_path: Path) -> None:
 
 
 @pytest.mark.full
-def test_numbers_that_are_not_finite(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_numbers_that_are_not_finite(tmp_path: Path, capsys: Capture) -> None:
     """An episode with one is left out; a network with one is not saved, and ends the training."""
     (tmp_path / "conf").mkdir()
     (tmp_path / "faulty.py").write_text(
@@ -115,7 +115,7 @@ def test_numbers_that_are_not_finite(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 @pytest.mark.full
 def test_a_full_disk_leaves_the_policies_before_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: Patch, capsys: Capture
 ) -> None:
     """After the first policies nothing larger than a kilobyte can be written. The same command goes
     on when there is room again."""
@@ -153,7 +153,7 @@ def test_every_batch_of_every_process_draws_anew() -> None:
 
 
 def test_a_process_may_come_when_the_first_one_has_begun(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: Patch
 ) -> None:
     (tmp_path / "training.json").write_text("{}")
     cfg = load_config([*REACH, f"job.folder={tmp_path}"])

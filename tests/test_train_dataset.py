@@ -13,6 +13,7 @@ import pytest
 import torch
 from compositions import load_config, refusal
 from dataset_checker import with_column
+from environments import Refused
 from policies import report
 
 from mjstack.cli import run
@@ -289,9 +290,7 @@ def test_no_dataset_and_others_terms_and_tasks(dataset: Path, tmp_path: Path) ->
     assert "expected seeds that training does not use" in refusal_of(used)
 
 
-def test_a_dataset_is_checked_before_anything_is_written(
-    tmp_path: Path, refused: Callable[..., str]
-) -> None:
+def test_a_dataset_is_checked_before_anything_is_written(tmp_path: Path, refused: Refused) -> None:
     assert refused(*TRAIN, f"job.dataset={tmp_path}", "job.folder=out")
 
 

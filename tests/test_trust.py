@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 from compositions import load_config, refusal
-from environments import one_second_episode
+from environments import Capture, Patch, Refused, one_second_episode
 from omegaconf import OmegaConf
 from policies import write_policy
 
@@ -49,7 +49,7 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def stranger(own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def stranger(own: Path, tmp_path: Path, monkeypatch: Patch) -> Path:
     """A copy of it below the working folder, which a payload would write to."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
@@ -79,7 +79,7 @@ def refused(call: Callable[[], object]) -> str:
 
 
 @pytest.mark.full
-def test_runs_have_values(own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_runs_have_values(own: Path, tmp_path: Path, monkeypatch: Patch) -> None:
     """Of a sweep too."""
     monkeypatch.chdir(tmp_path)
     args = ["gates=[batch]", "sim=native", "nworld=1", *one_second_episode()]
@@ -173,13 +173,13 @@ CALLABLE = ("pydoc.pipepager", "builtins.max", "builtins.dict", "sys.exit", "tor
 
 
 @pytest.mark.parametrize("name", others_full(CALLABLE, CALLABLE[0]))
-def test_only_what_declares_itself_is_called(name: str, refused: Callable[..., str]) -> None:
+def test_only_what_declares_itself_is_called(name: str, refused: Refused) -> None:
     line = refused(f"+reward.evil={{func: {name}, params: {{cmd: 'id > PWNED'}}, weight: 1}}")
     assert f"func={name}: expected a function or class whose first parameter is named env" in line
 
 
 @pytest.mark.full
-def test_a_gate_declares_itself(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_gate_declares_itself(capsys: Capture) -> None:
     assert run(["gate.batch.func=os.system", "gates=[batch]"]) == 2
     assert "first parameter is named run" in capsys.readouterr().err
 
@@ -188,7 +188,7 @@ def test_a_gate_declares_itself(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize("key", ["reset.evil", "controller.action.arm", "task.check"])
 @pytest.mark.parametrize("given", ["", "conf", "beside"])
 def test_no_module_of_the_folder_is_imported(
-    key: str, given: str, stranger: Path, monkeypatch: pytest.MonkeyPatch
+    key: str, given: str, stranger: Path, monkeypatch: Patch
 ) -> None:
     """Neither from the working folder, nor where a search path makes that importable."""
     (stranger / "payload.py").write_text(PAYLOAD)
@@ -208,7 +208,7 @@ def test_no_module_of_the_folder_is_imported(
 @pytest.mark.full
 @pytest.mark.parametrize("way", ["link", "two places"])
 def test_a_package_that_the_folder_lies_in_is_not_trusted(
-    way: str, stranger: Path, monkeypatch: pytest.MonkeyPatch
+    way: str, stranger: Path, monkeypatch: Patch
 ) -> None:
     """Nor where its configuration is a link that leads elsewhere, or where the package has a second
     place beside the search path."""
@@ -234,7 +234,7 @@ def test_a_package_that_the_folder_lies_in_is_not_trusted(
 @pytest.mark.full
 @pytest.mark.parametrize("start", ["-m mjstack", "a job of a sweep"])
 def test_the_working_folder_is_not_imported_from(
-    start: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    start: str, tmp_path: Path, monkeypatch: Patch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     for name in ("hydra", "omegaconf", "rich", "json", "difflib", "pathlib", "platform"):
@@ -347,9 +347,7 @@ def test_a_policy_cannot_claim_more_than_it_is(tmp_path: Path) -> None:
     assert ".clip=[True, True]: expected a list of 2 numbers" in line
 
 
-def test_arrays_are_not_unpacked_without_end(
-    stranger: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_arrays_are_not_unpacked_without_end(stranger: Path, monkeypatch: Patch) -> None:
     """A few bytes of an npz file may stand for gigabytes."""
     monkeypatch.setattr("mjstack.files._MOST_BYTES", 2**22)
     for name in ("worlds_seed0.npz", "starts.npz"):
@@ -362,7 +360,7 @@ def test_arrays_are_not_unpacked_without_end(
 
 
 def test_a_policy_that_a_training_saves_meanwhile_is_read_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: Patch
 ) -> None:
     """The weights that policy.json has just named may be gone before they are read."""
     folder = write_policy(tmp_path / "policy", load_config(["sim=native"]))
@@ -443,9 +441,7 @@ def test_a_record_is_read_as_it_was_written(own: Path) -> None:
 
 
 @pytest.mark.full
-def test_no_control_character_reaches_the_terminal(
-    stranger: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_no_control_character_reaches_the_terminal(stranger: Path, capsys: Capture) -> None:
     report = json.loads((stranger / "report.json").read_text())
     report["provenance"]["git_commit"] = "\x1b]0;PWNED\x07\x9b2J\u202e\u2066"
     (stranger / "report.json").write_text(json.dumps(report))

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from environments import Capture, Patch
 
 import mjstack
 
@@ -10,7 +11,7 @@ REACH = ["task=reach", "sim=native", "nworld=2"]
 
 
 def test_results_and_records_come_back_and_nothing_is_left(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: Patch, capsys: Capture
 ) -> None:
     monkeypatch.chdir(tmp_path)
     found = mjstack.verify([*REACH, "gates=[baseline,batch,success]", "gate.success.seeds=2"])

@@ -5,7 +5,6 @@ import os
 import shutil
 import sys
 import threading
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ import pytest
 import torch
 from compositions import load_config
 from dataset_checker import contents
-from environments import has_gl
+from environments import Patch, Refused, has_gl
 
 from mjstack.cli import run
 from mjstack.datasets import DatasetSpec, DatasetWriter, EpisodeData, Feature, Video, read_dataset
@@ -112,9 +111,7 @@ def test_statistics_are_per_channel_and_in_0_to_1(tmp_path: Path) -> None:
     assert total["action"]["count"] == [146]
 
 
-def test_a_resumed_dataset_is_the_uninterrupted_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_resumed_dataset_is_the_uninterrupted_one(tmp_path: Path, monkeypatch: Patch) -> None:
     def fail(*paths: Path) -> None:
         raise OSError("no more")
 
@@ -128,9 +125,7 @@ def test_a_resumed_dataset_is_the_uninterrupted_one(
     assert contents(tmp_path / "parts") == contents(tmp_path / "whole")
 
 
-def test_a_full_disk_keeps_what_was_committed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_keeps_what_was_committed(tmp_path: Path, monkeypatch: Patch) -> None:
     write(tmp_path, range(3))
     before = contents(tmp_path)
     script = tmp_path.parent / "ffmpeg"
@@ -149,7 +144,7 @@ def test_a_full_disk_keeps_what_was_committed(
 
 
 @pytest.mark.full
-def test_a_kill_leaves_what_was_committed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_kill_leaves_what_was_committed(tmp_path: Path, monkeypatch: Patch) -> None:
     """What one would have left is copied before the second commit's first file takes its place."""
     whole = tmp_path / "whole"
     left = tmp_path / "left"
@@ -171,7 +166,7 @@ def test_a_kill_leaves_what_was_committed(tmp_path: Path, monkeypatch: pytest.Mo
     assert len(image_names(left)) == 2
 
 
-def test_few_images_wait_for_the_encoders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_few_images_wait_for_the_encoders(tmp_path: Path, monkeypatch: Patch) -> None:
     encode = video_module.encode
     go = threading.Event()
     begun: list[int] = []
@@ -223,9 +218,7 @@ COMMAND += SMALL.split()
 
 
 @GL
-def test_without_an_encoder_nothing_is_written(
-    monkeypatch: pytest.MonkeyPatch, refused: Callable[..., str]
-) -> None:
+def test_without_an_encoder_nothing_is_written(monkeypatch: Patch, refused: Refused) -> None:
     for program in ("/bin/false", "/no/ffmpeg"):
         monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", program)
         assert "cannot be encoded" in refused(*COMMAND)
@@ -246,7 +239,7 @@ def halved(images: np.ndarray) -> np.ndarray:
 @pytest.mark.full
 @pytest.mark.parametrize("backend", ["native", "mjwarp"])
 def test_a_dataset_has_the_images_of_the_environment(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, backend: str
+    tmp_path: Path, monkeypatch: Patch, backend: str
 ) -> None:
     """Five episodes in batches of three; images as an environment draws them in its steps."""
     monkeypatch.chdir(tmp_path)
