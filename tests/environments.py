@@ -35,6 +35,10 @@ CUDA = [
 ]
 DEVICES = ["cpu", pytest.param("cuda:0", marks=CUDA)]
 TASKS = ("stack", "reach")
+# For tests whose path is one for both robots: the reBot's in test-rest alone
+REBOT_LATER = pytest.mark.parametrize(
+    "robot", ["so101", pytest.param("rebot", marks=pytest.mark.full)]
+)
 STATE = ("qpos", "qvel", "act", "ctrl")
 POSES = ("xpos", "xquat", "site_xpos", "geom_xpos")
 COUNTS = (

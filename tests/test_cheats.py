@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from check_cases import BLUE, RED, rules_of
-from environments import GetStage, MakeSim
+from environments import REBOT_LATER, GetStage, MakeSim
 from recordings import Recorder, World, feed
 
 from mjstack.drivers.driver import Driver
@@ -73,6 +73,7 @@ def test_the_expert_passes_without_phases(robot: str, drive: Callable[..., list[
     assert drive(robot, lambda targets, spans: None) == [set()] * NWORLD
 
 
+@REBOT_LATER
 def test_holding_is_no_stack(robot: str, drive: Callable[..., list[set[str]]]) -> None:
     """It never lets go; in the last two worlds it does so when the settled window has begun."""
 

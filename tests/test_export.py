@@ -252,24 +252,29 @@ def test_a_full_disk_leaves_neither_file(
     assert "cannot be written (No space left on device), and nothing was exported" in gate["reason"]
 
 
-def test_lerobots_folder_has_its_own_files_and_the_weights(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("observation", "key"),
+    [("pixels", "state"), pytest.param("state", "environment_state", marks=pytest.mark.full)],
+)
+def test_lerobots_folder_has_its_own_files_and_the_weights(
+    observation: str, key: str, tmp_path: Path
+) -> None:
     """LeRobot itself loads it in test_lerobot.py. One that sees measured joints alone takes a real
     arm's."""
-    for observation, key in (("state", "environment_state"), ("pixels", "state")):
-        policy = write_noiseless(tmp_path / observation, configure(f"observation={observation}"))
-        out = tmp_path / f"{observation}_out"
-        assert export(policy, out, "job.format=lerobot") == 0
-        config = json.loads((out / "config.json").read_text())
-        assert config["type"] == "mjstack"
-        assert list(config["input_features"]) == [f"observation.{key}"]
-        assert config["output_features"]["action"] == {"type": "ACTION", "shape": [6]}
-        assert np.array(config["joint_range"]).shape == (6, 2)
-        before, after = (load_policy(folder).network.state_dict() for folder in (policy, out))
-        assert all(torch.equal(value, after[name]) for name, value in before.items())
-        for kind in ("pre", "post"):
-            chain = json.loads((out / f"policy_{kind}processor.json").read_text())["steps"]
-            assert chain[-1]["registry_name"] == "device_processor"
-        assert not (out / "policy.onnx").exists()
+    policy = write_noiseless(tmp_path / observation, configure(f"observation={observation}"))
+    out = tmp_path / f"{observation}_out"
+    assert export(policy, out, "job.format=lerobot") == 0
+    config = json.loads((out / "config.json").read_text())
+    assert config["type"] == "mjstack"
+    assert list(config["input_features"]) == [f"observation.{key}"]
+    assert config["output_features"]["action"] == {"type": "ACTION", "shape": [6]}
+    assert np.array(config["joint_range"]).shape == (6, 2)
+    before, after = (load_policy(folder).network.state_dict() for folder in (policy, out))
+    assert all(torch.equal(value, after[name]) for name, value in before.items())
+    for kind in ("pre", "post"):
+        chain = json.loads((out / f"policy_{kind}processor.json").read_text())["steps"]
+        assert chain[-1]["registry_name"] == "device_processor"
+    assert not (out / "policy.onnx").exists()
 
 
 def test_lerobots_robots_take_joint_targets_alone(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from compositions import load_config
-from environments import at_double_speed
+from environments import REBOT_LATER, at_double_speed
 
 import mjstack
 from mjstack.config.schema import Backend, Config
@@ -108,6 +108,7 @@ def fall(value: torch.Tensor) -> torch.Tensor:
     ("task", "objects"),
     [("stack", 1), *(pytest.param(task, 2, marks=pytest.mark.full) for task in ("box", "tower"))],
 )
+@REBOT_LATER
 def test_the_stage_never_falls_along_an_accepted_episode(
     task: str, objects: int, robot: str
 ) -> None:
@@ -130,6 +131,7 @@ def test_the_stage_never_falls_along_an_accepted_episode(
 
 
 @pytest.mark.parametrize("task", ["reach", pytest.param("push", marks=pytest.mark.full)])
+@REBOT_LATER
 def test_a_reward_without_stages_rises_along_the_experts_way(task: str, robot: str) -> None:
     rec = expert(task, robot)
     assert rec.success.any(0).all()
@@ -143,6 +145,7 @@ def test_a_reward_without_stages_rises_along_the_experts_way(task: str, robot: s
     ("task", "opens"),
     [("stack", "release"), pytest.param("box", "open_blue", marks=pytest.mark.full)],
 )
+@REBOT_LATER
 def test_a_release_is_worth_more_than_holding_for_ever(
     task: str, opens: str, gamma: float, robot: str
 ) -> None:

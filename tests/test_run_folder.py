@@ -149,7 +149,10 @@ def test_sweeps_of_one_hour_have_a_folder_each(begin: Callable[..., int]) -> Non
     assert {path.name for path in Path("x").iterdir() if path.is_dir()} == {"s1", "s2"}
 
 
-@pytest.mark.parametrize("subdir", ["", "same", "x/../same"])
+SAME = ["", *(pytest.param(s, marks=pytest.mark.full) for s in ("same", "x/../same"))]
+
+
+@pytest.mark.parametrize("subdir", SAME)
 def test_jobs_of_a_sweep_may_not_share_a_folder(
     subdir: str, begin: Callable[..., int], capsys: Capture
 ) -> None:

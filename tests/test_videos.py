@@ -13,9 +13,9 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
-from compositions import load_config
+from compositions import load_config, refusal
 from dataset_checker import contents
-from environments import Patch, Refused, has_gl
+from environments import Patch, has_gl
 
 from mjstack.cli import run
 from mjstack.datasets import DatasetSpec, DatasetWriter, EpisodeData, Feature, Video, read_dataset
@@ -27,6 +27,7 @@ from mjstack.drivers.closed_loop import make_expert
 from mjstack.envs import build_env
 from mjstack.episodes.rollout import reset_worlds
 from mjstack.errors import ArgumentError, FolderError
+from mjstack.jobs import check_job
 
 GL = pytest.mark.skipif(not has_gl(), reason="MuJoCo does not draw offscreen here")
 SIZES = {"observation.images.front": (32, 48), "observation.images.wrist": (16, 16)}
@@ -218,15 +219,17 @@ COMMAND += SMALL.split()
 
 
 @GL
-def test_without_an_encoder_nothing_is_written(monkeypatch: Patch, refused: Refused) -> None:
+def test_without_an_encoder_nothing_is_written(monkeypatch: Patch) -> None:
+    def refused(*more: str, says: str) -> None:
+        refusal(lambda: check_job(load_config([*COMMAND, *more])), says)
+
     for program in ("/bin/false", "/no/ffmpeg"):
         monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", program)
-        assert "cannot be encoded" in refused(*COMMAND)
+        refused(says="cannot be encoded")
     monkeypatch.delenv("IMAGEIO_FFMPEG_EXE")
-    depth = "scene.cameras.wrist.outputs=[depth]"
-    assert "expected rgb among them" in refused(*COMMAND, depth)
+    refused("scene.cameras.wrist.outputs=[depth]", says="expected rgb among them")
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    assert "pip install 'mjstack[video]'" in refused(*COMMAND)
+    refused(says="pip install 'mjstack[video]'")
 
 
 def halved(images: np.ndarray) -> np.ndarray:
