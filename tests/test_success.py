@@ -3,6 +3,7 @@ both backends."""
 
 import csv
 from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -30,7 +31,7 @@ from mjstack.envs import Env
 from mjstack.episodes.failures import FailureMonitor, Sign
 from mjstack.episodes.record import FAILING
 from mjstack.episodes.regions import describe_region, find_regions, radial_yaw_deg, regions_table
-from mjstack.episodes.rollout import Hook, rollout
+from mjstack.episodes.rollout import Hook, reset_worlds, rollout
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Progress, Stage
 from mjstack.gates.success import Goal, find_doubts, run_success, success_config
@@ -442,7 +443,7 @@ def test_evaluations_that_show_less_than_they_seem_to_are_flagged() -> None:
     (repeated,) = find_doubts(distinct=50, episodes=200, successes=200, lost=0, rate=0.95)
     assert repeated == "150 of 200 starts are there twice"
     (lost,) = find_doubts(distinct=300, episodes=300, successes=296, lost=4, rate=0.95)
-    assert lost.startswith("4 episodes reached the goal and lost it")
+    assert lost.startswith("reached the goal and lost it: 4 of 300 episodes")
     (few,) = find_doubts(distinct=10, episodes=10, successes=10, lost=0, rate=0.95)
     assert few.startswith("10 episodes show at least 72.25 %, not 95 %")
 
@@ -466,7 +467,8 @@ def test_a_goal_that_is_reached_and_lost_is_counted(after: int, lost: int) -> No
     cfg = configure("task=reach", "sim=native", "nworld=2", "controller=closed_loop")
     stage = Stage(cfg)
     with closing(stage.batch_simulation(2)) as sim:
-        env = stage.start(sim, cfg.reset)
-        goal = Goal(Run(stage))
+        driven = replace(stage.driven(cfg.reset), task=cfg.task)
+        env = reset_worlds(Env(sim, stage.index, driven), seed=0)
+        goal = Goal(stage.ranks)
         rollout(env, Retreat(stage.driver(env), env, after), [goal])
         assert goal.lost == lost

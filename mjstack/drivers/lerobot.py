@@ -15,67 +15,49 @@ from mjstack.envs.env import Env
 from mjstack.errors import ArgumentError, FolderError
 from mjstack.managers.observation import ObservationManager
 from mjstack.policy.lerobot import IMAGES, SEEN, STATE
-from mjstack.robots.units import LerobotUnits
+from mjstack.robots.units import LEROBOT, LerobotUnits
 
 GROUP = "policy"  # the observation group that is LeRobot's environment_state
 
 
 class LerobotWords:
-    """Observations and joint targets of an environment as LeRobot has them.
-
-    Attributes:
-        begins: Whether the next targets are the first ones of an episode.
-    """
+    """Observations and joint targets of an environment as LeRobot has them, in its ``units``."""
 
     def __init__(
-        self,
-        env: Env,
-        observations: ObservationManager,
-        images: Mapping[str, Tensor],
-        *,
-        si: bool = False,
+        self, env: Env, seen: Mapping[str, Tensor], images: Mapping[str, Tensor], units: str
     ) -> None:
-        """Take what there is to see; ``si``: joint values are rad and m."""
+        """Take what there is to see: the observation group, if any, and the cameras' images."""
         self._env = env
-        self._observations = observations
+        self._seen = seen
         self._images = images
         self._joints = env.index.on(env.device, env.sim.qpos.dtype).qpos
-        self._units = None if si else LerobotUnits(env.index.n_arm, env.index.ctrl_range)
-        self.begins = True
-
-    def from_si(self, values: np.ndarray) -> np.ndarray:
-        """Joint values in LeRobot's units, float32."""
-        return values.astype(np.float32) if self._units is None else self._units.from_si(values)
+        self.units = LerobotUnits(env.index.n_arm, env.index.ctrl_range, units)
 
     def observe(self) -> dict[str, np.ndarray]:
         """What there is to see, by LeRobot's names. What is not finite is 0: the check fails its
         world.
         """
         positions = self._joints.read(self._env.sim.qpos)
-        numbers = {STATE: self.from_si(positions.cpu().numpy())}
-        for group in self._observations.groups.values():
-            numbers[SEEN] = group.float().cpu().numpy()
-        seen = {name: np.nan_to_num(part, posinf=0.0, neginf=0.0) for name, part in numbers.items()}
+        seen = {STATE: self.units.from_si(positions.cpu().numpy())}
+        for group in self._seen.values():
+            seen[SEEN] = group.float().cpu().numpy()
+        seen = {name: np.nan_to_num(part, posinf=0.0, neginf=0.0) for name, part in seen.items()}
         for name, image in self._images.items():
             seen[f"observation.{name}"] = image.to("cpu", copy=True).numpy()
         return seen
 
     def targets(self, actions: np.ndarray) -> Tensor:
-        """Joint targets [rad, m], shape ``(nworld, joints)``, float32, of such actions.
-
-        Raises:
-            ArgumentError: They have another width, or are radians where degrees are due.
+        """Joint targets [rad, m], shape ``(nworld, joints)``, float32, of such actions; an
+        ArgumentError if they have another width, or are radians where degrees are due.
         """
-        shape = (self._env.nworld, len(self._env.index.ctrl))
+        env = self._env
+        shape = (env.nworld, len(env.index.ctrl))
         if actions.shape != shape:
             expected = f"shape {shape}, a target for each joint"
             raise ArgumentError("action", f"shape {actions.shape}", expected)
-        if self._units is not None:
-            if self.begins:
-                self._units.check_commands(actions, self.observe()[STATE])
-            actions = self._units.to_si(actions)
-        self.begins = False
-        return torch.tensor(actions, device=self._env.device)
+        if not env.episode_step.any():
+            self.units.check_commands(actions, self.observe()[STATE])
+        return torch.tensor(self.units.to_si(actions), device=env.device)
 
 
 class LerobotDriver(Driver):
@@ -86,15 +68,8 @@ class LerobotDriver(Driver):
     """
 
     def __init__(self, env: Env, loaded: tuple[Any, Any, Any], cfg: Config) -> None:
-        """Check what the policy needs, and allocate for the environment's worlds.
-
-        Args:
-            env: The environment, its worlds started.
-            loaded: The policy and its processors, as of `load_lerobot`.
-            cfg: The configuration with its cameras and observations.
-
-        Raises:
-            MjstackError: The scene does not have what the policy needs.
+        """Take a policy and its processors, as of `load_lerobot`; a FolderError if the scene does
+        not have what they need. ``cfg`` is the configuration with its cameras and observations.
         """
         super().__init__(env.nworld, cfg.task.episode_steps, env.device)
         self._policy, self._before, self._after = loaded
@@ -108,7 +83,7 @@ class LerobotDriver(Driver):
         period = getattr(config, "n_action_steps", 1) if config.n_obs_steps == 1 else 1
         self._images = QueryImages(env, cameras, names, period)
         images = {f"images.{name}": image for name, image in self._images.images.items()}
-        self._words = LerobotWords(env, self._observations, images)
+        self._words = LerobotWords(env, self._observations.groups, images, LEROBOT)
         here = {name: part.shape[1:] for name, part in self._words.observe().items()}
         for name, shape in inputs.items():
             if here.get(name) not in (shape, (*shape[1:], *shape[:1])):  # images are (…, 3) here

@@ -155,7 +155,7 @@ def rollout(
     )
 
 
-def reset_worlds(env: Env, seed: int, worlds: Sequence[int] | None = None) -> Env:
+def reset_worlds(env: Env, seed: int | None, worlds: Sequence[int] | None = None) -> Env:
     """Reset every world, under these numbers if there are any, and bring everything that derives
     from their state up to date.
     """

@@ -109,15 +109,9 @@ class Assets:
 
     @cached_property
     def lerobot_policy(self) -> tuple[Any, Any, Any] | None:
-        """That of ``policy=lerobot:FOLDER``, as of `load_lerobot`; None if the policy is ours.
-
-        Raises:
-            MjstackError: It cannot be loaded.
-        """
+        """That of ``policy=lerobot:FOLDER``, as of `load_lerobot`; None if the policy is ours."""
         name = self.cfg.policy or ""
-        if not name.startswith(PREFIX):
-            return None
-        return load_lerobot(name, resolve_backend(self.cfg)[1])
+        return load_lerobot(name, resolve_backend(self.cfg)[1]) if name.startswith(PREFIX) else None
 
 
 @dataclass(eq=False)
@@ -215,12 +209,15 @@ class Stage:
         return policy.action
 
     def driven(self, reset: Reset) -> Config:
-        """The configuration of a driven episode. The live view also shows rewards and success."""
+        """The configuration of a driven episode. A policy's has success in every step, and that of
+        the live view rewards too.
+        """
         cfg = driven_config(self.cfg, reset, self.action)
         if self.cfg.view == "web":
             cfg = replace(cfg, reward=self.cfg.reward, task=self.cfg.task)
-        if self.cfg.controller.name == POLICY and self.assets.lerobot_policy:
-            cfg = replace(cfg, graph="off")  # it acts on the host
+        if self.cfg.controller.name == POLICY:
+            graph = "off" if self.assets.lerobot_policy else cfg.graph  # it acts on the host
+            cfg = replace(cfg, task=self.cfg.task, graph=graph)
         return cfg
 
     def start(

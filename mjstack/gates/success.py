@@ -11,6 +11,7 @@ from typing_extensions import override
 
 from mjstack.config.check import places_objects, reads_starts_file, with_region
 from mjstack.config.schema import Config
+from mjstack.distributed import Ranks
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.record import starts_name
@@ -19,7 +20,6 @@ from mjstack.episodes.rollout import CLOSED_LOOP, FEEDBACK, POLICY, Observer
 from mjstack.episodes.run import Run, needs_episode, spread
 from mjstack.episodes.seeds import play_seeds
 from mjstack.files import write_npz
-from mjstack.managers.term import Term
 from mjstack.math import wilson_interval
 from mjstack.mdp.starts.starts_file import start_arrays
 from mjstack.report.record import GateResult
@@ -48,17 +48,14 @@ def run_success(run: Run) -> list[GateResult]:
     cfg = success_run.cfg
     t = cfg.gate.success
     unwritten: list[str] = []
-    goals = [Goal(success_run) for _ in range(t.seeds) if cfg.controller.name == POLICY]
+    goals = [Goal(success_run.stage.ranks)] if cfg.controller.name == POLICY else []
     tally = play_seeds(
         success_run,
         "success",
         count=t.seeds,
         noun="episodes",
         signs=True,
-        observers=lambda seed: [
-            _StartsWriter(success_run, seed, unwritten),
-            *goals[seed - cfg.seed :][:1],
-        ],
+        observers=lambda seed: [_StartsWriter(success_run, seed, unwritten), *goals],
     )
     starts = tally.array("start_places")
     retries = tally.array("retries")
@@ -109,49 +106,42 @@ def find_doubts(distinct: int, episodes: int, successes: int, lost: int, rate: f
     """What keeps an evaluation from showing a rate, a line each: how many of its starts differ, how
     many of its episodes succeeded at their end, and how many reached the goal and lost it again.
     """
-    doubts = []
-    if distinct < episodes:
-        doubts.append(f"{episodes - distinct} of {episodes} starts are there twice")
     low, _ = wilson_interval(successes, episodes)
-    if low < rate <= successes / episodes:
-        bound = f"at least {format_percent(low)}, not {format_percent(rate)}"
-        doubts.append(f"{episodes} episodes show {bound}: play more (nworld, gate.success.seeds)")
-    if lost:
-        noun = "episode" if lost == 1 else "episodes"
-        doubts.append(f"{lost} {noun} reached the goal and lost it: a success in any step is none")
-    return doubts
+    bound = f"at least {format_percent(low)}, not {format_percent(rate)}"
+    doubts = {
+        f"{episodes - distinct} of {episodes} starts are there twice": distinct < episodes,
+        f"{episodes} episodes show {bound}: play more (nworld, gate.success.seeds)": (
+            low < rate <= successes / episodes
+        ),
+        f"reached the goal and lost it: {lost} of {episodes} episodes, which do not count": lost,
+    }
+    return [text for text, holds in doubts.items() if holds]
 
 
 class Goal(Observer):
-    """Counts episodes in which the task's goal held in some step, and does not at the end.
+    """Counts episodes in which the task's goal held in some step, and does not at the end, for
+    environments that compute it.
 
     Attributes:
-        lost: How many, at the end.
+        lost: How many, of all ranks and of all seeds that it has looked on at.
     """
 
-    lost = 0
-
-    def __init__(self, run: Run) -> None:
-        """Look on at the episodes of a run, whose ranks share them."""
-        self._term = run.cfg.task.success
-        self._ranks = run.stage.ranks
+    def __init__(self, ranks: Ranks) -> None:
+        self.lost = 0
+        self._ranks = ranks
 
     @override
     def start(self, env: Env, driver: Driver) -> None:
         super().start(env, driver)
-        self._holds = torch.zeros_like(env.success)
         self._reached = torch.zeros_like(env.success)
-        self._success = Term("task.success", self._term, env) if self._term else None
 
     @override
     def update(self) -> None:
-        if self._success is not None:
-            self._holds.copy_(self._success(self.env))
-            self._reached |= self._holds
+        self._reached |= self.env.success
 
     @override
     def finish(self) -> None:
-        self.lost = sum(self._ranks.gather(int((self._reached & ~self._holds).sum())))
+        self.lost += sum(self._ranks.gather(int((self._reached & ~self.env.success).sum())))
 
 
 class _StartsWriter(Observer):

@@ -5,7 +5,7 @@ of the batches that were played.
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -216,13 +216,13 @@ def make_spec(env: Env, cfg: Config, provenance: Mapping[str, Any]) -> DatasetSp
     """
     config = episode_config(cfg)
     job: CollectJobCfg = cfg.job
-    joints = tuple(cfg.robot.joints)
     units = joint_units(env)
-    positions = Feature(dtype="float32", names=tuple(f"{name}.pos" for name in joints), units=units)
-    if job.units == LEROBOT:
-        positions = replace(
-            positions, units=LerobotUnits(env.index.n_arm, env.index.ctrl_range).units
-        )
+    lerobot = LerobotUnits(env.index.n_arm, env.index.ctrl_range).units
+    positions = Feature(
+        dtype="float32",
+        names=tuple(f"{name}.pos" for name in cfg.robot.joints),
+        units=lerobot if job.units == LEROBOT else units,
+    )
     features = {STATE: positions}
     for group in cfg.observation:
         name = f"observation.{group}"

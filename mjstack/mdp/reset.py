@@ -5,7 +5,6 @@ values each time.
 import math
 from collections.abc import Sequence
 
-import mujoco
 import torch
 from torch import Tensor
 from typing_extensions import override
@@ -58,9 +57,9 @@ class JointNoise:
         write_robot(env, mask, torch.clamp(command, self._low, self._high), at)
 
 
-@uses_fields("body_quat")
+@uses_fields("qpos0")
 class JointZeros:
-    """Turns the zero of every hinge by a random angle that nobody measures, as the calibrations of
+    """Moves the zero of every joint by a random amount that nobody measures, as the calibrations of
     real arms differ: positions and commands count from the zero that the servo believes in, and the
     arm is elsewhere. Objects are placed clear of where it would be without.
     """
@@ -68,34 +67,18 @@ class JointZeros:
     label = "reset.zeros"
 
     def __init__(self, env: EnvView, *, arm: NotNegative, gripper: NotNegative = 0.0) -> None:
-        """Take the half-widths.
-
-        Args:
-            env: The environment.
-            arm: Of the arm's hinges [rad].
-            gripper: Of the gripper's [rad].
-
-        Raises:
-            ParameterError: The axis of a joint is not at its body's origin.
-        """
-        model = env.sim.model
-        joints = [model.joint(name).id for name in env.cfg.robot.joints]
-        if model.jnt_pos[joints].any():
-            expected = "a robot whose joints have pos 0, each at the origin of its body"
-            raise ParameterError("arm", arm, expected)
-        hinge = torch.from_numpy(model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE)
-        width = torch.full((len(joints),), gripper, dtype=torch.float64)
-        width[: env.index.n_arm] = arm
-        self._half = (0.5 * width * hinge).to(env.device)
-        self._axis = torch.from_numpy(model.jnt_axis[joints].copy()).to(env.device)
-        self._frames = Elements(env, "body_quat", model.jnt_bodyid[joints].tolist())
+        """Take the half-widths: of the arm's joints and of the gripper's [rad or m]."""
+        self._width = torch.full_like(robot(env).home, gripper, dtype=torch.float64)
+        self._width[: env.index.n_arm] = arm
+        nominal = env.sim.model.qpos0[env.index.robot_qpos]
+        self._nominal = torch.from_numpy(nominal).to(env.device)
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
-        """Write the frames of the joints' bodies."""
+        """Write qpos0, from which MuJoCo counts."""
         at = rows_of(mask)
-        half = self._half * random_uniform(env, self.label, len(self._half), at=at).double()
-        turn = torch.cat((torch.cos(half)[..., None], torch.sin(half)[..., None] * self._axis), -1)
-        self._frames.write(mask, quat_mul(self._frames.nominal.expand_as(turn), turn), at)
+        moved = self._width * random_uniform(env, self.label, len(self._width), at=at)
+        zeros = self._nominal - moved
+        robot(env).qpos.write_masked(env.sim.fields["qpos0"], mask, zeros, at)
 
 
 @offers("reset term")

@@ -1,6 +1,7 @@
 """Policies in LeRobot's folders: ours, written, and those that LeRobot has trained, loaded."""
 
 import json
+from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -18,44 +19,29 @@ _JOINTS = "mjstack.mdp.observation.joint_pos"  # its terms are computed from the
 
 
 def require_lerobot(what: str) -> None:
-    """Refuse what needs LeRobot, before it is imported.
-
-    Raises:
-        MjstackError: It is missing, or of another version.
-    """
+    """Refuse what needs LeRobot where that is missing, or of another version."""
     try:
         installed = version("lerobot")
     except PackageNotFoundError as error:
         raise MissingExtra(what, "lerobot", "lerobot") from error
     if not installed.startswith(SERIES):
-        raise MjstackError(
-            f"{what}: LeRobot {installed} is installed, expected {SERIES}x",
-            f"Run pip install 'lerobot=={SERIES}1'",
-        )
+        problem = f"{what}: LeRobot {installed} is installed, expected {SERIES}x"
+        raise MjstackError(problem, f"Run pip install 'lerobot=={SERIES}1'")
 
 
 def lerobot_files(policy: Policy, ctrl_range: np.ndarray) -> dict[str, str]:
-    """What makes a policy's folder one of LeRobot's, of type ``mjstack``: files by name.
+    """Files by name that make a policy's folder one of LeRobot's, of type ``mjstack``. Limits of
+    the joint targets [rad, m] are of shape ``(joints, 2)``.
 
     A policy that sees its joint positions and images alone takes what a real arm measures; another
-    one takes the environment ``mjstack``'s ``environment_state``.
-
-    Args:
-        policy: The policy.
-        ctrl_range: Limits of the joint targets [rad, m], shape ``(joints, 2)``.
-
-    Raises:
-        FolderError: Its actions are no joint targets.
+    one takes the environment ``mjstack``'s ``environment_state``. One whose actions are no joint
+    targets is a FolderError.
     """
-    targets = policy.config["controller"]["action"].values()
-    if [(term.func, term.params) for term in policy.action.values()] != [
-        (term["func"], term["params"]) for term in targets
-    ]:
-        raise FolderError(
-            f"policy={policy.folder}: its actions are {', '.join(policy.action)}, expected joint"
-            " targets, which LeRobot's robots take",
-            "Name a policy of trainer=dagger or clone",
-        )
+    targets = policy.config["controller"]["action"]
+    if [asdict(term) for term in policy.action.values()] != [*targets.values()]:
+        actions = f"its actions are {', '.join(policy.action)}, expected joint targets, which"
+        problem = f"policy={policy.folder}: {actions} LeRobot's robots take"
+        raise FolderError(problem, "Name a policy of trainer=dagger or clone")
     terms = list(policy.observation.terms.values())
     plain = all((term.history, term.scale, term.clip) == (1, 1.0, None) for term in terms)
     measured = len(terms) == 1 and terms[0].func.startswith(_JOINTS) and plain
@@ -63,34 +49,29 @@ def lerobot_files(policy: Policy, ctrl_range: np.ndarray) -> dict[str, str]:
     inputs = {key: {"type": kind, "shape": [sum(policy.widths.values())]}}
     for name, size in policy.network.vision.sizes.items():
         inputs[f"{IMAGES}.{name}"] = {"type": "VISUAL", "shape": [3, *size]}
-    device = {"registry_name": "device_processor", "config": {"device": "cpu", "float_dtype": None}}
-    rename = {"registry_name": "rename_observations_processor", "config": {"rename_map": {}}}
-    batch = {"registry_name": "to_batch_processor", "config": {}}
-    files: dict[str, Any] = {
-        "config.json": {
-            "type": "mjstack",
-            "input_features": inputs,
-            "output_features": {"action": {"type": "ACTION", "shape": [policy.network.width]}},
-            "push_to_hub": False,
-            "device": "cpu",
-            "joint_range": ctrl_range.tolist(),
-        }
+    config = {
+        "type": "mjstack",
+        "input_features": inputs,
+        "output_features": {"action": {"type": "ACTION", "shape": [policy.network.width]}},
+        "push_to_hub": False,
+        "device": "cpu",
+        "joint_range": ctrl_range.tolist(),
     }
-    for label, steps in {"pre": [rename, batch, device], "post": [device]}.items():
-        name = f"policy_{label}processor"
-        files[f"{name}.json"] = {"name": name, "steps": steps}
+    options: dict[str, Any] = {
+        "rename_observations_processor": {"rename_map": {}},
+        "to_batch_processor": {},
+        "device_processor": {"device": "cpu", "float_dtype": None},
+    }
+    steps = [{"registry_name": name, "config": values} for name, values in options.items()]
+    files: dict[str, Any] = {"config.json": config}
+    for name, part in {"policy_preprocessor": steps, "policy_postprocessor": steps[-1:]}.items():
+        files[f"{name}.json"] = {"name": name, "steps": part}
     return {name: json.dumps(data, indent=2) + "\n" for name, data in files.items()}
 
 
 def load_lerobot(name: str, device: str) -> tuple[Any, Any, Any]:
-    """Load ``lerobot:FOLDER`` onto a device. The folder is trusted code: files of its processors
-    may name classes to import.
-
-    Returns:
-        LeRobot's policy, and what processes its observations and its actions.
-
-    Raises:
-        MjstackError: LeRobot is missing or cannot load it.
+    """Load ``lerobot:FOLDER`` onto a device: LeRobot's policy, and what processes its observations
+    and its actions. The folder is trusted code: files of its processors may name classes to import.
     """
     require_lerobot(f"policy={name}")
     from lerobot.configs.policies import PreTrainedConfig

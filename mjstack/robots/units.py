@@ -17,12 +17,16 @@ class LerobotUnits:
         units: Unit of each joint's numbers.
     """
 
-    def __init__(self, arm_joints: int, ranges: np.ndarray) -> None:
-        """Take the joints' ranges [rad, m], shape ``(joints, 2)``, the arm's first."""
+    def __init__(self, arm_joints: int, ranges: np.ndarray, units: str = LEROBOT) -> None:
+        """Take the joints' ranges [rad, m], shape ``(joints, 2)``, the arm's first. With ``si``
+        numbers stay as they are.
+        """
         arm = np.arange(len(ranges)) < arm_joints
         low, high = ranges.astype(np.float64).T
         self._zero = np.where(arm, 0.5 * (low + high), low)
         self._scale = np.where(arm, 180.0 / np.pi, 100.0 / (high - low))
+        if units != LEROBOT:
+            self._zero, self._scale = np.zeros_like(low), np.ones_like(low)
         self.units = tuple("deg" if joint else "%" for joint in arm)
 
     def from_si(self, values: np.ndarray) -> np.ndarray:
@@ -35,11 +39,8 @@ class LerobotUnits:
 
     def check_commands(self, commands: np.ndarray, positions: np.ndarray) -> None:
         """Check the first commands of an episode, from where the arm stands in these units; both of
-        shape ``(worlds, joints)``.
-
-        Raises:
-            ArgumentError: They are radians: near to where the arm stands in those, and far from it
-                in degrees.
+        shape ``(worlds, joints)``. An ArgumentError if they are radians: near to where the arm
+        stands in those, and far from it in degrees.
         """
         arm = [k for k, unit in enumerate(self.units) if unit == "deg"]
         degrees = np.abs(commands - positions)[:, arm].max()

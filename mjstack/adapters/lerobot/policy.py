@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy
-from lerobot.processor.factory import make_default_pre_post_processors
 from torch import Tensor
 
 from mjstack.drivers.policy import GRID
@@ -17,8 +16,6 @@ from mjstack.errors import ArgumentError, ConfigError
 from mjstack.policy import Policy, load_policy
 from mjstack.policy.lerobot import IMAGES, SEEN, STATE
 from mjstack.robots.units import LerobotUnits
-
-make_mjstack_pre_post_processors = make_default_pre_post_processors  # by this name LeRobot finds it
 
 
 @PreTrainedConfig.register_subclass("mjstack")
@@ -33,16 +30,12 @@ class MjstackConfig(PreTrainedConfig):
     joint_range: list[list[float]] = field(default_factory=list)
     observation_delta_indices = action_delta_indices = reward_delta_indices = None
 
-    def get_scheduler_preset(self) -> Any:
-        """LeRobot does not train it.
-
-        Raises:
-            ConfigError: Always.
-        """
+    def get_optimizer_preset(self) -> Any:
+        """Refuse to be trained by LeRobot."""
         expected = "a policy that LeRobot trains"
         raise ConfigError("policy.type", self.type, expected, "Train it: mjstack job=train")
 
-    get_optimizer_preset = get_scheduler_preset
+    get_scheduler_preset = get_optimizer_preset
 
     def validate_features(self) -> None:
         """Leave that to the environment, which checks the actions' width."""
@@ -56,9 +49,9 @@ class MjstackPolicy(PreTrainedPolicy):
 
     config_class = MjstackConfig
     name = "mjstack"
+    forward = get_optim_params = None  # LeRobot does not train it
 
     def __init__(self, config: MjstackConfig, policy: Policy) -> None:
-        """Take the policy."""
         super().__init__(config)
         # As PolicyDriver has it
         self.network = policy.network if "cuda" in config.device else policy.network.double()
@@ -75,8 +68,7 @@ class MjstackPolicy(PreTrainedPolicy):
         cls, pretrained_name_or_path: str | Path, *, config: MjstackConfig, **kwargs: Any
     ) -> "MjstackPolicy":
         """Load a local folder."""
-        policy = load_policy(Path(pretrained_name_or_path))
-        return cls(config, policy).to(config.device).eval()
+        return cls(config, load_policy(Path(pretrained_name_or_path))).to(config.device).eval()
 
     def reset(self) -> None:
         """Begin new episodes."""
@@ -84,28 +76,23 @@ class MjstackPolicy(PreTrainedPolicy):
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Joint targets in LeRobot's units, shape ``(n, chunk, joints)``.
-
-        Raises:
-            ArgumentError: The observation has another width.
+        """Joint targets in LeRobot's units, shape ``(n, chunk, joints)``; an ArgumentError for an
+        observation of another width.
         """
         seen = batch[self._seen]
         network = self.network
         width = len(network.observation_mean)
         if seen.shape[-1] != width:
-            expected = f"{width}, as the policy was trained"
-            fix = "Name its folder: --env.policy=FOLDER"
-            raise ArgumentError(self._seen, f"{seen.shape[-1]} numbers", expected, fix)
+            expected = f"{width}: name the policy's folder, --env.policy=FOLDER"
+            raise ArgumentError(self._seen, f"{seen.shape[-1]} numbers", expected)
         if self._seen == STATE:
-            positions = self._units.to_si(seen.cpu().numpy()) - self._home
-            seen = torch.from_numpy(positions).float().to(seen.device)
-        dtype = network.action_mean.dtype
+            seen = torch.from_numpy(self._units.to_si(seen.cpu().numpy()) - self._home)
+        seen = seen.float().to(network.action_mean)
         images = [
-            (255.0 * batch[f"{IMAGES}.{name}"]).round().permute(0, 2, 3, 1).to(dtype)
+            (255.0 * batch[f"{IMAGES}.{name}"]).round().permute(0, 2, 3, 1).to(seen)
             for name in network.vision.sizes
         ]
-        chunk = network(seen.to(dtype), images)
-        chunk = (torch.round(chunk * GRID) / GRID).float()
+        chunk = (torch.round(network(seen, images) * GRID) / GRID).float()
         return torch.from_numpy(self._units.from_si(chunk.cpu().numpy())).to(seen.device)
 
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
@@ -115,9 +102,3 @@ class MjstackPolicy(PreTrainedPolicy):
             last = chunk.shape[1] - 1
             self._queue.extend(chunk[:, min(k, last)] for k in range(self._execute))
         return self._queue.popleft()
-
-    def forward(self, batch: Any = None) -> Any:
-        """See `MjstackConfig.get_scheduler_preset`."""
-        return self.config.get_scheduler_preset()
-
-    get_optim_params = forward
