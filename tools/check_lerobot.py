@@ -31,7 +31,12 @@ from lerobot.datasets.dataset_tools import merge_datasets
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.robots import make_robot_from_config
-from lerobot.scripts import lerobot_record, lerobot_replay
+from lerobot.scripts import (
+    lerobot_record,
+    lerobot_replay,
+    lerobot_rollout,
+    lerobot_teleoperate,
+)
 from lerobot.scripts.lerobot_eval import eval_policy
 from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
 
@@ -189,6 +194,60 @@ def arguments(line: str):
         yield
 
 
+@contextmanager
+def watched():
+    """Joints of `mjstack_follower` before each action, and the actions."""
+    seen: list[list[float]] = []
+    sent: list[list[float]] = []
+    send = MjstackFollower.send_action
+
+    def watch(self: MjstackFollower, action: dict) -> dict:
+        observation = self.get_observation()
+        seen.append([observation[name] for name in JOINTS])
+        sent.append([float(action[name]) for name in JOINTS])
+        return send(self, action)
+
+    with patch.object(MjstackFollower, "send_action", watch):
+        yield seen, sent
+
+
+def check_drive(folder: Path) -> str:
+    """`mjstack_follower` driven by a teleoperator and by the ACT of `check_page`."""
+    robot = f"--robot.{PLUGIN} --robot.type=mjstack_follower --robot.id=sim --robot.seed=3"
+    act = folder.parent / "page/outputs/act/checkpoints/last/pretrained_model"
+    cameras = "{front: {type: mjstack, width: 128, height: 128, fps: 30}, wrist: {type: mjstack,"
+    cameras += " width: 128, height: 128, fps: 30}}"
+    parts = []
+    with (
+        arguments(f"lerobot-teleoperate {robot} --teleop.type=scripted --fps=30 --teleop_time_s=5"),
+        patch.object(lerobot_teleoperate, "make_teleoperator_from_config", Scripted),
+        watched() as steps,
+    ):
+        lerobot_teleoperate.teleoperate()
+    parts.append(("lerobot-teleoperate with a scripted teleoperator", steps))
+    with (
+        arguments(
+            f"lerobot-rollout {robot} --robot.cameras='{cameras}' --strategy.type=base"
+            f" --policy.path={act} --policy.device=cpu --fps=30 --duration=5"
+            " --task='Put the red cube onto the blue cube.'"
+        ),
+        watched() as steps,
+    ):
+        lerobot_rollout.rollout()
+    parts.append(("lerobot-rollout with the page's ACT", steps))
+    texts = []
+    for name, (seen, sent) in parts:
+        moved = float(np.ptp(seen, axis=0).max())
+        apart = float(np.abs(np.subtract(seen[1:], sent[:-1])).max())
+        if len(seen) < 30 or moved < 0.5 or not np.isfinite(sent).all():
+            sys.exit(f"{name}: {len(seen)} steps, joints moved by {moved} degrees")
+        texts.append(
+            f"{name}: {len(seen)} actions, joints moved by up to {moved:.1f} degrees, and were at"
+            f" most {apart:.1f} from their targets one step later"
+        )
+    return "; ".join(texts)
+
+
 def check_robot(folder: Path) -> str:
     """A recording of `mjstack_follower`, replayed and merged."""
     robot = f"--robot.{PLUGIN} --robot.type=mjstack_follower --robot.id=sim --robot.seed=3"
@@ -205,20 +264,12 @@ def check_robot(folder: Path) -> str:
         lerobot_record.record()
     recorded = LeRobotDataset("local/recorded", root=root, video_backend="pyav")
     states = np.array(recorded.hf_dataset.with_format("numpy")["observation.state"][:])
-    seen = []
-    send = MjstackFollower.send_action
-
-    def watched(self: MjstackFollower, action: dict) -> dict:
-        observation = self.get_observation()
-        seen.append([observation[name] for name in JOINTS])
-        return send(self, action)
-
     with (
         arguments(
             f"lerobot-replay {robot} --dataset.repo_id=local/recorded --dataset.root={root}"
             " --dataset.episode=0 --play_sounds=false"
         ),
-        patch.object(MjstackFollower, "send_action", watched),
+        watched() as (seen, _),
     ):
         lerobot_replay.replay()
     apart = float(np.abs(np.array(seen) - states).max())
@@ -275,6 +326,7 @@ CHECKS: dict[str, Callable[[Path], str]] = {
     "policy": check_policy,
     "robot": check_robot,
     "page": check_page,
+    "drive": check_drive,
 }
 
 
