@@ -8,6 +8,7 @@ from compositions import load_config, refusal
 
 from mjstack import make_env
 from mjstack.errors import UnknownName
+from mjstack.mdp.starts.starts_file import start_arrays
 from mjstack.scene.build import build_model
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "servos"
@@ -85,4 +86,7 @@ def test_the_example_draws_servos_for_each_world() -> None:
         ]
         drawn.add(number)
     assert drawn == {0, 1, 2}
+    starts = start_arrays(env)  # which gate success writes
+    assert not any(name.endswith("_mass") for name in starts)
+    assert starts["gain_gripper"].min() < 0.1
     env.close()

@@ -257,7 +257,8 @@ def start_arrays(env: EnvView) -> dict[str, np.ndarray]:
         if bool((field != torch.from_numpy(getattr(model, name)).to(field)).any())
     }
     for kind, ends in _RANDOMIZED.items():
-        if varying & set(kind.model_fields):
+        fields = set(kind.model_fields)
+        if varying & fields and fields <= env.sim.fields.keys():
             quantity = kind(env, **{ends: (1.0, 1.0)})  # to be read alone
             out |= zip(quantity.columns, quantity.read().unbind(1), strict=True)
     out |= {f"{name}_xy": place_xy(env, name) for name in _drawn_places(env)}
