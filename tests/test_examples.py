@@ -81,7 +81,7 @@ def test_the_gates_pass(example: str, robot: str, gates: str, tmp_path: Path) ->
     if "parity" in results and example == "push":
         metrics = results["parity"]["metrics"]
         compared = {name.partition(".")[0] for name in metrics if ".step1." in name}
-        assert compared == {"before_contact", "in_contact", "at_end", "in_motion"}
+        assert compared == {"before_contact", "in_contact", "at_end", "in_motion", "swung"}
 
 
 @pytest.mark.full

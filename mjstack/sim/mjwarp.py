@@ -119,6 +119,7 @@ class MjwarpSimulation(Simulation):
             }
         )
         self.constraint_count = wp.to_torch(self._d.nefc)
+        self.solver_tolerance = wp.to_torch(self._m.opt.tolerance)
         for name, view in self._usage.views.items():
             setattr(self, name, view)
         self._erased = tuple(torch.zeros_like(self.overflow) for _ in range(3))

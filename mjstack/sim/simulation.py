@@ -108,6 +108,8 @@ class Simulation(ABC):
             worlds share no pool.
         solver_limits: Bits of `SolverLimit` for worlds whose solver stopped at a limit, shape
             ``(nworld,)``, int32; None where the backend does not tell.
+        solver_tolerance: The solver's tolerance, shape ``(1,)``, which may be written; None where
+            it is the model's.
     """
 
     model: mujoco.MjModel
@@ -135,6 +137,7 @@ class Simulation(ABC):
     sizes: BatchSizes | None = None
     peak_pool: Tensor | None = None
     solver_limits: Tensor | None = None
+    solver_tolerance: Tensor | None = None
     # Peak contacts, peak rows and overflow bits that masked resets have erased since the last full
     # one. They are taken in just before such a reset, and not in every substep: nothing else lowers
     # a counter, so the two together never miss one, and it costs a step three small operations.
