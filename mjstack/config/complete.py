@@ -12,9 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from mjstack.config.fields import accepted, check_fields
 from mjstack.config.schema import (
-    SHAPES,
     Config,
-    ObjectCfg,
     ObservationGroupCfg,
     ObservationTermCfg,
     RewardTermCfg,
@@ -124,7 +122,7 @@ def _complete_scene(scene: SceneCfg) -> None:
         thing.file = _find_file(f"{key}.file", thing.file, "scene", "task")
         if thing.parts or thing.file:
             thing.shape = "box"
-            thing.size = _half_sizes(thing)
+            thing.size = [1e-4] * 3  # of no account: its parts are what others meet
         if thing.pos is not None:
             thing.pos = in_world(thing.pos)
             thing.xy = thing.pos[:2]
@@ -137,19 +135,6 @@ def _complete_scene(scene: SceneCfg) -> None:
         place.xy = in_world(place.xy)
     if scene.box is not None:
         scene.box.center = in_world(scene.box.center)
-
-
-def _half_sizes(thing: ObjectCfg) -> list[float]:
-    """Half sizes of the box around an object's origin that holds its parts [m]; of a file, which is
-    not read yet, next to nothing.
-    """
-    sizes = [1e-4] * 3
-    for part in thing.parts.values():
-        if len(part.size) != SHAPES[part.shape][0]:
-            continue  # what is wrong is told later
-        for axis, unit in enumerate(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))):
-            sizes[axis] = max(sizes[axis], abs(part.pos[axis]) + part.reach(unit))
-    return sizes
 
 
 def _find_file(key: str, file: str | None, *groups: str) -> str | None:

@@ -224,15 +224,12 @@ def _files(group: str) -> Iterator[tuple[str, str]]:
 def _functions(kind: str, with_parameters: bool) -> Iterator[tuple[str, str]]:
     """Terms or conditions by their dotted names, and what their docstrings begin with."""
     modules = ["mjstack.tasks.parts"]
-    if kind == "terms":
+    text = ""
+    if kind == "terms":  # also those that the search path's files name
         modules = [f"mjstack.mdp.{name}" for name in _TERMS]
+        text = "".join(p.read_text() for f in config_folders() for p in sorted(f.rglob("*.yaml")))
     names = [f"{m}.{name}" for m in modules for name in vars(import_module(m)) if name[0] != "_"]
-    if kind == "terms":  # those that the search path's files name
-        files = [path for folder in config_folders() for path in sorted(folder.rglob("*.yaml"))]
-        names += [
-            name for path in files for name in re.findall(r"func: ([\w.]+)", path.read_text())
-        ]
-    for name in dict.fromkeys(names):
+    for name in dict.fromkeys([*names, *re.findall(r"func: ([\w.]+)", text)]):
         func: Any = find_object("list", name)
         if getattr(func, "__module__", "") != name.rpartition(".")[0] or not callable(func):
             continue

@@ -93,10 +93,8 @@ class ShapeCfg:
     def footprint(self) -> float:
         """Radius of the disc that it covers at any yaw [m]."""
         if not self.upright:  # around a box that holds it, turned about its own axes alone
-            signs = itertools.product((-1.0, 1.0), repeat=3)
-            corners = [[s * h for s, h in zip(sign, self.half, strict=True)] for sign in signs]
-            rows = self.axes[:2]
-            return max(math.hypot(*(_dot(row, at) for row in rows)) for at in corners)
+            corners = itertools.product(*((-half, half) for half in self.half))
+            return max(math.hypot(*(_dot(row, at) for row in self.axes[:2])) for at in corners)
         if self.shape == "box":
             return math.hypot(1.0, self.size[1] / self.size[0]) * self.size[0]
         return sum(self.size) if self.shape == "capsule" else self.size[0]
