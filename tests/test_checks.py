@@ -11,11 +11,12 @@ from mjstack.config.schema import Backend
 from mjstack.config.schema.scene import PlaceCfg
 from mjstack.episodes.rollout import NOMINAL
 from mjstack.episodes.stage import Stage
+from mjstack.errors import UnknownName
 from mjstack.scene import SceneIndex, build_model
 from mjstack.sim import make_simulation
 from mjstack.tasks.check import EpisodeCheck, Rule, make_check
-from mjstack.tasks.parts import AtRest, InWindow, Streak, at_place, in_hand
-from mjstack.tasks.view import Step
+from mjstack.tasks.parts import AtRest, InWindow, Streak, at_place, in_hand, on_table
+from mjstack.tasks.view import Step, TaskView
 
 
 class PutCheck(EpisodeCheck):
@@ -45,6 +46,22 @@ class PutCheck(EpisodeCheck):
 
     def placed(self, step: Step) -> torch.Tensor:
         return self.there(step)[:, None]
+
+
+def test_conditions_see_what_the_check_does_not_judge() -> None:
+    """Such as a fixture under the object. An object that is to be judged is one of the check's."""
+    cfg = load_config(["sim=native"])
+    model = build_model(cfg)
+    sim = make_simulation(model, cfg, 2, backend=Backend.native, device="cpu")
+    env = Stage(cfg).start(sim, NOMINAL)
+    step = TaskView(env, ["red"]).step()
+    blue = cfg.scene.objects["blue"]
+    expected = torch.tensor([*blue.xy, cfg.scene.table_top + blue.half_height])
+    torch.testing.assert_close(step.center("blue"), expected.expand(2, 3), rtol=0, atol=1e-6)
+    with pytest.raises(UnknownName, match=r"object of the check.*blue.*red"):
+        on_table("blue", gap=0.001)(step)
+    with pytest.raises(UnknownName, match=r"object 'bleu'"):
+        step.center("bleu")
 
 
 def test_a_check_of_ones_own_judges_native_worlds() -> None:

@@ -366,6 +366,22 @@ def test_an_object_that_lies_askew_in_the_hand_is_aligned(drive: Drive) -> None:
     assert left[True][1] < 3.0, left
 
 
+def test_what_is_oblong_is_aligned_by_half_turns(drive: Drive) -> None:
+    """A brick at any yaw is turned to blue's heading, not across it, within the joint's range."""
+    phases = "controller.phases"
+    aligned = [f"{phases}.{name}.align=true" for name in ("above_blue", "place_stack")]
+    env, controller = drive("scene.objects.red.size=[0.014,0.035,0.02]", *aligned, nworld=6)
+    yaw = torch.linspace(-1.4, 1.4, 6, dtype=torch.float64)
+    start = env.index.object_qpos[0] + 3
+    env.sim.qpos[:, start] = torch.cos(yaw / 2)
+    env.sim.qpos[:, start + 3] = torch.sin(yaw / 2)
+    for _ in range(controller.phases[5].stop):
+        env.step(controller.command())
+    red, blue = (measure_planar(env, name)[:, 2] for name in ("red", "blue"))
+    off = torch.remainder(red - blue + torch.pi / 2, torch.pi) - torch.pi / 2
+    assert torch.rad2deg(off.abs().max()) < 4.0, torch.rad2deg(off)
+
+
 BRICK = ["size=[0.035,0.014,0.02]"]
 TURNED = ["size=[0.014,0.035,0.02]"]
 LYING = ["shape=cylinder", "size=[0.014,0.035]", "quat=[0.7071068,0.7071068,0,0]"]

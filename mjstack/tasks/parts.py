@@ -129,7 +129,7 @@ def on_table(object: str, *, gap: float) -> Condition:
         half = scene.objects[object].half
         room = step.view.constant(*(scene.table_half[i] - half[i] for i in (0, 1)), gap)
         center = step.view.constant(*scene.table_center[:2], 0.0)
-        height = step.height[:, step.view.objects.index(object), None]
+        height = step.height[:, step.view.number(object), None]
         at = torch.cat((step.center(object)[:, :2], height), dim=1)
         return (at - center).abs() <= room
 

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from mjstack.errors import UnknownName
 from mjstack.managers.term import known_values
 from mjstack.managers.view import EnvView
 from mjstack.math import lowest_point, quat_to_matrix
@@ -111,8 +112,14 @@ class TaskView:
         """Columns of some objects, made once: a captured step may not copy from the host."""
         key = tuple(names)
         if key not in self._columns:
-            self._columns[key] = Columns(list(map(self.objects.index, names)), self.env.device)
+            self._columns[key] = Columns(list(map(self.number, names)), self.env.device)
         return self._columns[key]
+
+    def number(self, name: str) -> int:
+        """Number of an object among those of the task; any other name is an error with those."""
+        if name not in self.objects:
+            raise UnknownName("object of the check", name, self.objects)
+        return self.objects.index(name)
 
     def during(self, phases: PhaseNames) -> slice:
         """A key for `Step.judged`: for each column of a rule, the phases in which it counts."""
@@ -237,8 +244,11 @@ class Step:
         return self._sensed(self.view.jaws)
 
     def center(self, name: str) -> Tensor:
-        """Position of an object [m], shape ``(nworld, 3)``."""
-        return self.pos[:, self.view.objects.index(name)]
+        """Position of an object of the scene [m], shape ``(nworld, 3)``."""
+        view = self.view
+        if name not in view.objects:  # such as a fixture
+            return pose_w(view.env, name)[:, :3].float()
+        return self.pos[:, view.objects.index(name)]
 
     @step_value
     def in_hand(self) -> Tensor:
