@@ -181,7 +181,8 @@ def judge_by_phase(seen: Seen, rules: Any, phase: np.ndarray, color: str) -> Fou
 
 def judge_freely(seen: Seen, rules: Any, steps: int) -> Found:
     """Grasp, lift and carry in this order at any time before the settled window; released after the
-    carry, and at rest for the window at some time after that."""
+    carry, and at rest for the window at some time after that.
+    """
     before = range(steps - rules.window)
 
     def reaches(holds: np.ndarray, start: int | None, length: int) -> int | None:
@@ -231,7 +232,8 @@ def corners_of(
     pose: np.ndarray, velocity: np.ndarray, half: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """World places of the eight corners, ``(steps, 8, 3)``, and the speed of the fastest,
-    ``(steps,)``."""
+    ``(steps,)``.
+    """
     turn = rotations(pose[:, 3:])
     arms = np.einsum("fij,kj->fki", turn, half * SIGNS)
     spin = np.einsum(

@@ -63,7 +63,8 @@ class Tab:
 
     Attributes:
         problems: Errors that it logged, and exceptions.
-        requests: Addresses that it asked for, without those inside it."""
+        requests: Addresses that it asked for, without those inside it.
+    """
 
     def __init__(self, socket: Any) -> None:
         self._socket = socket

@@ -1,5 +1,6 @@
 """What the checks of both tasks are compared by: a recorded world, its outcome, and alterations of
-a recording that succeeded, each with the rules that it has to break."""
+a recording that succeeded, each with the rules that it has to break.
+"""
 
 import math
 from collections.abc import Callable
@@ -51,7 +52,8 @@ class Recording:
         xquat: Likewise, shape ``(nbody, 4)``.
         step_count: Physics steps the world has made.
         overflow: Whether it lost contacts or constraint rows.
-        finite_elsewhere: Whether the rest of its state stayed finite."""
+        finite_elsewhere: Whether the rest of its state stayed finite.
+    """
 
     phase: np.ndarray | None
     pose: np.ndarray
@@ -120,7 +122,8 @@ class Cases:
 
     def add_values(self, values: dict[str, tuple[str, str, Any, Any]]) -> None:
         """Registers changes of an array: the rules that break, the array of a world, where, and the
-        other value or what makes it of the value."""
+        other value or what makes it of the value.
+        """
 
         def change(world: Any, array: str, at: Any, value: Any) -> None:
             part = getattr(world, array)
@@ -131,7 +134,8 @@ class Cases:
 
     def play(self, fresh: Callable[[], Any], feed: Callable[[list[Any]], CheckResult]) -> Altered:
         """Every case as one world of one batch: by name the batch's result, the world's number in
-        it, and the world."""
+        it, and the world.
+        """
         worlds = []
         for alter in self.alter.values():
             worlds.append(fresh())

@@ -1,5 +1,6 @@
 """Configurations for tests: each choice of groups is composed once in a process, and values are set
-in a copy of it, as Hydra sets them. A composition takes half a second."""
+in a copy of it, as Hydra sets them. A composition takes half a second.
+"""
 
 import copy
 from collections.abc import Callable, Sequence

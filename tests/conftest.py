@@ -1,5 +1,6 @@
 """Shared scenes, planners and simulations. Everything here works offline and writes only below
-pytest's temporary folder."""
+pytest's temporary folder.
+"""
 
 import gc
 import os
@@ -48,7 +49,8 @@ def _outside_the_checkout(tmp_path_factory: pytest.TempPathFactory) -> Iterator[
 @pytest.fixture(scope="session")
 def get_stage() -> GetStage:
     """Configuration, model, index and planner of a robot under some overrides, each made once in
-    the session."""
+    the session.
+    """
     made: dict[tuple[str, ...], Stage] = {}
 
     def get(robot: str, *overrides: str) -> Stage:
@@ -63,7 +65,8 @@ def get_stage() -> GetStage:
 @pytest.fixture(scope="session")
 def new_run(get_stage: GetStage) -> NewRun:
     """A run of its own for some overrides that change neither scene nor, but for its
-    phases, plan: both are shared."""
+    phases, plan: both are shared.
+    """
 
     def make(*overrides: str, robot: str = "so101") -> Run:
         phases = [text for text in overrides if text.startswith("controller.phases.")]
@@ -76,7 +79,8 @@ def new_run(get_stage: GetStage) -> NewRun:
 @pytest.fixture(scope="session")
 def make_sim(get_stage: GetStage) -> MakeSim:
     """Simulations by (backend, nworld, overrides), reset and shared by all tests: MJWarp's are slow
-    to build."""
+    to build.
+    """
     made: dict[tuple, Simulation] = {}
 
     def make(backend: str, nworld: int, *overrides: str, robot: str = "so101") -> Simulation:
@@ -123,7 +127,8 @@ BACKENDS = ["native", "mjwarp", pytest.param("mjwarp-cuda", marks=CUDA)]
 @pytest.fixture(params=BACKENDS)
 def backend(request: pytest.FixtureRequest) -> str:
     """Every backend this machine has; MJWarp on Warp's CPU device, and on CUDA where
-    there is one."""
+    there is one.
+    """
     return request.param
 
 

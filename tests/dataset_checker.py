@@ -31,7 +31,8 @@ def with_column(table: pa.Table, name: str, values: Any) -> pa.Table:
 def check_dataset(folder: Path) -> StoredDataset:
     """Types and dimensions are those of info.json; indices, timestamps and places run on without a
     gap; every number is finite; tasks, lengths and totals agree; the statistics of each episode and
-    of all are those of its frames."""
+    of all are those of its frames.
+    """
     stored = read_dataset(folder)
     features = stored.info["features"]
     every: list[dict[str, np.ndarray]] = []

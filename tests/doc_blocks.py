@@ -1,7 +1,8 @@
 """Code blocks of the README and the pages in docs/.
 
 A block with a title, such as `yaml title="lift/conf/task/lift.yaml"`, is a file. A `python` block
-without one is a part of the page's program."""
+without one is a part of the page's program.
+"""
 
 import re
 from pathlib import Path
@@ -19,7 +20,8 @@ def python_blocks(markdown: str) -> list[str]:
 def python_lines(markdown: str) -> str:
     """The program, everything else blank: a traceback's line number is the page's.
 
-    Blocks that train are left out."""
+    Blocks that train are left out.
+    """
     lines: list[str] = []
     begins = 0
     fence = ""

@@ -1,5 +1,6 @@
 """Environments for tests. Simulations are slow to make, so tests share them, one environment at a
-time."""
+time.
+"""
 
 import json
 from collections.abc import Callable, Iterator, Sequence
@@ -96,7 +97,8 @@ def has_gl() -> bool:
 @cache
 def at_double_speed(robot: str = "so101", task: str = "stack") -> tuple[str, ...]:
     """Overrides that halve the phases' times: both arms still do both tasks, and stacking has the
-    same peaks."""
+    same peaks.
+    """
     phases = configure(f"task={task}", robot=robot).controller.phases
     return tuple(
         f"controller.phases.{name}.seconds={phase.seconds / 2}" for name, phase in phases.items()
@@ -118,7 +120,8 @@ def on_backend(backend: str) -> dict[str, Any]:
 
 def new_sim(backend: str, nworld: int, robot: str = "so101") -> Simulation:
     """A simulation with every field that a reset term of mjstack writes, and room for random
-    actions."""
+    actions.
+    """
     cfg = configure("reset=randomized", robot=robot)
     return make_simulation(
         _model(robot),
@@ -157,7 +160,8 @@ _shared = cache(new_sim)
 
 def on_shared_sim(backend: str, nworld: int, cfg: Config) -> Env:
     """An environment on the simulation that tests share: it is the tests' only one until the next
-    is built."""
+    is built.
+    """
     sim = _shared(backend, nworld, cfg.robot.name)
     for name, field in sim.fields.items():
         field[:] = torch.from_numpy(getattr(sim.model, name)).to(field)
@@ -211,7 +215,8 @@ def stack_starts(red: ArrayLike, blue: ArrayLike, **others: ArrayLike) -> dict[s
 
 def actions(env: Env, steps: int, seed: int = 0) -> list[torch.Tensor]:
     """Random actions between the bounds; world k's are the same in any environment that starts with
-    world 0."""
+    world 0.
+    """
     low = env.action_manager.low.cpu()
     high = env.action_manager.high.cpu()
     rows = []
@@ -261,7 +266,8 @@ def state_of(env: Env, views: tuple[str, ...] = VIEWS) -> dict[str, torch.Tensor
 
 def play(env: Env, moves: list[torch.Tensor], before: Callable[[int], None] | None = None) -> Trace:
     """Steps through the moves; per step what was returned, and the state, episode and step after
-    it."""
+    it.
+    """
     trace = []
     for t, move in enumerate(moves):
         if before is not None:
@@ -277,7 +283,8 @@ def play(env: Env, moves: list[torch.Tensor], before: Callable[[int], None] | No
 def assert_same_run(a: torch.Tensor, b: torch.Tensor, backend: str, forces: bool = False) -> None:
     """Bit for bit on the CPU backends. CUDA sums in no fixed order: there two runs agree to
     rounding (docs/design.md), and forces as well as a solver's do: to 1e-3 of the largest one in
-    99 % of states (docs/benchmarks.md, the fused solver)."""
+    99 % of states (docs/benchmarks.md, the fused solver).
+    """
     if backend.endswith("cuda"):
         atol = 1e-3 * max(1.0, float(b.abs().max())) if forces else 1e-3
         torch.testing.assert_close(a, b, rtol=1e-4, atol=atol)

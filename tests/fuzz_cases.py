@@ -247,7 +247,8 @@ _MUTATIONS = (
 def damaged_folders(fixture: Path) -> Make:
     """Policies that gate *batch* is to play (the first 300 cases), datasets that *collect* goes on
     with or a clone learns from (the next 100), and runs of which a world is to be played again. One
-    or two files of each are damaged."""
+    or two files of each are damaged.
+    """
     play = ["controller=policy", "policy=policy", "gates=[batch]", *SHORT]
     seen = ["observation=state", "+observation.policy.noise=false"]
     collect = ["job=collect", *SHORT, *seen, "job.keep_failures=true", "job.folder=set"]

@@ -51,7 +51,8 @@ class Arm:
 
     def jacobian(self, command: np.ndarray) -> np.ndarray:
         """Of the grasp point for the joints that inverse kinematics moves, by differences, shape
-        ``(3, n_moved)``."""
+        ``(3, n_moved)``.
+        """
         steps = np.zeros((2 * len(self.moved), len(command)))
         for k, j in enumerate(self.moved):
             steps[2 * k, j] = 1e-5
@@ -61,7 +62,8 @@ class Arm:
 
     def spare(self, command: np.ndarray) -> np.ndarray:
         """Projects onto what those joints can do without moving the centre, shape ``(n_moved,
-        n_moved)``."""
+        n_moved)``.
+        """
         jacobian = self.jacobian(command)
         return np.eye(len(self.moved)) - np.linalg.pinv(jacobian) @ jacobian
 
@@ -92,7 +94,8 @@ class Arm:
 
     def anywhere(self, nworld: int, seed: int) -> np.ndarray:
         """Random positions of the joints that inverse kinematics moves; the others at home, gripper
-        open."""
+        open.
+        """
         commands = self.at_home(nworld)
         moved = self.moved
         commands[:, moved] = np.random.default_rng(seed).uniform(

@@ -1,5 +1,6 @@
 """Policies for tests: small networks with random weights, which drive worlds without success; and
-what trainings leave, interrupted ones and ones in two processes."""
+what trainings leave, interrupted ones and ones in two processes.
+"""
 
 import os
 import socket
@@ -37,7 +38,8 @@ def make_policy(
 ) -> Policy:
     """A policy around the robot's start that moves every joint by up to some 0.05 rad. If the
     configuration has a policy decide below the control rate, its action terms are those of the
-    configuration."""
+    configuration.
+    """
     env = build_env(cfg, nworld=1, backend=Backend.native, device="cpu")
     widths = env.observation_manager.term_dims[group]
     targets = cfg.timing.policy_decimation == 1
@@ -123,7 +125,8 @@ def run_as_torchrun(
     overrides: Sequence[str], folder: Path, program: Sequence[str] = ("-m", "mjstack")
 ) -> list[str]:
     """Run a command in two processes, as torchrun starts them, with Gloo on a CPU, in the folders
-    ``0`` and ``1``; returns what each has printed."""
+    ``0`` and ``1``; returns what each has printed.
+    """
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]

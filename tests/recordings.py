@@ -1,5 +1,6 @@
 """Recorded episodes: whole batches at every step end, and single worlds for the plain checker of
-the task or for alterations."""
+the task or for alterations.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -98,7 +99,8 @@ def faster_stage(robot: str, *overrides: str) -> Stage:
 
 def put_cube(env: Env, cube: int, place: list[float] | np.ndarray) -> None:
     """Puts a cube of the last world somewhere, at rest; the place has its x, y, z [m] and, if it is
-    longer, its quaternion."""
+    longer, its quaternion.
+    """
     at = env.index.object_qpos[cube]
     velocity = env.index.object_qvel[cube]
     env.sim.qpos[-1, at : at + len(place)] = torch.as_tensor(place).to(env.sim.qpos)
@@ -228,7 +230,8 @@ def feed(
     worlds: list[World], dtype: torch.dtype = torch.float64, *, phased: bool = True
 ) -> CheckResult:
     """Plays recordings of one robot, equally long and with the same phases, through the check, as
-    of a driver with phases or without."""
+    of a driver with phases or without.
+    """
     stage = worlds[0].stage
     phases = stage.planner.phases
     stacked = {name: np.stack([getattr(w, name) for w in worlds]) for name in (*STATE, "phase")}

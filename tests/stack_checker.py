@@ -15,7 +15,8 @@ from mjstack.tasks.check import make_check
 
 def rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Angles between two orientations: from the chord between quaternions, the nearer of the two
-    signs."""
+    signs.
+    """
     chord = np.minimum(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1))
     return 4.0 * np.arcsin(np.minimum(1.0, 0.5 * chord))
 

@@ -38,7 +38,8 @@ def fake_batches(
         fails: Whether a world of a seed breaks a rule.
         after: Called with the seed and its measured joints, ``(steps + 1, worlds, 6)``.
         noise: Steps that differ from each other and cannot be compressed, some 0.2 MB for each
-            world."""
+            world.
+    """
 
     def play(
         stage: Stage, plans: Iterable[BatchPlan], channels: object, *, cfg: Config

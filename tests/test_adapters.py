@@ -230,7 +230,8 @@ def test_single_env_passes_gymnasiums_checker(group: str | None) -> None:
 @pytest.mark.full
 def test_single_env_is_the_one_world(make: Make) -> None:
     """The done step returns the final observation, and ``reset`` the start of the episode that
-    follows."""
+    follows.
+    """
     inner = make(nworld=1)
     env = GymnasiumEnv(make(nworld=1))
     raw, _ = inner.reset(seed=5)

@@ -1,5 +1,6 @@
 """The batch gate: totals over seeds, the interval of its rate, what it keeps of every world, and
-what a failure leaves."""
+what a failure leaves.
+"""
 
 import csv
 import os
@@ -70,7 +71,8 @@ def two_seeds(
     new_run: NewRun, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, GateResult, list[str]]:
     """A native batch of seven worlds under seeds 0 and 1, some of which fail, its folder, and what
-    it said."""
+    it said.
+    """
     folder = tmp_path_factory.mktemp("batch")
     run = new_run("sim=native", "nworld=7", "gate.batch.seeds=2", *TIGHT)
     lines: list[str] = []
@@ -232,7 +234,8 @@ def test_damaged_record_is_one_line(tmp_path: Path) -> None:
 @pytest.mark.full
 def test_no_trajectory_is_kept(new_run: NewRun, tmp_path: Path) -> None:
     """A trajectory of qpos alone would take 48 kB a world on the host. The 3-D page has its own
-    bound, of 64 worlds."""
+    bound, of 64 worlds.
+    """
 
     def peak(nworld: int) -> int:
         run = new_run("sim=native", f"nworld={nworld}", "web.episode=false", *at_double_speed())

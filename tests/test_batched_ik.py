@@ -93,7 +93,8 @@ class Compared(NamedTuple):
     Attributes:
         targets: Where the grasp point goes [m], shape ``(MINK, 3)``.
         commands: Where mink ended, gripper open, shape ``(MINK, nu)``.
-        reached: Whether within the tolerance."""
+        reached: Whether within the tolerance.
+    """
 
     targets: np.ndarray
     commands: np.ndarray
@@ -105,7 +106,8 @@ def by_mink(
     get_stage: GetStage, get_arm: Callable[[str], Arm], workspace: Callable
 ) -> Callable[[str], dict[str, Compared]]:
     """On and above the table, and wherever the arm reaches above the table's height; each target is
-    solved once."""
+    solved once.
+    """
 
     @cache
     def get(robot: str) -> dict[str, Compared]:
@@ -179,7 +181,8 @@ def test_an_approach_gain_tilts_less_than_mink(
     get_stage: GetStage, get_arm: Callable[[str], Arm], by_mink: Callable
 ) -> None:
     """What SO-101's gain is for: above the table its gripper is nowhere more tilted than where mink
-    is drawn home."""
+    is drawn home.
+    """
     arm = get_arm("so101")
     mink = by_mink("so101")[TABLE]
     ik = arm.solver(MINK, iterations=40, **shipped(get_stage("so101")))
@@ -240,7 +243,8 @@ def test_gains_do_not_spoil_the_position(
     approach_gain: float,
 ) -> None:
     """Neither from afar nor on the way: a target that moves 5 mm a step, from postures far from the
-    one that is wanted."""
+    one that is wanted.
+    """
     start, targets = workspace(robot)
     gains = {"posture_gain": posture_gain, "approach_gain": approach_gain}
     ik = arm.solver(1000, device, iterations=40, **gains)
@@ -263,7 +267,8 @@ def test_a_posture_is_approached_as_far_as_the_target_allows(
     robot: str, arm: Arm, device: str, workspace: Callable
 ) -> None:
     """At the end nothing of the way to it is left that would not move the centre: checked with
-    native MuJoCo's Jacobian."""
+    native MuJoCo's Jacobian.
+    """
     start, targets = workspace(robot)
     posture = arm.home.copy()
     posture[arm.moved] += 0.3
@@ -290,7 +295,8 @@ def test_the_approach_axis_turns_down_as_far_as_the_target_allows(
     robot: str, arm: Arm, device: str, workspace: Callable
 ) -> None:
     """At the end no motion that leaves the centre turns it further down, by differences of native
-    MuJoCo's kinematics."""
+    MuJoCo's kinematics.
+    """
     start, targets = workspace(robot)
     command, _ = results(
         arm.solver(1000, device, iterations=200, approach_gain=0.3), start, targets
@@ -316,7 +322,8 @@ def test_the_approach_axis_turns_where_it_is_wished(
     robot: str, arm: Arm, device: str, workspace: Callable
 ) -> None:
     """Each world to a direction of its own, which a posture nearby is known to have at the same
-    target."""
+    target.
+    """
     start, _ = workspace(robot)
     start = start[arm.free(start, 0.5)][:300]
     goal = start.copy()
@@ -400,7 +407,8 @@ def test_the_approach_axis_leads_from_the_wrist_to_the_grasp_point(
     robot: str, source: str, monkeypatch: Patch
 ) -> None:
     """It is the axis about which the last arm joint rolls, away from the wrist, and across the way
-    the jaws close."""
+    the jaws close.
+    """
     if source == "menagerie":
         upstream(robot)
         monkeypatch.setenv(
@@ -425,7 +433,8 @@ def test_the_approach_axis_leads_from_the_wrist_to_the_grasp_point(
 
 def test_small_steps_arrive(robot: str, arm: Arm, device: str, workspace: Callable) -> None:
     """Reachable targets some 5 mm away, made by moving the joints a little in a random
-    direction."""
+    direction.
+    """
     start, here = workspace(robot)
     nudge = np.zeros_like(start)
     nudge[:, arm.moved] = np.random.default_rng(2).normal(size=(len(start), len(arm.moved)))
@@ -469,7 +478,8 @@ def test_limits_hold_and_the_other_joints_stay(arm: Arm, device: str) -> None:
 
 def test_small_steps_arrive_from_limits(robot: str, arm: Arm) -> None:
     """Joints that cannot follow leave the work to the others; solving for all and cutting the step
-    would stall."""
+    would stall.
+    """
     start = arm.at_limits(2000, 23)
     goal = start.copy()
     goal[:, arm.moved] += np.random.default_rng(24).normal(scale=0.02, size=(2000, len(arm.moved)))
@@ -553,7 +563,8 @@ def test_world_k_of_n_is_world_k_of_one(robot: str, arm: Arm, workspace: Callabl
 
 def test_outputs_are_rewritten_in_place(arm: Arm, device: str) -> None:
     """Whatever the last call left, of outputs or of working memory, does not show in the next. An
-    output can be an input."""
+    output can be an input.
+    """
     start = arm.anywhere(20, 10)
     target = arm.grasp_point(arm.anywhere(20, 11))
     ik = arm.solver(20, device)

@@ -204,7 +204,8 @@ def rests(env: Env) -> dict[str, list[float]]:
 @pytest.mark.full
 def test_terms_know_the_box(robot: str) -> None:
     """World 0: both on the table. 1: red in the box. 2: both in it. 3: red over its place, on the
-    rim's height and above."""
+    rim's height and above.
+    """
     env = small_env("reset=nominal", robot=robot, nworld=4)
     places = rests(env)
     put(env, RED, places[RED], [1, 2])

@@ -1,5 +1,6 @@
 """Episodes of the box task, as recorded and altered: the check on the device against the plain
-checker, world by world."""
+checker, world by world.
+"""
 
 import math
 from collections.abc import Callable
@@ -38,7 +39,8 @@ LEVEL = [1.0, 0.0, 0.0, 0.0]
 @cache
 def planned() -> SimpleNamespace:
     """Two jittered native worlds of the SO-101; in the second one red drops out of the hand halfway
-    to the box, onto the table beside it."""
+    to the box, onto the table beside it.
+    """
 
     def drop(env: Env, _: str) -> None:
         middle = (stage.phase("carry_red").start + stage.phase("hold_red").start) // 2
@@ -85,7 +87,8 @@ def test_the_rebots_baseline_passes(tmp_path: Path) -> None:
 
 def test_recorded_episodes() -> None:
     """As they were judged while they were played, and fed to the check once more, in float32 and as
-    one batch."""
+    one batch.
+    """
     recs = [planned(), scripted()]
     worlds = [World.of(rec, k) for rec in recs for k in range(2)]
     result = feed(worlds, torch.float32)
@@ -100,7 +103,8 @@ def test_recorded_episodes() -> None:
 
 def test_scripted_controller_passes_the_success_gate() -> None:
     """An undisturbed world, and one in which both first grasps are empty: each is tried again, and
-    both cubes get there."""
+    both cubes get there.
+    """
     rec = scripted()
     result = rec.gate
     metrics = rec.gate.metrics
@@ -147,7 +151,8 @@ PLAYED = [
 @pytest.mark.parametrize(("robot", "controller", "device"), PLAYED)
 def test_mjwarp_fills_the_box(robot: str, controller: str, device: str) -> None:
     """One world on Warp's CPU device; on CUDA, where a step is a graph with the check in it,
-    jittered ones."""
+    jittered ones.
+    """
     cpu = device == "cpu"
     faster = at_double_speed(robot, "box") if cpu else ()
     cfg = load_config(["task=box", f"robot={robot}", f"controller={controller}", *faster])
@@ -189,7 +194,8 @@ PUSH = [0.1, 0.0, 0.0]  # N
 
 def both(name: str, rules: str, alter: Alter, *, red: str = "") -> None:
     """Registers an alteration for each cube; ``*`` in a rule is its colour. For red ``red`` breaks
-    too."""
+    too.
+    """
     for cube, color in ((RED, "red"), (BLUE, "blue")):
         broken = {*rules.replace("*", color.upper()).split(), *(red.split() if cube == RED else ())}
         CASES.add(
@@ -258,7 +264,8 @@ for name, (rules, *args) in FORCES.items():
 
 def _edge(w: World, axis: int, by: float) -> float:
     """Where a cube that is not turned has its corners ``by`` outside of the box's inside, high
-    side."""
+    side.
+    """
     scene = w.stage.cfg.scene
     assert scene.box is not None
     return scene.box.center[axis] + scene.box.half[axis] - scene.objects["red"].half_height + by
@@ -347,7 +354,8 @@ def _spinning(w: World, cube: int, color: str, by: float) -> None:
 
 def _rolling(w: World, cube: int, color: str) -> None:
     """Each part is slow enough; together they move one edge faster than allowed, and the opposite
-    one not at all."""
+    one not at all.
+    """
     half = w.stage.cfg.scene.objects["red"].half_height
     step = steps_of(w, "settle", color)[-20]
     w.pose(cube)[step, 3:] = [math.cos(0.3), 0.0, 0.0, math.sin(0.3)]
@@ -552,7 +560,8 @@ def test_cheats_in_the_box_break_a_rule() -> None:
 
 def test_a_fall_over_the_box_is_a_drop_without_phases() -> None:
     """Load lost high over the box and regained, and a cube let go of high above its place; just
-    low enough it is none."""
+    low enough it is none.
+    """
     worlds = {
         f"{name}_{color}": World.of(planned())
         for name in ("caught", "caught_late", "one_jaw", "high", "low", "let_go_high")

@@ -423,7 +423,8 @@ def test_agreement_of_images() -> None:
 
 def test_images_that_compare_too_little_fail(monkeypatch: Patch) -> None:
     """A cube wholly elsewhere, of too few pixels for an intersection over union: with nothing else
-    to compare but the background, and beside a robot that agrees."""
+    to compare but the background, and beside a robot that agrees.
+    """
     labels = ["table", "red", "gripper"]
 
     def images(size: int, cube: int, robot: int) -> dict[str, np.ndarray]:

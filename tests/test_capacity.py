@@ -1,5 +1,6 @@
 """Sizing the buffers: peaks that resets do not erase, sizes that are enough and not more, and who
-uses them."""
+uses them.
+"""
 
 import math
 import weakref

@@ -2,7 +2,8 @@
 checker agrees. Every accepted episode of the expert passes.
 
 Some cheats are driven, by joint targets of the expert that are changed a little. Others, which
-would take long to drive, are written into a recorded episode."""
+would take long to drive, are written into a recorded episode.
+"""
 
 from collections.abc import Callable
 from functools import cache
@@ -37,7 +38,8 @@ class Targets(Driver):
 @pytest.fixture(scope="module")
 def drive(get_stage: GetStage, make_sim: MakeSim) -> Callable[..., list[set[str]]]:
     """Drives jittered native worlds without phases by the expert's joint targets, changed; the
-    broken rules of each world, on which the plain checker agrees."""
+    broken rules of each world, on which the plain checker agrees.
+    """
 
     @cache
     def expert(robot: str) -> torch.Tensor:
@@ -91,7 +93,8 @@ def test_holding_is_no_stack(robot: str, drive: Callable[..., list[set[str]]]) -
 
 def test_leaning_on_the_stack_is_no_release(drive: Callable[..., list[set[str]]]) -> None:
     """World 0 keeps the open gripper away from the cube. In the others it turns towards the cube,
-    by more from world to world."""
+    by more from world to world.
+    """
     turns = torch.tensor([0.0, 0.02, 0.05, 0.08])
 
     def lean(targets: torch.Tensor, spans: dict[str, slice]) -> None:

@@ -66,7 +66,8 @@ def test_conditions_see_what_the_check_does_not_judge() -> None:
 
 def test_a_check_of_ones_own_judges_native_worlds() -> None:
     """World 0: blue stands at the place. 1: beside it. 2: at it, but both jaws have pressed on it
-    before."""
+    before.
+    """
     cfg = load_config(["sim=native"])
     own = {"object": "blue", "place": "goal", "grasp_steps": 3, "distance": 0.01, "window": 10}
     task = replace(cfg.task, check={"func": f"{__name__}.PutCheck", **own})

@@ -88,7 +88,8 @@ def test_every_world_looks_at_its_own_cube(drive: Drive) -> None:
 
 def test_jaws_turn_to_a_face(drive: Drive) -> None:
     """SO-101's closing axis ends across two faces of the cube, whatever its yaw; without alignment
-    it does not."""
+    it does not.
+    """
     off = {}
     for align in (0.0, 1.0):
         env, controller = drive(f"controller.yaw_alignment={align}", *at_double_speed(), nworld=4)
@@ -109,7 +110,8 @@ def test_jaws_turn_to_a_face(drive: Drive) -> None:
 @pytest.mark.full
 def test_an_empty_grasp_is_tried_once_more_in_time(drive: Drive) -> None:
     """World 1 loses its cube to the side as the jaws close. It goes back, looks again, hurries, and
-    stacks all the same."""
+    stacks all the same.
+    """
     env, controller = drive(nworld=2)
     names = [phase.name for phase in controller.phases]
     grasp = names.index("grasp_red")
@@ -143,7 +145,8 @@ def test_an_empty_grasp_is_tried_once_more_in_time(drive: Drive) -> None:
 @pytest.mark.full
 def test_a_cube_arrives_as_it_stood() -> None:
     """From near the base, where the gripper could point down, to far from it, where it must lean;
-    and the other way round."""
+    and the other way round.
+    """
     env = make_env(["task=stack", "action=joint_absolute", "sim=native"], nworld=2)
     env.reset(seed=0)
     red, blue = env.index.object_qpos
@@ -170,7 +173,8 @@ def test_a_cube_arrives_as_it_stood() -> None:
 @pytest.mark.full
 def test_tilt_follows_the_phases() -> None:
     """In the box task red's tilt is kept until blue is observed; a place without an anchor is
-    where the target was before."""
+    where the target was before.
+    """
     cfg = load_config(["task=box"])
     phases = cfg.controller.phases
     names = list(phases)
@@ -205,7 +209,8 @@ def test_no_retry_without_time(drive: Drive) -> None:
 @pytest.mark.full
 def test_worlds_start_over_by_themselves() -> None:
     """A world that ends in the middle of a phase is in its first phase in the step after, the
-    others go on."""
+    others go on.
+    """
     overrides = ["task=stack", "action=joint_absolute", "sim=native", "reset=jitter"]
     overrides += at_double_speed()
     env = make_env(overrides, nworld=3)
@@ -251,7 +256,8 @@ def test_other_actions_are_refused() -> None:
 @on_cuda
 def test_captured_commands_are_the_eager_ones() -> None:
     """Steps with the controller in them replay as one graph, and it reads nothing from
-    the device."""
+    the device.
+    """
     commands = {}
     for graph in ("require", "off"):
         env = make_env(
@@ -342,7 +348,8 @@ def test_a_phase_has_a_width_of_its_own() -> None:
 
 def test_an_object_that_lies_askew_in_the_hand_is_aligned(drive: Drive) -> None:
     """Red is grasped 8 mm off its middle, and blue is turned: with ``align`` red arrives all the
-    same."""
+    same.
+    """
     phases = "controller.phases"
     askew = [f"{phases}.{name}.offset=[0.008,0,0]" for name in ("descend_red", "grasp_red")]
     left = {}
@@ -400,7 +407,8 @@ def test_jaws_close_across_what_is_oblong(
     expert: type[FeedbackDriver], shape: list[str], drive: Drive, get_stage: GetStage
 ) -> None:
     """Across the narrower side, at any yaw, and by half a turn at most, within the joint's
-    range."""
+    range.
+    """
     red = [f"scene.objects.red.{text}" for text in shape]
     env, _ = drive(*red, "controller.yaw_alignment=0", nworld=6)
     start = env.index.object_qpos[0] + 3

@@ -1,5 +1,6 @@
 """Demonstrations of the expert: what a step holds, which episodes count, and that nothing
-is lost or there twice."""
+is lost or there twice.
+"""
 
 import contextlib
 import hashlib
@@ -76,7 +77,8 @@ def gate_episode(cfg: Config) -> SimpleNamespace:
 @pytest.fixture(scope="module")
 def demos(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     """Four real episodes. The stacks' offsets are 0.4, 0.7, 1.2 and 1.0 mm: by the threshold two of
-    them fail, and are kept."""
+    them fail, and are kept.
+    """
     folder = tmp_path_factory.mktemp("collect")
     args = [*COMMAND, "nworld=4", "job.episodes=4", "job.keep_failures=true", *at_double_speed()]
     args.append("task.check.xy_err=0.0009")
@@ -219,7 +221,8 @@ def test_success_is_the_evidence(demos: SimpleNamespace) -> None:
 @pytest.mark.full
 def test_a_step_is_the_state_before_its_action(demos: SimpleNamespace) -> None:
     """The actions, played in the environment, bring the same observations before and the same
-    rewards after each of them."""
+    rewards after each of them.
+    """
     episodes = [steps_of(demos.dataset, number) for number in range(4)]
 
     def stored(name: str, step: int) -> torch.Tensor:
@@ -402,7 +405,8 @@ def batches_of(folder: Path) -> list[tuple[int, int, int]]:
 
 def collect(*overrides: str) -> int:
     """Runs the job as the command line does once it has checked everything, and returns its exit
-    status."""
+    status.
+    """
     cfg = load_config([*COMMAND, *overrides])
     home = collect_folder(cfg)
     home.mkdir(parents=True, exist_ok=True)
@@ -539,7 +543,8 @@ def test_finished_batches_are_kept(
     capsys: Capture,
 ) -> None:
     """The second batch ends in the middle of its episodes. What goes on is in
-    test_collect_resume.py."""
+    test_collect_resume.py.
+    """
     write = PartWriter.write
 
     def broken(self: PartWriter, episode: Any, *args: Any) -> None:
@@ -639,7 +644,8 @@ def test_steps_come_to_the_host_in_chunks(monkeypatch: Patch) -> None:
 @on_cuda
 def test_demonstrations_on_cuda(folder: Path) -> None:
     """Captured steps are the eager ones, as far as two runs on CUDA agree, and the last step is one
-    of rest on the stack."""
+    of rest on the stack.
+    """
     short = ["job.episodes=8", "nworld=16", "sim=mjwarp", "sim.device=cuda:0"]
     assert run([*COMMAND, *short, "graph=require"]) == 0
     assert run(["job=collect", "job.folder=outputs/eager", *short, "graph=off"]) == 0

@@ -1,5 +1,6 @@
 """Demonstrations that were stopped anywhere: what the next call leaves is what an uninterrupted one
-does."""
+does.
+"""
 
 import copy
 import json
@@ -54,7 +55,8 @@ _content = cache(
 
 def patch_all(monkeypatch: Patch) -> None:
     """No world is played; a data file has room for four episodes, so that a batch has several;
-    what is slow is made once."""
+    what is slow is made once.
+    """
     monkeypatch.setattr(lerobot, "DATA_MB", 1)
     monkeypatch.setattr(job, "play_batches", fake_batches(some_fail, noise=True))
     monkeypatch.setattr(collect_plan, "run_provenance", lambda stage: dict(_provenance()))
@@ -131,7 +133,8 @@ successes_alone = pytest.mark.parametrize("whole", [False], ids=["successes"], i
 
 def test_figures_of_the_uninterrupted_one(whole: dict[str, Any]) -> None:
     """By hand: worlds 1 and 5 fail of the first nine; three episodes are missing then, for which
-    four worlds are played."""
+    four worlds are played.
+    """
     batches = whole["left"]["batches"]
     metrics = whole["left"]["metrics"]
     figures = [(b["seed"], b["worlds"], b["succeeded"], b["episodes"]) for b in batches]
@@ -198,7 +201,8 @@ def test_a_kill_between_any_two_files(
     whole: dict[str, Any], tmp_path: Path, monkeypatch: Patch
 ) -> None:
     """What a kill would have left is copied before and after each file takes its place, and gone on
-    with."""
+    with.
+    """
     home = tmp_path / "home"
     copies = tmp_path / "copies"
     replace_file = os.replace

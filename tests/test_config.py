@@ -1,5 +1,6 @@
 """Every configuration file composes, holds the task's figures, and every bad value is refused in
-one line."""
+one line.
+"""
 
 import runpy
 from itertools import zip_longest
@@ -31,7 +32,8 @@ def choices() -> list[str]:
 
 def rounds() -> list[list[str]]:
     """Every choice once: the first of every group together, then the second ones. Experiments are
-    alone: they choose jobs too."""
+    alone: they choose jobs too.
+    """
     groups: dict[str, list[str]] = {}
     for choice in choices():
         groups.setdefault(choice.partition("=")[0], []).append(choice)

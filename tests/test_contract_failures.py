@@ -1,5 +1,6 @@
 """Failures injected into real simulations: each is caught, in its own world and by its own rule,
-and no other world is."""
+and no other world is.
+"""
 
 import math
 import re
@@ -74,7 +75,8 @@ def test_native(get_stage: GetStage, make_sim: MakeSim) -> None:
 
 def crowd(stage: Stage, sim: Simulation, world: int) -> None:
     """Puts both cubes of one world into each other, the table and the gripper: far more contacts
-    than elsewhere."""
+    than elsewhere.
+    """
     grasp_point = sim.site_xpos[world, stage.index.grasp_sites].mean(0)
     top = stage.cfg.scene.table_center[2] + stage.cfg.scene.table_half[2]
     red, blue = stage.index.object_qpos

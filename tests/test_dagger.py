@@ -163,7 +163,8 @@ class Alone(Ranks):
 
 def test_the_share_of_the_expert() -> None:
     """Worlds in which the policy drives alone get its targets; in the others the expert drives for
-    about its share of the spells."""
+    about its share of the spells.
+    """
     import mjstack
 
     cfg = ["task=reach", "action=joint_absolute", "sim=native"]

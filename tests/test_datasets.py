@@ -1,5 +1,6 @@
 """Datasets in the layout of LeRobotDataset v3: what is on disk, and that nothing committed is ever
-lost."""
+lost.
+"""
 
 import errno
 import json
@@ -65,7 +66,8 @@ def episode(
     world: int, *, frames: int = 0, seed: int = 7, task: str = "stack", **changed: Any
 ) -> EpisodeData:
     """Random frames that depend on the world alone; the number of frames too, unless it
-    is given."""
+    is given.
+    """
     frames = frames or 20 + 3 * (world % 5)
     random = np.random.default_rng(world)
     arrays = {
@@ -115,7 +117,8 @@ def frames_of(table: pa.Table, name: str) -> np.ndarray:
 
 def test_the_files_are_those_of_lerobot(tmp_path: Path) -> None:
     """What LeRobotDataset v3.0 writes for such features, file by file (from a dataset that lerobot
-    0.6.1 wrote)."""
+    0.6.1 wrote).
+    """
     write(tmp_path, range(5))
     assert set(contents(tmp_path)) == {
         "meta/info.json",
@@ -224,7 +227,8 @@ def test_a_dataset_without_an_episode_has_no_frames(tmp_path: Path) -> None:
 
 def test_statistics_are_those_of_all_frames(tmp_path: Path) -> None:
     """Episodes of unequal length, over several commits and a resumed writer; a column far from zero
-    that hardly moves."""
+    that hardly moves.
+    """
     write(tmp_path, range(4))
     write(tmp_path, range(4, 11))
     check_dataset(tmp_path)  # of every episode, and of all but for the quantiles
@@ -288,7 +292,8 @@ def test_a_full_file_is_committed_and_chunks_follow(tmp_path: Path, monkeypatch:
 
 def test_frames_are_not_held(tmp_path: Path) -> None:
     """Nothing refers to the caller's arrays when `add` returns, and writing into them
-    does no harm."""
+    does no harm.
+    """
     with DatasetWriter(tmp_path, SPEC) as writer:
         added = episode(1)
         kept = added.arrays["action"].copy()
@@ -308,7 +313,8 @@ def test_frames_are_not_held(tmp_path: Path) -> None:
 @pytest.mark.full
 def test_a_kill_at_any_moment_keeps_what_was_committed(tmp_path: Path, monkeypatch: Patch) -> None:
     """What one would have left is copied before each file of the second commit takes its place:
-    data, tasks, episodes, statistics, info; and after."""
+    data, tasks, episodes, statistics, info; and after.
+    """
     whole = tmp_path / "whole"
     copies: list[Path] = []
     replaced = os.replace
@@ -378,7 +384,8 @@ def second_batch(writer: DatasetWriter) -> None:
 @pytest.mark.full
 def test_a_full_disk_keeps_what_was_committed(tmp_path: Path) -> None:
     """Wherever in the second batch the room ends: in each of its frames' files and in each of the
-    small ones."""
+    small ones.
+    """
     write(tmp_path / "probe", range(3))
     with DatasetWriter(tmp_path / "probe", SPEC) as writer, pytest.MonkeyPatch.context() as patch:
         disk = FullDisk(patch, 10**9)

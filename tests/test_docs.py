@@ -50,7 +50,8 @@ def folder(tmp_path: Path, monkeypatch: Patch) -> Iterator[Path]:
 @pytest.mark.parametrize("name", GUIDES)
 def test_python_blocks_run(name: str, folder: Path) -> None:
     """From a file: Warp reads the source of kernels, so they cannot come from a string. A line
-    number in a traceback is the page's."""
+    number in a traceback is the page's.
+    """
     text = (DOCS / name).read_text(encoding="utf-8")
     write_files(text, folder)
     script = folder / f"{Path(name).stem}_blocks.py"
@@ -60,7 +61,8 @@ def test_python_blocks_run(name: str, folder: Path) -> None:
 
 def shown_commands() -> list[dict[str, str]]:
     """Overrides of every command that the README and the pages show, by key; of a sweep, those of
-    its first job."""
+    its first job.
+    """
     commands: list[dict[str, str]] = []
     for page in PAGES:
         text = page.read_text(encoding="utf-8").replace("\\\n", " ")
@@ -80,7 +82,8 @@ def shown_commands() -> list[dict[str, str]]:
 @pytest.mark.full
 def test_shown_commands_compose() -> None:
     """Together where no key has two values, gates and worlds apart: a composition takes half a
-    second."""
+    second.
+    """
     groups: list[list[dict[str, str]]] = []
     for command in shown_commands():
         for group in groups:

@@ -96,7 +96,8 @@ def test_a_masked_reset_touches_nobody_else(backend: str, task: str, robot: str)
 @pytest.mark.full
 def test_starts_depend_on_seed_world_and_episode_alone(robot: str) -> None:
     """On how many worlds there are, which of them reset with it, and the backend they do not. The
-    configuration's seed is the one of a reset without."""
+    configuration's seed is the one of a reset without.
+    """
     cfg = randomized("reach", robot)
     cfg.seed = 5
     names = ("qpos", "qvel", "ctrl", "site_xpos")

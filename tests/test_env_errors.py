@@ -1,5 +1,6 @@
 """Mistakes that a user can make with an environment: one line each, that names the term or argument
-and says what to do."""
+and says what to do.
+"""
 
 import re
 from collections.abc import Callable, Iterable
@@ -461,7 +462,8 @@ def test_contact_pool_too_small() -> None:
 @pytest.mark.full
 def test_constraint_rows_too_few(cfg: Config) -> None:
     """Each step of a resting start needs some 100 rows; the environment says so at the first step,
-    or ends the episodes if it has the termination."""
+    or ends the episodes if it has the termination.
+    """
     env = warp_env(cfg, njmax=40)
     _, _, terminated, _, _ = env.step(zeros(env))
     assert terminated.all()

@@ -25,7 +25,8 @@ needs_franka = pytest.mark.skipif(
 @cache
 def arguments(example: str, robot: str) -> tuple[str, ...]:
     """A command line on native MuJoCo, with phases of half their time; but reBot's servos are too
-    slow to meet a slot or a hole in that."""
+    slow to meet a slot or a hole in that.
+    """
     folder = EXAMPLES / example / "conf"
     task = "stack" if example in ("scara", "panda") else example
     model = "menagerie" if example == "panda" else "builtin"

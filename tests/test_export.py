@@ -1,5 +1,6 @@
 """job=export: onnxruntime gives torch's numbers, the metadata is all that a program needs, and a
-program without mjstack drives native MuJoCo as PolicyDriver does."""
+program without mjstack drives native MuJoCo as PolicyDriver does.
+"""
 
 import ast
 import json
@@ -260,7 +261,8 @@ def test_lerobots_folder_has_its_own_files_and_the_weights(
     observation: str, key: str, tmp_path: Path
 ) -> None:
     """LeRobot itself loads it in test_lerobot.py. One that sees measured joints alone takes a real
-    arm's."""
+    arm's.
+    """
     policy = write_noiseless(tmp_path / observation, configure(f"observation={observation}"))
     out = tmp_path / f"{observation}_out"
     assert export(policy, out, "job.format=lerobot") == 0

@@ -1,5 +1,6 @@
 """NaN, infinite and huge numbers in single worlds of a batch: those worlds fail by a rule, or are
-named, and the others end as in a run without them. On CUDA every step is a captured graph."""
+named, and the others end as in a run without them. On CUDA every step is a captured graph.
+"""
 
 import itertools
 import math

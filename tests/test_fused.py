@@ -182,7 +182,8 @@ def test_every_kind_of_row(cone: str, condim: int, boxes: int, device: str) -> N
 )
 def test_contact_rows(condim: int, njmax: int, device: str) -> None:
     """All that MJWarp writes of a row, also where the buffer ends within a contact. On CUDA the
-    order of contacts is another in every run, so there rows are compared by contact."""
+    order of contacts is another in every run, so there rows are compared by contact.
+    """
     worlds = Worlds(every_row("elliptic", condim, 4), device, njmax=njmax)
     worlds.m.opt.impratio_invsqrt.fill_(0.2)
     names = ("J", "D", "aref", "vel", "pos", "margin", "frictionloss", "type")
@@ -215,7 +216,8 @@ def test_contact_rows(condim: int, njmax: int, device: str) -> None:
 
 def test_worlds_without_rows_and_with_too_many(device: str) -> None:
     """No row at all: the smooth acceleration. More rows than there is room for: that world is
-    marked as lost by MJWarp, and the others are solved."""
+    marked as lost by MJWarp, and the others are solved.
+    """
     box = "<body pos='{} 0 .049'><freejoint/><geom type='box' size='.05 .05 .05'/></body>"
     floor = "<geom type='plane' size='2 2 .1'/>"
     model = model_of(floor + box.format(0) + box.format(1), jacobian="auto")

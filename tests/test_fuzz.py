@@ -5,7 +5,8 @@ in the home folder changes, and no process is left. A tenth of the command lines
 twenty of the folders, are run to the end.
 
 The cases run in forked children of a process of their own, whose modules are loaded already:
-``python tests/test_fuzz.py commands 17 200-220`` runs these cases and prints what they say."""
+``python tests/test_fuzz.py commands 17 200-220`` runs these cases and prints what they say.
+"""
 
 import copy
 import gc

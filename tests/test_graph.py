@@ -1,5 +1,6 @@
 """Captured work: what replays is what ran, what cannot be captured is named, and what changed is
-captured anew."""
+captured anew.
+"""
 
 import logging
 from functools import partial
@@ -38,7 +39,8 @@ def reads_the_device(env: EnvView) -> torch.Tensor:
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_eager_and_replayed_steps_agree_through_resets(backend: str) -> None:
     """Over many resets. On the CPU device bit for bit; on CUDA, where two runs of the same differ,
-    the starts are equal."""
+    the starts are equal.
+    """
     steps = 20
     total = 300
     ends = ("success", "object_off_table", "joint_limit")

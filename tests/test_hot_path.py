@@ -1,5 +1,6 @@
 """The code of a captured step reads nothing back to the host and copies nothing from it: the source
-is checked."""
+is checked.
+"""
 
 import ast
 from pathlib import Path
@@ -127,7 +128,8 @@ def functions(tree: ast.Module) -> dict[str, ast.FunctionDef]:
 
 def cpu_only(function: ast.FunctionDef) -> set[ast.AST]:
     """What only the CPU gets to: after `not x.is_cuda and`, after `x.is_cuda or`, and in `if not
-    x.is_cuda:`."""
+    x.is_cuda:`.
+    """
     skipped: set[ast.AST] = set()
 
     def asks(node: ast.expr) -> bool:

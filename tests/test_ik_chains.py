@@ -56,7 +56,8 @@ ODD = """
 
 def odd_arm() -> Arm:
     """Slides and hinges beside their body's origin, two in one body, reference angles, one without
-    a command, a fork."""
+    a command, a fork.
+    """
     joints = ["lift", "turn", "bend", "sway"]
     robot = RobotCfg(
         arm_joints=joints,

@@ -170,7 +170,8 @@ COLORS = {"jobs/progress.py": "red"}  # of the terminal
 
 def words(path: Path) -> Iterator[tuple[int, str]]:
     """Identifiers, strings in quotation marks, and the words of strings that are no sentences, with
-    their lines."""
+    their lines.
+    """
     for node in ast.walk(ast.parse(path.read_text())):
         for key in ("id", "attr", "arg", "name", "value"):
             text = getattr(node, key, None)
@@ -241,7 +242,8 @@ report(run([*args, *sys.argv[1:]]))
 
 def test_the_package_has_what_its_configuration_names() -> None:
     """Classes of ``conf/``, and Hydra's plugins: their package is a namespace, which an
-    ``__init__.py`` would take from the plugins of others."""
+    ``__init__.py`` would take from the plugins of others.
+    """
     root = ROOT.parent
     tools = tomllib.loads((root / "pyproject.toml").read_text())["tool"]
     built = tools["hatch"]["build"]["targets"]

@@ -1,7 +1,8 @@
 """Ctrl-C and SIGTERM at random moments: of a command, in forked children of a process of their own
 as in test_fuzz.py, and of a script that steps an environment.
 
-``python tests/test_interrupts.py gates 250`` interrupts 250 runs and prints how they ended."""
+``python tests/test_interrupts.py gates 250`` interrupts 250 runs and prints how they ended.
+"""
 
 import json
 import math
@@ -137,7 +138,8 @@ def main(kind: str, count: str) -> int:
 
 def interrupt_command(kind: str, fixture: Path, delay: float | None) -> tuple[str, float]:
     """How a command ended that was interrupted after some seconds of processor time, or was not,
-    and the processor time from then on."""
+    and the processor time from then on.
+    """
     commands = {
         "gates": ["gates=[baseline,batch]", "gate.batch.seeds=3"],
         "collect": ["job=collect", "job.folder=demos", "job.episodes=5", "job.keep_failures=true"],

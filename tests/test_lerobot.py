@@ -1,5 +1,6 @@
 """The LeRobot adapter. LeRobot needs Python 3.12 and versions of its own: `make test-lerobot` makes
-an environment with it and runs these; elsewhere they are skipped."""
+an environment with it and runs these; elsewhere they are skipped.
+"""
 
 import json
 import shutil

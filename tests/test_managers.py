@@ -149,7 +149,8 @@ def test_overrides_change_exactly_what_they_name() -> None:
 
 def test_a_control_step_makes_few_torch_calls() -> None:
     """Each costs microseconds of one thread while the physics waits, on CUDA a kernel. There were
-    289 without views before terms shared the state of a step."""
+    289 without views before terms shared the state of a step.
+    """
 
     class Calls(TorchDispatchMode):
         count = 0
@@ -196,7 +197,8 @@ def test_a_branch_knows_what_came_before_it_and_keeps_the_rest() -> None:
 
 def test_an_interrupt_at_any_moment_leaves_no_values_behind() -> None:
     """KeyboardInterrupt at every call, line and return of a pass in a pass: what is computed after
-    it is new."""
+    it is new.
+    """
 
     def value() -> torch.Tensor:
         return shared("a", lambda: torch.zeros(1))

@@ -1,5 +1,6 @@
 """All private parts of mujoco_warp that mjstack uses are as in the release that it was written for.
-Where they are not, see docs/design.md, "A new release of MuJoCo Warp"."""
+Where they are not, see docs/design.md, "A new release of MuJoCo Warp".
+"""
 
 import ast
 import dataclasses

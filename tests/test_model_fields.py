@@ -31,7 +31,8 @@ def simulate(
 @pytest.fixture(scope="module")
 def make_fields(get_stage: GetStage) -> MakeSim:
     """Simulations of the SO-101 scene with fields, reset and with the model's values, shared by the
-    tests of this file."""
+    tests of this file.
+    """
     made: dict[tuple, Simulation] = {}
 
     def make(backend: str, nworld: int = N, fields: tuple[str, ...] = FIELDS) -> Simulation:
@@ -159,7 +160,8 @@ def test_a_heavy_cube_is_slowed_less(
     backend: str, make_fields: MakeSim, get_stage: GetStage
 ) -> None:
     """Damping c stops mass m as exp(-c t / m): the implicit integrator divides the speed by 1 + c
-    dt / m in every step."""
+    dt / m in every step.
+    """
     stage = get_stage("so101")
     body, q, v = cube(stage)
     sim = make_fields(backend)
@@ -288,7 +290,8 @@ def test_backends_agree(make_fields: MakeSim, get_stage: GetStage, mjwarp: str) 
 
 def test_a_scaled_free_body_is_what_set_const_computes(get_stage: GetStage) -> None:
     """All that mj_setConst derives for a body of its own scales with its mass, or with
-    one over it."""
+    one over it.
+    """
     stage = get_stage("so101")
     body, _, v = cube(stage)
     s = 1.7
@@ -333,7 +336,8 @@ def test_a_scaled_free_body_is_what_set_const_computes(get_stage: GetStage) -> N
 )
 def test_native_mass_matrix_of_a_simple_body_follows_its_mass(joints: str) -> None:
     """MuJoCo reads the inertia of such a body from dof_M0, made at compile time, and its weight
-    from body_mass."""
+    from body_mass.
+    """
     body = f"<body pos='0 0 1'>{joints}<geom type='box' size='.1 .2 .3'/></body>"
     m = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
     fields = ("body_mass", "body_inertia", "dof_armature")

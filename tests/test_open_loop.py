@@ -86,7 +86,8 @@ def test_phase_ends_reach_their_targets(stage: Stage, trajectory: JointTrajector
 
 def test_every_step_stays_on_its_straight_path(stage: Stage, trajectory: JointTrajectory) -> None:
     """Between waypoints too, the commands follow the smoothstep line from one target to
-    the next."""
+    the next.
+    """
     xy = layouts(stage)[1]
     before = target(stage, "above_red", xy)
     for phase in stage.planner.phases:

@@ -215,7 +215,8 @@ def test_the_pool_keeps_an_even_share_in_any_order() -> None:
 @pytest.mark.parametrize("backend", [pytest.param("mjwarp", marks=pytest.mark.full), "native"])
 def test_images_of_a_round_come_again(backend: str, tmp_path: Path) -> None:
     """A round that is read has the images that were rendered when it was played: those at which the
-    policy is queried and whose chunk the expert drove."""
+    policy is queried and whose chunk the expert drove.
+    """
     args = [*TINY, f"sim={backend}", "looks=randomized", "job.episodes=6"]
     stage = Stage(load_config(args))
     job: CloneJobCfg = stage.cfg.job

@@ -1,5 +1,6 @@
 """A policy's folder and its driver: what is saved comes back, what does not fit is refused in one
-line, and every gate takes a policy."""
+line, and every gate takes a policy.
+"""
 
 import importlib.metadata
 import json
@@ -107,7 +108,8 @@ def test_a_second_policy_replaces_the_first_at_once(tmp_path: Path, monkeypatch:
 @pytest.mark.parametrize(("chunk", "execute"), [(6, 4), (2, 5), (1, 1)])
 def test_answers_are_played_in_chunks(chunk: int, execute: int) -> None:
     """Against the network asked by hand, every ``execute`` steps; the last target of a shorter
-    chunk holds."""
+    chunk holds.
+    """
     env = driven(3)
     policy = make_policy(configure(), chunk=chunk, execute=execute)
     commands = play(env, PolicyDriver(env, policy), 11)
@@ -420,7 +422,8 @@ def test_nothing_is_written_where_a_policy_is_refused(folder: Path, refused: Ref
 @pytest.fixture(scope="module")
 def played(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """The folders of a run of the gates, and of its policy, which fails. The last test of them
-    writes the policy anew."""
+    writes the policy anew.
+    """
     home = tmp_path_factory.mktemp("played")
     policy = Path(shutil.copytree(whole, home / "policy"))
     driven = ["controller=policy", f"policy={policy}", "sim=native", "nworld=5"]
@@ -517,7 +520,8 @@ def test_a_policy_collects(folder: Path, tmp_path: Path) -> None:
 
 def test_the_rollout_plays_a_policy(backend: str) -> None:
     """Its targets are native's as long as the states are: here in the first steps. On CUDA they
-    come from the captured step."""
+    come from the captured step.
+    """
     policy = make_policy(configure(), chunk=4, execute=3)
     native = driven(3)
     wanted = play(native, PolicyDriver(native, policy), 8)

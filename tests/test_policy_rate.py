@@ -1,5 +1,6 @@
 """A policy below the control rate: in training an environment holds its actions, and when it drives
-worlds it repeats them. Both do the same."""
+worlds it repeats them. Both do the same.
+"""
 
 import pytest
 import torch
@@ -67,7 +68,8 @@ def test_held_steps_are_observed_for_a_history_alone(
 )
 def test_an_episode_ends_within_a_decision(ends: list[str], last: int, success: float) -> None:
     """It counts up to the control step in which it ended, and the next one begins with the next
-    decision."""
+    decision.
+    """
     forever = ["~termination.time_out", "~termination.success"]
     env = on_new_sim("native", 2, held(*ends))
     single = on_new_sim("native", 2, held(*ends, *forever, steps=1))
@@ -97,7 +99,8 @@ def test_an_episode_ends_within_a_decision(ends: list[str], last: int, success: 
 @pytest.mark.parametrize("action", ["joint_delta", "ee_upright"])
 def test_a_policy_drives_as_it_was_trained(action: str) -> None:
     """With its own action terms, observed last action and rate: the same joint targets and states
-    as in the environment of its training, bit for bit."""
+    as in the environment of its training, bit for bit.
+    """
     cfg = configure("task=reach", f"action={action}", f"timing.policy_decimation={HELD}")
     policy = make_policy(cfg, chunk=1, execute=HELD)
     trained = on_new_sim("native", 3, cfg)
@@ -240,7 +243,8 @@ def test_a_late_command_moves_the_arm_as_the_same_command_later() -> None:
 
 def test_each_world_has_a_delay_of_its_own_the_same_on_both_backends() -> None:
     """A world moves as one whose delay is the same in every world, to the bit, and draws a new one
-    for its next episode."""
+    for its next episode.
+    """
     plain = ("action=joint_absolute", "reset=randomized", "timing.command_delay=1")
     drawn: list[list[int]] = []
     for backend in ("native", "mjwarp"):

@@ -1,5 +1,6 @@
 """trainer=ppo: small trainings on native MuJoCo and how they go on; worlds that start in an
-expert's states."""
+expert's states.
+"""
 
 import shutil
 import sys
@@ -97,7 +98,8 @@ def test_networks_that_are_not_finite_end_the_training(tmp_path: Path, monkeypat
 def test_a_training_goes_on_after_ctrl_c(tmp_path: Path) -> None:
     """Weights, optimizer and figures are those of the interrupted one, so two resumed trainings are
     the same. Worlds begin new episodes, because the state of the physics is not saved: a training
-    that was never interrupted is another one."""
+    that was never interrupted is another one.
+    """
     out = tmp_path / "out"
     interrupted([*REACH, f"job.folder={out}"], PpoLearner, 3)
     again = tmp_path / "again"
@@ -146,7 +148,8 @@ def test_worlds_start_in_an_experts_states(
     masked: bool, tmp_path: Path, monkeypatch: Patch
 ) -> None:
     """By seed, world and episode, a falling share of them, with fresh counters; the others as they
-    would without."""
+    would without.
+    """
     if masked:  # the host does not look at the mask
         monkeypatch.setattr(expert_states, "rows_of", lambda mask: ALL)
     whole = on_new_sim("native", 6, configure("reset=randomized"))

@@ -6,7 +6,8 @@ was tried again, in any step of any world, so the reward of a step is at least t
 stage began. Within a stage the measured part may waver, with contacts or with a detour of the arm,
 by `WAVER` of the stage, in the stage reach by `REACH_WAVER`. A reward without stages (task reach,
 examples/push) is one stage. Costs (`action_rate`, `joint_vel`) are left out: they price effort.
-With them the weighted sum of all rewards rises from the end of each stage to that of the next."""
+With them the weighted sum of all rewards rises from the end of each stage to that of the next.
+"""
 
 from dataclasses import replace
 from functools import cache
@@ -37,7 +38,8 @@ NWORLD = 2
 
 class Terms(Observer):
     """Values of the first reward term, which is the task's, of success, and of the weighted sum of
-    all terms at every step end."""
+    all terms at every step end.
+    """
 
     def __init__(self, cfg: Config) -> None:
         self.cfg = cfg
@@ -150,7 +152,8 @@ def test_a_release_is_worth_more_than_holding_for_ever(
     task: str, opens: str, gamma: float, robot: str
 ) -> None:
     """From the last step in the hand: even if every other release fails, and is then worth nothing.
-    Any dwelling is worth less than success, too."""
+    Any dwelling is worth less than success, too.
+    """
     rec = expert(task, robot)
     reward = rec.cfg.reward
     dt = rec.cfg.timing.step_dt

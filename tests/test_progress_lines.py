@@ -29,7 +29,8 @@ def clock(monkeypatch: Patch) -> Clock:
 
 def test_a_unit_that_begins_in_the_middle_has_its_own_rate(clock: Clock) -> None:
     """A training that goes on at batch 700 has not made these 700 now, and its first report, late
-    after what came before, knows no rate yet."""
+    after what came before, knows no rate yet.
+    """
     out = io.StringIO()
     bar = ProgressBar(Console(file=out, width=200))
     bar.start("train")

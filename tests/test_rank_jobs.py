@@ -1,5 +1,6 @@
 """Jobs and gates in several ranks, on one machine and as two nodes: each leaves what one rank
-leaves."""
+leaves.
+"""
 
 import json
 import socket
@@ -23,7 +24,8 @@ pytestmark = pytest.mark.full
 
 def test_two_nodes(tmp_path: Path) -> None:
     """Two agents of torchrun, as on two machines with one disk: one report, and neither agent waits
-    for the other after it, though the gate has failed."""
+    for the other after it, though the gate has failed.
+    """
     run = [*SHORT, "nworld=3", f"hydra.run.dir={tmp_path}/run"]
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]

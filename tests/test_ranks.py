@@ -1,5 +1,6 @@
 """A job in several ranks: world k is world k, one report, failures by rank, and runs that are gone
-on with in another number of ranks."""
+on with in another number of ranks.
+"""
 
 import contextlib
 import csv
@@ -120,7 +121,8 @@ def assert_same_episodes(one: Path, other: Path) -> None:
 @pytest.mark.full
 def test_ranks_play_what_one_plays(tmp_path: Path) -> None:
     """Five worlds, so that shares differ, with the feedback of the closed loop. Batch and success,
-    whose starts are drawn; every gate has one result, and says where its worlds were."""
+    whose starts are drawn; every gate has one result, and says where its worlds were.
+    """
     args = [*SHORT, "gates=[baseline,batch,success]", "nworld=5", "gate.batch.seeds=2"]
     args.append("controller=closed_loop")
     assert run([*args, f"hydra.run.dir={tmp_path}/one"]) == 1  # the episodes are too short
@@ -183,7 +185,8 @@ def trap(tmp_path: Path) -> list[str]:
 @pytest.mark.parametrize(("env", "why"), [({}, "the trap"), ({"KILL": "1"}, "was killed")])
 def test_a_rank_that_breaks(env: dict[str, str], why: str, trap: list[str], tmp_path: Path) -> None:
     """The run fails with the rank and the reason, within seconds; finished seeds are kept, and one
-    process goes on with them."""
+    process goes on with them.
+    """
     folder = tmp_path / "run"
     began = time.monotonic()
     text = play(2, [*trap, f"hydra.run.dir={folder}"], tmp_path, 1, **env)
@@ -210,7 +213,8 @@ def test_a_rank_that_breaks(env: dict[str, str], why: str, trap: list[str], tmp_
 @pytest.mark.parametrize("script", [False, True], ids=["devices=2", "torchrun scripts/run.py"])
 def test_a_killed_first_rank_is_named(script: bool, trap: list[str], tmp_path: Path) -> None:
     """It would have said so itself: the lowest rank that is left does, alone, and the command that
-    has started the ranks gives the signal."""
+    has started the ranks gives the signal.
+    """
     folder = tmp_path / "run"
     args = [*trap, f"hydra.run.dir={folder}"]
     launcher = ["-m", "torch.distributed.run", "--nproc-per-node=3", str(SCRIPT)]

@@ -1,5 +1,6 @@
 """What the arm reaches: against MuJoCo and mink, regions that are refused, obstacles, and the map
-of the tool."""
+of the tool.
+"""
 
 import csv
 import math
@@ -163,7 +164,8 @@ def touching(
     model: mujoco.MjModel, index: SceneIndex, command: np.ndarray, cube: str, xy: Any, yaw: float
 ) -> set[str]:
     """Names of the geoms, but for the table's, that a cube on the table touches. The other cube is
-    away."""
+    away.
+    """
     data = mujoco.MjData(model)
     data.qpos[index.robot_qpos] = command
     for name, at in zip(("red", "blue"), index.object_qpos, strict=True):
@@ -182,7 +184,8 @@ def touching(
 
 def test_finger_room_is_what_the_open_jaws_need(get_stage: GetStage, robot: str) -> None:
     """Jaws around red, blue beside it at the smallest distance, any yaw. Only the SO-101 hits,
-    towards its base."""
+    towards its base.
+    """
     cfg = get_stage(robot).cfg
     model = get_stage(robot).model
     index = get_stage(robot).index

@@ -1,5 +1,6 @@
 """Job replay: a world of an earlier run does alone what it did among others, and every rule is
-explained."""
+explained.
+"""
 
 import io
 import json
@@ -50,7 +51,8 @@ SUCCEEDED = "1:3"  # of the run below
 @pytest.fixture(scope="module")
 def earlier(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a native run of five worlds under two seeds, with a threshold so tight that
-    some fail."""
+    some fail.
+    """
     folder = tmp_path_factory.mktemp("earlier") / "run"
     assert run([*EARLIER, f"hydra.run.dir={folder}"]) == 1
     return folder
@@ -253,7 +255,8 @@ def carry(red_x: float = 0.31, red_mass: float = 0.09) -> bytes:
 @pytest.fixture(scope="module")
 def from_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a run of both gates from a file and, beside it, random joints. The file is
-    gone."""
+    gone.
+    """
     home = tmp_path_factory.mktemp("from_file")
     noise = ["+reset.noise.func=mjstack.mdp.reset.JointNoise", "+reset.noise.params.arm=0.01"]
     start = ["reset=starts_file", "starts=carry.npz", "nworld=2", "sim=native", *noise]

@@ -1,5 +1,6 @@
 """Hundreds of random stacks on the GPU: with the primitive box collider all come to rest, with the
-convex one some never do."""
+convex one some never do.
+"""
 
 import math
 
@@ -58,5 +59,6 @@ def moving_stacks(*, primitive: bool) -> int:
 @pytest.mark.parametrize("primitive", [True, False])
 def test_random_stacks_come_to_rest(primitive: bool) -> None:
     """With the convex collider some never do. When MJWarp mends it this fails: then drop the
-    primitive one."""
+    primitive one.
+    """
     assert (moving_stacks(primitive=primitive) == 0) is primitive

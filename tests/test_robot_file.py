@@ -1,5 +1,6 @@
 """A robot from anybody's MJCF file: where it is found, what follows from it, what is refused, and
-kinematics of an arm with a slide against MuJoCo's."""
+kinematics of an arm with a slide against MuJoCo's.
+"""
 
 import re
 import shutil

@@ -56,7 +56,8 @@ def _compile(path: Path) -> mujoco.MjModel:
 
 def upstream(robot: str) -> mujoco.MjModel:
     """Menagerie's model; skips the test where there is no copy, fails where MENAGERIE_ROOT points
-    beside one."""
+    beside one.
+    """
     named = os.environ.get("MENAGERIE_ROOT")
     path = (Path(named) if named else REPO.parent / "shared" / "menagerie") / UPSTREAM[robot]
     if path.is_file():
@@ -254,7 +255,8 @@ def test_rebot_contact_parameters() -> None:
 
 def test_grasp_point_sites() -> None:
     """The sites sit at the centroids of the built-in tip spheres, and at the origins of the finger
-    bodies."""
+    bodies.
+    """
     so101 = built_in("so101")
     rebot = built_in("rebot")
     sites = [

@@ -1,5 +1,6 @@
 """A run's folder: two runs never share one, and what a full disk or a kill leaves in it does not
-keep the same command from going on."""
+keep the same command from going on.
+"""
 
 import csv
 import gc

@@ -382,7 +382,8 @@ CROWD = """
 @pytest.mark.parametrize("most", [4096, 4])
 def test_native_worlds_that_mujoco_warns_of_take_every_step(most: int, monkeypatch: Patch) -> None:
     """Many steps in one call of MuJoCo's, and in calls of few worlds each, are as many single ones,
-    also for worlds that overflow or diverge."""
+    also for worlds that overflow or diverge.
+    """
     from mjstack.sim import native
 
     monkeypatch.setattr(native, "_STEPS", most)

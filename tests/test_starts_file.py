@@ -1,5 +1,6 @@
 """Starts files: the same worlds again, on both backends, and one line for whatever is wrong with a
-file."""
+file.
+"""
 
 import re
 from pathlib import Path

@@ -82,7 +82,8 @@ def test_a_step_ends_where_mjwarps_own_does(step: str, robot: str, device: str) 
 @on_cuda
 def test_branches_count_and_sense_what_one_after_the_other_does(robot: str) -> None:
     """Cubes at rest, red between the jaws: a few decimation from one state, where rounding has no
-    time to grow."""
+    time to grow.
+    """
     sim = worlds(robot, "cuda:0", "arranged")
     stock = worlds(robot, "cuda:0", "stock")
     cfg = configure(robot=robot)

@@ -1,5 +1,6 @@
 """The success gate: rates, where episodes go wrong, what is left of them, and the same starts on
-both backends."""
+both backends.
+"""
 
 import csv
 from contextlib import closing
@@ -222,7 +223,8 @@ def test_region_is_the_gates_alone() -> None:
 
 def test_tracker_against_a_plain_recount(monkeypatch: Patch) -> None:
     """Made-up episodes of 300 worlds, in which anything may happen at any time; the recount goes
-    world by world."""
+    world by world.
+    """
     size = (90, 300)
     rng = np.random.default_rng(3)
     moves = rng.random(size) < 0.12
@@ -260,7 +262,8 @@ def monitor(
     overflow: np.ndarray,
 ) -> FailureMonitor:
     """The monitor after episodes that the test made up: each step's phases of the worlds, objects
-    in hand and objects placed, positions and overflow."""
+    in hand and objects placed, positions and overflow.
+    """
     n = phase.shape[1]
     counts = torch.zeros(n, dtype=torch.int32)
     sim = SimpleNamespace(qpos=torch.zeros(n, 3), qvel=torch.zeros(n, 3), overflow=counts)
@@ -306,7 +309,8 @@ def recount(
 @pytest.mark.full
 def test_signs_in_real_episodes(new_run: NewRun) -> None:
     """Worlds that somebody interferes with: each shows its own sign, in its phase, and one is
-    undisturbed."""
+    undisturbed.
+    """
     base = new_run("sim=native", "nworld=6")
     run = base.on(base.stage.with_config(success_config(base.cfg)))
     red, _ = run.stage.index.object_qpos

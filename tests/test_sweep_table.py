@@ -49,7 +49,8 @@ def table(folder: Path) -> list[dict[str, str]]:
 
 class InThisProcess:
     """Stands in for `Child`: the command line runs in this process, which has imported everything.
-    The test of Ctrl-C starts real processes."""
+    The test of Ctrl-C starts real processes.
+    """
 
     seconds = 1.0
 
@@ -275,7 +276,8 @@ def test_crossover(
 
 def test_a_job_that_failed_is_a_gap_even_with_figures(tmp_path: Path, monkeypatch: Patch) -> None:
     """Of three jobs the middle one measured physics and then failed; its figure would move the
-    crossover."""
+    crossover.
+    """
     rows = rates({"mjwarp": {1: 1.0, 10: 99.0, 100: 100.0}, "native": {1: 10.0, 10: 10, 100: 10}})
     rows[1]["status"] = "fail"
     assert crossover(PLOT, rows) == (pytest.approx(10.0), "mjwarp", "native")

@@ -1,5 +1,6 @@
 """Terms and managers: values against NumPy and MuJoCo, managers without an environment, and how
-worlds start."""
+worlds start.
+"""
 
 import inspect
 import math
@@ -114,7 +115,8 @@ def test_every_term_has_its_shape_and_range(backend: str, robot: str) -> None:
 
 def mujocos_observations(env: Env, world: int, action: np.ndarray) -> dict[str, np.ndarray]:
     """The terms of conf/observation/stack.yaml and reach.yaml in native MuJoCo, read by names,
-    without noise, clip and scale."""
+    without noise, clip and scale.
+    """
     robot = env.cfg.robot
     data = mujoco.MjData(env.sim.model)
     data.qpos[:] = env.sim.qpos[world].double().cpu()
@@ -373,7 +375,8 @@ def test_success_ends_a_scripted_episode(
     get_stage: GetStage, scripted: Callable[[str], SimpleNamespace]
 ) -> None:
     """In the step in which it is first achieved, and not before the cubes have rested for a whole
-    window."""
+    window.
+    """
     rec = scripted("so101")
     first = rec.success.int().argmax(0).tolist()
     window = limits(rec.cfg).window
@@ -404,7 +407,8 @@ def rested(rec: SimpleNamespace, *views: torch.Tensor, since: np.ndarray) -> np.
     Args:
         rec: Configuration and addresses.
         views: qpos, qvel and sensordata, each ``(steps, n)``.
-        since: First step of the episode that each step belongs to, shape ``(steps,)``."""
+        since: First step of the episode that each step belongs to, shape ``(steps,)``.
+    """
     window = limits(rec.cfg).window
     windows = len(views[0]) - window + 1
     env = env_of(rec, windows)  # world w has the window that begins with step w
@@ -502,7 +506,8 @@ def assert_success(
     rec: SimpleNamespace, worlds: list[tuple[str, *tuple[torch.Tensor, ...]]], expected: np.ndarray
 ) -> None:
     """The term says what is expected, shape ``(worlds, steps)``; some worlds start anew when their
-    trajectory is altered."""
+    trajectory is altered.
+    """
     names, *views = zip(*worlds, strict=True)
     state = [torch.stack(view, 1) for view in views]
     env = env_of(rec, len(names))
@@ -521,7 +526,8 @@ def assert_success(
 @pytest.mark.full
 def test_stack_success_is_rules_four_to_six(scripted: Callable[[str], SimpleNamespace]) -> None:
     """Step by step, over the recorded episodes and altered ends of the first, some of whose worlds
-    start anew in between."""
+    start anew in between.
+    """
     rec = scripted("rebot")
     ends = (rec.cfg.robot.gripper_closed, rec.cfg.robot.gripper_open)
     closed, opened = map(np.array, ends)
@@ -582,7 +588,8 @@ def test_stack_success_is_rules_four_to_six(scripted: Callable[[str], SimpleName
 
 def test_reaching_ends_the_episode_after_ten_steps_in_a_row(backend: str) -> None:
     """The goal is carried to the grasp_point: in world 1 all the time, in world 2 with an
-    interruption."""
+    interruption.
+    """
     cfg = configure("task=reach", "reset=nominal")
     cfg.termination.pop("object_off_table")
     env = on_shared_sim(backend, 3, cfg)

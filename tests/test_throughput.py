@@ -199,7 +199,8 @@ def test_bare_steps_play_the_same_trajectory(
     new_run: NewRun, make_sim: MakeSim, monkeypatch: Patch
 ) -> None:
     """Warp's CPU device is bit-reproducible: whatever else an arranged step does, the physics of
-    both is the same."""
+    both is the same.
+    """
     run = new_run("nworld=1", *at_double_speed())
     sim = make_sim("mjwarp", 1, "sim.step=auto")  # its own, not the one that other tests share
     sim.plan = StepPlan("arranged")
@@ -348,7 +349,8 @@ def test_worlds_with_an_empty_grasp_are_counted(new_run: NewRun) -> None:
 @pytest.mark.full
 def test_the_parts_play_one_trajectory(monkeypatch: Patch) -> None:
     """Physics alone ends where the whole step ended, except in worlds that were reset meanwhile, of
-    which there are some."""
+    which there are some.
+    """
     cfg = load_config(["task=stack", "sim=native", "task.episode_steps=9"])
     env = build_env(cfg, nworld=12)
     wholes = []

@@ -118,7 +118,8 @@ def test_a_full_disk_leaves_the_policies_before_it(
     tmp_path: Path, monkeypatch: Patch, capsys: Capture
 ) -> None:
     """After the first policies nothing larger than a kilobyte can be written. The same command goes
-    on when there is room again."""
+    on when there is room again.
+    """
     out = tmp_path / "training"
     real = checkpoint.write_atomic
     _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -182,7 +183,8 @@ def test_two_cores_train(overrides: list[str], rate: float, tmp_path: Path) -> N
 @pytest.mark.full
 def test_a_clone_of_stack_drives_the_batch(tmp_path: Path) -> None:
     """From few episodes at double speed, which take seconds: no success is asked for. It sees what
-    a real arm has, with its past, decides ten times a second, and its commands are late."""
+    a real arm has, with its past, decides ten times a second, and its commands are late.
+    """
     fast = [*at_double_speed(), "reset=jitter", "timing.command_delay=5"]
     seen = ["observation@job.observation=real", "+job.observation.policy.terms.joint_pos.history=2"]
     out = tmp_path / "training"

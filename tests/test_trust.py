@@ -153,7 +153,8 @@ def test_a_run_names_terms_alone(name: str, term: str, stranger: Path) -> None:
 
 def test_each_kind_of_term_is_listed(tmp_path: Path) -> None:
     """A policy names observation and action terms, a run action and reset terms and checks: those
-    of the list, and nothing else of mjstack."""
+    of the list, and nothing else of mjstack.
+    """
     listed = set((ROOT / "tests" / "data" / "may_be_named.txt").read_text().splitlines())
     named = set()
     for module in pkgutil.walk_packages(mjstack.__path__, "mjstack.", onerror=lambda name: None):
@@ -211,7 +212,8 @@ def test_a_package_that_the_folder_lies_in_is_not_trusted(
     way: str, stranger: Path, monkeypatch: Patch
 ) -> None:
     """Nor where its configuration is a link that leads elsewhere, or where the package has a second
-    place beside the search path."""
+    place beside the search path.
+    """
     home = Path("home")
     (home / "conf" / "task").mkdir(parents=True)
     (home / "outputs").mkdir()
