@@ -145,7 +145,8 @@ def test_reaches_what_mink_reaches(
 
     In front of the base nothing that mink reaches is missed. Behind it, where the way from home
     ends at the joints' limits, either one ends short at times where the other arrives; with the
-    base turned as mink turned it, nothing is missed at all."""
+    base turned as mink turned it, nothing is missed at all.
+    """
     own = shipped(get_stage(robot)) if gains == "shipped" else {"posture_gain": 0.3}
     ik = arm.solver(MINK, iterations=40, **own)
     for mink in by_mink(robot).values():
@@ -204,7 +205,8 @@ def test_follows_minks_way_as_shipped(
 
     Above the table all of it is followed. Elsewhere SO-101 is lost at times where the way comes as
     near to the base's axis as the arm can, 26 mm: there no joint moves the grasp_point in or out,
-    the base may turn either way, and on to its limit."""
+    the base may turn either way, and on to its limit.
+    """
     data = mujoco.MjData(arm.model)
     steps = 200
     mujoco.mj_kinematics(arm.model, data)

@@ -245,7 +245,8 @@ def test_terms_know_the_box(robot: str) -> None:
 def test_success_needs_rest_in_the_box_an_open_gripper_and_the_whole_window(robot: str) -> None:
     """World 0 has all of it. In 1 blue is on the table, in 2 the gripper is closed, in 3 red moves
     now and then, in 4 a jaw touches blue in the first step, in 5 a corner of red is above the
-    rim."""
+    rim.
+    """
     env = small_env("reset=nominal", robot=robot, nworld=6)
     success = BoxSuccess(env)
     places = rests(env)

@@ -62,7 +62,8 @@ def planned() -> SimpleNamespace:
 @cache
 def scripted() -> SimpleNamespace:
     """What the success gate plays natively from two random starts; in the second one each cube is
-    taken from between the jaws as they close for the first time, and put down beside them."""
+    taken from between the jaws as they close for the first time, and put down beside them.
+    """
     taken: list[str] = []
 
     def take_away(env: Env, phase: str) -> None:

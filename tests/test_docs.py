@@ -162,7 +162,8 @@ def test_training_block_learns(folder: Path, capsys: Capture) -> None:
     it passes 1.5.
 
     Held against that and not against the first iterations, in which some runs, from other weights,
-    have learnt already. The weights are the same in every run."""
+    have learnt already. The weights are the same in every run.
+    """
     torch.manual_seed(0)
     blocks = python_blocks((DOCS / "training.md").read_text(encoding="utf-8"))
     (block,) = (block for block in blocks if TRAINS in block)

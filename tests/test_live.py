@@ -170,7 +170,8 @@ def test_worlds_pause_step_and_are_chosen(
 )
 def test_a_driven_episode_shows_cameras_and_rewards(server: Any, backend: str) -> None:
     """Its environment draws nothing; the images are those that one with cameras would have, in
-    the looks of the world. Without the view the episode has no rewards."""
+    the looks of the world. Without the view the episode has no rewards.
+    """
     sizes = [f"scene.cameras.{name}.size=[32,32]" for name in ("front", "wrist")]
     args = ["view=web", f"sim={backend}", "cameras=[front,wrist]", "looks=randomized", *sizes]
     cfg = load_config((*args, "reset=randomized", "sim.device=cpu"))

@@ -176,7 +176,8 @@ def test_maps_of_a_large_batch_show_failed_worlds_first(
 
 def test_maps_show_ways(tmp_path: Path) -> None:
     """A line per episode from the start on, one point while the object rests; what is not finite
-    is left out."""
+    is left out.
+    """
     gate, worlds = batch(8)
     way = np.array([[0.1, 0.1], [0.1, 0.1], [0.3, 0.1], [np.nan, np.nan], [0.1, 0.1]])
     lost = np.full((3, 2), np.nan)

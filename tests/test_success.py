@@ -347,7 +347,8 @@ def test_signs_in_real_episodes(new_run: NewRun) -> None:
 @pytest.mark.full
 def test_each_cube_of_the_box_has_its_own_release(monkeypatch: Patch) -> None:
     """World by world: all well; red misses, blue does not; red is let go well and leaves under
-    blue's approach; blue misses; blue leaves at the end."""
+    blue's approach; blue misses; blue leaves at the end.
+    """
     cfg = load_config(["task=box"])
     names = list(cfg.controller.phases)
     at = {name: 2 * number for number, name in enumerate(names)}  # two steps a phase
