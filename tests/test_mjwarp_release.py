@@ -5,6 +5,10 @@ Where they are not, see docs/design.md, "A new release of MuJoCo Warp".
 import ast
 import dataclasses
 import inspect
+import os
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import mujoco
@@ -137,3 +141,61 @@ def test_the_narrow_phase(world: tuple[mjw.Model, mjw.Data]) -> None:
         ]
         expected = calls.split()
         assert actual == expected, changed(f"the calls of {function.__name__}", expected, actual)
+
+
+MAKE = """
+from mjstack.config import load_config
+from mjstack.config.schema import Backend
+from mjstack.scene import build_model
+from mjstack.sim import make_simulation
+from mjstack.sim.sizes import resolve_env_sizes
+
+for robot in ("so101", "rebot"):
+    cfg = load_config(["task=box", f"robot={robot}"])
+    sizes = resolve_env_sizes(cfg)
+    print(make_simulation(
+        build_model(cfg), cfg, 2, backend=Backend.mjwarp, device="cpu", sizes=sizes
+    ).plan)
+"""
+KEPT = "else kbimp[0]\n"  # the stiffness of a row
+ALTERED = "else 1.02 * kbimp[0]\n"
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(
+    ("alters", "plan"),
+    [
+        (False, "fused step"),
+        (
+            True,
+            "stock step (mjstack's was written for mujoco-warp 4.0.0, and differs from its step by",
+        ),
+    ],
+)
+def test_another_release_is_compared_with_its_own_step(
+    alters: bool, plan: str, tmp_path: Path
+) -> None:
+    """A copy of mujoco_warp with another version, as it is and with rows 2 % stiffer."""
+    package = Path(mjw.__file__).parent
+    copy = tmp_path / "mujoco_warp"
+    shutil.copytree(package, copy, ignore=shutil.ignore_patterns("test_data", "__pycache__"))
+    named = copy / "__init__.py"
+    text = named.read_text()
+    version = 'metadata.version("mujoco_warp")'
+    assert version in text
+    named.write_text(text.replace(version, '"4.0.9"'))
+    rows = copy / "_src/constraint.py"
+    text = rows.read_text()
+    assert text.count(KEPT) == 1
+    rows.write_text(text.replace(KEPT, ALTERED if alters else KEPT))
+    path = os.pathsep.join([str(tmp_path), *sys.path])
+    done = subprocess.run(
+        [sys.executable, "-c", MAKE],
+        env=os.environ | {"PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    lines = done.stdout.splitlines()
+    assert len(lines) == 2
+    assert all(line.startswith(plan) for line in lines), lines

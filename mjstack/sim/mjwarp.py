@@ -17,7 +17,7 @@ from mjstack.errors import MjstackError, first_line
 from mjstack.sim.cameras import Cameras
 from mjstack.sim.fused.launch import arguments
 from mjstack.sim.fused.smooth import positions
-from mjstack.sim.fused.step import StepPlan, plan_step, rearranged_step
+from mjstack.sim.fused.step import RELEASES, StepPlan, disagreement, plan_step, rearranged_step
 from mjstack.sim.graph import StepGraph, side_by_side
 from mjstack.sim.mjwarp_cameras import MjwarpCameras
 from mjstack.sim.model_fields import PLACING_FIELDS, Fields, check_fields
@@ -88,6 +88,14 @@ class MjwarpSimulation(Simulation):
             self._m.opt.warn_overflow = 0
             self._d = mjw.make_data(model, nworld=nworld, **sizes.as_kwargs())
             self.plan = StepPlan() if step == "stock" else plan_step(model, self._m, self._d)
+            if self.plan.name != "stock" and mjw.__version__ not in RELEASES:
+                facts = (model, self._m, self._d, self.device, self.plan)
+                with torch_stream_scope(self._device):
+                    wrong = disagreement(*facts)
+                if wrong:
+                    verified = ", ".join(RELEASES)
+                    text = f"mjstack's was written for mujoco-warp {verified}, and {wrong}"
+                    self.plan = StepPlan(reason=text)
             self._usage = Usage(model, nworld, self.device)
             # MJWarp's kernel skips geoms that are welded to the world, but not to a mocap body:
             # with these it skips all others

@@ -4,11 +4,20 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import mujoco
+import numpy as np
 import torch
+import warp as wp
+from torch import Tensor
 
+from mjstack.errors import first_line
 from mjstack.sim.fused import constraints, smooth
 from mjstack.sim.graph import side_by_side
 from mjstack.sim.mujoco_warp import mjw
+
+RELEASES = ("4.0.0",)  # of mujoco-warp that docs/design.md, "A new release", was done with
+_CONVERGED = 1e-8  # tolerance of the solver that float32 can still tell
+_STATES = 8
+_AGREES = 1e-3  # of a world's largest acceleration, or of 1 m/s^2
 
 
 @dataclass(frozen=True)
@@ -126,3 +135,58 @@ def rearranged_step(
         mjw.sensor_vel(m, d)
         mjw.sensor_acc(m, d)
     (smooth.advance if plan.smooth else mjw.implicit)(m, d)
+
+
+def disagreement(
+    model: mujoco.MjModel, m: mjw.Model, d: mjw.Data, device: torch.device, plan: StepPlan
+) -> str:
+    """What the planned step does otherwise than `mujoco_warp.step`; empty if nothing.
+
+    Both make a step from the same states: joints anywhere, some at their limits, free bodies
+    pressed into what they lie on, all of them moving. The worlds are left in one of these states.
+    """
+    nworld = len(d.qpos)
+    tolerance = wp.to_torch(m.opt.tolerance)
+    configured = tolerance.clone()
+    tolerance.fill_(_CONVERGED)
+    rng = np.random.default_rng(0)
+    worst = 0.0
+    try:
+        for _ in range(_STATES):
+            state = [torch.tensor(_draw(model, rng), device=device).float() for _ in range(nworld)]
+            ends = []
+            for own in (True, False):
+                mjw.reset_data(m, d)
+                wp.to_torch(d.qpos).copy_(torch.stack(state)[:, : model.nq])
+                wp.to_torch(d.qvel).copy_(torch.stack(state)[:, model.nq :])
+                if own:
+                    rearranged_step(m, d, device, plan, sensors=False)
+                else:
+                    mjw.step(m, d)
+                ends.append(wp.to_torch(d.qacc).clone())
+            worst = max(worst, _error(*ends))
+    except Exception as error:
+        return f"fails on it ({first_line(error)})"
+    finally:
+        tolerance.copy_(configured)
+    return "" if worst <= _AGREES else f"differs from its step by {worst:.1e} of an acceleration"
+
+
+def _draw(model: mujoco.MjModel, rng: np.random.Generator) -> np.ndarray:
+    """Positions and velocities of a state."""
+    qpos = model.qpos0.copy()
+    qvel = rng.uniform(-1.0, 1.0, model.nv)
+    for kind, at, (low, high) in zip(
+        model.jnt_type, model.jnt_qposadr, model.jnt_range, strict=True
+    ):
+        if kind == int(mujoco.mjtJoint.mjJNT_FREE):
+            qpos[at + 2] -= rng.uniform(0.0, 1e-3)
+        elif low < high:
+            qpos[at] = np.clip(rng.uniform(low - 0.1, high + 0.1), low - 0.01, high + 0.01)
+    return np.concatenate([qpos, qvel])
+
+
+def _error(a: Tensor, b: Tensor) -> float:
+    """Largest difference of a world over its largest number; infinite where one is not finite."""
+    error = (a - b).abs().amax(1) / b.abs().amax(1).clamp(min=1.0)
+    return float(error.nan_to_num(nan=torch.inf).max())
