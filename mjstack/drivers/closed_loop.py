@@ -187,9 +187,9 @@ class ClosedLoopDriver(FeedbackDriver):
             off = yaw - self._carried_pose()[:, 2]
             apart = torch.where(self._oblong[self._carried[self.phase]], 2.0 * _QUARTER, _QUARTER)
             off = self._roll_sign * (off - apart * torch.round(off / apart))
-            other = off - torch.copysign(apart, off)  # where the nearer one is out of range
+            back = off - torch.copysign(apart, off)  # where the nearer one is out of range
             cost = off.abs() + self._beyond(self._roll + off)
-            off = torch.where(cost <= other.abs() + self._beyond(self._roll + other), off, other)
+            off = torch.where(cost <= back.abs() + self._beyond(self._roll + back), off, back)
             off = (_ALIGN * off).clamp(-_ROLL_STEP, _ROLL_STEP)
             self._roll += off * self._turns_held[self.phase]
         command[:, self._roll_column] = column + self._roll
