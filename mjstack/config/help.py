@@ -26,6 +26,7 @@ _LISTED = {  # the group of each, if it is one
 }
 _TERMS = ("action", "observation", "reward", "reset", "termination", "looks")
 _RANGE = re.compile(r"(?:typing\.)?Annotated\[(\w+), Range\(.*?\)\]")
+_PLAIN = re.compile(r"collections\.abc\.|mjstack\.\w+\.\w+\.|torch\.(?=Tensor)| = <.+>$")
 _TEXT = """\
 mjstack: a task of a robot arm, from native MuJoCo to thousands of MuJoCo Warp worlds,\
  verified in gates.
@@ -233,11 +234,14 @@ def _functions(kind: str, with_parameters: bool) -> Iterator[tuple[str, str]]:
         func: Any = find_object("list", name)
         if getattr(func, "__module__", "") != name.rpartition(".")[0] or not callable(func):
             continue
+        options = inspect.signature(func).parameters
+        if kind == "conditions" and next(iter(options), "") == "step":  # a helper of conditions
+            continue
         doc = inspect.getdoc(func) or ""
         yield name, " ".join(doc.partition("\n\n")[0].split()).partition(". ")[0]
         called = func.__init__ if inspect.isclass(func) else func
         notes = dict(re.findall(r"(?m)^ +(\w+): (.+)$", inspect.getdoc(called) or ""))
-        for option in inspect.signature(func).parameters.values() if with_parameters else ():
+        for option in options.values() if with_parameters else ():
             if option.kind is option.KEYWORD_ONLY:
-                text = _RANGE.sub(r"\1", str(option))
+                text = _PLAIN.sub("", _RANGE.sub(r"\1", str(option)))
                 yield "", f"{text}. {notes.get(option.name, '')}"
