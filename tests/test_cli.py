@@ -110,7 +110,7 @@ LINES = [
 
 LINES += [(flags, "mjstack: ") for flags in FLAGS]
 LINES += [("nworld=2 -m gates=[nope]", "gate 'nope'"), ("--cfg job -p gate.nope", "gate.nope")]
-# Of a kind that test_config.py has in make test, or that another line is of
+# In test-rest alone: test_config.py or another line has the same kind in make test
 ALIKE = ("++robot.hoem=1", "+gate.batch.seds=1", "task.check.dz_max=inf", "task.check=3")
 ALIKE += ("cameras=[front,wirst]", "-m seed=1 +hydra.sweeper.params.nworld=2", "--seed nworld=2")
 ALIKE += ("-m hydra/launcher=gpus sim=native seed=0,1 devices=2", "hydra/launcher=nope")

@@ -21,6 +21,7 @@ from mjstack.episodes.stage import Stage
 from mjstack.jobs import check_job
 from mjstack.math import mcnemar_p_value
 
+FULL = pytest.mark.full
 TINY = ("job=compare", "task=reach", "sim=native", "nworld=4", "gate.success.seeds=2")
 FAULTS = {"closed_loop": (0, 2), "state_based": (2, 3)}  # worlds in which the driver does nothing
 
@@ -131,9 +132,14 @@ def test_equal_sides(tmp_path: Path) -> None:
             ['job.against=["seed=1"]'],
             "expected the same robot, task, worlds and seeds (seed=1, expected 0)",
         ),
-        (['job.against=["robot=rebot"]'], "(robot=rebot, expected so101)"),
-        (['job.against=["gate.success.seeds=3"]'], "(gate.success.seeds=3, expected 2)"),
-        (['job.against=["task.check.distance=0.5"]'], "(task.check.distance=0.5, expected 0.02)"),
+        *(
+            pytest.param([f'job.against=["{side}"]'], f"({side}, expected {value})", marks=FULL)
+            for side, value in (
+                ("robot=rebot", "so101"),
+                ("gate.success.seeds=3", "2"),
+                ("task.check.distance=0.5", "0.02"),
+            )
+        ),
         (['job.against=["gate.success.region=[0.01,0.01]"]'], "expected equal starts, which"),
         (['job.against=["controller=policy","policy=nowhere/last"]'], "nowhere/last"),
         (['job.against=["graph=off"]', "view=web"], "expected false with job=compare"),

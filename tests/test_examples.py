@@ -102,7 +102,7 @@ def test_a_dataset_and_a_replay(tmp_path: Path) -> None:
     ("example", "threshold", "rules"),
     [
         ("push", "within=1e-6", ["AT_GOAL"]),
-        ("tower", "xy_err=1e-6", ["RED", "GREEN"]),
+        pytest.param("tower", "xy_err=1e-6", ["RED", "GREEN"], marks=pytest.mark.full),
         pytest.param("slot", "depth=0.05", ["DEPTH"], marks=pytest.mark.full),
         pytest.param("peg", "within=1e-6", ["IN_HOLE"], marks=pytest.mark.full),
     ],
@@ -129,7 +129,14 @@ class Still(Driver):
 
 
 @pytest.mark.parametrize(
-    ("example", "rules"), [("push", ["AT_GOAL"]), ("tower", ["RED", "GREEN"]), ("slot", ["DEPTH"])]
+    ("example", "rules"),
+    [
+        ("tower", ["RED", "GREEN"]),
+        *(
+            pytest.param(*row, marks=pytest.mark.full)
+            for row in (("push", ["AT_GOAL"]), ("slot", ["DEPTH"]))
+        ),
+    ],
 )
 def test_worlds_that_are_not_driven_fail(example: str, rules: list[str]) -> None:
     cfg = configure(example, "so101", "nworld=2", "reset=randomized")

@@ -134,7 +134,7 @@ def drivers_targets(policy: Path, cfg: Config, steps: int) -> np.ndarray:
     return np.array(targets)
 
 
-@pytest.mark.parametrize("task", ["reach", "stack"])
+@pytest.mark.parametrize("task", ["reach", pytest.param("stack", marks=pytest.mark.full)])
 def test_the_example_drives_as_the_driver_does(task: str, exported: Path, tmp_path: Path) -> None:
     """Bit for bit but for onnxruntime's float32 where the driver has float64."""
     cfg = configure(f"task={task}", "sim=native", "nworld=1")

@@ -227,6 +227,7 @@ def test_a_video_that_cannot_be_written_fails_the_job(
     monkeypatch.setattr(play, "save_video", full)
     policy = write_policy(tmp_path / "policy", configure("task=reach"))
     out = tmp_path / "out"
-    assert run([*REACH, f"policy={policy}", "nworld=1", f"hydra.run.dir={out}"]) == 1
+    args = [*REACH, f"policy={policy}", "nworld=1", "web.episode=false", f"hydra.run.dir={out}"]
+    assert run(args) == 1
     assert "episode.mp4 was not written: No space left on device" in gate_of(out)["reason"]
     assert not (out / "episode.mp4").exists()

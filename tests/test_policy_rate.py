@@ -4,7 +4,7 @@ worlds it repeats them. Both do the same.
 
 import pytest
 import torch
-from environments import Patch, actions, configure, on_new_sim, on_shared_sim, state_of
+from environments import REBOT_LATER, Patch, actions, configure, on_new_sim, on_shared_sim, state_of
 from policies import make_policy
 
 from mjstack.adapters.rsl_rl import RslRlVecEnv
@@ -143,6 +143,7 @@ def near_the_table(robot: str) -> list[str]:
     return ["reset=randomized", *([low] if robot == "rebot" else [])]
 
 
+@REBOT_LATER
 def test_the_upright_gripper_rolls_and_points_down(robot: str) -> None:
     """The grasp point goes where it is sent, and the roll joint turns by itself."""
     cfg = configure("action=ee_upright", *near_the_table(robot), robot=robot)
@@ -166,6 +167,7 @@ def test_the_upright_gripper_rolls_and_points_down(robot: str) -> None:
     assert (upright[:, 2] < -0.9).all()
 
 
+@REBOT_LATER
 def test_the_gripper_tilts_as_far_as_it_is_told(robot: str) -> None:
     """Away from the base, by a step at most, while the grasp point stays."""
     cfg = configure("action=ee_tilt", *near_the_table(robot), robot=robot)
