@@ -373,6 +373,7 @@ def test_an_object_that_lies_askew_in_the_hand_is_aligned(drive: Drive) -> None:
     assert left[True][1] < 3.0, left
 
 
+@pytest.mark.full
 def test_what_is_oblong_is_aligned_by_half_turns(drive: Drive) -> None:
     """A brick at any yaw is turned to blue's heading, not across it, within the joint's range."""
     phases = "controller.phases"

@@ -41,6 +41,7 @@ def rounds() -> list[list[str]]:
     return [*(list(filter(None, row)) for row in zip_longest(*groups.values())), *alone]
 
 
+@pytest.mark.full
 def test_every_file_composes() -> None:
     assert len(choices()) > 40
     for chosen in rounds():

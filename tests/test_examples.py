@@ -62,7 +62,7 @@ def play_gates(example: str, robot: str, folder: Path, *overrides: str) -> dict[
 @pytest.mark.parametrize(
     ("example", "robot", "gates"),
     [
-        ("tower", "so101", "batch"),
+        pytest.param("tower", "so101", "batch", marks=pytest.mark.full),
         pytest.param("tower", "rebot", "baseline,parity,batch", marks=pytest.mark.full),
         ("push", "so101", "baseline,batch"),
         pytest.param("push", "rebot", "baseline,parity,batch", marks=pytest.mark.full),

@@ -212,7 +212,8 @@ def test_the_pool_keeps_an_even_share_in_any_order() -> None:
     assert (torch.histc(kept.float(), 10, 0, 3000) - 10).abs().max() <= 2
 
 
-@pytest.mark.parametrize("backend", [pytest.param("mjwarp", marks=pytest.mark.full), "native"])
+@pytest.mark.full
+@pytest.mark.parametrize("backend", ["mjwarp", "native"])
 def test_images_of_a_round_come_again(backend: str, tmp_path: Path) -> None:
     """A round that is read has the images that were rendered when it was played: those at which the
     policy is queried and whose chunk the expert drove.

@@ -116,6 +116,7 @@ def test_a_video_has_worlds_side_by_side(tmp_path: Path) -> None:
     assert picture[370:, 490:].max() < 40  # the fourth is empty
 
 
+@pytest.mark.full
 @pytest.mark.skipif(not has_gl(), reason="MuJoCo cannot draw offscreen here")
 def test_a_camera_of_the_scene_draws_the_video(tmp_path: Path) -> None:
     """Ten pictures per second of 60 steps, each world in its own looks."""

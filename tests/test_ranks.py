@@ -292,6 +292,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.full
 def test_finished_seeds_are_read_back(finished: Path) -> None:
     """Every figure of a read record is that of the played one; more seeds may be asked for."""
     played = report_of(finished)

@@ -155,11 +155,11 @@ def disagreement(
         for _ in range(_STATES):
             state = [torch.tensor(_draw(model, rng), device=device).float() for _ in range(nworld)]
             ends = []
-            for own in (True, False):
+            for planned in (True, False):
                 mjw.reset_data(m, d)
                 wp.to_torch(d.qpos).copy_(torch.stack(state)[:, : model.nq])
                 wp.to_torch(d.qvel).copy_(torch.stack(state)[:, model.nq :])
-                if own:
+                if planned:
                     rearranged_step(m, d, device, plan, sensors=False)
                 else:
                     mjw.step(m, d)
