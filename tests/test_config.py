@@ -210,6 +210,11 @@ BAD = [
         ["job=collect", "job.fps=30"],
         "job.fps is a key of job=play, and this is job=collect. Set job=play.",
     ),
+    (
+        ["trainer=ppo", "job.chunk=3"],
+        "job.chunk is a key of trainer=dagger and trainer=clone, and this is trainer=ppo. Set"
+        " trainer=dagger.",
+    ),
     (["=3"], "=3: "),
     (["nworld"], "override 'nworld' cannot be read: expected key=value"),
     (

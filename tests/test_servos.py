@@ -7,7 +7,7 @@ import pytest
 from compositions import load_config, refusal
 
 from mjstack import make_env
-from mjstack.errors import UnknownName
+from mjstack.errors import MjstackError
 from mjstack.mdp.starts.starts_file import start_arrays
 from mjstack.scene.build import build_model
 
@@ -64,8 +64,18 @@ def test_a_value_that_cannot_be_is_refused(override: str, message: str) -> None:
 
 def test_a_joint_that_the_robot_lacks_is_refused() -> None:
     cfg = load_config(["actuator=gtc_berlin", "robot=rebot"])
-    with pytest.raises(UnknownName, match="shoulder_pan"):
+    with pytest.raises(MjstackError, match=r"shoulder_pan.* joint1, .* Or set actuator to"):
         build_model(cfg)
+
+
+def test_one_servo_is_set_over_those_of_the_file() -> None:
+    """By ``+``, which is what is said of a key that is not there."""
+    key = "robot.servos.elbow_flex"
+    message = refusal(lambda: load_config([f"{key}.stiffness=25"]))
+    assert message == f"'{key}' is not in the configuration. To add it, write +{key}=..."
+    for override in (f"+{key}.stiffness=25", f"+{key}={{stiffness: 25}}"):
+        gains = build_model(load_config([override])).actuator_gainprm[:, 0]
+        assert gains.tolist() == [998.22, 998.22, 25.0, 998.22, 998.22, 998.22]
 
 
 def test_the_example_draws_servos_for_each_world() -> None:

@@ -150,6 +150,10 @@ def _unknown_key(key: str, known: Iterable[str], overrides: Sequence[str]) -> Mj
     parent, _, leaf = key.rpartition(".")
     job = ["job=gates", *(o for o in overrides if o.startswith("job="))][-1]
     owners = [f"job={name}" for name, schema in JOB_SCHEMAS.items() if leaf in _field_names(schema)]
+    trainer = [o for o in overrides if o.startswith("trainer=")][-1:]
+    if parent == "job" and trainer and "job=train" in owners:  # of some trainers, and not of this
+        owners = ["trainer=dagger", "trainer=clone"]
+        job = trainer[0]
     if parent == "job" and owners and job not in owners:
         return MjstackError(
             f"{key} is a key of {' and '.join(owners)}, and this is {job}. Set {owners[0]}."
@@ -159,10 +163,12 @@ def _unknown_key(key: str, known: Iterable[str], overrides: Sequence[str]) -> Mj
     keys += [f"{parent}.{name}".lstrip(".") for name in known]
     keys = [name for name in keys if not f"{key}.".startswith(f"{name}.")]
     # A key of nearly the same name, or one that is alike as a whole
-    namesakes = [n for n in keys if get_close_matches(leaf, [n.rpartition(".")[2]])]
+    namesakes = [n for n in keys if get_close_matches(leaf, [n.rpartition(".")[2]], 1, 0.7)]
     near = get_close_matches(key, namesakes, 1, 0.3) or get_close_matches(key, keys, 1)
+    if parent == "robot.servos":  # others are no joints
+        near = [name for name in near if name.startswith(f"{parent}.")]
     hint = f" Did you mean '{near[0]}'?" if near else ""
-    if key.partition(".")[0] in TERM_GROUPS:
+    if key.partition(".")[0] in TERM_GROUPS or parent == "robot.servos":
         problem = f"'{key}' is not in the configuration.{hint} To add it, write +{key}=..."
         return MjstackError(problem)
     hint = hint or f" {suggest(key, _beside(key, keys))}"

@@ -56,8 +56,8 @@ _REPLAYED = {
 
 # An override that adds an entry to a mapping by names, of which the schema knows the type
 _ENTRY = re.compile(
-    r"\++((?:scene\.(?:objects|places|cameras)|controller\.phases|robot\.placements)\.\w+"
-    r"(?:\.parts\.\w+)?)[.=]"
+    r"\++((?:scene\.(?:objects|places|cameras)|controller\.phases|robot\.(?:placements|servos))"
+    r"\.\w+(?:\.parts\.\w+)?)[.=]"
 )
 
 _added: ContextVar[tuple[Path, ...]] = ContextVar("search path", default=())
@@ -289,7 +289,7 @@ def _once(load: Callable[..., DictConfig]) -> Callable[..., DictConfig]:
 
 def _add_entries(overrides: Sequence[str]) -> list[str]:
     """Let the next composition end with an empty entry of the right type for each object, place,
-    phase or camera that a ``+`` adds: OmegaConf would take none from a command line.
+    phase, camera or servo that a ``+`` adds: OmegaConf would take none from a command line.
 
     Returns:
         The overrides, which set such an entry's values over its defaults.

@@ -59,7 +59,10 @@ def robot_spec(robot: RobotCfg, model: ModelCfg) -> mujoco.MjSpec:
             spec.actuator(name).forcerange = [-robot.arm_force_limit, robot.arm_force_limit]
     for name, servo in robot.servos.items():
         if name not in robot.joints:
-            raise UnknownName("robot.servos: joint", name, robot.joints)
+            problem = UnknownName("robot.servos: joint", name, robot.joints)
+            raise MjstackError(
+                f"{problem}", "Or set actuator to a choice for this robot, or default"
+            )
         _set_servo(spec, name, servo)
     return spec
 
