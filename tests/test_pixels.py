@@ -260,6 +260,18 @@ def test_it_learns_to_tell_where_objects_are(tmp_path: Path) -> None:
         assert error() < 0.5 * before
 
 
+def test_a_group_without_numbers_is_not_estimated(tmp_path: Path) -> None:
+    """Such as headings of objects that are all round: the mean of no error is not a number."""
+    stage = Stage(load_config([*TINY, "job.rounds=0", "job.batches=1"]))
+    pool = ImagePool(vision_of(stage.cfg, stage.cfg.job).sizes, 1000, "cpu")
+    played = make_round(stage, tmp_path, None, 0, pool)
+    assert played.estimated is not None
+    played = replace(played, estimated=played.estimated[:, :0])
+    with closing(CloneLearner(stage, played, tmp_path, pool)) as learner:
+        learner.learn()
+        assert learner.curve[-1]["loss"] > 0.0
+
+
 def test_augmentation_shifts_and_tints() -> None:
     pool = [torch.randint(0, 256, (5, 9, 12, 3), dtype=torch.uint8) for _ in range(2)]
     rows = torch.tensor([4, 0, 0, 2])

@@ -67,8 +67,10 @@ class CloneLearner(Learner):
         self._networks = nn.ModuleDict({"network": self._network, "average": self._average})
         self._trained: list[nn.Parameter] = list(self._network.parameters())
         self._estimator: Estimator | None = None
-        if demonstrations.estimated is not None:
-            self._estimator = Estimator(cfg, demonstrations.estimated, ranks).to(device)
+        estimated = demonstrations.estimated
+        # Terms may give no number, such as headings of round objects: the mean of no error is nan
+        if estimated is not None and estimated.shape[1] > 0:
+            self._estimator = Estimator(cfg, estimated, ranks).to(device)
             self._networks["estimator"] = self._estimator
             self._trained += self._estimator.parameters()
         self.process(demonstrations)
@@ -205,8 +207,8 @@ class CloneLearner(Learner):
         images: Sequence[Tensor],
         noise: Tensor | float = 0.0,
     ) -> Tensor:
-        """Mean error, by ``job.loss``, of the normalised actions at some steps, shape ``(n,)``. At
-        an episode's end its last joint targets hold.
+        """Mean error, by ``job.loss``, of the normalised actions at some steps, shape ``(n,)``, and
+        in training of what is estimated. At an episode's end its last joint targets hold.
 
         Noise on the observation says that the actions are the same a little off the expert's way.
         It also stops the policy from reading elapsed time out of micrometre drift: while the expert
