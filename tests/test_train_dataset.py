@@ -228,6 +228,10 @@ def rename(info: dict[str, Any]) -> None:
 
 CHANGES: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "robot": (lambda i: i.update(robot_type="so100"), "has robot_type=so100, expected so101"),
+    "LeRobot's units": (
+        lambda i: i.update(robot_type="so_follower"),
+        "has robot_type=so_follower, expected so101. Give one in rad and m: collect it without job",
+    ),
     "rate": (lambda i: i.update(fps=30), "has fps=30, expected 50"),
     "version": (lambda i: i.update(codebase_version="v2.1"), "v2.1, expected v3.0"),
     "column": (rename, "has no column headings.1 in observation.policy"),
