@@ -188,7 +188,7 @@ class CloneLearner(Learner):
         images: Sequence[Tensor] = ()
         if self._pool is not None:
             images = self._augment(self._pool.images.values(), self._rows[self._chosen])
-        loss = self._loss(self._network, steps, images, self._widest * self._noise)
+        action_loss, loss = self._loss(self._network, steps, images, self._widest * self._noise)
         # Into memory that is laid out as the weights, which the fused optimizer asks for
         for weight, gradient in zip(weights, torch.autograd.grad(loss, weights), strict=True):
             weight.grad = torch.empty_like(weight).copy_(gradient)
@@ -198,7 +198,7 @@ class CloneLearner(Learner):
         change = torch._foreach_sub([p.data for p in self._network.parameters()], average)
         torch._foreach_mul_(change, self._replaced)
         torch._foreach_add_(average, change)
-        self._sum += loss.detach()
+        self._sum += action_loss.detach()
 
     def _loss(
         self,
@@ -206,9 +206,10 @@ class CloneLearner(Learner):
         steps: Tensor,
         images: Sequence[Tensor],
         noise: Tensor | float = 0.0,
-    ) -> Tensor:
-        """Mean error, by ``job.loss``, of the normalised actions at some steps, shape ``(n,)``, and
-        in training of what is estimated. At an episode's end its last joint targets hold.
+    ) -> tuple[Tensor, Tensor]:
+        """Mean error, by ``job.loss``, of the normalised actions at some steps, shape ``(n,)``; and
+        the same with the error of what is estimated, of the network that is trained. At an
+        episode's end its last joint targets hold.
 
         Noise on the observation says that the actions are the same a little off the expert's way.
         It also stops the policy from reading elapsed time out of micrometre drift: while the expert
@@ -228,12 +229,12 @@ class CloneLearner(Learner):
         with fast:
             features = network.encode(images)
             action = network.normalized(self._seen[steps] + noise, features)
-            loss = error(action.float(), target)
+            action_loss = loss = error(action.float(), target)
             if self._estimator is not None and network is self._network:
                 assert self._estimated is not None
                 estimate, truth = self._estimator(features, self._estimated[steps])
-                loss += self._job.vision.estimate * error(estimate.float(), truth)
-        return loss
+                loss = action_loss + self._job.vision.estimate * error(estimate.float(), truth)
+        return action_loss, loss
 
     @torch.no_grad()
     def _validate(self) -> float:
@@ -244,7 +245,7 @@ class CloneLearner(Learner):
         parts = self._validation.split(size), self._validation_rows.split(size)
         for steps, rows in zip(*parts, strict=True):
             images = [image[rows].float() for image in stored]
-            losses.append(self._loss(self._average, steps, images) * len(steps))
+            losses.append(self._loss(self._average, steps, images)[0] * len(steps))
         total = torch.stack(losses).sum()
         count = torch.full_like(total, len(self._validation))
         self._ranks.sum_(total, count)

@@ -159,11 +159,11 @@ def _find_columns(
     folder = _folder(cfg)
     expected = {"robot_type": cfg.robot.name, "fps": round(cfg.task.control_hz)}
     for key, value in expected.items():
-        if (found := info.get(key)) != value:
+        if (recorded := info.get(key)) != value:
             cure = "Give another dataset, or set robot and task to its own"
-            if found and found == cfg.robot.lerobot_type:  # in degrees
+            if recorded and recorded == cfg.robot.lerobot_type:  # in degrees
                 cure = "Give one in rad and m: collect it without job.units=lerobot"
-            raise FolderError(f"job.dataset={folder}: has {key}={found}, expected {value}", cure)
+            raise FolderError(f"job.dataset={folder}: has {key}={recorded}, expected {value}", cure)
 
     def locate(features: Sequence[str], columns: Sequence[str]) -> list[Place]:
         """The place of each column in these features; of one name, the first."""

@@ -158,8 +158,8 @@ def disagreement(
     try:
         d = mjw.make_data(model, nworld=nworld, nconmax=_CONTACTS, njmax=d.njmax)
         for _ in range(_STATES):
-            drawn = np.stack([_draw(model, rng) for _ in range(nworld)])
-            state = torch.tensor(drawn, dtype=torch.float32, device=device)
+            states = np.stack([_draw(model, rng) for _ in range(nworld)])
+            state = torch.tensor(states, dtype=torch.float32, device=device)
             ends = []
             for planned in (True, False):
                 mjw.reset_data(m, d)
