@@ -332,6 +332,7 @@ def test_baseline_leaves_a_whole_report(folder: Path) -> None:
     assert [path.name for path in folder.iterdir()] == ["outputs"]
 
 
+@pytest.mark.full
 def test_sweep_reports_each_job_and_exits_with_its_worst(folder: Path) -> None:
     small = ["web.episode=false", "sim=native", *at_double_speed()]
     assert run(["-m", "task.check.xy_err=0.015,1e-6", "gates=[baseline]", *small]) == 1

@@ -346,6 +346,7 @@ def test_a_phase_has_a_width_of_its_own() -> None:
     assert (widths["grasp_red"], widths["lift_red"], widths["above_blue"]) == (0.04, 0.03, 0.04)
 
 
+@pytest.mark.full
 def test_an_object_that_lies_askew_in_the_hand_is_aligned(drive: Drive) -> None:
     """Red is grasped 8 mm off its middle, and blue is turned: with ``align`` red arrives all the
     same.

@@ -109,6 +109,7 @@ def test_two_drivers_that_differ_in_known_worlds(tmp_path: Path, monkeypatch: Pa
         assert (tmp_path / "out" / name).stat().st_size > 0, name
 
 
+@pytest.mark.full
 def test_equal_sides(tmp_path: Path) -> None:
     settings = [
         'job.against=["graph=off"]',

@@ -54,6 +54,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.full
 def test_a_policy_sees_images_and_joints(trained: Path) -> None:
     policy = load_policy(trained / "last")
     assert list(policy.widths) == ["joint_pos"]
@@ -72,6 +73,7 @@ def test_a_policy_sees_images_and_joints(trained: Path) -> None:
         assert not torch.allclose(policy.network(seen, lit), answer)
 
 
+@pytest.mark.full
 def test_the_driver_sees_what_the_environment_draws(trained: Path) -> None:
     """Each world's images when it asks, also after a reset of its own."""
     policy = load_policy(trained / "last")
@@ -96,6 +98,7 @@ def test_the_driver_sees_what_the_environment_draws(trained: Path) -> None:
     env.close()
 
 
+@pytest.mark.full
 def test_what_a_policy_saw_is_drawn_again(trained: Path) -> None:
     """From the positions of a world alone, in its own looks."""
     chosen = ["controller=policy", f"policy={trained}/last", "looks=randomized", "nworld=2"]
@@ -117,6 +120,7 @@ def test_what_a_policy_saw_is_drawn_again(trained: Path) -> None:
         assert (seen[0] != seen[-1]).any()
 
 
+@pytest.mark.full
 @pytest.mark.skipif(not has_gl(), reason="MuJoCo cannot draw offscreen here")
 def test_a_video_has_what_the_policy_saw_in_a_corner(trained: Path, tmp_path: Path) -> None:
     clip = ["job=play", f"policy={trained}/last", "nworld=1", "job.format=webp", "job.fps=5"]
@@ -133,6 +137,7 @@ def test_a_video_has_what_the_policy_saw_in_a_corner(trained: Path, tmp_path: Pa
         assert abs(corner[:, left : left + width] - first).mean() < 12
 
 
+@pytest.mark.full
 def test_other_cameras_are_refused(trained: Path, capsys: Capture) -> None:
     base = [*SMALL[:4], *SHORT, "controller=policy", f"policy={trained}/last", "gates=[batch]"]
     for cameras, says in (
@@ -155,6 +160,7 @@ def test_other_cameras_are_refused(trained: Path, capsys: Capture) -> None:
     env.close()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("change", "says"),
     [

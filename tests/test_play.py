@@ -43,6 +43,7 @@ def saved(monkeypatch: Patch) -> list[np.ndarray]:
     return videos
 
 
+@pytest.mark.full
 def test_a_policy_plays_worlds_as_a_batch_starts_them(
     saved: list[np.ndarray], tmp_path: Path
 ) -> None:

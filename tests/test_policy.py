@@ -434,6 +434,7 @@ def played(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path,
     return home / "run", policy
 
 
+@pytest.mark.full
 def test_every_gate_takes_a_policy(played: tuple[Path, Path], tmp_path: Path) -> None:
     """A policy that fails is judged in every world, and a replay ends bit for bit where it did."""
     out, _ = played
@@ -451,6 +452,7 @@ def test_every_gate_takes_a_policy(played: tuple[Path, Path], tmp_path: Path) ->
     assert "bit for bit where it did" in report(again)["replay_native"]["reason"]
 
 
+@pytest.mark.full
 def test_a_policy_that_succeeds_is_timed_and_shown(tmp_path: Path, monkeypatch: Patch) -> None:
     """The episode has a figure, and the video shows the policy's world of *baseline*."""
     shown: list[np.ndarray] = []
@@ -496,6 +498,7 @@ def test_mjwarp_plays_a_policy_as_native_does(folder: Path, tmp_path: Path) -> N
     assert gates["parity"]["reason"] == words
 
 
+@pytest.mark.full
 def test_a_replay_names_a_policy_that_was_written_anew(
     played: tuple[Path, Path], tmp_path: Path
 ) -> None:
