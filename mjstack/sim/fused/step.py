@@ -142,7 +142,7 @@ def rearranged_step(
 def disagreement(
     model: mujoco.MjModel, m: mjw.Model, d: mjw.Data, device: torch.device, plan: StepPlan
 ) -> str:
-    """What the planned step does otherwise than `mujoco_warp.step`; empty if nothing.
+    """How the planned step differs from `mujoco_warp.step`; empty if it does not.
 
     Both make a step from the same states: joints anywhere, some at their limits, free bodies
     pressed into what they lie on, all of them moving. The worlds are others than those of ``d``,
