@@ -4,6 +4,7 @@ import os
 import signal
 import time
 from collections import Counter
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from compositions import load_config
+from environments import Patch
 from policies import curve, interrupted, report, same
 from test_ranks import play, rank_process, start
 
@@ -159,6 +161,28 @@ class Alone(Ranks):
 
     def any(self, flag: bool) -> bool:
         return flag
+
+
+def test_gradients_are_cut_and_the_learning_rate_rises(tmp_path: Path, monkeypatch: Patch) -> None:
+    """A round begins with the small moments of the one before, so a full rate would leap."""
+    stage = Stage(load_config([*TINY, "job.warm_up=0.5", "job.max_grad_norm=0.001"]))
+    played = rounds.make_round(stage, tmp_path, None, 0)
+    rates, lengths = [], []
+    with closing(CloneLearner(stage, played, tmp_path)) as learner:
+        cut = learner._optimizer.step
+
+        def step() -> None:
+            rates.append(float(learner._optimizer.param_groups[0]["lr"]))
+            gradients = [w.grad.norm() for w in learner._trained if w.grad is not None]
+            lengths.append(float(torch.stack(gradients).norm()))
+            cut()
+
+        monkeypatch.setattr(learner._optimizer, "step", step)
+        learner.learn(0, 20)
+    np.testing.assert_allclose(lengths, 0.001, rtol=1e-3)
+    share = np.arange(20) / 20
+    cosine = 0.001 * (1.0 + np.cos(np.pi * share)) / 2
+    np.testing.assert_allclose(rates, cosine * np.minimum(1.0, 2 * share), rtol=1e-5)
 
 
 def test_the_share_of_the_expert() -> None:

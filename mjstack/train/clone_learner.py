@@ -168,6 +168,8 @@ class CloneLearner(Learner):
         """
         share = (self.done - self._first) / (self._total - self._first)
         rate = 0.5 * (1.0 + math.cos(math.pi * share))
+        if self._job.warm_up > 0.0:
+            rate *= min(1.0, share / self._job.warm_up)
         self._generator.manual_seed(draw_seed(self._cfg.seed, self._ranks.rank, self.done))
         count = len(self._training)
         torch.randint(count, self._chosen.shape, generator=self._generator, out=self._chosen)
@@ -193,6 +195,8 @@ class CloneLearner(Learner):
         for weight, gradient in zip(weights, torch.autograd.grad(loss, weights), strict=True):
             weight.grad = torch.empty_like(weight).copy_(gradient)
         self._ranks.average_gradients(weights)
+        if self._job.max_grad_norm is not None:
+            nn.utils.clip_grad_norm_(weights, self._job.max_grad_norm)
         self._optimizer.step()
         average = [p.data for p in self._average.parameters()]
         change = torch._foreach_sub([p.data for p in self._network.parameters()], average)

@@ -141,6 +141,11 @@ class CloneJobCfg(TrainJobCfg):
     """Joint targets of one answer."""
     execute: int = spec(unit="steps", ge=1, le=1000)
     """Control steps between two answers."""
+    warm_up: float = spec(ge=0.0, le=1.0)
+    """Share of a round's batches in which the learning rate rises to ``learning_rate``, before a
+    cosine brings it to 0."""
+    max_grad_norm: float | None = spec(None, gt=0.0)
+    """A longer gradient, of all weights, is cut to this length; null: none is."""
     loss: str = spec(choices=("squared", "absolute"))
     """Error of a joint target. Where the expert's answer jumps, the least absolute error is one of
     the answers, and the least squared one lies between them."""
