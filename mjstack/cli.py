@@ -8,6 +8,7 @@ Hydra runs what was composed.
 
 import logging
 import os
+import re
 import shutil
 import sys
 import traceback
@@ -44,8 +45,9 @@ from mjstack.report.table import Console
 if TYPE_CHECKING:
     from mjstack.jobs import CheckedJob
 
-# mjstack runs its own configuration.
-_OTHER_CONFIG = {"--config-name", "-cn", "--config-path", "-cp", "--experimental-rerun"}
+# mjstack runs its own configuration, and `--cfg` and `--help` show it.
+_NOT_OFFERED = {"--config-name", "-cn", "--config-path", "-cp", "--experimental-rerun"}
+_NOT_OFFERED |= {"--info", "-i", "--shell-completion", "-sc"}
 
 _checked: dict[tuple[str, ...], "CheckedJob"] = {}  # by their overrides, until Hydra runs them
 _results: list[Report] = []  # of the jobs that ran in this process
@@ -95,13 +97,6 @@ def _dispatch(flags: Namespace, overrides: list[str]) -> int:
             _print_help(overrides)
         elif flags.hydra_help:
             hydra.hydra_help(CONFIG_NAME, args_parser=get_args_parser(), args=flags)
-        elif flags.info is not None:
-            compose(overrides)
-            hydra.show_info(flags.info, CONFIG_NAME, overrides)
-        elif flags.shell_completion:
-            if not " ".join(overrides).startswith(("install=", "query=", "uninstall=")):
-                raise MjstackError("-sc: expected install=SHELL or uninstall=SHELL alone.")
-            hydra.shell_completion(CONFIG_NAME, overrides)
         elif flags.cfg:
             _show(hydra, flags, overrides)
         elif flags.multirun:
@@ -188,9 +183,9 @@ def _sweep(hydra: Any, overrides: list[str]) -> int:
     """Compose and check every job of a sweep, then run those that are left."""
     if is_rank():
         raise MjstackError("torchrun: expected one job, and -m makes several. Leave one out.")
-    if any("hydra.sweeper.params" in override for override in overrides):
+    if any(re.search("hydra[./]sweeper", override) for override in overrides):
         raise MjstackError(
-            "hydra.sweeper.params: expected none. Give the values on the command line, as in"
+            "hydra.sweeper: expected Hydra's own. Give the values on the command line, as in"
             " -m nworld=1,2."
         )
     overrides = [*overrides, "hydra.mode=MULTIRUN"]
@@ -204,8 +199,7 @@ def _sweep(hydra: Any, overrides: list[str]) -> int:
     reports: dict[int, Report] = {}
     with claim_sweep(master, known) as claimed:
         try:
-            returned = hydra.multirun(CONFIG_NAME, run_job, overrides)
-            batches = returned if isinstance(returned, list) else []
+            batches = hydra.multirun(CONFIG_NAME, run_job, overrides)
             _results[:] = [job.return_value for batch in batches for job in batch]
             reports = dict(enumerate(_results))
         finally:
@@ -229,7 +223,7 @@ def run_job(cfg: DictConfig) -> Report:
     """Run a job in the folder that Hydra made. A launcher may call it in another process, where
     nothing has been checked yet.
     """
-    from mjstack.jobs.sweep_folder import SweepJob, add_jobs  # they load torch
+    from mjstack.jobs.sweep_folder import SweepJob  # they load torch
     from mjstack.jobs.sweep_table import update_summary
 
     logging.raiseExceptions = False  # a full disk would print a traceback for each line of run.log
@@ -240,7 +234,6 @@ def run_job(cfg: DictConfig) -> Report:
         sweep = Path(settings.sweep.dir) if settings.mode is RunMode.MULTIRUN else None
         if sweep is not None:
             job = SweepJob(settings.job.num, folder, tuple(overrides))
-            add_jobs(sweep, [job])  # a sweeper may bring it only now
             if (done := job.result()) is not None:
                 print(f"job {job.number}: {done.status}, done before", flush=True)
                 _save_config(cfg, folder)  # Hydra has just put one with interpolations there
@@ -286,7 +279,7 @@ def _parse(args: list[str]) -> Namespace:
     parser.error = refuse  # type: ignore[method-assign]
     parser._optionals.conflict_handler = "resolve"
     parser.add_argument("--config-dir", "-cd", action="append", default=[])  # several add up
-    known = set(parser._option_string_actions) - _OTHER_CONFIG
+    known = set(parser._option_string_actions) - _NOT_OFFERED
     for arg in args:
         if arg.startswith("-") and arg.partition("=")[0] not in known:
             raise MjstackError(

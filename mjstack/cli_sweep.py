@@ -25,9 +25,7 @@ if TYPE_CHECKING:  # what loads torch need not wait for a misspelt key
 
 
 def expand(master: DictConfig, overrides: Sequence[str]) -> list[list[str]]:
-    """The jobs of a sweep as Hydra's basic sweeper makes them; none for another sweeper."""
-    if any(o.startswith("hydra/sweeper=") and o != "hydra/sweeper=basic" for o in overrides):
-        return []
+    """The jobs of a sweep as Hydra's basic sweeper makes them."""
     params = OmegaConf.select(master, "hydra.sweeper.params") or {}
     texts = [*(f"{key}={value}" for key, value in params.items()), *own_overrides(overrides)]
     values: dict[str, list[str]] = {}  # of each key, the last override's
@@ -52,7 +50,6 @@ def check_jobs(
 ) -> list["SweepJob"]:
     """Compose and check every job of a sweep's folder.
 
-    Jobs of a sweeper other than Hydra's basic one are not known before; each is checked as it runs.
     Of jobs in processes of their own, one that needs more memory than there is stops no other.
     """
     folder = hydra_path(master, "sweep.dir")
