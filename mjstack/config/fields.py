@@ -13,7 +13,7 @@ import ast
 import inspect
 import math
 import textwrap
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import Field, dataclass, field, fields, is_dataclass
 from enum import EnumMeta
 from functools import cache
@@ -85,17 +85,17 @@ Fraction = Annotated[float, Range(ge=0.0, le=1.0)]
 Count = Annotated[int, Range(ge=1)]
 
 
-def spec(default: Any = MISSING, *, factory: Callable[[], Any] | None = None, **limits: Any) -> Any:
+def spec(default: Any = MISSING, **limits: Any) -> Any:
     """Declare a configuration field with its unit and range.
 
     Args:
-        default: Its value where the YAML has none; without one, the YAML must have it.
-        factory: Makes the default, where that is a list or a mapping.
+        default: Its value where the YAML has none, of a list or mapping a copy; without one, the
+            YAML must have it.
         limits: Attributes of its `Range`.
     """
     metadata = {_SPEC: Range(**limits)}
-    if factory is not None:
-        return field(default_factory=factory, metadata=metadata)
+    if isinstance(default, list | dict):
+        return field(default_factory=default.copy, metadata=metadata)
     return field(default=default, metadata=metadata)
 
 

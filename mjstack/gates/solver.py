@@ -29,7 +29,7 @@ _KEY = "gate.solver.changes"
 class SolverGateCfg(GateFuncCfg):
     """A variant of the solver, and how it is measured."""
 
-    changes: dict[str, Any] = spec(factory=dict)
+    changes: dict[str, Any] = spec({})
     """Keys of ``solver`` that the variant changes; none: a second copy of the configured one."""
     repetitions: int = spec(ge=1)
     """Repetitions of the variant, and as many of the configured solver beside them."""

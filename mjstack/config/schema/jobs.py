@@ -62,7 +62,7 @@ class ExportJobCfg(JobCfg):
 class CompareJobCfg(JobCfg):
     """Two policies, drivers or settings, compared on equal starts."""
 
-    against: list[str] = spec(factory=list)
+    against: list[str] = spec([])
     """Overrides that make the second side of the command's configuration, which is the first."""
 
 
@@ -76,11 +76,11 @@ class TrainJobCfg(JobCfg):
     """Folder of the training; null: ``outputs/train/<hash>`` of everything training depends on."""
     test_seed: int = spec(ge=0, le=MOST_SEEDS - 1)
     """First seed of the starts from which the policy is judged, gate.success.seeds of them."""
-    observation: dict[str, Any] = spec(factory=dict, finite=False)
+    observation: dict[str, Any] = spec({}, finite=False)
     """Groups that the policy may see; ``observation@job.observation`` chooses them."""
     group: str = spec()
     """The group that it sees."""
-    leave_out: list[str] = spec(factory=list)
+    leave_out: list[str] = spec([])
     """Terms of the group that the policy does not see; NAME? if there is that one."""
     observation_noise: bool = spec()
     """Whether its observations have their noise."""
@@ -94,9 +94,9 @@ class TrainJobCfg(JobCfg):
 class VisionCfg:
     """Images that a policy sees, and how it learns from them."""
 
-    cameras: list[str] = spec(factory=list)
+    cameras: list[str] = spec([])
     """Cameras of the scene that it sees; empty: none."""
-    channels: list[int] = spec(factory=lambda: [32, 64, 128, 128], ge=1, le=4096)
+    channels: list[int] = spec([32, 64, 128, 128], ge=1, le=4096)
     """Channels of the convolutions for each camera; each halves height and width."""
     features: int = spec(256, ge=1, le=65536)
     """Numbers that the other layers get from each image."""

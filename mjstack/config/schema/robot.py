@@ -1,6 +1,6 @@
 """The robot: names in its MJCF file, servos, and where each scene's objects stand for it."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from omegaconf import MISSING
 
@@ -25,9 +25,9 @@ class PlacementsCfg:
     """Centre of the table."""
     table_half: list[float] = spec(unit="m", length=3, gt=0.0)
     """Half sizes of the table."""
-    objects: dict[str, list[float]] = spec(factory=dict, unit="m", length=2)
+    objects: dict[str, list[float]] = spec({}, unit="m", length=2)
     """Nominal x and y of each object."""
-    places: dict[str, list[float]] = spec(factory=dict, unit="m", length=2)
+    places: dict[str, list[float]] = spec({}, unit="m", length=2)
     """x and y of each place."""
     random_xy: list[float] = spec(unit="m", length=2, ge=0.0)
     """How far ``reset=randomized`` moves each object, plus or minus."""
@@ -96,13 +96,13 @@ class RobotCfg:
     """Bodies that touch a grasped object. A sensor measures the force of each on each object."""
     grasp_sites: list[str] = spec(length=2)
     """Two sites, one on each jaw. Their midpoint is the grasp point."""
-    grasp_parts: dict[str, list[str]] = field(default_factory=dict)
+    grasp_parts: dict[str, list[str]] = spec({})
     """Where a grasp site goes that the file lacks: the mean of these geoms or bodies of one jaw."""
-    grasp_pos: dict[str, list[float]] = spec(factory=dict, unit="m", length=3)
+    grasp_pos: dict[str, list[float]] = spec({}, unit="m", length=3)
     """Where such a site lies in the frame of the body that ``grasp_parts`` names; its origin."""
     home: list[float] = spec(unit="rad, m")
     """Joint values at which a driven episode begins."""
-    start: list[float] = spec(factory=list, unit="rad, m")
+    start: list[float] = spec([], unit="rad, m")
     """Joint values at which environments begin, clear of the table. Empty: ``home``."""
     gripper_open: list[float] = spec(unit="rad, m")
     """Joint targets of the open gripper."""
@@ -112,17 +112,17 @@ class RobotCfg:
     """Width of that object. Around another one the jaws close as much nearer or farther."""
     arm_force_limit: float | None = spec(None, unit="N m, N", gt=0.0)
     """Largest force of the arm's servos. null: the file's own."""
-    servos: dict[str, ServoCfg] = spec(factory=dict)
+    servos: dict[str, ServoCfg] = spec({})
     """Servos by joint, which the group ``actuator`` chooses; other joints have the file's own."""
 
-    locked: dict[str, float] = spec(factory=dict, unit="rad, m")
+    locked: dict[str, float] = spec({}, unit="rad, m")
     """Arm joints that inverse kinematics holds, with their values."""
-    ik_joints: list[str] = field(default_factory=list)
+    ik_joints: list[str] = spec([])
     """Arm joints for inverse kinematics, each moves both grasp sites. Empty: all not locked."""
     approach_body: str = ""
     """Body with the approach axis: the last that carries both jaws. Empty: the body of the last arm
     joint."""
-    approach_axis: list[float] = spec(factory=lambda: [0.0, 0.0, -1.0], length=3)
+    approach_axis: list[float] = spec([0.0, 0.0, -1.0], length=3)
     """Direction from the wrist towards the grasped object, in that body's frame."""
     roll_joint: str | None = None
     """Arm joint that turns the gripper about the approach axis. null: there is none, and no yaw
@@ -140,7 +140,7 @@ class RobotCfg:
     """Free room around an object for the open jaws."""
     wrist_camera: CameraPoseCfg | None = None
     """Pose of a camera on the gripper. null: there is none."""
-    placements: dict[str, PlacementsCfg] = field(default_factory=dict)
+    placements: dict[str, PlacementsCfg] = spec({})
     """Where the objects of each scene stand for this robot."""
 
     @property

@@ -43,15 +43,15 @@ class Config:
     sim: SimCfg = spec()
     """Physics engine and device."""
     # Terms by name, which `complete` types.
-    action: dict[str, Any] = spec(factory=dict)
+    action: dict[str, Any] = spec({})
     """Action of a policy."""
-    observation: dict[str, Any] = spec(factory=dict)
+    observation: dict[str, Any] = spec({})
     """Observations of a policy."""
-    reset: dict[str, Any] = spec(factory=dict)
+    reset: dict[str, Any] = spec({})
     """Start states of the worlds."""
-    termination: dict[str, Any] = spec(factory=dict)
+    termination: dict[str, Any] = spec({})
     """Ends of an episode."""
-    reward: dict[str, Any] = spec(factory=dict)
+    reward: dict[str, Any] = spec({})
     """Rewards of a policy."""
     task: TaskCfg = spec()
     """The task; it chooses some of the groups above."""

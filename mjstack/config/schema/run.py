@@ -102,12 +102,12 @@ class SweepCfg:
     """Above both."""
     over: str | None = None
     """Name of the values over which the picture is drawn; null: of the first key with several."""
-    columns: dict[str, str] = spec(factory=dict)
+    columns: dict[str, str] = spec({})
     """Names by the columns' titles; empty: the keys with several values, and the gates' results."""
-    panels: dict[str, dict[str, str]] = spec(factory=dict)
+    panels: dict[str, dict[str, str]] = spec({})
     """Curves of each panel by its label: names by the curves' labels, or names with a factor, such
     as ``NAME * 10``; empty: success and rates."""
-    notes: list[str] = spec(factory=list)
+    notes: list[str] = spec([])
     """Sentences below the table."""
 
 
@@ -180,7 +180,7 @@ class CapacityCfg(GateFuncCfg):
     """Most worlds that size an environment with ``batch=auto`` on CUDA; on a CPU, cpu_nworld."""
     probe_steps: int = spec(unit="steps", ge=1)
     """Steps of random actions that size an environment with ``batch=auto``."""
-    reset: dict[str, Any] = spec(factory=dict)
+    reset: dict[str, Any] = spec({})
     """Reset terms of the workload with randomised starts."""
 
 
@@ -244,7 +244,7 @@ class SuccessGateCfg(GateFuncCfg):
     """Episodes below which a cell has no rate."""
     worst_regions: int = spec(unit="cells", ge=1)
     """Worst cells in report.md."""
-    reset: dict[str, Any] = spec(factory=dict)
+    reset: dict[str, Any] = spec({})
     """Reset terms, unless ``reset=starts_file`` names a file."""
 
 
@@ -264,7 +264,7 @@ class GateCfg:
     """Speed."""
     success: SuccessGateCfg = field(default_factory=SuccessGateCfg)
     """Success rate from randomised starts."""
-    added: dict[str, Any] = spec(factory=dict)
+    added: dict[str, Any] = spec({})
     """Gates of the search path by name; their keys are ``gate.NAME.KEY``."""
 
     def __getitem__(self, name: str) -> Any:

@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from mjstack.config.fields import spec
 
@@ -19,10 +19,6 @@ SHAPES = {  # and the sizes of each
 
 def _dot(a: Iterable[float], b: Iterable[float]) -> float:
     return sum(x * y for x, y in zip(a, b, strict=True))
-
-
-def _friction() -> list[float]:
-    return [1.0, 0.005, 0.0005]
 
 
 @dataclass(slots=True)
@@ -54,7 +50,7 @@ class ShapeCfg:
 
     shape: str = spec("box", choices=tuple(SHAPES))
     """box, cylinder (its length along its z axis), sphere, or capsule (along its x axis)."""
-    size: list[float] = spec(factory=list, unit="m", ge=1e-4, le=10.0)
+    size: list[float] = spec([], unit="m", ge=1e-4, le=10.0)
     """Half sizes of a box; radius of a sphere; radius and half length of the others."""
     yaw: float = spec(0.0, unit="rad")
     """Turn about the vertical."""
@@ -124,7 +120,7 @@ class ShapeCfg:
 class PartCfg(ShapeCfg):
     """A part of a fixed object."""
 
-    pos: list[float] = spec(factory=lambda: [0.0, 0.0, 0.0], unit="m", length=3)
+    pos: list[float] = spec([0.0, 0.0, 0.0], unit="m", length=3)
     """Its centre in the object's frame, whose origin stands on the table."""
 
 
@@ -134,17 +130,17 @@ class ObjectCfg(ShapeCfg):
 
     mass: float | None = spec(None, unit="kg", ge=1e-5, le=1000.0)
     """Mass; a fixed object needs none."""
-    friction: list[float] = spec(factory=_friction, length=3, gt=0.0)
+    friction: list[float] = spec([1.0, 0.005, 0.0005], length=3, gt=0.0)
     """Sliding, torsional and rolling coefficient."""
-    color: list[float] = spec(factory=lambda: [0.6, 0.6, 0.6, 1.0], length=4, ge=0.0, le=1.0)
+    color: list[float] = spec([0.6, 0.6, 0.6, 1.0], length=4, ge=0.0, le=1.0)
     """Red, green, blue and alpha, 0 to 1."""
-    xy: list[float] = spec(factory=list, unit="m")
+    xy: list[float] = spec([], unit="m")
     """Nominal position of its centre, standing on the table."""
     pos: list[float] | None = spec(None, unit="m", length=3)
     """Nominal position of its centre, in place of ``xy``: also over the table."""
     fixed: bool = False
     """Whether it is fixed to the world. Fixed objects may touch and overlap each other."""
-    parts: dict[str, PartCfg] = field(default_factory=dict)
+    parts: dict[str, PartCfg] = spec({})
     """Shapes of a fixed object that has several, by name, in place of ``shape`` and ``size``."""
     file: str | None = None
     """A fixed object's MJCF file, in place of them: relative to the YAML, or to the working
@@ -213,7 +209,7 @@ class PlaceCfg:
 
     xy: list[float] = spec(unit="m", length=2)
     """Its position, or the centre of the region from which it is drawn."""
-    random_xy: list[float] = spec(factory=lambda: [0.0, 0.0], unit="m", length=2, ge=0.0)
+    random_xy: list[float] = spec([0.0, 0.0], unit="m", length=2, ge=0.0)
     """Half-widths of the region from which each episode draws it; 0: always at ``xy``."""
 
 
@@ -228,7 +224,7 @@ class CameraPoseCfg:
     """Position of the camera."""
     target: list[float] = spec(unit="m", length=3)
     """The point in the middle of the image."""
-    up: list[float] = spec(factory=lambda: [0.0, 0.0, 1.0], length=3)
+    up: list[float] = spec([0.0, 0.0, 1.0], length=3)
     """The direction that points up in the image."""
 
 
@@ -238,13 +234,13 @@ class CameraCfg:
 
     pose: CameraPoseCfg | None = None
     """Its pose. null: ``robot.wrist_camera``, on the gripper."""
-    size: list[int] = spec(factory=lambda: [128, 128], unit="pixels", length=2, ge=1, le=4096)
+    size: list[int] = spec([128, 128], unit="pixels", length=2, ge=1, le=4096)
     """Height and width of the image."""
     fovy: float = spec(45.0, unit="deg", ge=1.0, le=170.0)
     """Vertical field of view."""
     rate: float | None = spec(None, unit="Hz", gt=0.0)
     """Images per second. null: one in every control step."""
-    outputs: list[str] = spec(factory=lambda: ["rgb"], choices=OUTPUTS)
+    outputs: list[str] = spec(["rgb"], choices=OUTPUTS)
     """Its observations: ``rgb`` colours, ``depth`` [m], ``segmentation`` numbers of things."""
     terminal: bool = False
     """Whether the last image of an episode is drawn too, for ``final_obs``."""
@@ -263,19 +259,19 @@ class SceneCfg:
     frame: str = spec("world", choices=("world", "table"))
     """Where positions of objects and places count from: the arm's base, or the middle of the
     table's top. Loading turns them into the world's."""
-    table_friction: list[float] = spec(factory=_friction, length=3, gt=0.0)
+    table_friction: list[float] = spec([1.0, 0.005, 0.0005], length=3, gt=0.0)
     """Sliding, torsional and rolling coefficient of the table."""
-    random_xy: list[float] = spec(factory=lambda: [0.03, 0.03], unit="m", length=2, ge=0.0)
+    random_xy: list[float] = spec([0.03, 0.03], unit="m", length=2, ge=0.0)
     """How far ``reset=randomized`` moves each object off its ``xy``, plus or minus."""
-    objects: dict[str, ObjectCfg] = field(default_factory=dict)
+    objects: dict[str, ObjectCfg] = spec({})
     """Objects by name, in the order in which everything lists them."""
-    places: dict[str, PlaceCfg] = field(default_factory=dict)
+    places: dict[str, PlaceCfg] = spec({})
     """Named spots on the table."""
     support_sensors: bool = False
     """Whether sensors measure what presses on each object beside the jaws."""
     box: BoxCfg | None = None
     """A receiving box."""
-    cameras: dict[str, CameraCfg] = field(default_factory=dict)
+    cameras: dict[str, CameraCfg] = spec({})
     """Cameras by name. Without any, the model has nothing that only pictures need."""
     grasp_offset: float = spec(0.0, unit="m")
     """How far above an object's centre the grasp point is for phases ``in_hand``."""

@@ -1,6 +1,6 @@
 """The managers' terms, and the task with the scripted motion that does it."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from mjstack.config.fields import spec
@@ -12,7 +12,7 @@ class TermCfg:
 
     func: str = spec()
     """Dotted name of the function or class."""
-    params: dict[str, Any] = spec(factory=dict, finite=False)
+    params: dict[str, Any] = spec({}, finite=False)
     """Keyword parameters."""
 
 
@@ -36,7 +36,7 @@ class ObservationGroupCfg:
 
     noise: bool = True
     """Whether its terms have their noise."""
-    terms: dict[str, Any] = spec(factory=dict, finite=False)
+    terms: dict[str, Any] = spec({}, finite=False)
     """Its terms, by name."""
 
 
@@ -70,7 +70,7 @@ class TaskCfg:
     """Length of an episode of the environment; null: that of the phases."""
     episode_steps: int = spec("${steps:${task.episode_seconds}}", unit="steps", ge=1, le=1_000_000)
     """The same in control steps."""
-    params: dict[str, Any] = field(default_factory=dict)
+    params: dict[str, Any] = spec({})
     """Numbers that several terms of the task share, as ``${task.params.NAME}``."""
     check: dict[str, Any] | None = None
     """Judges an episode: ``func`` names a subclass of ``EpisodeCheck``, the other keys are its
@@ -89,7 +89,7 @@ class PhaseCfg:
     """Height of the target: center (of the anchor as it stands; a place is on the table), table
     (its surface at the anchor), or on_top (centre of the object grasped last, standing on the
     anchor)."""
-    offset: list[float] = spec(factory=lambda: [0.0, 0.0, 0.0], unit="m", length=3)
+    offset: list[float] = spec([0.0, 0.0, 0.0], unit="m", length=3)
     """Added to the target in x, y and z."""
     h_scale: float = 0.0
     """How many ``robot.approach_height`` higher the target is."""
@@ -129,7 +129,7 @@ class ControllerCfg:
     """open_loop, closed_loop, state_based or policy."""
     action: dict[str, Any] = spec()
     """Its action terms, by name."""
-    phases: dict[str, PhaseCfg] = spec(factory=dict)
+    phases: dict[str, PhaseCfg] = spec({})
     """Phases in their order."""
     knots: int = spec(ge=3, le=1000)
     """Inverse-kinematics solutions per phase of a plan."""
