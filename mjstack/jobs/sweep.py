@@ -2,11 +2,10 @@
 
 import math
 import os
-import stat
-import tempfile
+import socket
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -16,7 +15,7 @@ import torch
 from mjstack.config import spec
 from mjstack.config.complete import typed
 from mjstack.config.session import quoted, search_path_args
-from mjstack.errors import ConfigError, FolderError
+from mjstack.errors import ConfigError
 from mjstack.files import move_aside
 from mjstack.interrupt import interrupted
 from mjstack.jobs.sweep_folder import LOG, SweepJob, add_jobs, lock_file
@@ -61,14 +60,14 @@ class Queueing:
 
         Raises:
             ConfigError: There are not as many GPUs or cores.
-            FolderError: Another user has the folder of the GPUs' locks.
         """
         count = self.jobs
         if gpus := torch.cuda.device_count():
             if (count or 1) > gpus:
                 raise ConfigError("hydra.launcher.jobs", count, f"at most {gpus}, a GPU for each")
             visible = os.environ.get("CUDA_VISIBLE_DEVICES") or ",".join(map(str, range(gpus)))
-            locks = _lock_folder()
+            # Below the home: in a shared folder, others could hold a lock for ever.
+            locks = Path.home() / ".cache/mjstack/gpus" / socket.gethostname()
             return [
                 Slot(f"GPU {name}", {"CUDA_VISIBLE_DEVICES": name}, lock=locks / name)
                 for name in visible.split(",")[: count or gpus]
@@ -222,23 +221,3 @@ class _Queue:
         self._waiting.remove(job)
         self._print(f"job {job.number} on {slot.name}: {' '.join(job.overrides)}")
         return True
-
-
-def _lock_folder() -> Path:
-    """This user's folder with a lock for each GPU, on this machine. Others may not write there:
-    they could hold a lock for ever, or put a link in its place.
-
-    Raises:
-        FolderError: Another user has made it.
-    """
-    folder = Path(tempfile.gettempdir()) / f"mjstack-gpus-{os.getuid()}"
-    with suppress(FileExistsError):
-        folder.mkdir(mode=0o700)
-    facts = folder.lstat()
-    if not stat.S_ISDIR(facts.st_mode) or facts.st_uid != os.getuid():
-        raise FolderError(
-            f"{folder} is another user's or no folder, expected one of yours, for locks of GPUs",
-            "Set TMPDIR to a folder of yours",
-        )
-    folder.chmod(0o700)
-    return folder
