@@ -26,11 +26,9 @@ from mjstack.errors import RankError
 from mjstack.files import write_atomic
 from mjstack.jobs.collect_episodes import EpisodeSource, demonstration_channels
 from mjstack.jobs.collect_plan import (
-    ACTION,
     BATCHES,
     DATASET,
     NAME,
-    STATE,
     BatchRecord,
     CollectPlan,
     check_folder,
@@ -40,7 +38,6 @@ from mjstack.jobs.collect_plan import (
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import CheckedJob, Job
 from mjstack.report.record import GateResult, Status
-from mjstack.report.table import Table
 
 _SPARE = 1.05  # worlds played over episodes that are missing: some fail
 _MOST_EMPTY = 3  # batches in a row without an episode
@@ -262,7 +259,6 @@ class Collection:
                 "megabytes": size,
             },
             notes={"dataset": str(self.path), "config_sha256": self._plan.spec.config_sha256},
-            tables=[self._ranges()] if self.committed else [],
         )
         asked = f"{self.committed:,} episodes, {self._job.episodes:,} asked for"
         reasons = [problem, f"{asked} ({self.writer.frames:,} steps, {size:.1f} MB)"]
@@ -290,18 +286,6 @@ class Collection:
             reasons.append("they were there already")
         result.reason = "; ".join(filter(None, reasons))
         return result
-
-    def _ranges(self) -> Table:
-        """The range of every joint and its target."""
-        statistics = json.loads((self.path / lerobot.STATS).read_text())
-        rows = []
-        for name in (STATE, ACTION):
-            feature = self._plan.spec.features[name]
-            columns = [statistics[name][key] for key in ("min", "mean", "max")]
-            for joint, unit, *values in zip(feature.names, feature.units, *columns, strict=True):
-                rows.append([f"{name} {joint}", unit, *(f"{value:.4f}" for value in values)])
-        header = ["number", "unit", "smallest", "mean", "largest"]
-        return Table(title="Ranges", header=header, rows=rows)
 
 
 JOB = Job(check_collect)
