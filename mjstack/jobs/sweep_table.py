@@ -16,7 +16,7 @@ from mjstack.jobs.sweep_folder import LOG, list_jobs
 from mjstack.report.markdown import to_markdown
 from mjstack.report.record import Report, Status
 from mjstack.report.sections import Part, Section
-from mjstack.report.sweep_picture import Plot, Row, describe_crossover, save_sweep
+from mjstack.report.sweep_picture import Plot, Row, save_sweep
 from mjstack.report.table import Table
 from mjstack.report.write import safely_write
 
@@ -74,7 +74,7 @@ def write_summary(
     problem = ""
     if draw and any(row["status"] != _NOT_RUN for row in rows) and plot.shows(rows):
         problem = safely_write(picture, save_sweep, plot, rows, stops=False)
-    notes = [*filter(None, [describe_crossover(plot, rows)]), *sweep.notes]
+    notes = list(sweep.notes)
     for key, name in (("backend", "hardware"), ("git_commit", "commit")):
         values = sorted({str(row[key]) for row in rows if row.get(key)})
         notes += [f"{name}: {value}" for value in values]

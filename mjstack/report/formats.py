@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import cache
+from pathlib import Path
 
 from mjstack.report.html import to_html
 from mjstack.report.markdown import to_markdown
@@ -10,10 +11,8 @@ from mjstack.report.record import Report
 from mjstack.report.sections import Section, make_sections
 from mjstack.report.write import safely_write, write_report
 
-FORMATS: dict[str, Callable[[Sequence[Section]], str]] = {
-    "report.md": to_markdown,
-    "report.html": to_html,
-}
+Format = Callable[[Sequence[Section]], str]
+FORMATS: dict[str, Format] = {"report.md": to_markdown, "report.html": to_html}
 
 
 def write_formats(report: Report, page: Page) -> None:
@@ -27,9 +26,9 @@ def write_formats(report: Report, page: Page) -> None:
     """
     write_report(report)
     sections = cache(lambda: make_sections(report, page))
+
+    def write(path: Path, to_text: Format) -> None:
+        path.write_text(to_text(sections()), encoding="utf-8")
+
     for name, to_text in FORMATS.items():
-        safely_write(
-            report.folder / name,
-            lambda path, to_text=to_text: path.write_text(to_text(sections()), encoding="utf-8"),
-            stops=False,
-        )
+        safely_write(report.folder / name, write, to_text, stops=False)

@@ -67,45 +67,27 @@ def save_sweep(path: Path, plot: Plot, rows: Sequence[Row]) -> None:
     (_draw_curves if plot.is_numeric(rows) else _draw_bars)(path, plot, rows)
 
 
-def crossover(plot: Plot, rows: Sequence[Row]) -> tuple[float, str, str] | None:
-    """Where one of two lines passes the other, in the first curve of the first panel.
+def crossover(plot: Plot, rows: Sequence[Row]) -> float | None:
+    """Where one of two lines passes the other, in the first curve of the first panel; None if the
+    rows do not show it.
 
     Interpolated between the two numbers that bracket it, straight in logarithms. Jobs that did not
     pass do not count.
-
-    Returns:
-        The number, the line that is above from there on, and the other; None if the rows do not
-        show it.
     """
-    groups = dict(plot.groups(rows)) if plot.is_numeric(rows) else {}
+    groups = [group for _, group in plot.groups(rows)]
     if len(groups) != 2:
         return None
-    first, second = groups
     metric = next(iter(next(iter(plot.panels.values())).values()))
-    upper, lower = (
-        {row[plot.over]: _value(row, metric) for row in group} for group in groups.values()
-    )
+    first, second = ({row[plot.over]: _value(row, metric) for row in group} for group in groups)
     points = [
-        (x, math.log(upper[x] / lower[x]))
-        for x in sorted(upper.keys() & lower.keys())
-        if x > 0 and upper[x] > 0.0 and lower[x] > 0.0
+        (math.log(x), math.log(first[x] / second[x]))
+        for x in sorted(first.keys() & second.keys())
+        if x > 0 and first[x] > 0.0 and second[x] > 0.0
     ]
     for (x0, gap0), (x1, gap1) in itertools.pairwise(points):
         if (gap0 > 0.0) != (gap1 > 0.0):
-            at = math.exp(math.log(x0) + math.log(x1 / x0) * -gap0 / (gap1 - gap0))
-            return at, *((first, second) if gap1 > 0.0 else (second, first))
+            return math.exp(x0 - (x1 - x0) * gap0 / (gap1 - gap0))
     return None
-
-
-def describe_crossover(plot: Plot, rows: Sequence[Row]) -> str:
-    """The crossover in a sentence; empty where there is none."""
-    crossing = crossover(plot, rows)
-    if crossing is None:
-        return ""
-    at, above, below = crossing
-    panel, curves = next(iter(plot.panels.items()))
-    what = f"{next(iter(curves))}, {panel}".removeprefix(", ")
-    return f"Crossover: from {plot.over} of about {at:,.0f} on {above} is above {below} ({what})."
 
 
 def _value(row: Row, metric: str) -> float:
@@ -149,8 +131,8 @@ def _draw_curves(path: Path, plot: Plot, rows: Sequence[Row]) -> None:
             axes.set_xticks(ticks, [f"{tick:,}" for tick in ticks], rotation=45)
             axes.grid(alpha=0.3)
             if crossing is not None:
-                text = f"crossover, {crossing[0]:,.0f}"
-                axes.axvline(crossing[0], color="0.4", linestyle=":", label=text)
+                text = f"crossover, {crossing:,.0f}"
+                axes.axvline(crossing, color="0.4", linestyle=":", label=text)
             if axes.get_legend_handles_labels()[0]:
                 axes.legend(frameon=False, fontsize=8)
 
