@@ -20,10 +20,8 @@ from mjstack.config.session import CONFIG_FOLDER, config_folders, list_choices
 from mjstack.errors import UnknownName
 
 _GROUP = re.compile(r"^  - (\w+): (\[.*\]|\S+) # (.+)$", re.MULTILINE)  # name, default, words
-_LISTED = {  # the group of each, if it is one
-    **{"tasks": "task", "robots": "robot", "terms": "", "conditions": ""},
-    **{"gates": "gate", "trainers": "trainer"},
-}
+_LISTED = ("tasks", "robots", "terms", "conditions", "gates", "trainers")
+_FUNCTIONS = ("terms", "conditions")  # the others are groups
 _TERMS = ("action", "observation", "reward", "reset", "termination", "looks")
 _RANGE = re.compile(r"(?:typing\.)?Annotated\[(\w+), Range\(.*?\)\]")
 _PLAIN = re.compile(r"collections\.abc\.|mjstack\.\w+\.\w+\.|torch\.(?=Tensor)| = <.+>$")
@@ -209,7 +207,7 @@ def list_text(kinds: Sequence[str]) -> str:
         raise UnknownName("list", kind, _LISTED)
     lines = []
     for kind in kinds or _LISTED:
-        named = _files(_LISTED[kind]) if _LISTED[kind] else _functions(kind, len(kinds) == 1)
+        named = _functions(kind, len(kinds) == 1) if kind in _FUNCTIONS else _files(kind[:-1])
         lines += [f"{kind}:", *(f"  {name:<12} {words}".rstrip() for name, words in named)]
     return "\n".join(lines)
 

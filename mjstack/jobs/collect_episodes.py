@@ -161,11 +161,7 @@ class EpisodeSource:
                 yield self._episode(batch, row, arrays, images)
 
     def _episode(
-        self,
-        batch: Batch,
-        row: int,
-        arrays: dict[str, np.ndarray],
-        images: dict[str, np.ndarray],
+        self, batch: Batch, row: int, arrays: dict[str, np.ndarray], images: dict[str, np.ndarray]
     ) -> EpisodeData:
         """A world's steps and its result. `next.success` is true in the last step of a successful
         episode alone.

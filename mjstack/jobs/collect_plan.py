@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import mujoco
 import torch
@@ -232,7 +232,7 @@ def make_spec(env: Env, cfg: Config, provenance: Mapping[str, Any]) -> DatasetSp
                 "a group",
                 f"another name, because {name} are the measured joints",
             )
-        features[name] = group_feature(env, group, units)
+        features[name] = group_feature(env, group)
     features |= {
         ACTION: positions,
         REWARD: Feature(dtype="float32", names=("reward",), units=("1",)),
@@ -264,14 +264,15 @@ def joint_units(env: Env) -> tuple[str, ...]:
     return tuple("rad" if kinds[int(address)] == hinge else "m" for address in env.index.robot_qpos)
 
 
-def group_feature(env: Env, group: str, joints: tuple[str, ...]) -> Feature:
+def group_feature(env: Env, group: str) -> Feature:
     """Name and unit of each column of an observation group: ``red_pose.2``, and ``red_pose.2.t-1``
-    one step before. ``joints`` are the joints' units.
+    one step before.
     """
+    joints = joint_units(env)
     names: list[str] = []
     units: list[str] = []
     for term, dim in env.observation_manager.term_dims[group].items():
-        cfg = cast(ObservationTermCfg, env.cfg.observation[group].terms[term])
+        cfg: ObservationTermCfg = env.cfg.observation[group].terms[term]
         width = dim // cfg.history
         names += term_columns(term, dim, cfg.history)
         units += cfg.history * _scaled(_term_units(cfg.func, width, joints), cfg.scale)

@@ -87,7 +87,7 @@ def export_facts(stage: Stage) -> dict[str, Any]:
     cfg.observation = {policy.group: policy.observation}
     with stage.native_env(cfg) as env:
         units = joint_units(env)
-        columns = group_feature(env, policy.group, units)
+        columns = group_feature(env, policy.group)
         index = env.index
     network = policy.network
     return policy_facts(policy) | {

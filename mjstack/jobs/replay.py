@@ -223,11 +223,7 @@ def _play_failing(
             status=Status.failed if again else Status.passed,
             reason=f"{again} of {len(played)} failing worlds fail again ({rate}, 95 % interval"
             f" {interval}), {same} by the same rules",
-            metrics={
-                "worlds": len(played),
-                "fail_again": again,
-                "by_the_same_rules": same,
-            },
+            metrics={"worlds": len(played), "fail_again": again, "by_the_same_rules": same},
             notes={"backend": f"{backend} on {device}", "table": TABLE},
             tables=[Table.of(columns, table_rows, f"Failing worlds (all of them: {TABLE})")],
         )

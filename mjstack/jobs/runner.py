@@ -114,8 +114,7 @@ class CheckedJob:
         console = Console(highlight=False, soft_wrap=True)
         cfg = self.stage.cfg
         page = Page(
-            title=f"{cfg.robot.title}, {self.title}",
-            motion=cfg.web.episode and not lacks_viser(),
+            title=f"{cfg.robot.title}, {self.title}", motion=cfg.web.episode and not lacks_viser()
         )
         report = Report(
             folder=folder,

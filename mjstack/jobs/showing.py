@@ -52,10 +52,7 @@ def check_showing(cfg: Config, ending: str = ".mp4") -> None:
 
 
 def draw_episode(
-    stage: Stage,
-    folder: Path,
-    pictured: tuple[str, np.ndarray] | None,
-    draw: Callable[..., None],
+    stage: Stage, folder: Path, pictured: tuple[str, np.ndarray] | None, draw: Callable[..., None]
 ) -> None:
     """Draw the one-world episode, if there was one, with `Run.draw`."""
     if pictured is None:

@@ -77,7 +77,7 @@ class Shapes:
         """Lowest and highest corner of everything in the model's own state [m]."""
         mujoco.mj_resetData(self.model, self._data)
         mujoco.mj_kinematics(self.model, self._data)
-        corners = [] if self.meshes else [np.zeros((1, 3))]
+        corners = []
         for number, _, (vertices, _) in self.meshes:
             body = self.bodies[number]
             turn = self._data.xmat[body].reshape(3, 3)

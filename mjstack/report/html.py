@@ -5,6 +5,7 @@ import re
 from collections.abc import Sequence
 from html import escape
 from itertools import groupby
+from mimetypes import guess_type
 from pathlib import Path
 
 from mjstack.report.sections import Part, Plots, Section
@@ -13,7 +14,6 @@ from mjstack.report.table import Marked, Table
 _ROWS = 40  # of a table that is not folded
 _DIGITS = r"([-+]?[\d,.]+(e[-+]?\d+)?( [^\d\s]{1,4})?|[-+]?(nan|inf))"
 _NUMBER = re.compile(rf"{_DIGITS}( / {_DIGITS})?|-")
-_TYPES = {".png": "png", ".jpg": "jpeg", ".webp": "webp", ".gif": "gif"}
 
 # "Passed" and "failed" have a colour and a word each: no meaning hangs on the colour alone.
 _STYLE = """
@@ -126,13 +126,13 @@ def _text(text: str) -> str:
 
 def _picture(path: Path) -> str:
     """A picture with its bytes in the page; empty where it cannot be read."""
-    kind = _TYPES.get(path.suffix)
     try:
-        content = base64.b64encode(path.read_bytes()).decode() if kind else ""
+        content = base64.b64encode(path.read_bytes()).decode()
     except OSError:
         return ""
+    kind, _ = guess_type(path)
     name = escape(path.name)
-    return content and (
-        f"<figure><img alt='{name}' src='data:image/{kind};base64,{content}'>"
+    return (
+        f"<figure><img alt='{name}' src='data:{kind};base64,{content}'>"
         f"<figcaption>{name}</figcaption></figure>"
     )

@@ -17,11 +17,7 @@ PACKAGES = ("mujoco", "mujoco-warp", "warp-lang", "torch", "mink", "hydra-core",
 def collect_provenance() -> Provenance:
     """Date, versions, processor and commit."""
     versions = {"python": platform.python_version(), "mjstack": mjstack.__version__}
-    for name in PACKAGES:
-        try:
-            versions[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            versions[name] = "not installed"
+    versions |= {name: metadata.version(name) for name in PACKAGES}
     return {
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC"),
         "versions": versions,
