@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _FACES = [[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]]
 """Corners of a box in the order of their signs, by its faces."""
 Draw = Callable[[np.ndarray], Iterable[np.ndarray]]
-Frames = Callable[[Sequence[int]], Iterator[Image.Image]]
+Write = Callable[[Path, Iterator[Image.Image], int, float], None]
 
 
 @contextmanager
@@ -134,27 +134,26 @@ def save_video(
     columns = math.ceil(math.sqrt(worlds))
     wide = (width or (640 if worlds == 1 else 960)) // columns
 
-    def frames(numbers: Sequence[int]) -> Iterator[Image.Image]:
-        """Draw some frames."""
-        chosen = states[list(numbers)]
-        if draw is None:
-            images = _render(model, chosen.reshape(-1, nq), wide, 3 * wide // 4)
-        else:
-            images = (image for frame in chosen for image in draw(frame))
-        if seen:
-            corners = (
-                [rows[number * skip] for rows in cameras.values()]
-                for number in numbers
-                for cameras in seen
-            )
-            images = map(_with_corner, images, corners)
-        for done in range(1, len(chosen) + 1):
+    images: Iterator[np.ndarray]
+    if draw is None:
+        images = _render(model, states.reshape(-1, nq), wide, 3 * wide // 4)
+    else:
+        images = (image for frame in states for image in draw(frame))
+    if seen:
+        corners = (
+            [rows[number * skip] for rows in cameras.values()]
+            for number in range(count)
+            for cameras in seen
+        )
+        images = map(_with_corner, images, corners)
+
+    def frames() -> Iterator[Image.Image]:
+        for done in range(1, count + 1):
             check_interrupt()
             yield _side_by_side(list(itertools.islice(images, worlds)), columns, wide)
-            if len(chosen) == count:  # not of a sample
-                advance("pictures of the video", done, count)
+            advance("pictures of the video", done, count)
 
-    write(path, frames, count, step_dt * skip)
+    write(path, frames(), count, step_dt * skip)
 
 
 def _with_corner(image: np.ndarray, seen: Sequence[np.ndarray]) -> np.ndarray:
@@ -180,9 +179,9 @@ def _side_by_side(images: Sequence[np.ndarray], columns: int, wide: int) -> Imag
     return frame
 
 
-def require_video(ending: str = ".mp4") -> Callable[[Path, Frames, int, float], None]:
-    """What writes a video by the ending of its name: called with the file, what draws its frames,
-    their number, and the time between two of them [s].
+def require_video(ending: str) -> Write:
+    """What writes a video by the ending of its name: called with the file, its frames, their
+    number, and the time between two of them [s].
 
     Raises:
         MissingExtra: The mp4 writer is not installed.
@@ -194,15 +193,14 @@ def require_video(ending: str = ".mp4") -> Callable[[Path, Frames, int, float], 
     return _write_mp4
 
 
-def _write_mp4(path: Path, frames: Frames, count: int, dt: float) -> None:
+def _write_mp4(path: Path, frames: Iterator[Image.Image], count: int, dt: float) -> None:
     from imageio_ffmpeg import write_frames
 
-    images = frames(range(count))
-    first = next(images)
+    first = next(frames)
     writer = write_frames(str(path), first.size, fps=1.0 / dt, macro_block_size=16)
     writer.send(None)
-    for image in itertools.chain([first], images):
-        writer.send(image.tobytes())
+    for frame in itertools.chain([first], frames):
+        writer.send(frame.tobytes())
     writer.close()
 
 
@@ -212,23 +210,21 @@ _COLORS = 96  # of a GIF; with 255 it is 40 % larger, and looks the same
 
 
 def _write_loop(
-    path: Path, frames: Frames, count: int, dt: float, options: Mapping[str, Any]
+    path: Path, frames: Iterator[Image.Image], count: int, dt: float, options: Mapping[str, Any]
 ) -> None:
-    """Write a GIF or a WebP. All frames of a GIF have the same colours, without dithering, so that
-    what does not move keeps its colour.
+    """Write a GIF or a WebP. All frames of a GIF have the first one's colours, without dithering,
+    so that what does not move keeps its colour.
     """
-    images = frames(range(count))
+    first = next(frames)
     if path.suffix == ".gif":
-        sample = np.concatenate(list(map(np.asarray, frames([0, count // 2, count - 1]))))
-        palette = Image.fromarray(sample).quantize(_COLORS)
-        quantize = partial(Image.Image.quantize, palette=palette, dither=Image.Dither.NONE)
-        images = map(quantize, images)
-    first = next(images)
+        first = first.quantize(_COLORS)
+        quantize = partial(Image.Image.quantize, palette=first, dither=Image.Dither.NONE)
+        frames = map(quantize, frames)
     ends = 10 * np.round(100.0 * dt * np.arange(count + 1)).astype(int)  # a GIF counts in 10 ms
     first.save(
         path,
         save_all=True,
-        append_images=images,
+        append_images=frames,
         duration=np.diff(ends).tolist(),
         loop=0,
         **options,
