@@ -1,6 +1,5 @@
 """Sweeps: composes and checks their jobs, claims their folder, and shows their table."""
 
-import itertools
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -8,7 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.types import ValueType
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from mjstack.config.explain import own_overrides, parse
@@ -28,25 +29,17 @@ def expand(master: DictConfig, overrides: Sequence[str]) -> list[list[str]]:
     """The jobs of a sweep as Hydra's basic sweeper makes them."""
     params = OmegaConf.select(master, "hydra.sweeper.params") or {}
     texts = [*(f"{key}={value}" for key, value in params.items()), *own_overrides(overrides)]
-    values: dict[str, list[str]] = {}  # of each key, the last override's
-    for override in map(parse, texts):
-        key = override.get_key_element()
-        if override.is_discrete_sweep():
-            values[key] = [f"{key}={value}" for value in override.sweep_string_iterator()]
-        elif override.is_sweep_override():  # a glob
-            raise MjstackError(f"{' '.join(overrides)}: expected a list of values.")
-        else:
-            values[key] = [f"{key}={override.get_value_element_as_str()}"]
-    jobs = [list(job) for job in itertools.product(*values.values())]
+    parsed = list(map(parse, texts))
+    if any(override.value_type is ValueType.GLOB_CHOICE_SWEEP for override in parsed):
+        raise MjstackError(f"{' '.join(overrides)}: expected a list of values.")
+    (jobs,) = BasicSweeper.split_arguments(parsed, None)
     if not jobs:
         raise MjstackError(f"{' '.join(overrides)}: has no jobs, expected at least one value.")
     return jobs
 
 
 def check_jobs(
-    master: DictConfig,
-    jobs: Sequence[list[str]],
-    check: Callable[[DictConfig, list[str]], object],
+    master: DictConfig, jobs: Sequence[list[str]], check: Callable[[DictConfig, list[str]], object]
 ) -> list["SweepJob"]:
     """Compose and check every job of a sweep's folder.
 
@@ -54,7 +47,7 @@ def check_jobs(
     """
     folder = hydra_path(master, "sweep.dir")
     separate = not _launcher(master).endswith(".BasicLauncher")
-    of_hydra = cast(list, OmegaConf.to_container(master.hydra.overrides.hydra))
+    of_hydra = list(master.hydra.overrides.hydra)
     placed: list[SweepJob] = []
     numbers: dict[Path, int] = {}
     for number, job in enumerate(jobs):
@@ -113,10 +106,9 @@ def claim_sweep(master: DictConfig, jobs: Sequence["SweepJob"]) -> Iterator[Path
     with claim_folder(folder, marker=marker, numbered=hourly, shared=queued, key=key) as claimed:
         master.hydra.sweep.dir = str(claimed)
         master.hydra.overrides.hydra.append(f"hydra.sweep.dir={quoted(claimed)}")  # of its jobs
-        names = (os.path.relpath(job.folder, folder) for job in jobs)
-        paths = (Path(os.path.normpath(claimed / name)) for name in names)
-        moved = [replace(job, folder=path) for job, path in zip(jobs, paths, strict=True)]
-        add_jobs(claimed, moved)
+        names = [os.path.relpath(job.folder, folder) for job in jobs]
+        paths = [Path(os.path.normpath(claimed / name)) for name in names]
+        add_jobs(claimed, [replace(job, folder=paths[job.number]) for job in jobs])
         yield claimed
 
 
