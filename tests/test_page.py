@@ -157,20 +157,14 @@ def test_histograms_count_every_world(tmp_path: Path) -> None:
     assert "threshold 0.015 m" in text
 
 
-@pytest.mark.parametrize(
-    ("count", "failed", "note"),
-    [
-        (10_000, 2000, "3,000 of 10,000 are drawn, all failed ones among them."),
-        (20_000, 3000, "3,000 of 20,000 are drawn, 3,000 of 4,000 failed ones among them."),
-    ],
-)
+@pytest.mark.parametrize(("count", "failed"), [(10_000, 2000), (20_000, 3000)])
 def test_maps_of_a_large_batch_show_failed_worlds_first(
-    tmp_path: Path, count: int, failed: int, note: str
+    tmp_path: Path, count: int, failed: int
 ) -> None:
     text = page(tmp_path, count)
     assert text.count("<path class=x") == failed
     assert text.count("<circle class=o") == 3000 - failed
-    assert note in text
+    assert f"3,000 of {count:,} are drawn, failed ones first." in text
     assert len(text) < 1e6
 
 

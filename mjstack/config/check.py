@@ -76,8 +76,7 @@ def _run(cfg: Config) -> Checks:
     known = cfg.gate.functions()
     yield "gates", not cfg.gates, f"at least one of {', '.join(known)}"
     _require("gate", (*cfg.gates, *cfg.gate.added), known)  # a misspelt one has no function
-    wrong = not _DEVICE.fullmatch(cfg.sim.device)
-    yield "sim.device", wrong, "auto, cpu or cuda:N, such as cuda:0"
+    yield "sim.device", not _DEVICE.fullmatch(cfg.sim.device), "auto, cpu or cuda:N, such as cuda:0"
     step_dt = 1.0 / cfg.task.control_hz
     if not math.isclose(cfg.timing.step_dt, step_dt, rel_tol=1e-9):
         raise ConfigError(
@@ -110,8 +109,7 @@ def _robot(cfg: Config) -> Checks:
     joints = len(robot.joints)
     lengths = {"home": joints, "start": joints, "gripper_open": grip, "gripper_closed": grip}
     for key, size in lengths.items():
-        wrong = len(getattr(robot, key)) != size
-        yield f"robot.{key}", wrong, f"{size} numbers, one per joint"
+        yield f"robot.{key}", len(getattr(robot, key)) != size, f"{size} numbers, one per joint"
     wrong = abs(math.hypot(*robot.approach_axis) - 1.0) > 1e-3
     yield "robot.approach_axis", wrong, "a vector of length 1, such as [0, 0, -1]"
     for key in ("name", "menagerie_name", "menagerie_file"):  # they become paths
@@ -206,8 +204,7 @@ def _phases(cfg: Config) -> Checks:
     controller = cfg.controller
     gain = max(controller.posture_gain, controller.approach_gain)
     wrong = gain > 0 and controller.step_iterations < 4
-    expected = "at least 4 with a posture_gain or an approach_gain"
-    yield "controller.step_iterations", wrong, expected
+    yield "controller.step_iterations", wrong, "at least 4 with a posture_gain or an approach_gain"
     closed_loop = controller.name == "closed_loop" or "success" in cfg.gates
     phases = controller.phases
     names = list(phases)

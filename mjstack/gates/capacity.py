@@ -64,11 +64,7 @@ def run_capacity(run: Run) -> list[GateResult]:
         randomized=partial(run.stage.play_task, t.reset),
     )
     task = _measure(
-        run,
-        result,
-        "driven task",
-        resolve_sizes(cfg),
-        task=partial(run.stage.play_task, cfg.reset),
+        run, result, "driven task", resolve_sizes(cfg), task=partial(run.stage.play_task, cfg.reset)
     )
 
     # Problems. Motion that lost physics sizes nothing that follows.

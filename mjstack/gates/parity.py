@@ -66,11 +66,9 @@ def _compare(run: Run, mjwarp: Simulation) -> GateResult:
         problems.append(reason)
     if bits := int(mjwarp.overflow[0]):
         problems.append(f"{describe_overflow(bits)} overflow: raise batch.njmax or batch.nconmax")
-    limits = mjwarp.solver_limits
     result.metrics |= judged | {
         "peak_contacts": int(mjwarp.peak_contacts[0]),
         "peak_constraint_rows": int(mjwarp.peak_constraints[0]),
-        "solver_limit_hit": bool(limits is not None and int(limits[0])),
         "episode_s": episode.timing.seconds,
     }
     problems += _compare_ends(run, world, result)

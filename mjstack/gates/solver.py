@@ -7,7 +7,7 @@ import statistics
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
-from typing import Any, cast
+from typing import Any
 
 from mjstack.bench.physics import HeldPhysics, play_to_phase
 from mjstack.bench.timing import describe_lost, steps_that_fit
@@ -61,7 +61,7 @@ def run_solver(run: Run) -> list[GateResult]:
     median, ``ratio_min``, ``ratio_max``).
     """
     stage = run.stage
-    gate = cast(SolverGateCfg, run.cfg.gate["solver"])
+    gate: SolverGateCfg = run.cfg.gate["solver"]
     before = asdict(run.cfg.solver)
     solver = gate.apply(before)
     changes = [f"{key}={value}" for key, value in asdict(solver).items() if value != before[key]]

@@ -58,11 +58,7 @@ def _measure(run: Run, gate: str, backend: Backend, device: str) -> GateResult:
     on_cuda = device.startswith("cuda")
     seconds = t.max_seconds if on_cuda else t.cpu_max_seconds
     limits = {"seconds": seconds, "repetitions": t.repetitions, "meter": EnergyMeter(device)}
-    result.metrics = {
-        "worlds": cfg.nworld,
-        "cpu_count": os.cpu_count() or 1,
-        "time_budget_s": seconds,
-    }
+    result.metrics = {"worlds": cfg.nworld, "cpu_count": os.cpu_count() or 1}
 
     # The measurements
     worlds = (run, backend, device, result, limits)

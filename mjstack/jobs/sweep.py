@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
 
@@ -53,7 +53,7 @@ class Queueing:
             ConfigError: A value is not accepted.
         """
         keys = {key: value for key, value in launcher.items() if key != "_target_"}
-        return cast(Queueing, typed("hydra.launcher", keys, cls))
+        return typed("hydra.launcher", keys, cls)
 
     def slots(self) -> list[Slot]:
         """Places for jobs: GPUs, or shares of the cores.

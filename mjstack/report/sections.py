@@ -232,11 +232,9 @@ def _episode_parts(worlds: Worlds, thresholds: Mapping[str, float]) -> Iterator[
             "Where the objects started, seen from above, the arm's base at the triangle; failed"
             " episodes as red crosses."
         )
-        on_map = np.sort(np.argsort(~failed, kind="stable")[:_POINTS]).tolist()  # failed ones first
+        on_map = np.sort(np.argsort(~failed, kind="stable")[:_POINTS]).tolist()
         if count > _POINTS:
-            lost = int(failed.sum())
-            among = f"{_POINTS:,} of {lost:,}" if lost > _POINTS else "all"
-            text += f" {_POINTS:,} of {count:,} are drawn, {among} failed ones among them."
+            text += f" {_POINTS:,} of {count:,} are drawn, failed ones first."
         if ways := len(worlds.maps[0].ways):
             text += f" Lines are the objects' ways in {ways} of the episodes."
         figures = [table_map(plan, worlds.names, worlds.broken, on_map) for plan in worlds.maps]
