@@ -190,14 +190,15 @@ def _sweep(hydra: Any, overrides: list[str]) -> int:
         )
     overrides = [*overrides, "hydra.mode=MULTIRUN"]
     master = compose(overrides, RunMode.MULTIRUN)
-    known = check_jobs(master, expand(master, overrides), _check)
+    jobs = expand(master, overrides)
+    check_jobs(master, jobs, _check)
     begin_job()
     from mjstack.jobs.sweep_folder import list_jobs
     from mjstack.jobs.sweep_table import sweep_config
 
     sweep = sweep_config(master)
     reports: dict[int, Report] = {}
-    with claim_sweep(master, known) as claimed:
+    with claim_sweep(master, jobs) as claimed:
         try:
             batches = hydra.multirun(CONFIG_NAME, run_job, overrides)
             _results[:] = [job.return_value for batch in batches for job in batch]

@@ -1,16 +1,14 @@
 """Sweeps: composes and checks their jobs, claims their folder, and shows their table."""
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import ValueType
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, OmegaConf
 
 from mjstack.config.explain import own_overrides, parse
 from mjstack.config.load import compose
@@ -20,9 +18,6 @@ from mjstack.errors import ConfigError, MjstackError, is_out_of_memory
 from mjstack.files import claim_folder
 from mjstack.report.record import Report
 from mjstack.report.table import Console
-
-if TYPE_CHECKING:  # what loads torch need not wait for a misspelt key
-    from mjstack.jobs.sweep_folder import SweepJob
 
 
 def expand(master: DictConfig, overrides: Sequence[str]) -> list[list[str]]:
@@ -40,17 +35,15 @@ def expand(master: DictConfig, overrides: Sequence[str]) -> list[list[str]]:
 
 def check_jobs(
     master: DictConfig, jobs: Sequence[list[str]], check: Callable[[DictConfig, list[str]], object]
-) -> list["SweepJob"]:
-    """Compose and check every job of a sweep's folder.
+) -> None:
+    """Compose and check every job of a sweep.
 
     Of jobs in processes of their own, one that needs more memory than there is stops no other.
     """
     folder = hydra_path(master, "sweep.dir")
     separate = not _launcher(master).endswith(".BasicLauncher")
     of_hydra = list(master.hydra.overrides.hydra)
-    placed: list[SweepJob] = []
-    numbers: dict[Path, int] = {}
-    for number, job in enumerate(jobs):
+    for job in jobs:
         cfg = compose([*of_hydra, f"hydra.sweep.dir={quoted(folder)}", *job])
         if cfg.devices is not None:
             fix = "Leave it out: with hydra/launcher=gpus each job has one GPU"
@@ -60,26 +53,6 @@ def check_jobs(
         except MjstackError as error:
             if not (separate and is_out_of_memory(str(error))):
                 raise
-        placed.append(place_job(cfg, number, job))
-        path = placed[-1].folder
-        first = numbers.setdefault(path, number)
-        if first != number:
-            raise MjstackError(
-                f"hydra.sweep.subdir: jobs {first} and {number} would both write into {path},"
-                " expected a folder for each job. Leave it out, or let it name what differs."
-            )
-    return placed
-
-
-def place_job(cfg: DictConfig, number: int, overrides: Sequence[str]) -> "SweepJob":
-    """Number a job of a sweep, in its composition too, which names its folder."""
-    from mjstack.jobs.sweep_folder import SweepJob
-
-    with open_dict(cfg):
-        cfg.hydra.job.num = number
-        cfg.hydra.job.id = str(number)
-    folder = hydra_path(cfg, "sweep.dir") / hydra_path(cfg, "sweep.subdir")
-    return SweepJob(number, Path(os.path.normpath(folder)), tuple(overrides))
 
 
 def _launcher(master: DictConfig) -> str:
@@ -88,12 +61,12 @@ def _launcher(master: DictConfig) -> str:
 
 
 @contextmanager
-def claim_sweep(master: DictConfig, jobs: Sequence["SweepJob"]) -> Iterator[Path]:
+def claim_sweep(master: DictConfig, jobs: Sequence[list[str]]) -> Iterator[Path]:
     """A sweep's folder, with the list of its jobs: a new one by the hour, or one in which the same
     command goes on, with a queue also beside others.
     """
     from mjstack.jobs.sweep import Queueing
-    from mjstack.jobs.sweep_folder import SWEEP, add_jobs
+    from mjstack.jobs.sweep_folder import SWEEP, add_jobs, number_jobs
 
     folder = hydra_path(master, "sweep.dir")
     queued = _launcher(master).endswith(".GpuLauncher")
@@ -106,9 +79,7 @@ def claim_sweep(master: DictConfig, jobs: Sequence["SweepJob"]) -> Iterator[Path
     with claim_folder(folder, marker=marker, numbered=hourly, shared=queued, key=key) as claimed:
         master.hydra.sweep.dir = str(claimed)
         master.hydra.overrides.hydra.append(f"hydra.sweep.dir={quoted(claimed)}")  # of its jobs
-        names = [os.path.relpath(job.folder, folder) for job in jobs]
-        paths = [Path(os.path.normpath(claimed / name)) for name in names]
-        add_jobs(claimed, [replace(job, folder=paths[job.number]) for job in jobs])
+        add_jobs(claimed, number_jobs(claimed, jobs))
         yield claimed
 
 

@@ -129,14 +129,10 @@ os._exit(130)
     assert (done.returncode, done.stderr) == (130, b"")
 
 
-def test_a_sweeper_brings_jobs_in_batches(stub: Path) -> None:
-    """All of them are in one list, also where their folders are below others."""
-    sweep = [
-        SweepJob(n, stub / "so101" / str(n), (f"seed={seed}",)) for n, seed in enumerate((1, 4))
-    ]
-    for job in sweep:
+def test_jobs_in_several_calls_are_in_one_list(stub: Path) -> None:
+    for job in jobs(stub, 1, 4):
         assert [report.status for report in run_jobs(stub, [job])] == ["pass"]
-    assert json.loads((stub / SWEEP).read_text())["1"] == ["so101/1", ["seed=4"]]
+    assert json.loads((stub / SWEEP).read_text())["1"] == ["1", ["seed=4"]]
 
 
 @pytest.mark.parametrize("count", [0, -1, "x", 1.5])

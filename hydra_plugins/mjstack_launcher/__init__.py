@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 
 
 class GpuLauncher(Launcher):
-    """Names the folder of each job as Hydra does, and leaves the rest to `mjstack.jobs.sweep`."""
+    """Leaves the jobs to `mjstack.jobs.sweep`."""
 
     def __init__(self, **queueing: Any) -> None:
         """Take the attributes of `mjstack.jobs.sweep.Queueing`."""
@@ -21,7 +21,6 @@ class GpuLauncher(Launcher):
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
     ) -> None:
         """See `Launcher`."""
-        self._loader = hydra_context.config_loader
         self._config = config
 
     def launch(
@@ -29,15 +28,13 @@ class GpuLauncher(Launcher):
     ) -> Sequence[JobReturn]:
         """See `Launcher`."""
         # Hydra looks at every plugin, and these load torch.
-        from mjstack.cli_sweep import hydra_path, place_job
+        from mjstack.cli_sweep import hydra_path
         from mjstack.jobs.sweep import Queueing, run_jobs
+        from mjstack.jobs.sweep_folder import number_jobs
         from mjstack.jobs.sweep_table import update_summary
 
-        jobs = []
-        for number, overrides in enumerate(job_overrides, initial_job_idx):
-            cfg = self._loader.load_sweep_config(self._config, list(overrides))
-            jobs.append(place_job(cfg, number, overrides))
         folder = hydra_path(self._config, "sweep.dir")
+        jobs = number_jobs(folder, job_overrides, initial_job_idx)
         finish = partial(update_summary, folder, self._config)
         reports = run_jobs(folder, jobs, Queueing.of(self._queueing), finish)
         return [

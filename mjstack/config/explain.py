@@ -10,6 +10,7 @@ from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
 from typing import Any
 
+from hydra import compose
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException, MissingConfigException
@@ -20,8 +21,8 @@ from mjstack.config.fields import accepted, find_field
 from mjstack.config.schema import JOB_SCHEMAS, Config, GateCfg
 from mjstack.config.session import (
     CONFIG_NAME,
-    compose_raw,
     config_folders,
+    hydra_session,
     list_choices,
     list_items,
 )
@@ -34,10 +35,10 @@ TERM_GROUPS = ("action", "observation", "reset", "termination", "reward")
 def check_overrides(overrides: Sequence[str]) -> None:
     """Raise a `MjstackError` for the first override that cannot be used alone."""
     for override in overrides:
-        if re.match(r"[+~]*hydra([./]job_logging|\.output_subdir)", override):
+        if re.match(r"[+~]*hydra([./]job_logging|\.output_subdir|\.sweep\.subdir)", override):
             raise MjstackError(
-                f"{override}: expected Hydra's own, because every run has run.log and .hydra. Leave"
-                " it out."
+                f"{override}: expected the configured one, because every run has run.log and"
+                " .hydra, and a job's folder in a sweep its number. Leave it out."
             )
     for override in own_overrides(overrides):
         parsed = parse(override)
@@ -185,8 +186,9 @@ def _field_names(owner: Any) -> list[str]:
 
 def _keys(overrides: Iterable[str]) -> list[str]:
     """Dotted keys of a composition, mappings included."""
-    try:
-        cfg = compose_raw(list(overrides))
-    except HydraException:
-        cfg = compose_raw([])
+    with hydra_session():
+        try:
+            cfg = compose(CONFIG_NAME, list(overrides))
+        except HydraException:
+            cfg = compose(CONFIG_NAME)
     return [key for key, _ in list_items(cfg)]

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml  # type: ignore[import-untyped]
-from hydra import compose, initialize_config_dir
+from hydra import initialize_config_dir
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
@@ -303,12 +303,6 @@ def _add_entries(overrides: Sequence[str]) -> list[str]:
         out.append(f"++{text.lstrip('+')}" if entry else text)
     ConfigStore.instance().store("added_entries", entries, package="_global_", provider="mjstack")
     return out
-
-
-def compose_raw(overrides: Sequence[str]) -> DictConfig:
-    """Compose on the current search path, with Hydra's own errors."""
-    with hydra_session():
-        return compose(CONFIG_NAME, list(overrides))
 
 
 def without_hydra(cfg: DictConfig) -> DictConfig:

@@ -1,8 +1,7 @@
 """The folder of a sweep: its jobs, and what their runs have left in it so far."""
 
 import json
-import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,17 +45,22 @@ class SweepJob:
         return earlier is not None and earlier.resumes == "gates"
 
 
+def number_jobs(folder: Path, jobs: Iterable[Sequence[str]], first: int = 0) -> list[SweepJob]:
+    """The jobs of a sweep by their overrides, each in a folder that its number names."""
+    return [SweepJob(n, folder / str(n), tuple(job)) for n, job in enumerate(jobs, first)]
+
+
 def add_jobs(folder: Path, jobs: Sequence[SweepJob]) -> None:
-    """Add jobs to the list of a sweep's folder. A sweeper may bring them in several batches.
+    """Add jobs to the list of a sweep's folder.
 
     Raises:
         FolderError: The list has another job of one of these numbers, or a job's folder has other
             files than those of its run.
     """
-    listed = {job.number: _entry(folder, job) for job in list_jobs(folder)}
+    listed = {job.number: _entry(job) for job in list_jobs(folder)}
     before = dict(listed)
     for job in jobs:
-        entry = _entry(folder, job)
+        entry = _entry(job)
         if listed.setdefault(job.number, entry) != entry:
             overrides = " ".join(listed[job.number][1])
             raise FolderError(
@@ -75,9 +79,9 @@ def add_jobs(folder: Path, jobs: Sequence[SweepJob]) -> None:
         write_atomic(folder / SWEEP, json.dumps(listed, indent=1) + "\n")
 
 
-def _entry(folder: Path, job: SweepJob) -> tuple[str, list[str]]:
+def _entry(job: SweepJob) -> tuple[str, list[str]]:
     """A job's folder and overrides in the list of a sweep's folder."""
-    return os.path.relpath(job.folder, folder), list(job.overrides)
+    return job.folder.name, list(job.overrides)
 
 
 def list_jobs(folder: Path) -> list[SweepJob]:
@@ -85,8 +89,7 @@ def list_jobs(folder: Path) -> list[SweepJob]:
     jobs = []
     with suppress(OSError, ValueError, TypeError, AttributeError):
         for number, (name, overrides) in json.loads((folder / SWEEP).read_text()).items():
-            path = Path(os.path.normpath(folder / name))
-            jobs.append(SweepJob(int(number), path, tuple(overrides)))
+            jobs.append(SweepJob(int(number), folder / name, tuple(overrides)))
     return sorted(jobs, key=lambda job: job.number)
 
 
