@@ -25,12 +25,13 @@ from mjstack.sim import BatchSizes, resolve_sizes
 from mjstack.sim.cameras import image_bytes
 from mjstack.sim.sizes import apply_configured, configured_sizes, resolve_env_sizes
 
+_TITLES = {"task": "driven task", "env": "environments (random actions, randomised starts)"}
+
 
 @dataclass(kw_only=True, slots=True)
 class _Group:
     """Workloads whose worlds have the same buffer sizes."""
 
-    title: str
     runs: dict[str, Workload]  # with room to spare
     peaks: Peaks  # the most that any of them used
     sizes: BatchSizes  # in force
@@ -58,14 +59,12 @@ def run_capacity(run: Run) -> list[GateResult]:
     env = _measure(
         run,
         result,
-        "environments (random actions, randomised starts)",
         resolve_env_sizes(cfg),
         random_actions=partial(play_random, run),
         randomized=partial(run.stage.play_task, t.reset),
     )
-    task = _measure(
-        run, result, "driven task", resolve_sizes(cfg), task=partial(run.stage.play_task, cfg.reset)
-    )
+    play_task = partial(run.stage.play_task, cfg.reset)
+    task = _measure(run, result, resolve_sizes(cfg), task=play_task)
 
     # Problems. Motion that lost physics sizes nothing that follows.
     groups = {"task": task, "env": env}
@@ -120,7 +119,6 @@ def play_random(run: Run, sizes: BatchSizes | None = None) -> Workload:
 def _measure(
     run: Run,
     result: GateResult,
-    title: str,
     configured: BatchSizes,
     **plays: Callable[..., Workload],
 ) -> _Group:
@@ -140,7 +138,6 @@ def _measure(
     how = f"batch=auto: gate capacity, {run.stage.measuring_nworld} worlds, times {margin:g}"
     advice = recommend_sizes(peaks, margin, how if cfg.batch.auto else "gate capacity")
     group = _Group(
-        title=title,
         runs=runs,
         peaks=peaks,
         sizes=apply_configured(cfg, advice) if cfg.batch.auto else configured,
@@ -210,9 +207,10 @@ def _report(run: Run, name: str, group: _Group, result: GateResult) -> None:
             **{f"{prefix}pool_{key}": peak for key, peak in peaks.pools.items()},
             f"{prefix}peak_constraint_rows_per_world": int(peaks.rows.max()),
         }
-    line = f"{group.title}: {group.advice.as_overrides()}"
+    title = _TITLES[name]
+    line = f"{title}: {group.advice.as_overrides()}"
     if group.lost:
-        line = f"{group.title}: not known, physics was lost"
+        line = f"{title}: not known, physics was lost"
     elif native and name == "task":
         line += " (contacts alone: native MuJoCo does not count the pairs that share their pool)"
     run.print_line(line)

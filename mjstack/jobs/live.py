@@ -19,7 +19,7 @@ from mjstack.episodes.rollout import Observer
 from mjstack.episodes.stage import Stage
 from mjstack.interrupt import check_interrupt
 from mjstack.report.geometry import Shapes
-from mjstack.report.page import MOST_WORLDS
+from mjstack.report.page import MOST_WORLDS, World
 from mjstack.report.web import Stage as SceneView
 from mjstack.sim import StateRenderer
 
@@ -165,8 +165,9 @@ class LiveView(Observer):
         qpos = env.sim.qpos[index].double().cpu().numpy()
         if self._view is None:
             self._server.scene.reset()
-            labels = [str(number) for number in env.world[index].tolist()]
-            self._view = SceneView(self._server, self._shapes, labels, [None] * len(labels))
+            places = zip(env.world[index].tolist(), qpos[:, None], strict=True)
+            worlds = [World(label=str(number), qpos=frames) for number, frames in places]
+            self._view = SceneView(self._server, self._shapes, worlds)
         self._view.update(np.nan_to_num(qpos))
         world = min(max(0, int(plotted)), env.nworld - 1)
         terms, lines = self._values(world)

@@ -306,8 +306,8 @@ def save_curves(
     lines: Mapping[str, Sequence[float]],
     title: str,
     label: str,
-    scale: str = "log",
-    bands: Mapping[str, Sequence[Sequence[float]]] | None = None,
+    scale: str,
+    bands: Mapping[str, Sequence[Sequence[float]]],
 ) -> None:
     """Plot values over a number that counts, on a ``log`` or ``linear`` scale, a line for each by
     its name; ``bands`` are the lower and the upper ends of their intervals, for those that have
@@ -316,7 +316,7 @@ def save_curves(
     with figure(path, title, figsize=(7.5, 4.5)) as (_, axes):
         for name, values in lines.items():
             axes.plot(at, values, ".-", label=name)
-            if bands and name in bands:
+            if name in bands:
                 axes.fill_between(at, *bands[name], alpha=0.2)
         axes.set(xlabel=label, yscale=scale)
         axes.grid(alpha=0.3, which="both")

@@ -47,33 +47,24 @@ def lacks_viser() -> str:
 class Stage:
     """Worlds side by side in a viser server's scene."""
 
-    def __init__(
-        self,
-        server: Any,
-        shapes: Shapes,
-        labels: Sequence[str],
-        tints: Sequence[np.ndarray | None],
-        seen: Sequence[Mapping[str, np.ndarray]] = (),
-    ) -> None:
-        """Add the worlds.
+    def __init__(self, server: Any, shapes: Shapes, worlds: Sequence[World]) -> None:
+        """Add the worlds, in the model's own state.
 
         Args:
             server: A ``viser.ViserServer``.
             shapes: The geometry of each world.
-            labels: The text of each world.
-            tints: The colour of what does not move in each world; None for the model's own.
-            seen: Images of each world by camera, ``(frames, height, width, 3)``; they stand behind
-                its table.
+            worlds: Their texts, and their images, which stand behind the table. In those that
+                failed, what does not move is red.
         """
         self._shapes = shapes
-        count = len(labels)
+        count = len(worlds)
         low, high = shapes.box
         self._offsets = _grid(count, high[:2] - low[:2] + _MARGIN)
         self._handles: list[tuple[int, Any]] = []
         places, turns = self._round(*shapes.poses(np.repeat(shapes.model.qpos0[None], count, 0)))
         self._last = (places, turns)
         for number, (body, rgba, (vertices, faces)) in enumerate(shapes.meshes):
-            colors = [rgba[:3] if body or tint is None else tint for tint in tints]
+            colors = [_FAILED if world.failed and not body else rgba[:3] for world in worlds]
             handle = server.scene.add_batched_meshes_simple(
                 f"/{number}",
                 vertices.astype(np.float32),
@@ -88,15 +79,23 @@ class Stage:
             )
             self._handles.append((body, handle))
 
-        # Images, texts, the floor, and where one looks from
+        # Texts, images, the floor, and where one looks from
         self._images: list[tuple[np.ndarray, Any]] = []
-        for world, cameras in enumerate(seen):
-            x, y = self._offsets[world]
+        for number, world in enumerate(worlds):
+            x, y = self._offsets[number]
+            server.scene.add_label(
+                f"/label/{number}",
+                world.label,
+                position=(x + high[0], y + 0.5 * (low[1] + high[1]), low[2]),
+                anchor="top-center",
+                font_size_mode="scene",
+                font_scene_height=0.035,
+            )
             left = y + low[1]
-            for name, images in cameras.items():
+            for name, images in world.images.items():
                 wide = _IMAGE * images.shape[2] / images.shape[1]
                 handle = server.scene.add_image(
-                    f"/image/{world}/{name}",
+                    f"/image/{number}/{name}",
                     images[0],
                     wide,
                     _IMAGE,
@@ -107,16 +106,6 @@ class Stage:
                 )
                 left += wide + 0.02
                 self._images.append((images, handle))
-        for world, text in enumerate(labels):
-            x, y = self._offsets[world]
-            server.scene.add_label(
-                f"/label/{world}",
-                text,
-                position=(x + high[0], y + 0.5 * (low[1] + high[1]), low[2]),
-                anchor="top-center",
-                font_size_mode="scene",
-                font_scene_height=0.035,
-            )
         span = np.ptp(self._offsets, 0) + (high - low)[:2]
         centre = np.array([*self._offsets.mean(0) + 0.5 * (low + high)[:2], 0.0])
         server.scene.add_grid(
@@ -189,10 +178,7 @@ def save_episode(
     """
     server = start_server("127.0.0.1", 0)
     try:
-        tints = [_FAILED if world.failed else None for world in worlds]
-        labels = [world.label for world in worlds]
-        seen = [world.images for world in worlds]
-        stage = Stage(server, Shapes(model), labels, tints, seen)
+        stage = Stage(server, Shapes(model), worlds)
         qpos = np.stack([_fill(world, worlds) for world in worlds], axis=1)
         stage.update(qpos[0])
         scene = server.get_scene_serializer()
