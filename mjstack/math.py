@@ -8,16 +8,15 @@ from collections.abc import Sequence
 from functools import cache
 
 import torch
+from torch import Tensor
 
 # The third row of a rotation matrix is 2xz - 2wy, 2yz + 2wx, 1 - 2xx - 2yy: columns of w, x, y, z
-# in the products of both terms, their signs times 2, and what is added.
-_Z_ROW_LEFT = torch.tensor([1, 2, 1, 2, 1, 2])
-_Z_ROW_RIGHT = torch.tensor([3, 3, 1, 0, 0, 2])
-_Z_ROW_SIGNS = torch.tensor([2.0, 2.0, -2.0, -2.0, 2.0, -2.0])
-_Z_ROW_ADDED = torch.tensor([0.0, 0.0, 1.0])
+# in the products of both terms; and their signs times 2, and what is added.
+_Z_ROW_COLUMNS = torch.tensor([[1, 2, 1, 2, 1, 2], [3, 3, 1, 0, 0, 2]])
+_Z_ROW_NUMBERS = torch.tensor([2.0, 2.0, -2.0, -2.0, 2.0, -2.0, 0.0, 0.0, 1.0])
 
 
-def atan2(y: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+def atan2(y: Tensor, x: Tensor) -> Tensor:
     """Angle [rad] of the direction (x, y), shape ``(...)``, alike in tensors of any size.
 
     On CPUs `torch.atan2` has two routines, which round differently: one for whole vectors of packed
@@ -29,7 +28,7 @@ def atan2(y: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
     return torch.atan2(y, x)
 
 
-def quat_mul(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+def quat_mul(a: Tensor, b: Tensor) -> Tensor:
     """Hamilton product ``a b``, shape ``(..., 4)``."""
     aw, ax, ay, az = a.unbind(-1)
     bw, bx, by, bz = b.unbind(-1)
@@ -44,7 +43,7 @@ def quat_mul(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     )
 
 
-def quat_from_yaw(yaw: torch.Tensor) -> torch.Tensor:
+def quat_from_yaw(yaw: Tensor) -> Tensor:
     """Rotation about world z.
 
     Args:
@@ -58,7 +57,7 @@ def quat_from_yaw(yaw: torch.Tensor) -> torch.Tensor:
     return torch.stack((torch.cos(half), zero, zero, torch.sin(half)), dim=-1)
 
 
-def quat_angle(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+def quat_angle(a: Tensor, b: Tensor) -> Tensor:
     """Angle [rad] of the rotation between two unit quaternions, in [0, pi], shape ``(...)``.
 
     The sine comes from the vector part of ``conj(a) b``, so that small angles keep their precision
@@ -69,7 +68,7 @@ def quat_angle(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     return 2.0 * atan2(torch.linalg.vector_norm(rel[..., 1:], dim=-1), rel[..., 0].abs())
 
 
-def quat_z_row(quat: torch.Tensor) -> torch.Tensor:
+def quat_z_row(quat: Tensor) -> Tensor:
     """Third row of the rotation matrix: the world-z components of the body's axes, shape ``(...,
     3)``.
     """
@@ -79,14 +78,14 @@ def quat_z_row(quat: torch.Tensor) -> torch.Tensor:
 
 
 @cache
-def _z_row_constants(device: torch.device, dtype: torch.dtype) -> tuple[torch.Tensor, ...]:
+def _z_row_constants(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, ...]:
     """The constants of `quat_z_row`, copied once: a captured step may not copy from the host."""
     with torch.inference_mode(False):
-        columns = (part.to(device) for part in (_Z_ROW_LEFT, _Z_ROW_RIGHT))
-        return (*columns, *(part.to(device, dtype) for part in (_Z_ROW_SIGNS, _Z_ROW_ADDED)))
+        numbers = _Z_ROW_NUMBERS.to(device, dtype)
+        return (*_Z_ROW_COLUMNS.to(device), *numbers.split((6, 3)))
 
 
-def quat_to_matrix(quat: torch.Tensor) -> torch.Tensor:
+def quat_to_matrix(quat: Tensor) -> Tensor:
     """Rotation matrix of a unit quaternion: its columns are the body's axes in the world, shape
     ``(..., 3, 3)``.
     """
@@ -100,9 +99,7 @@ def quat_to_matrix(quat: torch.Tensor) -> torch.Tensor:
     return outer + cross + torch.diag_embed((2.0 * w.square() - 1.0).expand(*w.shape[:-1], 3))
 
 
-def lowest_point(
-    pos: torch.Tensor, quat: torch.Tensor, shape: str, size: Sequence[float]
-) -> torch.Tensor:
+def lowest_point(pos: Tensor, quat: Tensor, shape: str, size: Sequence[float]) -> Tensor:
     """Height [m] of the lowest point of an object.
 
     Args:
@@ -116,7 +113,7 @@ def lowest_point(
     """
     up = quat_z_row(quat)
     if shape == "sphere":
-        reach: torch.Tensor | float = size[0]
+        reach: Tensor | float = size[0]
     elif shape == "capsule":  # it lies along its x axis
         reach = size[0] + size[1] * up[..., 0].abs()
     elif shape == "cylinder":
@@ -132,12 +129,12 @@ def lowest_point(
 
 def describe_tensor(value: object) -> str:
     """A tensor's type, shape and device in words; the type of anything else."""
-    if not isinstance(value, torch.Tensor):
+    if not isinstance(value, Tensor):
         return f"a {type(value).__name__}"
     return f"a {value.dtype} tensor of shape {tuple(value.shape)} on {value.device}"
 
 
-def not_finite(*parts: torch.Tensor) -> torch.Tensor:
+def not_finite(*parts: Tensor) -> Tensor:
     """Rows in which a number is NaN or infinite.
 
     Args:
@@ -154,7 +151,7 @@ def not_finite(*parts: torch.Tensor) -> torch.Tensor:
     return sum(more, first) != 0.0
 
 
-def all_finite(*parts: torch.Tensor) -> bool:
+def all_finite(*parts: Tensor) -> bool:
     """Whether a short look at tensors on the CPU shows that every number is finite: a finite sum
     has finite summands only.
     """

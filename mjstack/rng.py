@@ -10,6 +10,7 @@ import operator
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from mjstack.errors import ArgumentError
 
@@ -50,11 +51,11 @@ def philox(counter: np.ndarray, key: tuple[int, int]) -> np.ndarray:
 def uniform(
     seed: int,
     stream: int,
-    world: torch.Tensor,
-    episode: torch.Tensor,
-    step: torch.Tensor | None,
+    world: Tensor,
+    episode: Tensor,
+    step: Tensor | None,
     size: int,
-) -> torch.Tensor:
+) -> Tensor:
     """Uniform numbers in [-1, 1).
 
     Args:

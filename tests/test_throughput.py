@@ -1,5 +1,6 @@
 """The throughput gate: its measurements, and what voids their figures."""
 
+import math
 import sys
 import time
 from dataclasses import replace
@@ -369,7 +370,16 @@ def test_the_parts_play_one_trajectory(monkeypatch: Patch) -> None:
         return lost(sim, steps)
 
     monkeypatch.setattr(env_step, "lost_worlds", look)
-    times = measure_env_step(env, steps=4, repetitions=3)
+    times = measure_env_step(
+        env,
+        steps=4,
+        repetitions=3,
+        seconds=math.inf,
+        meter=EnergyMeter("cpu"),
+        advance=lambda what, done, total: None,
+        share=1.0,
+        name="env_step",
+    )
     figures = times.samples
     names = ("ms_per_env_step", "physics_ms_per_step", "managers_ms_per_step")
     repetitions = list(zip(*(figures[name] for name in names), strict=True))

@@ -19,10 +19,10 @@ With cameras, the images of all worlds and cameras are timed too, however slow a
 
 from collections.abc import Sequence
 from functools import partial
-from math import inf
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from mjstack.bench.timing import (
     NO_METER,
@@ -49,11 +49,11 @@ def measure_env_step(
     *,
     steps: int,
     repetitions: int,
-    seconds: float = inf,
-    meter: EnergyMeter = NO_METER,
-    advance: Advance = lambda what, done, total: None,
-    share: float = 1.0,
-    name: str = "env_step",
+    seconds: float,
+    meter: EnergyMeter,
+    advance: Advance,
+    share: float,
+    name: str,
 ) -> Measurement:
     """Play random actions in interleaved repetitions.
 
@@ -221,11 +221,11 @@ class _Parts:
         times.append(timed(sim, play_images) if images else 0.0)
         return times, counted["episodes"]
 
-    def _set_ages(self, ages: torch.Tensor) -> None:
+    def _set_ages(self, ages: Tensor) -> None:
         for counter, age in zip((self._env.episode_step, self._env.episode), ages, strict=True):
             counter.copy_(age)
 
-    def _actions(self, count: int) -> list[torch.Tensor]:
+    def _actions(self, count: int) -> list[Tensor]:
         shape = (count, self._env.nworld, len(self._span))
         noise = torch.rand(shape, generator=self._generator)
         return list((self._low + self._span * noise).to(self._env.device).unbind())

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 
-import torch
+from torch import Tensor
 from typing_extensions import override
 
 from mjstack.config.schema import Config
@@ -31,7 +31,6 @@ class EnergyMeter:
     def __init__(self, device: str) -> None:
         """Open the counter of ``cpu`` or ``cuda:N``."""
         self._counter: Callable[[], float] | None = None  # [mJ]
-        self._began = self._first = 0.0
         self.clear()
         self.reason = ""
         if device == "cpu":
@@ -221,7 +220,7 @@ def timed(sim: Simulation, work: Callable[[], object], meter: EnergyMeter = NO_M
     return seconds
 
 
-def lost_worlds(sim: Simulation, steps: int | None = None) -> torch.Tensor:
+def lost_worlds(sim: Simulation, steps: int | None = None) -> Tensor:
     """Worlds whose time would be void, shape ``(nworld,)``, bool.
 
     Args:
@@ -232,7 +231,7 @@ def lost_worlds(sim: Simulation, steps: int | None = None) -> torch.Tensor:
     return lost if steps is None else lost | (sim.step_count != steps)
 
 
-def describe_lost(lost: torch.Tensor) -> str:
+def describe_lost(lost: Tensor) -> str:
     """The number of lost worlds in a sentence; empty where there are none. Waits for the device."""
     count = int(lost.sum())
     return f"{count} worlds overflowed, diverged or were not stepped" if count else ""

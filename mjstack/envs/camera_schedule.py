@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from mjstack.config.schema import CameraCfg, Config
+from mjstack.config.schema import Config
 from mjstack.managers.view import EnvView
 from mjstack.sim.cameras import Cameras, Masks
 
@@ -19,13 +19,14 @@ class CameraSchedule:
         final_images: Those of the last state of an episode, of cameras with ``terminal``.
     """
 
-    def __init__(self, env: EnvView, cameras: Mapping[str, CameraCfg]) -> None:
+    def __init__(self, env: EnvView) -> None:
         """Allocate the buffers, if there are cameras.
 
         Raises:
             ConfigError: They do not fit into the device's memory.
         """
-        cameras = {name: camera for name, camera in cameras.items() if camera.outputs}
+        scene = env.cfg.scene
+        cameras = {name: camera for name, camera in scene.cameras.items() if camera.outputs}
         self._env = env
         timing = env.cfg.timing
         self._decimation = timing.policy_decimation

@@ -71,6 +71,8 @@ class Env:
         cameras: What draws them, with the names in their segmentation; None without cameras.
     """
 
+    observation_manager: ObservationManager
+
     def __init__(
         self,
         sim: Simulation,
@@ -123,16 +125,17 @@ class Env:
         if cfg.task.success is not None:
             self._success = Term("task.success", cfg.task.success, self)
             first_value(self._success, self, boolean=True)
-        self.termination_manager = ends = TerminationManager(self, cfg.termination)
-        self.reward_manager = rewards = RewardManager(self, cfg.reward)
+        self.termination_manager = TerminationManager(self, cfg.termination)
+        self.reward_manager = RewardManager(self, cfg.reward)
         self.observation_manager = ObservationManager(self, cfg.observation)
-        self.statistics = EpisodeStatistics(rewards.names, ends.names, sim.device)
+        names = (self.reward_manager.names, self.termination_manager.names)
+        self.statistics = EpisodeStatistics(*names, sim.device)
         self._reset_managers(self._all_worlds)
-        self._draws = CameraSchedule(self, cfg.scene.cameras)
+        self._draws = CameraSchedule(self)
         self.images = self._draws.images
         self.cameras = self._draws.cameras
         self.episode.fill_(-1)
-        self._outputs = Outputs(rewards, ends, self.observation_manager, self.success)
+        self._outputs = Outputs(self)
         self.faults = FaultLatch(self, check=check_faults)
         self.graph = self.captured(self.advance, "env.step")
 

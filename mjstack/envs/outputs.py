@@ -1,12 +1,12 @@
 """Results of a step: what a reset changes is kept, and everything returned is a copy."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from mjstack.managers.episode import RewardManager, TerminationManager
-from mjstack.managers.observation import ObservationManager
+if TYPE_CHECKING:
+    from mjstack.envs.env import Env
 
 ResetResult = tuple[dict[str, Tensor], dict[str, Any]]
 StepResult = tuple[dict[str, Tensor], Tensor, Tensor, Tensor, dict[str, Any]]
@@ -17,19 +17,11 @@ class Outputs:
     of their own.
     """
 
-    def __init__(
-        self,
-        rewards: RewardManager,
-        ends: TerminationManager,
-        observations: ObservationManager,
-        success: Tensor,
-    ) -> None:
-        self._rewards = rewards
-        self._ends = ends
-        self._groups = observations.groups
-        self._success = success
+    def __init__(self, env: "Env") -> None:
+        self._env = env
+        self._groups = env.observation_manager.groups
         self._final = {name: torch.zeros_like(group) for name, group in self._groups.items()}
-        self._final_success = torch.zeros_like(success)
+        self._final_success = torch.zeros_like(env.success)
 
     def write_final(self, broken: Tensor | None) -> None:
         """Keep success and the observations of this step, before a reset changes them.
@@ -39,7 +31,7 @@ class Outputs:
                 none. Their last observation is 0 where it is NaN, which a value times 0 would hand
                 on.
         """
-        self._final_success.copy_(self._success)
+        self._final_success.copy_(self._env.success)
         for name, final in self._final.items():
             group = self._groups[name]
             if broken is None:
@@ -58,6 +50,6 @@ class Outputs:
         obs = {name: group.clone() for name, group in self._groups.items()} | images
         final = {name: group.clone() for name, group in self._final.items()} | final_images
         extras = {"final_obs": final, "success": self._final_success.clone()}
-        ends = self._ends
-        reward = self._rewards.reward.clone()
+        ends = self._env.termination_manager
+        reward = self._env.reward_manager.reward.clone()
         return obs, reward, ends.terminated.clone(), ends.truncated.clone(), extras

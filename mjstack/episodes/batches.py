@@ -54,9 +54,11 @@ class Batch:
 
     def finite(self) -> Tensor:
         """Whether all that was recorded of each world is finite, shape ``(nworld,)``, bool."""
-        numbers = (rows for rows in self.rows.values() if rows.is_floating_point())
-        finite = (rows.isfinite() for rows in numbers)
-        parts = [rows.reshape(*rows.shape[:2], -1).all(2).all(0) for rows in finite]
+        parts = [
+            rows.isfinite().reshape(*rows.shape[:2], -1).all(2).all(0)
+            for rows in self.rows.values()
+            if rows.is_floating_point()
+        ]
         return torch.stack(parts).all(0)
 
     def select(self, name: str, worlds: Tensor) -> Tensor:
@@ -72,7 +74,6 @@ def play_batches(
     channels: Sequence[Channels] = (),
     *,
     cfg: Config | None = None,
-    sim: Simulation | None = None,
     simulate: Callable[[int], Simulation] | None = None,
     driver: Callable[[BatchPlan, Env], Driver] | None = None,
     observers: Callable[[BatchPlan], Sequence[Observer]] = lambda plan: (),
@@ -86,22 +87,21 @@ def play_batches(
         plans: The batches.
         channels: What is recorded.
         cfg: Configuration of the environment, if not that of a driven episode.
-        sim: The worlds, which the caller closes; by default they are made, and closed at the end.
-        simulate: Makes so many worlds, if not those of the stage's batch.
+        simulate: Makes so many worlds, if not those of the stage's batch; they are closed at the
+            end.
         driver: Makes the driver of worlds that have started, if not the configured one.
         observers: More observers of a batch.
         label: Name of the steps in the progress, before the seed.
     """
     cfg = cfg or stage.driven(stage.cfg.reset)
-    made: Simulation | None = None
+    sim: Simulation | None = None
     try:
         for plan in plans:
-            worlds = sim or made
-            if worlds is None or worlds.nworld != len(plan.worlds):
-                if made is not None:
-                    made.close()
-                worlds = made = (simulate or stage.batch_simulation)(len(plan.worlds))
-            env = Env(worlds, stage.index, cfg, check_faults=False)  # the check names lost worlds
+            if sim is None or sim.nworld != len(plan.worlds):
+                if sim is not None:
+                    sim.close()
+                sim = (simulate or stage.batch_simulation)(len(plan.worlds))
+            env = Env(sim, stage.index, cfg, check_faults=False)  # the check names lost worlds
             reset_worlds(env, plan.seed, plan.worlds)
             recorder = Recorder(*channels)
             episode = play_episode(
@@ -114,5 +114,5 @@ def play_batches(
             yield Batch(plan, env, episode, recorder.rows)
             recorder.rows.clear()
     finally:
-        if made is not None:
-            made.close()
+        if sim is not None:
+            sim.close()

@@ -97,8 +97,8 @@ class EpisodeRecord:
     @property
     def values(self) -> dict[str, np.ndarray]:
         """The measurements of the check, by name with unit."""
-        named = ((name.partition("."), array) for name, array in self.worlds.items())
-        return {name: array for (kind, _, name), array in named if kind == "value"}
+        names = [name for name in self.worlds if name.startswith("value.")]
+        return {name.removeprefix("value."): self.worlds[name] for name in names}
 
     @classmethod
     def join(cls, parts: Sequence["EpisodeRecord"]) -> "EpisodeRecord":

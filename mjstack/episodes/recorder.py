@@ -88,12 +88,12 @@ class Recorder(Observer):
 
 
 def _read_world(env: Env, driver: Driver) -> Read:
-    sim = env.sim
-    return lambda: {"qpos": sim.qpos[:1].double(), "phase": driver.phase[:1]}
+    qpos = env.sim.qpos
+    return lambda: {"qpos": qpos[:1].double()}
 
 
 class WorldRecorder(Recorder):
-    """Records positions and phases of world 0 at every step end."""
+    """Records positions of world 0 at every step end."""
 
     channels = (Channels(_read_world),)
 
@@ -101,11 +101,6 @@ class WorldRecorder(Recorder):
     def qpos(self) -> np.ndarray:
         """Positions, shape ``(steps, nq)``, float64; NaN in steps not made."""
         return self.rows["qpos"][:, 0].cpu().numpy()
-
-    @property
-    def phase(self) -> np.ndarray:
-        """Numbers of the phases, shape ``(steps,)``; -1 in steps not made."""
-        return self.rows["phase"][:, 0].cpu().numpy()
 
 
 def read_commands(env: Env, driver: Driver) -> Read:
@@ -146,6 +141,5 @@ class Snapshots(Recorder):
     @property
     def states(self) -> dict[int, State]:
         """The states by step; none before an episode."""
-        host = {name: rows.cpu().numpy() for name, rows in self.rows.items()}
-        rows = zip(*(host[name] for name in State._fields), strict=True) if host else ()
-        return {step: State(*row) for step, row in zip(self._steps, rows, strict=False)}
+        states = zip(*(rows.cpu().numpy() for rows in self.rows.values()), strict=True)
+        return {step: State(*state) for step, state in zip(self._steps, states, strict=False)}

@@ -25,7 +25,6 @@ STATE_BASED = "state_based"
 POLICY = "policy"
 FEEDBACK = (CLOSED_LOOP, STATE_BASED, POLICY)
 PHASELESS = (STATE_BASED, POLICY)
-StepHook = Callable[[int, Simulation], None]
 Reset = dict[str, TermCfg]
 NOMINAL: Reset = {"home": TermCfg(func="mjstack.mdp.reset.home")}
 
@@ -272,7 +271,7 @@ class Judge(Observer):
 class Hook(Observer):
     """Calls a function after every step, on the host."""
 
-    def __init__(self, function: StepHook) -> None:
+    def __init__(self, function: Callable[[int, Simulation], None]) -> None:
         """``function`` gets the step's number and the simulation."""
         self._function = function
 

@@ -105,7 +105,10 @@ class _Player:
         tally = self.tally
         missing = self._missing(seeds)
         try:
-            for batch in play_batches(run.stage, missing, sim=sim, observers=self._observe):
+            batches = play_batches(
+                run.stage, missing, simulate=lambda count: sim, observers=self._observe
+            )
+            for batch in batches:
                 tally.first = tally.first or batch.episode
                 part = _record(run.stage, batch, self._monitor)
                 record = EpisodeRecord.join(run.stage.ranks.gather(part))
@@ -182,12 +185,11 @@ def _worlds(tally: EpisodeTally, run: Run) -> Worlds:
             f"report.html shows {len(plotted):,} of the {len(bits):,} {tally.noun}: the first ones,"
             " and all that failed"
         )
-    measured = tally.records[0].values
     worlds = Worlds(
         names=tally.names(plotted),
         broken=[rules.broken(failed) for failed in bits[plotted].tolist()],
         rules=rules.texts,
-        values={name: tally.array(f"value.{name}")[plotted] for name in measured},
+        values={name: values[plotted] for name, values in tally.values.items()},
     )
     start = tally.array("start_qpos")[plotted]
     moving = run.page.worlds3d.get(tally.gate, [])

@@ -69,6 +69,11 @@ class EpisodeTally:
         return np.concatenate([record.worlds[name] for record in self.records])
 
     @property
+    def values(self) -> dict[str, np.ndarray]:
+        """The measurements of the check over the episodes of all seeds, by name with unit."""
+        return {name: self.array(f"value.{name}") for name in self.records[0].values}
+
+    @property
     def episodes(self) -> int:
         """Number of episodes played."""
         return sum(len(record.failed) for record in self.records)
@@ -108,9 +113,9 @@ class EpisodeTally:
             **rate_metrics(self.successes, self.episodes),
         }
         # NaN, which a diverged world has, is handed on
+        values = self.values
         for metric, (value, side) in self.check.summaries.items():
-            values = self.array(f"value.{value}")
-            metrics[metric] = float(values.min() if side == "min" else values.max())
+            metrics[metric] = float(getattr(values[value], side)())
         metrics["waypoint_error_max_m"] = float(self.array("measured.waypoint_error_m").max())
         for name in ("contacts", "constraint_rows"):
             metrics[f"peak_{name}_per_world"] = int(self.array(f"measured.peak_{name}").max())
@@ -148,13 +153,12 @@ class EpisodeTally:
             thresholds: More of them than the check's.
             tables: More of them than `tables`.
         """
-        failed = np.flatnonzero(self.array("failed"))
+        bits = self.array("failed")
+        failed = np.flatnonzero(bits)
         texts = self.check.rules.texts
-        which = self.check.rules.failing(self.array("failed"))
+        which = self.check.rules.failing(bits)
         broken = {texts[rule]: episodes for rule, episodes in which.items()}
-        values = [name for name in self.records[0].worlds if name.startswith("value.")]
-        measured = {name.removeprefix("value."): self.array(name) for name in values}
-        why, beyond = self.check.why(self.array("failed"), measured)
+        why, beyond = self.check.why(bits, self.values)
         reason = [*parts]
         if len(failed):
             counts = "; ".join(f"{texts[n]} in {len(which[n])}{words}" for n, words in why.items())

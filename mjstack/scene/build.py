@@ -4,6 +4,7 @@ set before compilation.
 
 import itertools
 import math
+from functools import partial
 from typing import Any
 
 import mujoco
@@ -73,9 +74,9 @@ def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> m
     # Bodies
     world = spec.worldbody
     _add_geom(world, "floor", "plane", size=[0, 0, 0.05], rgba=[0.32, 0.36, 0.42, 1])
-    place = {"pos": scene.table_center, "size": scene.table_half}
-    friction = scene.table_friction
-    _add_geom(world, TABLE, "box", **place, friction=friction, rgba=[0.72, 0.66, 0.58, 1])
+    table = _add_geom(world, TABLE, "box", pos=scene.table_center, size=scene.table_half)
+    table.friction = scene.table_friction
+    table.rgba = [0.72, 0.66, 0.58, 1]
     if scene.box is not None:
         _add_box(spec, scene.box, scene.table_top)
     for name, thing in scene.objects.items():
@@ -212,14 +213,17 @@ def _add_box(spec: mujoco.MjSpec, box: BoxCfg, top: float) -> None:
     half_x, half_y = box.half
     thick = 0.5 * box.wall
     up = 0.5 * box.height
-    parts = {
-        "floor": ([x, y, top + 0.5 * box.floor], [*box.half, 0.5 * box.floor], box.floor_solref)
-    }
+    color = [0.50, 0.55, 0.52, 1]
+    add = partial(_add_geom, spec.worldbody, shape="box", friction=box.friction, rgba=color)
+    half_floor = 0.5 * box.floor
+    add(
+        "box_floor",
+        pos=[x, y, top + half_floor],
+        size=[*box.half, half_floor],
+        solref=box.floor_solref,
+    )
     for name, i, j in (("near", -1, 0), ("far", 1, 0), ("right", 0, -1), ("left", 0, 1)):
         pos = [x + i * half_x + i * thick, y + j * half_y + j * thick, top + up]
         # The walls across x close the corners.
         size = [thick, half_y + box.wall, up] if i else [half_x, thick, up]
-        parts[name] = (pos, size, box.wall_solref)
-    for name, (pos, size, solref) in parts.items():
-        surface = {"friction": box.friction, "solref": solref, "rgba": [0.50, 0.55, 0.52, 1]}
-        _add_geom(spec.worldbody, f"box_{name}", "box", pos=pos, size=size, **surface)
+        add(f"box_{name}", pos=pos, size=size, solref=box.wall_solref)

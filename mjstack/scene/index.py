@@ -32,7 +32,7 @@ class Columns:
     def __init__(self, indices: Sequence[int] | np.ndarray, device: torch.device) -> None:
         """Take the columns."""
         self.indices = tuple(int(i) for i in indices)
-        first = self.indices[0] if self.indices else 0
+        first = min(self.indices, default=0)
         stop = first + len(self.indices)
         self.at: Rows = slice(first, stop)
         if self.indices != tuple(range(first, stop)):
@@ -128,11 +128,11 @@ class SceneIndex:
         self._tensors: dict[tuple[torch.device, torch.dtype], RobotTensors] = {}
         narrowest = min([robot.closed_width, *(thing.width for thing in scene.free.values())])
         self._closed = gripper_targets(model, robot, [narrowest])[0]
-        self.robot_qpos = np.array([model.jnt_qposadr[j] for j in joints])
-        self.robot_qvel = np.array([model.jnt_dofadr[j] for j in joints])
-        self.robot_range = model.jnt_range[joints].copy()
+        self.robot_qpos = model.jnt_qposadr[joints]
+        self.robot_qvel = model.jnt_dofadr[joints]
+        self.robot_range = model.jnt_range[joints]
         self.ctrl = np.array([model.actuator(name).id for name in robot.joints])
-        self.ctrl_range = model.actuator_ctrlrange[self.ctrl].copy()
+        self.ctrl_range = model.actuator_ctrlrange[self.ctrl]
         self.n_arm = len(robot.arm_joints)
         self.grasp_sites = [model.site(name).id for name in robot.grasp_sites]
         free = {name: model.joint(name) for name in scene.free}
@@ -180,10 +180,8 @@ class SceneIndex:
             columns = [Columns(a, device) for a in addresses]
             r = self._robot
             poses = (r.home, r.start, r.gripper_open, self._closed)
-            numbers = [
-                torch.as_tensor(np.asarray(values, dtype=float), dtype=dtype, device=device)
-                for values in (self.robot_range, self.ctrl_range, *poses)
-            ]
+            ranges = (self.robot_range, self.ctrl_range)
+            numbers = [torch.tensor(n, dtype=dtype, device=device) for n in (*ranges, *poses)]
             numbers.append(numbers[-2] - numbers[-1])
             self._tensors[key] = RobotTensors(*columns, *numbers)  # type: ignore[arg-type]
         return self._tensors[key]
@@ -325,9 +323,11 @@ def lowest_height(
     radius = model.geom_size[geoms, 0]
     middle, half = model.geom_aabb[geoms].reshape(-1, 2, 3).swapaxes(0, 1)
     # Of round shapes the box is only what lies between the balls or discs: half a length in z.
+    ball = np.isin(kind, (g.mjGEOM_SPHERE, g.mjGEOM_CAPSULE))
+    disc = kind == g.mjGEOM_CYLINDER
     half = half.copy()
-    half[np.isin(kind, (g.mjGEOM_SPHERE, g.mjGEOM_CAPSULE, g.mjGEOM_CYLINDER))] = 0.0
-    long = np.isin(kind, (g.mjGEOM_CAPSULE, g.mjGEOM_CYLINDER))
+    half[ball | disc] = 0.0
+    long = disc | (kind == g.mjGEOM_CAPSULE)
     half[long, 2] = model.geom_size[geoms[long], 1]
     axes = np.zeros((len(geoms), 3, 3))
     for matrix, quat in zip(axes, model.geom_quat[geoms], strict=True):
@@ -344,8 +344,7 @@ def lowest_height(
     at = xpos[..., 2].index_select(1, body).float() + (up * constant(center)).sum(-1)
     reach = (
         (along.abs() * constant(half)).sum(-1)
-        + constant(radius * np.isin(kind, (g.mjGEOM_SPHERE, g.mjGEOM_CAPSULE)))
-        + constant(radius * (kind == g.mjGEOM_CYLINDER))
-        * torch.linalg.vector_norm(along[..., :2], dim=-1)
+        + constant(radius * ball)
+        + constant(radius * disc) * torch.linalg.vector_norm(along[..., :2], dim=-1)
     )
     return (at - reach).amin(1)
