@@ -17,7 +17,7 @@ from environments import REBOT_LATER, GetStage, MakeSim
 from recordings import Recorder, World, feed
 
 from mjstack.drivers.driver import Driver
-from mjstack.episodes.recorder import CommandRecorder
+from mjstack.episodes import recorder
 from mjstack.episodes.rollout import play_episode
 
 RULES = rules_of("stack")
@@ -44,7 +44,7 @@ def drive(get_stage: GetStage, make_sim: MakeSim) -> Callable[..., list[set[str]
     @cache
     def expert(robot: str) -> torch.Tensor:
         stage = get_stage(robot)
-        commands = CommandRecorder()
+        commands = recorder.Recorder(recorder.COMMANDS)
         stage.play(make_sim("native", NWORLD, robot=robot), stage.cfg.reset, [commands])
         return commands.rows["ctrl"].clone()
 

@@ -138,9 +138,8 @@ def test_the_batch_gates_episode_is_the_first_repetition(
     first = Episode(result=result, **arrays, timing=spent, description="some")
     more = [replace(first, timing=replace(spent, seconds=2.0)) for _ in range(played)]
     monkeypatch.setattr(episode, "_play", lambda *_: more.pop())
-    measured = episode.measure_episode(
-        run.stage, sim, first, seconds=100.0, repetitions=repetitions, meter=EnergyMeter("cpu")
-    )
+    limits = {"seconds": 100.0, "repetitions": repetitions}
+    measured = episode.measure_episode(run.stage, sim, first, **limits)
     assert not more
     assert measured.samples["seconds"] == [1.0] + [2.0] * played
     assert measured.facts["of_the_batch_gate"] == 1
@@ -375,7 +374,6 @@ def test_the_parts_play_one_trajectory(monkeypatch: Patch) -> None:
         steps=4,
         repetitions=3,
         seconds=math.inf,
-        meter=EnergyMeter("cpu"),
         advance=lambda what, done, total: None,
         share=1.0,
         name="env_step",
@@ -448,7 +446,7 @@ def test_energy_is_that_of_the_stretches_alone(monkeypatch: Patch) -> None:
         "gpu_power_mean_w": pytest.approx(20.0),
         "gpu_energy_j": pytest.approx(200.0),
     }
-    energy.clear()
+    energy = meter(monkeypatch, nvml)
     assert energy.metrics() == {}
     assert "too short" in energy.missing
 

@@ -50,7 +50,6 @@ def measure_env_step(
     steps: int,
     repetitions: int,
     seconds: float,
-    meter: EnergyMeter,
     advance: Advance,
     share: float,
     name: str,
@@ -62,7 +61,6 @@ def measure_env_step(
         steps: Control steps per repetition.
         repetitions: Measured repetitions; one before them warms up.
         seconds: Shortens the repetitions so that all of them take about this long [s].
-        meter: Measures the energy of the whole steps.
         advance: Shows progress.
         share: Share of the action range from which actions are sampled uniformly, about its middle.
         name: The measurement's name.
@@ -85,6 +83,7 @@ def measure_env_step(
     # The repetitions; the first one warms up
     times: list[list[float]] = []
     ended = 0.0
+    meter = EnergyMeter(str(env.device))
     parts.play(steps, NO_METER)
     for repetition in range(repetitions):
         spent, episodes = parts.play(steps, meter)

@@ -20,7 +20,7 @@ from mjstack.bench.timing import (
 )
 from mjstack.drivers.driver import OpenLoopDriver
 from mjstack.drivers.open_loop import JointTrajectory
-from mjstack.episodes.recorder import CommandRecorder
+from mjstack.episodes.recorder import COMMANDS, Recorder
 from mjstack.episodes.rollout import FEEDBACK, Episode
 from mjstack.episodes.stage import Stage
 from mjstack.errors import name_worlds
@@ -37,7 +37,6 @@ def measure_episode(
     *,
     seconds: float,
     repetitions: int,
-    meter: EnergyMeter,
     step_seconds: float = 0.0,
 ) -> Measurement:
     """Measure whole episodes with their check, alternating with bare steps on MJWarp.
@@ -52,7 +51,6 @@ def measure_episode(
         before: The episode of gate *batch*, if it was timed.
         seconds: Time budget [s].
         repetitions: Most repetitions.
-        meter: Measures the energy.
         step_seconds: About how long a control step takes [s].
     """
     cfg = stage.cfg
@@ -68,7 +66,7 @@ def measure_episode(
         estimate *= 2
         rounds = max(1, rounds)
     began = time.perf_counter()
-    meter.clear()
+    meter = EnergyMeter(str(sim.device))
     for number in range(rounds):
         if time.perf_counter() - began + estimate > seconds:
             break
@@ -158,10 +156,10 @@ def _play(stage: Stage, sim: Simulation, meter: EnergyMeter, out: Measurement) -
     cfg = stage.cfg
     mjwarp = sim.backend == "mjwarp"
     keep = mjwarp and cfg.controller.name in FEEDBACK
-    recorders = [CommandRecorder()] if keep else []
+    recorders = [Recorder(COMMANDS)] if keep else []
     episode = stage.play(sim, cfg.reset, [*recorders, EnergyObserver(meter)])
     if mjwarp:
-        commands = recorders[0].commands if keep else None
+        commands = recorders[0].rows["ctrl"] if keep else None
         bare, problem = play_bare(stage, cast("MjwarpSimulation", sim), commands)
         out.problem = out.problem or problem
         out.samples.setdefault("bare_seconds", []).append(bare)

@@ -58,7 +58,6 @@ def measure_physics(
     *,
     seconds: float,
     repetitions: int,
-    meter: EnergyMeter,
 ) -> Measurement:
     """Measure physics steps under a held joint target, the object in hand.
 
@@ -82,7 +81,7 @@ def measure_physics(
 
     # The repetitions
     steps = steps_that_fit(t.steps, seconds, repetitions * physics.warm_up())
-    meter.clear()
+    meter = EnergyMeter(str(sim.device))
     times = []
     for repetition in range(repetitions):
         times.append(physics.play(steps, meter))

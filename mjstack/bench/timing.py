@@ -31,7 +31,8 @@ class EnergyMeter:
     def __init__(self, device: str) -> None:
         """Open the counter of ``cpu`` or ``cuda:N``."""
         self._counter: Callable[[], float] | None = None  # [mJ]
-        self.clear()
+        self._joules = self._seconds = 0.0
+        self._stretches = 0
         self.reason = ""
         if device == "cpu":
             return
@@ -47,11 +48,6 @@ class EnergyMeter:
             self.reason = f"NVML: {error}"
         else:
             self._counter = partial(pynvml.nvmlDeviceGetTotalEnergyConsumption, handle)
-
-    def clear(self) -> None:
-        """Start from zero."""
-        self._joules = self._seconds = 0.0
-        self._stretches = 0
 
     def start(self) -> None:
         """Begin a stretch of work, the device idle."""

@@ -110,19 +110,9 @@ def read_commands(env: Env, driver: Driver) -> Read:
     return lambda: {"ctrl": columns.read(ctrl).float()}
 
 
-class CommandRecorder(Recorder):
-    """Records the joint targets of all worlds.
-
-    Memory: ``steps * nworld * 4 * nu`` bytes on the device, 0.79 GB for 2,000 steps of 16,384
-    worlds with six joint targets.
-    """
-
-    channels = (Channels(read_commands),)
-
-    @property
-    def commands(self) -> Tensor:
-        """Shape ``(steps, nworld, nu)``, float32."""
-        return self.rows["ctrl"]
+COMMANDS = Channels(read_commands)
+"""The joint targets of all worlds: ``steps * nworld * 4 * nu`` bytes on the device, 0.79 GB for
+2,000 steps of 16,384 worlds with six joint targets."""
 
 
 def _read_state(env: Env, driver: Driver) -> Read:

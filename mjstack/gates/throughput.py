@@ -11,7 +11,7 @@ from typing import Any
 from mjstack.bench.env_step import measure_env_step
 from mjstack.bench.episode import measure_episode
 from mjstack.bench.physics import measure_physics
-from mjstack.bench.timing import EnergyMeter, Measurement
+from mjstack.bench.timing import Measurement
 from mjstack.config.schema import Backend
 from mjstack.envs import build_env, decided_every_step, without_images
 from mjstack.episodes.run import Run, each_rank
@@ -57,7 +57,7 @@ def _measure(run: Run, gate: str, backend: Backend, device: str) -> GateResult:
     began = time.perf_counter()
     on_cuda = device.startswith("cuda")
     seconds = t.max_seconds if on_cuda else t.cpu_max_seconds
-    limits = {"seconds": seconds, "repetitions": t.repetitions, "meter": EnergyMeter(device)}
+    limits = {"seconds": seconds, "repetitions": t.repetitions}
     result.metrics = {"worlds": cfg.nworld, "cpu_count": os.cpu_count() or 1}
 
     # The measurements
