@@ -123,7 +123,7 @@ def test_recommended_pools_hold_what_was_seen(margin: float) -> None:
         seen = peaks(contacts=pool, pairs=6 * pool, ccd_pairs=pool // 2, nworld=3)
         found = recommend_sizes(seen, margin, "")
         assert found.nconmax >= 2 * pool * margin
-        assert 3 * found.convex_room >= pool // 2
+        assert 3 * found.as_kwargs()["nccdmax"] >= pool // 2
         assert found.nccdmax is not None
         assert found.nccdmax <= found.nconmax
         assert max(8, 2 * pool * margin + 8) >= found.nconmax
@@ -218,7 +218,7 @@ def test_convex_room_is_within_the_pool(
     cfg = load_config([])
     model = get_stage("so101").model
     sim = make_simulation(model, cfg, 3, backend=Backend.mjwarp, device="cpu", sizes=sizes)
-    assert sizes.convex_room == room
+    assert sizes.as_kwargs()["nccdmax"] == room
     assert sim._d.naccdmax == 3 * room  # type: ignore[attr-defined]
 
 

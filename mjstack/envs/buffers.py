@@ -145,7 +145,7 @@ class Workload:
 
 def play_workload(
     cfg: Config,
-    make: Callable[[BatchSizes], Simulation],
+    make: Callable[..., Simulation],
     play: Callable[[Simulation], np.ndarray],
     sizes: BatchSizes | None = None,
 ) -> Workload:
@@ -157,7 +157,7 @@ def play_workload(
 
     Args:
         cfg: The configuration.
-        make: Makes the worlds.
+        make: Makes the worlds with some ``sizes``.
         play: Plays in them, and returns the bits of the rules that each world broke.
         sizes: Of the buffers.
 
@@ -166,7 +166,7 @@ def play_workload(
     """
     room = sizes or resolve_measuring_sizes(cfg)
     for growths_left in reversed(range(_GROWTHS + 1)):
-        sim = make(room)
+        sim = make(sizes=room)
         try:
             failed = play(sim)
             run = Workload(
@@ -248,13 +248,15 @@ def probe_env_sizes(cfg: Config, model: mujoco.MjModel, nworld: int, device: str
     """
     c = cfg.gate.capacity
     worlds = min(nworld, c.probe_nworld if device.startswith("cuda") else c.cpu_nworld)
-
-    def make(sizes: BatchSizes) -> Simulation:
-        fields = required_fields(cfg.reset)
-        return make_simulation(
-            model, cfg, worlds, backend=Backend.mjwarp, device=device, fields=fields, sizes=sizes
-        )
-
+    make = partial(
+        make_simulation,
+        model,
+        cfg,
+        worlds,
+        backend=Backend.mjwarp,
+        device=device,
+        fields=required_fields(cfg.reset),
+    )
     with torch.no_grad():
         probe = play_workload(cfg, make, partial(random_actions, cfg, c.probe_steps))
     source = f"{c.probe_steps} steps of random actions in {worlds} worlds"

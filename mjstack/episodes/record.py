@@ -117,8 +117,9 @@ class EpisodeRecord:
         )
 
     @classmethod
-    def read(cls, folder: Path, seed: int, gate: str = "batch") -> "EpisodeRecord | None":
-        """Read the record of a gate's seed in a run's folder; None if the gate did not get there.
+    def read(cls, folder: Path | None, seed: int, gate: str = "batch") -> "EpisodeRecord | None":
+        """Read the record of a gate's seed in a run's folder; None if the gate did not get there,
+        or there is no folder.
 
         Args:
             folder: The folder.
@@ -128,8 +129,8 @@ class EpisodeRecord:
         Raises:
             FolderError: The file cannot be read.
         """
-        path = folder / record_name(gate, seed)
-        if not path.exists():
+        path = folder and folder / record_name(gate, seed)
+        if path is None or not path.exists():
             return None
         with reading(path, "Run the gate again"):
             arrays = read_npz(path)

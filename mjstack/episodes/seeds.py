@@ -135,8 +135,10 @@ class _Player:
     def _missing(self, seeds: range) -> Iterator[BatchPlan]:
         """The seeds that no earlier call of the run has played; its records are counted."""
         run = self.run
+        folder = run.folder if run.cfg.resume is not None else None
         for seed in seeds:
-            record = run.stage.ranks.from_first(partial(self._read, seed))
+            read = partial(EpisodeRecord.read, folder, seed, self.tally.gate)
+            record = run.stage.ranks.from_first(read)
             if record is None:
                 yield BatchPlan(seed, run.stage.worlds)
                 continue
@@ -164,13 +166,6 @@ class _Player:
                 f" {len(record.failed)} worlds succeeded, {tally.successes} of {tally.episodes}"
                 " so far"
             )
-
-    def _read(self, seed: int) -> EpisodeRecord | None:
-        """The results of a seed that an earlier call of the run has left."""
-        folder = self.run.folder
-        if self.run.cfg.resume is None or folder is None:
-            return None
-        return EpisodeRecord.read(folder, seed, self.tally.gate)
 
 
 def _worlds(tally: EpisodeTally, run: Run) -> Worlds:

@@ -135,9 +135,9 @@ class SceneIndex:
         self.ctrl_range = model.actuator_ctrlrange[self.ctrl]
         self.n_arm = len(robot.arm_joints)
         self.grasp_sites = [model.site(name).id for name in robot.grasp_sites]
-        free = {name: model.joint(name) for name in scene.free}
         self.objects = {
-            name: (int(joint.qposadr[0]), int(joint.dofadr[0])) for name, joint in free.items()
+            name: (int(model.joint(name).qposadr[0]), int(model.joint(name).dofadr[0]))
+            for name in scene.free
         }
         self.object_qpos = [qpos for qpos, _ in self.objects.values()]
         self.object_qvel = [qvel for _, qvel in self.objects.values()]

@@ -21,11 +21,10 @@ from mjstack.sim.fused.step import RELEASES, StepPlan, disagreement, plan_step, 
 from mjstack.sim.graph import StepGraph, side_by_side
 from mjstack.sim.mjwarp_cameras import MjwarpCameras
 from mjstack.sim.model_fields import PLACING_FIELDS, Fields, check_fields
-from mjstack.sim.mujoco_warp import mjw
+from mjstack.sim.mujoco_warp import mjw, torch_stream_scope, wp
 from mjstack.sim.simulation import Simulation, named_options
 from mjstack.sim.sizes import BatchSizes
 from mjstack.sim.usage import Usage
-from mjstack.sim.warp_setup import torch_stream_scope, wp
 
 log = logging.getLogger(__name__)
 _log_once = cache(log.info)  # in a process

@@ -11,8 +11,7 @@ from typing_extensions import override
 
 from mjstack.config.schema import CameraCfg
 from mjstack.sim.cameras import PREFIXES, VISIBLE_GROUPS, Cameras, Masks
-from mjstack.sim.mujoco_warp import mjw
-from mjstack.sim.warp_setup import torch_stream_scope, wp
+from mjstack.sim.mujoco_warp import mjw, torch_stream_scope, wp
 
 _AWAY = 1e6  # m above everything: where cameras that draw nothing look up from
 TILE = 8

@@ -1,6 +1,6 @@
 """Model fields that may differ from world to world, and what native MuJoCo derives from them."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import mujoco
 import numpy as np
@@ -80,49 +80,45 @@ class Fields(dict[str, Tensor]):
             raise MjstackError(REBOUND.format(f"sim.fields['{name}']"))
 
 
-class SimpleBodies:
-    """Keeps ``dof_M0`` of simple bodies up to date with per-world mass, inertia and armature.
+SIMPLE_FIELDS = ("body_mass", "body_inertia", "dof_armature")
+
+
+def simple_inertia(
+    model: mujoco.MjModel, fields: Mapping[str, np.ndarray], dof_M0: np.ndarray
+) -> Callable[[], None]:
+    """A function that brings ``dof_M0`` of simple bodies up to date with per-world mass, inertia
+    and armature.
 
     Native MuJoCo does not compute the mass matrix of a body that it calls simple, such as a free
-    cube: it reads ``dof_M0``, which the compiler made from mass, inertia and armature. A body whose
-    mass is changed would weigh more and resist no more, so ``dof_M0`` has to follow.
+    cube: it reads ``dof_M0``, which the compiler made from `SIMPLE_FIELDS`. A body whose mass is
+    changed would weigh more and resist no more, so ``dof_M0`` has to follow.
+
+    Args:
+        model: The compiled model.
+        fields: Every world's values of the fields that differ.
+        dof_M0: Diagonal of the mass matrix at qpos0 [kg, kg m2], shape ``(nworld, nv)``, which the
+            function writes.
     """
+    dofs = np.flatnonzero(model.dof_simplenum)
+    bodies = model.dof_bodyid[dofs]
+    mass, inertia, armature = (
+        fields.get(name, getattr(model, name)[None]) for name in SIMPLE_FIELDS
+    )
+    # A simple body's inertial step is its own frame, so inertia is diagonal there: M0 =
+    # armature + a * mass + b . inertia.
+    joint = model.dof_jntid[dofs]
+    kind = model.jnt_type[joint]
+    number = dofs - model.jnt_dofadr[joint]  # of the degree of freedom in its joint
+    axis = model.jnt_axis[joint]
+    free = (kind == mujoco.mjtJoint.mjJNT_FREE) & (number < 3)
+    slides = (kind == mujoco.mjtJoint.mjJNT_SLIDE) | free
+    hinges = kind == mujoco.mjtJoint.mjJNT_HINGE
+    lever = (np.cross(axis, model.jnt_pos[joint]) ** 2).sum(axis=1)
+    a = np.where(hinges, lever, slides)
+    b = np.where(hinges[:, None], axis**2, ~slides[:, None] * np.eye(3)[number % 3])
 
-    FIELDS = ("body_mass", "body_inertia", "dof_armature")
+    def update() -> None:
+        spin = (inertia[:, bodies] * b).sum(-1)
+        dof_M0[:, dofs] = armature[:, dofs] + mass[:, bodies] * a + spin
 
-    def __init__(
-        self, model: mujoco.MjModel, fields: Mapping[str, np.ndarray], dof_M0: np.ndarray
-    ) -> None:
-        """Find the degrees of freedom and what their inertia is made of.
-
-        Args:
-            model: The compiled model.
-            fields: Every world's values of the fields that differ.
-            dof_M0: Diagonal of the mass matrix at qpos0 [kg, kg m2], shape ``(nworld, nv)``, which
-                `update` writes.
-        """
-        self._dof_M0 = dof_M0
-        self._dofs = np.flatnonzero(model.dof_simplenum)
-        self._bodies = model.dof_bodyid[self._dofs]
-        self._sources = [fields.get(name, getattr(model, name)[None]) for name in self.FIELDS]
-        # A simple body's inertial step is its own frame, so inertia is diagonal there: M0 =
-        # armature + a * mass + b . inertia.
-        joint = model.dof_jntid[self._dofs]
-        kind = model.jnt_type[joint]
-        number = self._dofs - model.jnt_dofadr[joint]  # of the degree of freedom in its joint
-        axis = model.jnt_axis[joint]
-        free = (kind == mujoco.mjtJoint.mjJNT_FREE) & (number < 3)
-        slides = (kind == mujoco.mjtJoint.mjJNT_SLIDE) | free
-        hinges = kind == mujoco.mjtJoint.mjJNT_HINGE
-        lever = (np.cross(axis, model.jnt_pos[joint]) ** 2).sum(axis=1)
-        self._a = np.where(hinges, lever, slides)
-        turns = ~slides[:, None] * np.eye(3)[number % 3]
-        self._b = np.where(hinges[:, None], axis**2, turns)
-
-    def update(self) -> None:
-        """Compute dof_M0 from what the fields hold now."""
-        mass, inertia, armature = self._sources
-        spin = (inertia[:, self._bodies] * self._b).sum(-1)
-        self._dof_M0[:, self._dofs] = (
-            armature[:, self._dofs] + mass[:, self._bodies] * self._a + spin
-        )
+    return update

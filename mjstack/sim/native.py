@@ -2,7 +2,7 @@
 
 import copy
 import platform
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -16,7 +16,7 @@ from mjstack.errors import MjstackError, first_line
 from mjstack.interrupt import check_interrupt
 from mjstack.process import available_cores
 from mjstack.sim.cameras import Cameras
-from mjstack.sim.model_fields import Fields, SimpleBodies, check_fields
+from mjstack.sim.model_fields import SIMPLE_FIELDS, Fields, check_fields, simple_inertia
 from mjstack.sim.native_cameras import NativeCameras
 from mjstack.sim.simulation import Overflow, Simulation, named_options
 
@@ -121,8 +121,9 @@ class NativeSimulation(Simulation):
         self.fields = Fields(
             {name: torch.from_numpy(values) for name, values in self._fields.items()}
         )
-        derive = not self._fields.keys().isdisjoint(SimpleBodies.FIELDS) and m.dof_simplenum.any()
-        self._simple = SimpleBodies(m, self._fields, batch.expand("dof_M0")) if derive else None
+        self._derive: Callable[[], None] | None = None
+        if not self._fields.keys().isdisjoint(SIMPLE_FIELDS):
+            self._derive = simple_inertia(m, self._fields, batch.expand("dof_M0"))
         self.reset()
 
     @override
@@ -204,8 +205,8 @@ class NativeSimulation(Simulation):
     def _compute(self, n: int, kinematics: bool) -> None:
         """Step every world n times, 0 meaning forward."""
         batch = self.batch
-        if self._simple is not None:
-            self._simple.update()
+        if self._derive is not None:
+            self._derive()
         for single, values in self._single:
             single[:] = values
         finite = self._finite_worlds(self._derived)

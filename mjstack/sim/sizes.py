@@ -24,16 +24,14 @@ class BatchSizes:
     nccdmax: int | None = None
     source: str = field(default="the configuration", compare=False)
 
-    @property
-    def convex_room(self) -> int:
-        """Convex collisions per world that fit. They are some of the pairs in the contact pool, so
-        more room than that has is never used, and MJWarp refuses it.
-        """
-        return min(self.nconmax, self.nccdmax or self.nconmax)
-
     def as_kwargs(self) -> dict[str, int]:
-        """Arguments for ``mujoco_warp.make_data``."""
-        return {"nconmax": self.nconmax, "njmax": self.njmax, "nccdmax": self.convex_room}
+        """Arguments for ``mujoco_warp.make_data``.
+
+        Convex collisions are some of the pairs in the contact pool: more room than that has is
+        never used, and MJWarp refuses it.
+        """
+        convex = min(self.nconmax, self.nccdmax or self.nconmax)
+        return {"nconmax": self.nconmax, "njmax": self.njmax, "nccdmax": convex}
 
     def as_overrides(self) -> str:
         """The same on the command line: ``batch.nconmax=40 batch.njmax=184``."""

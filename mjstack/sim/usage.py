@@ -9,10 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mjstack.sim.mujoco_warp import mjw
+from mjstack.sim.mujoco_warp import mjw, wp
 from mjstack.sim.simulation import LOST_PHYSICS
 from mjstack.sim.sizes import BatchSizes
-from mjstack.sim.warp_setup import wp
 
 
 class Usage:

@@ -8,8 +8,7 @@ from functools import partial
 import mujoco
 
 from mjstack.sim.fused.launch import SHARED_BYTES, arguments, launch, padded_rows
-from mjstack.sim.mujoco_warp import mjw
-from mjstack.sim.warp_setup import wp
+from mjstack.sim.mujoco_warp import mjw, wp
 
 MAX_NV = 64
 

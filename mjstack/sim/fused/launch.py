@@ -14,8 +14,7 @@ from typing import Any
 
 import mujoco
 
-from mjstack.sim.mujoco_warp import mjw
-from mjstack.sim.warp_setup import wp
+from mjstack.sim.mujoco_warp import mjw, wp
 
 SHARED_BYTES = 48 * 1024 - 256
 """Shared memory that every block may have, less Warp's own [bytes]."""

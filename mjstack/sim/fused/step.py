@@ -6,13 +6,12 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 import torch
-import warp as wp
 from torch import Tensor
 
 from mjstack.errors import first_line
 from mjstack.sim.fused import constraints, smooth
 from mjstack.sim.graph import side_by_side
-from mjstack.sim.mujoco_warp import mjw
+from mjstack.sim.mujoco_warp import mjw, wp
 
 RELEASES = ("4.0.0",)  # of mujoco-warp that docs/design.md, "A new release", was done with
 _CONVERGED = 1e-8  # tolerance of the solver that float32 can still tell
