@@ -395,8 +395,9 @@ def test_worst_regions_of_made_up_episodes() -> None:
     corner = (places[:, 0, 0] >= 0.34) & (places[:, 0, 0] < 0.36) & (places[:, 0, 1] < -0.12)
     turned = (radial_yaw_deg(places[:, 1]) >= 30.0) & (radial_yaw_deg(places[:, 1]) < 45.0)
     succeeded = ~(corner & (rng.random(n) < 0.9)) & ~(turned & (rng.random(n) < 0.5))
-    cells = {"cell": 0.02, "yaw_cell_deg": 15.0, "episodes": 20, "objects": ("red", "blue")}
-    regions = find_regions(places, succeeded, **cells)
+    cfg = load_config(["gate.success.worst_regions=2"]).gate.success
+    assert (cfg.cell, cfg.yaw_cell_deg, cfg.cell_episodes) == (0.02, 15.0, 20)
+    regions = find_regions(cfg, places, succeeded, ("red", "blue"))
     assert [region["rate"] for region in regions] == sorted(region["rate"] for region in regions)
     assert all(region["episodes"] >= 20 for region in regions)
     assert not any(region["object"] == "red" and region.get("x_min_m") == 0.4 for region in regions)
@@ -419,7 +420,7 @@ def test_worst_regions_of_made_up_episodes() -> None:
     assert len({str(region) for region in regions}) == len(regions)
     # A region without a failure has no place among the worst
     flawless = worst | {"object": "blue", "succeeded": worst["episodes"]}
-    (table,) = regions_table(load_config(["gate.success.worst_regions=2"]), [worst, flawless])
+    (table,) = regions_table(cfg, [worst, flawless])
     assert table.title == "Worst regions of at least 20 episodes (1 of 1 with a failure)"
     assert [row[0] for row in table.rows] == [text]
 

@@ -89,8 +89,8 @@ def build_env(
     """
     if first_world < 0:
         raise ArgumentError("first_world", first_world, "an integer of at least 0")
-    model = build_model(cfg) if model is None else model
-    nworld = cfg.nworld if nworld is None else nworld
+    model = model or build_model(cfg)
+    nworld = nworld or cfg.nworld
     backend, device = resolve_backend(cfg, backend, device)
     if sizes is None and cfg.batch.auto and backend is Backend.mjwarp:
         sizes = probe_env_sizes(cfg, model, nworld, device)

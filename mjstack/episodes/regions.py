@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mjstack.config.schema import Config
+from mjstack.config.schema import SuccessGateCfg
 from mjstack.episodes.record import REGIONS
 from mjstack.episodes.tally import rate_cells
 from mjstack.files import to_csv, write_atomic
@@ -38,39 +38,32 @@ def radial_yaw_deg(places: np.ndarray) -> np.ndarray:
 
 
 def find_regions(
-    places: np.ndarray,
-    succeeded: np.ndarray,
-    *,
-    cell: float,
-    yaw_cell_deg: float,
-    episodes: int,
-    objects: Sequence[str],
+    cfg: SuccessGateCfg, places: np.ndarray, succeeded: np.ndarray, objects: Sequence[str]
 ) -> list[Region]:
     """Cells of each object's position, of its direction, and of both, that have enough episodes;
-    the lowest rate first.
+    the lowest rate first. In x and y they begin at multiples of their width; the last one in
+    direction ends at 90.
 
     Args:
+        cfg: The configuration of the gate, with their widths and the least number of episodes.
         places: x and y [m] and rotation about z [rad] of each object at the start, shape ``(n,
             objects, 3)``.
         succeeded: Whether each episode was, shape ``(n,)``, bool.
-        cell: Width of a cell in x and y [m]; cells begin at multiples of it.
-        yaw_cell_deg: Width in direction [deg]; the last one ends at 90.
-        episodes: Least number of episodes.
         objects: Names of the objects.
     """
     out: list[Region] = []
-    widths = np.array([cell, cell, yaw_cell_deg])
+    widths = np.array([cfg.cell, cfg.cell, cfg.yaw_cell_deg])
     ends = np.array([math.inf, math.inf, 90.0])
     for number, name in enumerate(objects):
         yaw = radial_yaw_deg(places[:, number])
         keys = np.floor(np.column_stack((places[:, number, :2], yaw)) / widths + _EDGE)
-        keys[keys[:, 2] * yaw_cell_deg >= 90.0, 2] = 0.0  # on the edge of 90, which is 0
+        keys[keys[:, 2] * cfg.yaw_cell_deg >= 90.0, 2] = 0.0  # on the edge of 90, which is 0
         for axes in ([0, 1], [2], [0, 1, 2]):
             cells, which = np.unique(keys[:, axes], axis=0, return_inverse=True)
             for row, key in enumerate(cells):
                 outcomes = succeeded[which.ravel() == row]
                 n = len(outcomes)
-                if n < episodes:
+                if n < cfg.cell_episodes:
                     continue
                 k = int(outcomes.sum())
                 edges = (key * widths[axes], np.minimum((key + 1.0) * widths[axes], ends[axes]))
@@ -91,19 +84,18 @@ def describe_region(region: Region) -> str:
     return f"{region['object']}: {', '.join(parts)}"
 
 
-def regions_table(cfg: Config, regions: list[Region]) -> list[Table]:
+def regions_table(cfg: SuccessGateCfg, regions: list[Region]) -> list[Table]:
     """The regions with the lowest rates; no table where none has a failure."""
-    t = cfg.gate.success
     failing = [r for r in regions if r["succeeded"] < r["episodes"]]
     if not failing:
         return []
     rows = []
-    for region in failing[: t.worst_regions]:
+    for region in failing[: cfg.worst_regions]:
         n, k = region["episodes"], region["succeeded"]
         rows.append([describe_region(region), str(n), str(k), *rate_cells(k, n)])
     title = (
-        f"Worst regions of at least {t.cell_episodes} episodes ({len(rows)} of {len(failing)} with"
-        " a failure)"
+        f"Worst regions of at least {cfg.cell_episodes} episodes ({len(rows)} of {len(failing)}"
+        " with a failure)"
     )
     header = ["where the object started", "episodes", "succeeded", "rate", "95 % interval"]
     return [Table(title=title, header=header, rows=rows)]

@@ -4,7 +4,6 @@ import logging
 import socket
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -68,15 +67,14 @@ def play_seeds(
         replayed=cfg.job.name == "gates",
     )
     run.records[gate] = tally.records
+    path = folder / f"motion_{gate}.npz" if folder is not None and run.page.motion else None
     with closing(run.stage.batch_simulation(len(run.stage.worlds))) as sim:
         tally.notes = {
             "backend": sim.description,
             "sizes": str(sim.sizes or "native MuJoCo has no fixed buffers"),
         }
-        motion = folder / f"motion_{gate}.npz" if folder is not None and run.page.motion else None
-        player = _Player(run, tally, signs, observers, motion)
         try:
-            player.play(range(cfg.seed, cfg.seed + count), sim)
+            _play(run, tally, range(cfg.seed, cfg.seed + count), sim, path, signs, observers)
         finally:
             tally.write_failing()  # once: it grows with the seeds
     if tally.again:
@@ -87,85 +85,80 @@ def play_seeds(
     return tally
 
 
-@dataclass
-class _Player:
-    """Plays seeds into a tally; ``path`` is the file of worlds in motion, None if there is none,
-    and the other attributes are arguments of `play_seeds`.
+def _play(
+    run: Run,
+    tally: EpisodeTally,
+    seeds: range,
+    sim: Simulation,
+    path: Path | None,
+    signs: bool,
+    observers: Callable[[int], Sequence[Observer]],
+) -> None:
+    """Play or read back seed after seed, and count them. ``path`` is the file of worlds in motion,
+    those of the first seed, None if there is none; the last two arguments are as of `play_seeds`.
     """
+    monitor = FailureMonitor() if signs else None
+    motion = motion_recorder(run.cfg.timing.step_dt)
 
-    run: Run
-    tally: EpisodeTally
-    signs: bool
-    observers: Callable[[int], Sequence[Observer]]
-    path: Path | None
+    def observe(plan: BatchPlan) -> list[Observer]:
+        recorder = motion if path is not None and plan.seed == seeds[0] else None
+        return [*filter(None, (monitor, *observers(plan.seed), recorder))]
 
-    def play(self, seeds: range, sim: Simulation) -> None:
-        """Play or read back seed after seed, and count them."""
-        run = self.run
-        tally = self.tally
-        missing = self._missing(seeds)
-        try:
-            batches = play_batches(
-                run.stage, missing, simulate=lambda count: sim, observers=self._observe
-            )
-            for batch in batches:
-                tally.first = tally.first or batch.episode
-                part = _record(run.stage, batch, self._monitor)
-                record = EpisodeRecord.join(run.stage.ranks.gather(part))
-                # Before the next one can break or be stopped. A full disk takes no result back.
-                if tally.path is not None:
-                    path = tally.path.with_name(record_name(tally.gate, record.seed))
-                    if problem := safely_write(path, write_npz, record.arrays(), stops=False):
-                        tally.details.append(problem)
-                if self._motion is not None and self.path is not None:
-                    qpos = self._motion.rows["qpos"]
-                    page = (run.stage, run.page, self.path, tally.gate)
-                    show_batch(*page, qpos, sim, record.failed)
-                self._count(record)
-        except Exception as error:
-            check_interrupt()
-            if not tally.records or run.stage.ranks.size > 1:
-                raise
-            seed = seeds[len(tally.records)]
-            log.exception("seed %d broke", seed)
-            why = first_line(error)
-            left = f"seed {seed}" if seed == seeds[-1] else f"seeds {seed} to {seeds[-1]}"
-            tally.problems.append(f"{left} not played: {why} (run.log has the traceback)")
+    batches = play_batches(
+        run.stage,
+        _missing(run, tally, seeds, path),
+        simulate=lambda count: sim,
+        observers=observe,
+    )
+    try:
+        for batch in batches:
+            tally.first = tally.first or batch.episode
+            part = _record(run.stage, batch, monitor)
+            record = EpisodeRecord.join(run.stage.ranks.gather(part))
+            # Before the next one can break or be stopped. A full disk takes no result back.
+            if tally.path is not None:
+                file = tally.path.with_name(record_name(tally.gate, record.seed))
+                if problem := safely_write(file, write_npz, record.arrays(), stops=False):
+                    tally.details.append(problem)
+            if path is not None and record.seed == seeds[0]:
+                qpos = motion.rows.pop("qpos")
+                show_batch(run.stage, run.page, path, tally.gate, qpos, sim, record.failed)
+            _count(run, tally, record)
+    except Exception as error:
+        check_interrupt()
+        if not tally.records or run.stage.ranks.size > 1:
+            raise
+        seed = seeds[len(tally.records)]
+        log.exception("seed %d broke", seed)
+        why = first_line(error)
+        left = f"seed {seed}" if seed == seeds[-1] else f"seeds {seed} to {seeds[-1]}"
+        tally.problems.append(f"{left} not played: {why} (run.log has the traceback)")
 
-    def _missing(self, seeds: range) -> Iterator[BatchPlan]:
-        """The seeds that no earlier call of the run has played; its records are counted."""
-        run = self.run
-        folder = run.folder if run.cfg.resume is not None else None
-        for seed in seeds:
-            read = partial(EpisodeRecord.read, folder, seed, self.tally.gate)
-            record = run.stage.ranks.from_first(read)
-            if record is None:
-                yield BatchPlan(seed, run.stage.worlds)
-                continue
-            self.tally.again.append(seed)
-            if self.path is not None and seed == run.cfg.seed:
-                restore_batch(run.page, self.path, self.tally.gate)
-            self._count(record)
 
-    def _observe(self, plan: BatchPlan) -> list[Observer]:
-        """The observers of a seed."""
-        cfg = self.run.cfg
-        in_motion = self.path is not None and plan.seed == cfg.seed
-        self._monitor = FailureMonitor() if self.signs else None
-        self._motion = motion_recorder(cfg.timing.step_dt) if in_motion else None
-        watchers = [self._monitor, *self.observers(plan.seed), self._motion]
-        return [watcher for watcher in watchers if watcher is not None]
+def _missing(run: Run, tally: EpisodeTally, seeds: range, path: Path | None) -> Iterator[BatchPlan]:
+    """The seeds that no earlier call of the run has played; its records are counted."""
+    folder = run.folder if run.cfg.resume is not None else None
+    for seed in seeds:
+        read = partial(EpisodeRecord.read, folder, seed, tally.gate)
+        record = run.stage.ranks.from_first(read)
+        if record is None:
+            yield BatchPlan(seed, run.stage.worlds)
+            continue
+        tally.again.append(seed)
+        if path is not None and seed == seeds[0]:
+            restore_batch(run.page, path, tally.gate)
+        _count(run, tally, record)
 
-    def _count(self, record: EpisodeRecord) -> None:
-        """Count a seed, and print where there are several."""
-        tally = self.tally
-        tally.add(record)
-        if tally.several:
-            self.run.print_line(
-                f"{tally.gate}, seed {record.seed}: {int(record.succeeded.sum())} of"
-                f" {len(record.failed)} worlds succeeded, {tally.successes} of {tally.episodes}"
-                " so far"
-            )
+
+def _count(run: Run, tally: EpisodeTally, record: EpisodeRecord) -> None:
+    """Count a seed, and print where there are several."""
+    tally.add(record)
+    if tally.several:
+        run.print_line(
+            f"{tally.gate}, seed {record.seed}: {int(record.succeeded.sum())} of"
+            f" {len(record.failed)} worlds succeeded, {tally.successes} of {tally.episodes}"
+            " so far"
+        )
 
 
 def _worlds(tally: EpisodeTally, run: Run) -> Worlds:

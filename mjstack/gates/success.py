@@ -62,14 +62,7 @@ def run_success(run: Run) -> list[GateResult]:
     succeeded = tally.array("failed") == 0
     retried = int((retries > 0).sum())
     retried_succeeded = int(((retries > 0) & succeeded).sum())
-    regions = find_regions(
-        starts,
-        succeeded,
-        cell=t.cell,
-        yaw_cell_deg=t.yaw_cell_deg,
-        episodes=t.cell_episodes,
-        objects=tally.records[0].object_names,
-    )
+    regions = find_regions(t, starts, succeeded, tally.records[0].object_names)
     distinct = len(np.unique(np.round(starts, 6).reshape(len(starts), -1), axis=0))
     lost = sum(goal.lost for goal in goals)
     doubts = find_doubts(distinct, tally.episodes, tally.successes, lost, t.rate)
@@ -97,7 +90,7 @@ def run_success(run: Run) -> list[GateResult]:
         passed=tally.successes / tally.episodes >= t.rate,
         metrics=metrics,
         thresholds={"success_rate_min": t.rate},
-        tables=regions_table(cfg, regions),
+        tables=regions_table(t, regions),
     )
     return [result]
 
