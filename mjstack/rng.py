@@ -49,12 +49,7 @@ def philox(counter: np.ndarray, key: tuple[int, int]) -> np.ndarray:
 
 
 def uniform(
-    seed: int,
-    stream: int,
-    world: Tensor,
-    episode: Tensor,
-    step: Tensor | None,
-    size: int,
+    seed: int, stream: int, world: Tensor, episode: Tensor, step: Tensor | None, size: int
 ) -> Tensor:
     """Uniform numbers in [-1, 1).
 

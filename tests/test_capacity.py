@@ -168,7 +168,7 @@ def test_room_to_measure_in_grows_where_it_is_too_little_but_not_for_ever(
     assert [(s.njmax, s.nconmax) for s in made] == [(768, 128), (1536, 256), (3072, 256)]
     assert not run.peaks.overflow.any()
     assert run.sizes == made[-1]
-    assert measured_sizes(load_config([]), "it", run, "").njmax == 16
+    assert measured_sizes(load_config([]), run, "").njmax == 16
     made, run = tried(monkeypatch, lambda _: int(Overflow.NEFC))
     assert run.peaks.overflow.any()
     assert len(made) == 4
@@ -189,9 +189,9 @@ def test_nothing_is_sized_from_motion_that_lost_physics(bits: Overflow, fix: str
     lost = peaks(overflow=np.array([0, int(bits), 0, int(bits)]))
     run = workload(peaks=lost, sizes=BatchSizes(nconmax=128, njmax=768))
     with pytest.raises(FaultError) as caught:
-        measured_sizes(load_config([]), "the driven task", run, "")
+        measured_sizes(load_config([]), run, "the driven task")
     says = str(caught.value)
-    assert says.startswith("batch=auto: what the driven task needs cannot be measured: ")
+    assert says.startswith("batch=auto: sizes cannot be measured by the driven task: ")
     assert "overflow in 2 of 4 worlds (1, 3) even with batch.nconmax=128 batch.njmax=768. " in says
     assert says.endswith(fix)
     assert "\n" not in says
@@ -536,7 +536,7 @@ def test_a_probe_that_lost_physics_makes_no_environment(monkeypatch: Patch) -> N
 
     monkeypatch.setattr("mjstack.envs.buffers.Env", keep)
     overrides = ["batch=auto", "sim=mjwarp", "gate.capacity.probe_steps=1"]
-    message = r"^batch=auto: what an environment of 1 worlds .*Set batch\.njmax higher still\.$"
+    message = r"^batch=auto: sizes cannot be measured by 1 steps .*Set batch\.njmax higher still\.$"
     with pytest.raises(FaultError, match=message):
         mjstack.make_env(overrides, nworld=1, device="cpu")
     assert len(made) == 4
@@ -550,7 +550,7 @@ def test_gates_get_no_sizes_from_a_task_that_lost_physics(
     lost = workload(peaks=peaks(nworld=2, overflow=np.array([int(Overflow.NEFC), 0])))
     monkeypatch.setattr(Stage, "play_task", lambda *_: lost)
     run = new_run("sim=mjwarp", "sim.device=cpu", "nworld=2", "batch=auto")
-    message = "what the driven task needs cannot be measured: NEFC overflow in 1 of 2 worlds"
+    message = "measured by the driven task in 2 worlds: NEFC overflow in 1 of 2 worlds"
     with pytest.raises(FaultError, match=message):
         run.stage.sizes  # noqa: B018
     assert "task" not in run.stage.measured

@@ -141,9 +141,9 @@ class _Parts:
         manager = env.action_manager
         self._env = env
         self._generator = torch.Generator().manual_seed(0)
-        low = manager.low.float().cpu()
-        self._span = share * (manager.high.float().cpu() - low)
-        self._low = 0.5 * (low + manager.high.float().cpu() - self._span)
+        low, high = (limit.float().cpu() for limit in (manager.low, manager.high))
+        self._span = share * (high - low)
+        self._low = 0.5 * (low + high - self._span)
         self.on_cuda = env.device.type == "cuda"
         self.lost = torch.zeros(env.nworld, dtype=torch.bool, device=env.device)
         self.problem = ""

@@ -52,12 +52,7 @@ class HeldPhysics:
 
 
 def measure_physics(
-    stage: Stage,
-    sim: Simulation,
-    carry: State | None = None,
-    *,
-    seconds: float,
-    repetitions: int,
+    stage: Stage, sim: Simulation, carry: State | None = None, *, seconds: float, repetitions: int
 ) -> Measurement:
     """Measure physics steps under a held joint target, the object in hand.
 

@@ -193,15 +193,15 @@ def play_workload(
     return run
 
 
-def measured_sizes(cfg: Config, what: str, run: Workload, source: str) -> BatchSizes:
-    """Sizes for ``batch=auto`` from one run, such as of ``the driven task``, with the configured
-    margin and their source in words; sizes that the configuration sets win.
+def measured_sizes(cfg: Config, run: Workload, source: str) -> BatchSizes:
+    """Sizes for ``batch=auto`` from one run, which ``source`` has in words, with the configured
+    margin; sizes that the configuration sets win.
 
     Raises:
         FaultError: A world lost physics; names the worlds and what to do.
     """
     if run.loss:
-        raise FaultError(f"batch=auto: what {what} needs cannot be measured: {run.loss}")
+        raise FaultError(f"batch=auto: sizes cannot be measured by {source}: {run.loss}")
     margin = cfg.gate.capacity.margin
     how = f"batch=auto: {source}, times {margin:g}"
     return apply_configured(cfg, recommend_sizes(run.peaks, margin, how))
@@ -260,6 +260,6 @@ def probe_env_sizes(cfg: Config, model: mujoco.MjModel, nworld: int, device: str
     with torch.no_grad():
         probe = play_workload(cfg, make, partial(random_actions, cfg, c.probe_steps))
     source = f"{c.probe_steps} steps of random actions in {worlds} worlds"
-    sizes = measured_sizes(cfg, f"an environment of {worlds} worlds", probe, source)
+    sizes = measured_sizes(cfg, probe, source)
     log.info("%s", sizes)
     return sizes

@@ -110,9 +110,7 @@ def decided_every_step(cfg: Config) -> Config:
 
 
 def driven_config(
-    cfg: Config,
-    reset: dict[str, TermCfg] | None = None,
-    action: dict[str, TermCfg] | None = None,
+    cfg: Config, reset: dict[str, TermCfg] | None = None, action: dict[str, TermCfg] | None = None
 ) -> Config:
     """The configuration of an environment in which a driver plays one whole episode.
 

@@ -101,9 +101,9 @@ class EarlierRun:
             record = EpisodeRecord.read(self.folder, seed, gate)
             if record is not None:
                 episodes += len(record.failed)
-                worlds = np.flatnonzero(record.failed).tolist()
-                bits[seed] = {world: int(record.failed[world]) for world in worlds}
-        return {seed: worlds for seed, worlds in bits.items() if worlds}, episodes
+                if worlds := np.flatnonzero(record.failed).tolist():
+                    bits[seed] = {world: int(record.failed[world]) for world in worlds}
+        return bits, episodes
 
 
 def archive_starts(cfg: Config, folder: Path) -> Config:

@@ -105,10 +105,7 @@ def _play(
         return [*filter(None, (monitor, *observers(plan.seed), recorder))]
 
     batches = play_batches(
-        run.stage,
-        _missing(run, tally, seeds, path),
-        simulate=lambda count: sim,
-        observers=observe,
+        run.stage, _missing(run, tally, seeds, path), simulate=lambda count: sim, observers=observe
     )
     try:
         for batch in batches:

@@ -276,12 +276,7 @@ class Stage:
         return self.simulation(nworld, *self.backend)
 
     def simulation(
-        self,
-        nworld: int,
-        backend: Backend,
-        device: str,
-        *,
-        sizes: BatchSizes | None = None,
+        self, nworld: int, backend: Backend, device: str, *, sizes: BatchSizes | None = None
     ) -> Simulation:
         """Worlds that can start as the configuration says.
 
@@ -312,10 +307,9 @@ class Stage:
         if not self.cfg.batch.auto or self.backend[0] is Backend.native:
             return resolve_sizes(self.cfg)
         if "task" not in self.measured:
-            what = "the driven task"
-            source = f"{what} in {self.measuring_nworld} worlds"
+            source = f"the driven task in {self.measuring_nworld} worlds"
             task = self.play_task(self.cfg.reset)
-            self.measured["task"] = measured_sizes(self.cfg, what, task, source)
+            self.measured["task"] = measured_sizes(self.cfg, task, source)
             self.progress.print_line(str(self.measured["task"]))
         return apply_configured(self.cfg, self.measured["task"])
 

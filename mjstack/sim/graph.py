@@ -228,28 +228,26 @@ class Scratch:
 
     def __init__(self, device: wp.Device) -> None:
         self._device = device
-        self._free: dict[tuple[int, int], list[int]] = defaultdict(list)
-        self._owner: dict[int, int] = {}
+        self._free: dict[tuple[int, int], list[int]] = defaultdict(list)  # by stream and size
+        self._keys: dict[int, tuple[int, int]] = {}
         self._blocks: list[Tensor] = []
 
     def allocate(self, size_in_bytes: int) -> int:
         """Address of a block on the current stream."""
         size = -(-size_in_bytes // _ALIGNMENT) * _ALIGNMENT
-        stream = self._device.stream.cuda_stream or 0
-        free = self._free[stream, size]
-        if free:
-            return free.pop()
+        key = (self._device.stream.cuda_stream or 0, size)
+        if self._free[key]:
+            return self._free[key].pop()
         block = torch.empty(size, dtype=torch.uint8, device=str(self._device))
         self._blocks.append(block)
-        self._owner[block.data_ptr()] = stream
+        self._keys[block.data_ptr()] = key
         return block.data_ptr()
 
     def deallocate(self, ptr: int, size_in_bytes: int) -> None:
         """Take a block back. The memory itself stays, because a graph may write to it at every
         replay.
         """
-        size = -(-size_in_bytes // _ALIGNMENT) * _ALIGNMENT
-        self._free[self._owner[ptr], size].append(ptr)
+        self._free[self._keys[ptr]].append(ptr)
 
 
 def side_by_side(device: torch.device, *works: Callable[[], object]) -> None:

@@ -29,9 +29,7 @@ _CONSTANTS = {
     **_numbers(mujoco.mjtJoint, "FREE SLIDE HINGE", "mjJNT_"),
     **_numbers(mujoco.mjtConstraint, "ELLIPTIC FRICTIONLESS", "mjCNSTR_CONTACT_"),
     **_numbers(
-        mujoco.mjtConstraintState,
-        "SATISFIED QUADRATIC LINEARNEG LINEARPOS CONE",
-        "mjCNSTRSTATE_",
+        mujoco.mjtConstraintState, "SATISFIED QUADRATIC LINEARNEG LINEARPOS CONE", "mjCNSTRSTATE_"
     ),
     **_numbers(mjw.DynType, "NONE INTEGRATOR FILTER FILTEREXACT"),
     **_numbers(mjw.GainType, "AFFINE", here="GAIN_"),

@@ -47,10 +47,7 @@ def plan_step(model: mujoco.MjModel, m: mjw.Model, d: mjw.Data) -> StepPlan:
         return StepPlan(reason="the model has features that only mujoco_warp.step knows")
     if reason := constraints.why_not(m, d):
         return StepPlan("arranged", reason=reason)
-    slower = {
-        "contact rows": constraints.why_not_rows(m),
-        "smooth dynamics": smooth.why_not(m),
-    }
+    slower = {"contact rows": constraints.why_not_rows(m), "smooth dynamics": smooth.why_not(m)}
     reasons = [f"MJWarp's {part}, because {reason}" for part, reason in slower.items() if reason]
     return StepPlan("fused", smooth=not slower["smooth dynamics"], reason="; ".join(reasons))
 
