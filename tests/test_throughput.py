@@ -1,6 +1,5 @@
 """The throughput gate: its measurements, and what voids their figures."""
 
-import math
 import sys
 import time
 from dataclasses import replace
@@ -126,7 +125,9 @@ def test_native_measurements(new_run: NewRun) -> None:
 def test_the_batch_gates_episode_is_the_first_repetition(
     backend: str, repetitions: int, played: int, new_run: NewRun, monkeypatch: Patch
 ) -> None:
-    run = new_run("sim=native", "nworld=4")
+    limits = {"repetitions": repetitions, "cpu_max_seconds": 100}
+    choices = [f"gate.throughput.{key}={value}" for key, value in limits.items()]
+    run = new_run("sim=native", "nworld=4", *choices)
     sim, _ = worlds(monkeypatch, "cpu")
     sim.backend = backend
     sim.description = "some"
@@ -138,8 +139,7 @@ def test_the_batch_gates_episode_is_the_first_repetition(
     first = Episode(result=result, **arrays, timing=spent, description="some")
     more = [replace(first, timing=replace(spent, seconds=2.0)) for _ in range(played)]
     monkeypatch.setattr(episode, "_play", lambda *_: more.pop())
-    limits = {"seconds": 100.0, "repetitions": repetitions}
-    measured = episode.measure_episode(run.stage, sim, first, **limits)
+    measured = episode.measure_episode(run.stage, sim, first)
     assert not more
     assert measured.samples["seconds"] == [1.0] + [2.0] * played
     assert measured.facts["of_the_batch_gate"] == 1
@@ -351,7 +351,9 @@ def test_the_parts_play_one_trajectory(monkeypatch: Patch) -> None:
     """Physics alone ends where the whole step ended, except in worlds that were reset meanwhile, of
     which there are some.
     """
-    cfg = load_config(["task=stack", "sim=native", "task.episode_steps=9"])
+    limits = {"env_steps": 4, "repetitions": 3, "cpu_max_seconds": 1000}
+    choices = [f"gate.throughput.{key}={value}" for key, value in limits.items()]
+    cfg = load_config(["task=stack", "sim=native", "task.episode_steps=9", *choices])
     env = build_env(cfg, nworld=12)
     wholes = []
     take = env_step.snapshot
@@ -369,15 +371,7 @@ def test_the_parts_play_one_trajectory(monkeypatch: Patch) -> None:
         return lost(sim, steps)
 
     monkeypatch.setattr(env_step, "lost_worlds", look)
-    times = measure_env_step(
-        env,
-        steps=4,
-        repetitions=3,
-        seconds=math.inf,
-        advance=lambda what, done, total: None,
-        share=1.0,
-        name="env_step",
-    )
+    times = measure_env_step(env, "env_step", lambda what, done, total: None)
     figures = times.samples
     names = ("ms_per_env_step", "physics_ms_per_step", "managers_ms_per_step")
     repetitions = list(zip(*(figures[name] for name in names), strict=True))

@@ -32,6 +32,7 @@ from mjstack.bench.timing import (
     describe_lost,
     lost_worlds,
     steps_that_fit,
+    time_budget,
     timed,
 )
 from mjstack.config.functions import offered
@@ -44,26 +45,13 @@ from mjstack.sim.graph import StepGraph
 _COST = 4.0  # of a repetition over that of its whole steps from the start, when fewer things touch
 
 
-def measure_env_step(
-    env: Env,
-    *,
-    steps: int,
-    repetitions: int,
-    seconds: float,
-    advance: Advance,
-    share: float,
-    name: str,
-) -> Measurement:
+def measure_env_step(env: Env, name: str, advance: Advance) -> Measurement:
     """Play random actions in interleaved repetitions.
 
     Args:
-        env: The environment.
-        steps: Control steps per repetition.
-        repetitions: Measured repetitions; one before them warms up.
-        seconds: Shortens the repetitions so that all of them take about this long [s].
-        advance: Shows progress.
-        share: Share of the action range from which actions are sampled uniformly, about its middle.
+        env: The environment; its ``cfg.gate.throughput`` says how many, and how long they take.
         name: The measurement's name.
+        advance: Shows progress.
 
     Returns:
         Samples of the whole step (``ms_per_env_step``), its physics and its managers.
@@ -76,20 +64,21 @@ def measure_env_step(
     """
     sim = env.sim
     decimation = env.cfg.timing.decimation
-    parts = _Parts(env, share)
-    step_seconds = parts.warm_up()
-    steps = steps_that_fit(steps, seconds, _COST * (repetitions + 1) * step_seconds)
+    t = env.cfg.gate.throughput
+    parts = _Parts(env, t.action_share)
+    seconds = _COST * (t.repetitions + 1) * parts.warm_up()
+    steps = steps_that_fit(t.env_steps, time_budget(env.cfg, sim), seconds)
 
     # The repetitions; the first one warms up
     times: list[list[float]] = []
     ended = 0.0
     meter = EnergyMeter(str(env.device))
     parts.play(steps, NO_METER)
-    for repetition in range(repetitions):
+    for repetition in range(t.repetitions):
         spent, episodes = parts.play(steps, meter)
         ended += episodes
         times.append(spent)
-        advance(f"{name}, repetitions", repetition + 1, repetitions)
+        advance(f"{name}, repetitions", repetition + 1, t.repetitions)
 
     # The result
     out = Measurement(name=name)

@@ -16,6 +16,7 @@ from mjstack.bench.timing import (
     EnergyObserver,
     Measurement,
     lost_worlds,
+    time_budget,
     timed,
 )
 from mjstack.drivers.driver import OpenLoopDriver
@@ -35,8 +36,6 @@ def measure_episode(
     sim: Simulation,
     before: Episode | None = None,
     *,
-    seconds: float,
-    repetitions: int,
     step_seconds: float = 0.0,
 ) -> Measurement:
     """Measure whole episodes with their check, alternating with bare steps on MJWarp.
@@ -49,11 +48,11 @@ def measure_episode(
         stage: Scene and planner.
         sim: The worlds.
         before: The episode of gate *batch*, if it was timed.
-        seconds: Time budget [s].
-        repetitions: Most repetitions.
         step_seconds: About how long a control step takes [s].
     """
     cfg = stage.cfg
+    t = cfg.gate.throughput
+    seconds = time_budget(cfg, sim)
     mjwarp = sim.backend == "mjwarp"
     out = Measurement(name="episode")
     steps = stage.episode_steps
@@ -61,7 +60,7 @@ def measure_episode(
     worlds = (sim.description, sim.nworld)
     played = [before] if before and (before.description, len(before.start)) == worlds else []
     estimate = max([step_seconds * steps, *(episode.timing.seconds for episode in played)])
-    rounds = repetitions - len(played)
+    rounds = min(t.repetitions, t.episodes) - len(played)
     if mjwarp:
         estimate *= 2
         rounds = max(1, rounds)

@@ -10,6 +10,7 @@ from mjstack.bench.timing import (
     describe_lost,
     lost_worlds,
     steps_that_fit,
+    time_budget,
     timed,
 )
 from mjstack.config.schema import Backend
@@ -51,9 +52,7 @@ class HeldPhysics:
             self.sim.step(self.decimation)
 
 
-def measure_physics(
-    stage: Stage, sim: Simulation, carry: State | None = None, *, seconds: float, repetitions: int
-) -> Measurement:
+def measure_physics(stage: Stage, sim: Simulation, carry: State | None = None) -> Measurement:
     """Measure physics steps under a held joint target, the object in hand.
 
     A grasp may be empty at the start, about to be retried. The number of full ones is reported, and
@@ -75,12 +74,13 @@ def measure_physics(
             return out
 
     # The repetitions
-    steps = steps_that_fit(t.steps, seconds, repetitions * physics.warm_up())
+    seconds = t.repetitions * physics.warm_up()
+    steps = steps_that_fit(t.steps, time_budget(stage.cfg, sim), seconds)
     meter = EnergyMeter(str(sim.device))
     times = []
-    for repetition in range(repetitions):
+    for repetition in range(t.repetitions):
         times.append(physics.play(steps, meter))
-        stage.progress.advance("physics, repetitions", repetition + 1, repetitions)
+        stage.progress.advance("physics, repetitions", repetition + 1, t.repetitions)
 
     # The result
     graph = sim.graph_of(physics.decimation)

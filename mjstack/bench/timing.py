@@ -233,6 +233,12 @@ def describe_lost(lost: Tensor) -> str:
     return f"{count} worlds overflowed, diverged or were not stepped" if count else ""
 
 
+def time_budget(cfg: Config, sim: Simulation) -> float:
+    """Seconds that a measurement on these worlds may take."""
+    t = cfg.gate.throughput
+    return t.max_seconds if sim.device.type == "cuda" else t.cpu_max_seconds
+
+
 def steps_that_fit(most: int, budget: float, seconds_per_step: float) -> int:
     """As many steps as a time budget [s] allows, from 1 to most."""
     return max(1, int(min(most, budget / max(seconds_per_step, 1e-9))))

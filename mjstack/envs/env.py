@@ -128,8 +128,7 @@ class Env:
         self.termination_manager = TerminationManager(self, cfg.termination)
         self.reward_manager = RewardManager(self, cfg.reward)
         self.observation_manager = ObservationManager(self, cfg.observation)
-        names = (self.reward_manager.names, self.termination_manager.names)
-        self.statistics = EpisodeStatistics(*names, sim.device)
+        self.statistics = EpisodeStatistics(self)
         self._reset_managers(self._all_worlds)
         self._draws = CameraSchedule(self)
         self.images = self._draws.images
@@ -327,10 +326,9 @@ class Env:
         the observation to go on with. ``broken`` are worlds whose state is not finite, None if
         there are none; both of shape ``(nworld,)``, bool.
         """
-        ended_by = self.termination_manager.values
         # On CUDA, where looking would stop the device, worlds are always reset: those of an empty
         # mask, if need be.
-        ending = ended_by.shape[1] > 0 and (done.is_cuda or bool(done.any()))
+        ending = self.termination_manager.values.shape[1] > 0 and (done.is_cuda or bool(done.any()))
 
         def keep() -> None:
             self._outputs.write_final(broken)
@@ -338,8 +336,7 @@ class Env:
 
         def count() -> None:
             if ending:
-                rewards = self.reward_manager.episode_sums
-                self.statistics.update(done, self.episode_step, self.success, rewards, ended_by)
+                self.statistics.update(done)
 
         def record() -> None:
             if done.is_cuda and broken is not None:

@@ -1,40 +1,36 @@
 """Statistics of the episodes that ended, added up on the device and read now and then."""
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
+
+if TYPE_CHECKING:
+    from mjstack.envs.env import Env
 
 
 class EpisodeStatistics:
     """Sums over finished episodes. One tensor holds them all, so that reading is one copy."""
 
-    def __init__(
-        self, reward_names: list[str], termination_names: list[str], device: torch.device
-    ) -> None:
+    def __init__(self, env: "Env") -> None:
+        self._env = env
         self._names = [
             *("steps", "success", "return"),
-            *(f"reward/{name}" for name in reward_names),
-            *(f"termination/{name}" for name in termination_names),
+            *(f"reward/{name}" for name in env.cfg.reward),
+            *(f"termination/{name}" for name in env.cfg.termination),
         ]
         # float64 counts exactly far beyond the 16.7 million at which float32 stops.
-        self._sums = torch.zeros(1 + len(self._names), dtype=torch.float64, device=device)
+        self._sums = torch.zeros(1 + len(self._names), dtype=torch.float64, device=env.device)
 
-    def update(
-        self, done: Tensor, steps: Tensor, success: Tensor, rewards: Tensor, terminations: Tensor
-    ) -> None:
-        """Add the episodes that end in this step.
-
-        Args:
-            done: Which end, shape ``(nworld,)``, bool.
-            steps: Their lengths, shape ``(nworld,)``.
-            success: Whether the task is achieved, shape ``(nworld,)``, bool.
-            rewards: Episode sum of every reward term, shape ``(nworld, nterm)``.
-            terminations: What every termination term says, shape ``(nworld, nterm)``, bool.
-        """
+    def update(self, done: Tensor) -> None:
+        """Add the episodes that end in this step, shape ``(nworld,)``, bool."""
+        env = self._env
+        rewards = env.reward_manager.episode_sums
         # A step count is exact in float32 up to 16.7 million; the sums are float64.
-        columns = torch.stack((done.float(), steps.float(), success.float(), rewards.sum(1)), dim=1)
-        row = torch.cat((columns, rewards, terminations.float()), dim=1)
+        ends = (done.float(), env.episode_step.float(), env.success.float(), rewards.sum(1))
+        parts = (torch.stack(ends, dim=1), rewards, env.termination_manager.values.float())
+        row = torch.cat(parts, dim=1)
         self._sums += torch.where(done[:, None], row, 0.0).sum(0, dtype=torch.float64)
 
     def read(self) -> dict[str, float]:

@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable
 from contextlib import closing
 from functools import partial
-from typing import Any
 
 from mjstack.bench.env_step import measure_env_step
 from mjstack.bench.episode import measure_episode
@@ -56,12 +55,10 @@ def _measure(run: Run, gate: str, backend: Backend, device: str) -> GateResult:
         return result
     began = time.perf_counter()
     on_cuda = device.startswith("cuda")
-    seconds = t.max_seconds if on_cuda else t.cpu_max_seconds
-    limits = {"seconds": seconds, "repetitions": t.repetitions}
     result.metrics = {"worlds": cfg.nworld, "cpu_count": os.cpu_count() or 1}
 
     # The measurements
-    worlds = (run, backend, device, result, limits)
+    worlds = (run, backend, device, result)
     measured = _on_driven_worlds(*worlds)
     for name in ("env_step", "cameras") if cfg.scene.cameras else ("env_step",):
         if name in t.measurements:
@@ -100,7 +97,7 @@ def _describe(measured: Measurement, on_cuda: bool) -> str:
 
 
 def _on_driven_worlds(
-    run: Run, backend: Backend, device: str, result: GateResult, limits: dict[str, Any]
+    run: Run, backend: Backend, device: str, result: GateResult
 ) -> dict[str, Measurement]:
     """Measurements *physics* and *episode*, on the same worlds."""
     t = run.cfg.gate.throughput
@@ -126,22 +123,22 @@ def _on_driven_worlds(
     step_seconds = 0.0
     if "physics" in names:
         carry = run.artifacts.carry_start
-        physics = _guarded("physics", measure_physics, *worlds, carry, **limits)
+        physics = _guarded("physics", measure_physics, *worlds, carry)
         measured["physics"] = physics
         if physics.samples:
             step_ms = physics.median("ms_per_batched_step")
             step_seconds = 1e-3 * step_ms * run.cfg.timing.decimation
     if "episode" in names:
-        more = {"repetitions": min(t.repetitions, t.episodes), "step_seconds": step_seconds}
         before = run.artifacts.timed_episode
-        episode = _guarded("episode", measure_episode, *worlds, before, **(limits | more))
+        measure = partial(measure_episode, step_seconds=step_seconds)
+        episode = _guarded("episode", measure, *worlds, before)
         measured["episode"] = episode
     sim.close()
     return measured
 
 
 def _on_environment(
-    name: str, run: Run, backend: Backend, device: str, result: GateResult, limits: dict[str, Any]
+    name: str, run: Run, backend: Backend, device: str, result: GateResult
 ) -> Measurement:
     """Measurement *env_step* or *cameras*, on an environment with room for random actions."""
     cfg = decided_every_step(run.cfg)
@@ -160,25 +157,16 @@ def _on_environment(
     build_seconds = time.perf_counter() - began
     with closing(worlds) as env:
         result.notes.setdefault("backend", env.sim.description)
-        measured = measure_env_step(
-            env,
-            steps=cfg.gate.throughput.env_steps,
-            **limits,
-            advance=run.stage.progress.advance,
-            share=cfg.gate.throughput.action_share,
-            name=name,
-        )
+        measured = measure_env_step(env, name, run.stage.progress.advance)
         measured.facts["build_and_compile_s"] = build_seconds
         if env.sim.sizes is not None:
             measured.notes["sizes"] = str(env.sim.sizes)
         return measured
 
 
-def _guarded(
-    name: str, measure: Callable[..., Measurement], *args: object, **options: object
-) -> Measurement:
+def _guarded(name: str, measure: Callable[..., Measurement], *args: object) -> Measurement:
     """A measurement, or the error that broke it as its problem."""
     try:
-        return measure(*args, **options)
+        return measure(*args)
     except Exception as error:
         return Measurement(name=name, problem=log_error(error).rstrip("."))

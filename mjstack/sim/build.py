@@ -86,10 +86,7 @@ def make_simulation(
         return NativeSimulation(model, nworld, fields=fields)
     from mjstack.sim.mjwarp import MjwarpSimulation  # loads Warp, which native runs do not need
 
-    sizes = sizes or resolve_sizes(cfg)
-    return MjwarpSimulation(
-        model, nworld, sizes, device, cfg.graph, fields=fields, step=cfg.sim.step
-    )
+    return MjwarpSimulation(model, cfg, nworld, sizes or resolve_sizes(cfg), device, fields)
 
 
 class StateRenderer:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from mjstack.config.schema import CameraCfg
+from mjstack.config.schema import CameraCfg, Config
 from mjstack.errors import MjstackError, first_line
 from mjstack.sim.cameras import Cameras
 from mjstack.sim.fused.launch import arguments
@@ -46,17 +46,14 @@ class MjwarpSimulation(Simulation):
     def __init__(
         self,
         model: mujoco.MjModel,
+        cfg: Config,
         nworld: int,
         sizes: BatchSizes,
         device: str,
-        graph: str = "auto",
-        *,
-        fields: Sequence[str] = (),
-        step: str = "auto",
+        fields: Sequence[str],
     ) -> None:
-        """Upload the model and allocate the worlds at qpos0, on ``"cpu"`` or ``"cuda:N"``. Graph
-        and step are ``graph`` and ``sim.step`` of the configuration; other arguments as of
-        `make_simulation`.
+        """Upload the model and allocate the worlds at qpos0, on ``"cpu"`` or ``"cuda:N"``;
+        arguments as of `make_simulation`.
 
         Raises:
             UnknownName: A field does not exist, or cannot differ.
@@ -67,7 +64,7 @@ class MjwarpSimulation(Simulation):
         self.sizes = sizes
         self.device = torch.device(device)
         self._device = wp.get_device(device)
-        self._graph_mode = graph
+        self._graph_mode = cfg.graph
         self._graphs: dict[tuple[int, bool], StepGraph] = {}
         names = check_fields(fields)
         self._placing = not PLACING_FIELDS.isdisjoint(names)
@@ -86,7 +83,9 @@ class MjwarpSimulation(Simulation):
             self._m.opt.disableflags |= int(mjw.DisableBit.NATIVECCD)
             self._m.opt.warn_overflow = 0
             self._d = mjw.make_data(model, nworld=nworld, **sizes.as_kwargs())
-            self.plan = StepPlan() if step == "stock" else plan_step(model, self._m, self._d)
+            self.plan = (
+                StepPlan() if cfg.sim.step == "stock" else plan_step(model, self._m, self._d)
+            )
             if self.plan.name != "stock" and mjw.__version__ not in RELEASES:
                 facts = (model, self._m, self._d, self.device, self.plan)
                 with torch_stream_scope(self._device):
