@@ -55,7 +55,7 @@ PATHS: dict[str, dict[str, str] | None] = {
     "mdp/starts/randomization.py": {"Randomized": "__call__", "Elements": "read write scale"},
     "mdp/starts/starts_file.py": {"FromStartsFile": "__call__"},
     "mdp/starts/expert_states.py": {"ExpertStates": "__call__"},
-    "episodes/recorder.py": {"Recorder": "update", "": "_read_world read_commands _read_state"},
+    "episodes/recorder.py": {"Recorder": "update", "": "_read_world read_commands read_state"},
     "episodes/replay.py": {"": "_read_trace"},
     "mdp/starts/placement.py": {"Placement": "choose"},
     "tasks/check.py": {"EpisodeCheck": "update"},

@@ -155,10 +155,11 @@ def _play(stage: Stage, sim: Simulation, meter: EnergyMeter, out: Measurement) -
     cfg = stage.cfg
     mjwarp = sim.backend == "mjwarp"
     keep = mjwarp and cfg.controller.name in FEEDBACK
-    recorders = [Recorder(COMMANDS)] if keep else []
-    episode = stage.play(sim, cfg.reset, [*recorders, EnergyObserver(meter)])
+    recorder = Recorder(COMMANDS)
+    observers = [recorder] if keep else []
+    episode = stage.play(sim, cfg.reset, [*observers, EnergyObserver(meter)])
     if mjwarp:
-        commands = recorders[0].rows["ctrl"] if keep else None
+        commands = recorder.rows.get("ctrl")
         bare, problem = play_bare(stage, cast("MjwarpSimulation", sim), commands)
         out.problem = out.problem or problem
         out.samples.setdefault("bare_seconds", []).append(bare)

@@ -120,7 +120,7 @@ def driven_config(
     """
     return replace(
         without_images(decided_every_step(cfg)),
-        action=cfg.controller.action if action is None else action,
+        action=action or cfg.controller.action,
         observation={},
         termination={},
         reward={},

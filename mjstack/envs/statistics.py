@@ -51,12 +51,10 @@ def join_statistics(parts: Sequence[dict[str, float]]) -> dict[str, float]:
     """Statistics of the episodes of all ranks, from those that each has read."""
     if len(parts) == 1:
         return parts[0]
-    counts = [part["episodes"] for part in parts]
-    total = sum(counts)
+    total = sum(part["episodes"] for part in parts)
     names = dict.fromkeys(name for part in parts for name in part if name != "episodes")
     means = {
-        name: sum(n * part[name] for n, part in zip(counts, parts, strict=True) if n) / total
+        name: sum(part["episodes"] * part[name] for part in parts if name in part) / total
         for name in names
-        if total
     }
     return {"episodes": total, **means}

@@ -115,7 +115,8 @@ COMMANDS = Channels(read_commands)
 2,000 steps of 16,384 worlds with six joint targets."""
 
 
-def _read_state(env: Env, driver: Driver) -> Read:
+def read_state(env: Env, driver: Driver) -> Read:
+    """Read the parts of a `State`, in its precision."""
     sim = env.sim
     return lambda: {name: getattr(sim, name).double() for name in State._fields}
 
@@ -126,7 +127,7 @@ class Snapshots(Recorder):
     def __init__(self, steps: Collection[int]) -> None:
         """``steps`` after which the state is recorded."""
         self._steps = sorted(step for step in steps if step >= 0)
-        super().__init__(Channels(_read_state, lambda _: [step + 1 for step in self._steps]))
+        super().__init__(Channels(read_state, lambda _: [step + 1 for step in self._steps]))
 
     @property
     def states(self) -> dict[int, State]:

@@ -9,7 +9,7 @@ from typing_extensions import override
 from mjstack.config.schema import Backend
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
-from mjstack.episodes.recorder import Channels, Read, Recorder
+from mjstack.episodes.recorder import Channels, Read, Recorder, read_state
 from mjstack.episodes.rollout import Episode
 from mjstack.episodes.stage import Stage
 from mjstack.sim import Simulation, describe_overflow, resolve_sizes
@@ -38,7 +38,7 @@ def _read_start(env: Env, driver: Driver) -> Read:
 
 def _read_trace(env: Env, driver: Driver) -> Read:
     """State, objects and the check's values, by name in the file."""
-    sim = env.sim
+    state = read_state(env, driver)
     check = make_check(env.cfg)
     task = check.view(env)
     free = TaskView(env, list(env.cfg.scene.free))
@@ -46,9 +46,7 @@ def _read_trace(env: Env, driver: Driver) -> Read:
     def read() -> dict[str, Tensor]:
         objects = free.step()
         return {
-            "qpos": sim.qpos.double(),
-            "qvel": sim.qvel.double(),
-            "ctrl": sim.ctrl.double(),
+            **state(),
             "object_pos_m": objects.pos,
             "object_speed_m_per_s": objects.speed,
             "object_height_m": objects.height,

@@ -142,10 +142,7 @@ class MjwarpSimulation(Simulation):
     @override
     def step(self, n: int = 1, *, kinematics: bool = False) -> None:
         with torch_stream_scope(self._device):
-            if n:
-                self.graph_of(n, kinematics=kinematics)()
-            elif kinematics:
-                self._pose()
+            self.graph_of(n, kinematics=kinematics)()
 
     @override
     def forward(self) -> None:

@@ -128,10 +128,7 @@ class NativeSimulation(Simulation):
 
     @override
     def step(self, n: int = 1, *, kinematics: bool = False) -> None:
-        if n:
-            self._compute(n, kinematics)
-        elif kinematics:
-            self.kinematics()
+        self._compute(n, kinematics)
 
     @override
     def forward(self) -> None:

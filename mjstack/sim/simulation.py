@@ -193,7 +193,7 @@ class Simulation(ABC):
         """Advance every world by n physics steps under the current ctrl.
 
         Args:
-            n: Number of steps.
+            n: Number of steps, at least 1.
             kinematics: Whether the poses are brought up to the state after the last of them. The
                 physics is the same.
         """
