@@ -17,7 +17,8 @@ from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.envs import Env, build_env
 from mjstack.math import quat_to_matrix
 from mjstack.mdp.geometry import above_table
-from mjstack.scene import SceneIndex, build_model, lowest_height
+from mjstack.scene import SceneIndex, build_model
+from mjstack.scene.index import lowest_height
 from mjstack.scene.phases import nominal_xy
 from mjstack.tasks.box import BoxSuccess
 from mjstack.tasks.box_terms import ToSlot

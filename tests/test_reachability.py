@@ -239,7 +239,7 @@ def with_wall(
 ) -> mujoco.MjModel:
     """The scene with one more geom that is fixed to the world."""
     from mjstack.robots import robot_spec
-    from mjstack.scene import build_scene
+    from mjstack.scene.build import build_scene
 
     spec = robot_spec(cfg.robot, cfg.model)
     z = cfg.scene.table_top + 0.0275

@@ -1,6 +1,5 @@
 """Demonstrations on disk in the layout of LeRobotDataset v3, with pyarrow and ffmpeg."""
 
-from mjstack.datasets.lerobot import require_pyarrow
 from mjstack.datasets.reader import StoredDataset, read_dataset
 from mjstack.datasets.spec import DatasetSpec, EpisodeData, Feature, Video
 from mjstack.datasets.writer import DatasetWriter
@@ -13,5 +12,4 @@ __all__ = [
     "StoredDataset",
     "Video",
     "read_dataset",
-    "require_pyarrow",
 ]

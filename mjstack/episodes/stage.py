@@ -238,9 +238,8 @@ class Stage:
             worlds: Their numbers, which random numbers depend on: ``[17]`` starts one world as
                 world 17 of any batch starts. By default they are numbered from 0 on.
         """
-        cfg = self.driven(reset)
-        env = Env(sim, self.index, cfg, check_faults=False)
-        return reset_worlds(env, cfg.seed if seed is None else seed, worlds)
+        env = Env(sim, self.index, self.driven(reset), check_faults=False)
+        return reset_worlds(env, seed, worlds)
 
     def driver(self, env: Env) -> Driver:
         """The configured driver, for worlds that have started."""

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from mjstack.config.schema import CollectJobCfg, Config
-from mjstack.datasets import DatasetWriter, lerobot, require_pyarrow
+from mjstack.datasets import DatasetWriter, lerobot
 from mjstack.datasets.part import Part
 from mjstack.envs import demonstration_config
 from mjstack.episodes.batches import Batch, BatchPlan, play_batches
@@ -45,7 +45,7 @@ _MOST_EMPTY = 3  # batches in a row without an episode
 
 def check_collect(cfg: Config) -> CheckedJob:
     """Raise for what cannot be done, before anything is written."""
-    require_pyarrow()
+    lerobot.require_pyarrow()
     require_episode(cfg)
     stage = Stage(cfg)
     check_task(stage)

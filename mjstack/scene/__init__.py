@@ -1,7 +1,7 @@
 """Scenes: a robot, a table and objects as one MjModel, and where each name lies in it."""
 
 import mjstack.report.gl  # noqa: F401  (before mujoco)
-from mjstack.scene.build import build_model, build_scene
-from mjstack.scene.index import SceneIndex, lowest_height
+from mjstack.scene.build import build_model
+from mjstack.scene.index import SceneIndex
 
-__all__ = ["SceneIndex", "build_model", "build_scene", "lowest_height"]
+__all__ = ["SceneIndex", "build_model"]

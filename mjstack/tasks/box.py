@@ -13,7 +13,7 @@ from mjstack.config.fields import spec
 from mjstack.errors import ConfigError, UnknownName
 from mjstack.managers.view import EnvView
 from mjstack.mdp.geometry import place_xy
-from mjstack.scene import lowest_height
+from mjstack.scene.index import lowest_height
 from mjstack.tasks.check import EpisodeCheck, Judgement, Rule
 from mjstack.tasks.parts import (
     AllOf,
