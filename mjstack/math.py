@@ -28,6 +28,11 @@ def atan2(y: Tensor, x: Tensor) -> Tensor:
     return torch.atan2(y, x)
 
 
+def norm(vectors: Tensor) -> Tensor:
+    """Length of each vector, shape ``(..., n)``; shape ``(...)``."""
+    return torch.linalg.vector_norm(vectors, dim=-1)
+
+
 def quat_mul(a: Tensor, b: Tensor) -> Tensor:
     """Hamilton product ``a b``, shape ``(..., 4)``."""
     aw, ax, ay, az = a.unbind(-1)
@@ -65,7 +70,7 @@ def quat_angle(a: Tensor, b: Tensor) -> Tensor:
     """
     conj = torch.cat((a[..., :1], -a[..., 1:]), dim=-1)
     rel = quat_mul(conj, b)
-    return 2.0 * atan2(torch.linalg.vector_norm(rel[..., 1:], dim=-1), rel[..., 0].abs())
+    return 2.0 * atan2(norm(rel[..., 1:]), rel[..., 0].abs())
 
 
 def quat_z_row(quat: Tensor) -> Tensor:
@@ -117,7 +122,7 @@ def lowest_point(pos: Tensor, quat: Tensor, shape: str, size: Sequence[float]) -
     elif shape == "capsule":  # it lies along its x axis
         reach = size[0] + size[1] * up[..., 0].abs()
     elif shape == "cylinder":
-        across = torch.linalg.vector_norm(up[..., :2], dim=-1)
+        across = norm(up[..., :2])
         reach = size[0] * across + size[1] * up[..., 2].abs()
     elif len(set(size)) == 1:  # a cube
         reach = size[0] * up.abs().sum(-1)

@@ -3,7 +3,6 @@ needs no host.
 """
 
 import math
-from collections.abc import Iterable
 
 import numpy as np
 import torch
@@ -13,7 +12,7 @@ from mjstack.drivers.feedback import STAY, FeedbackDriver, measure_planar
 from mjstack.drivers.open_loop import OpenLoopPlanner, smoothstep
 from mjstack.envs import Env
 from mjstack.managers.view import EnvView
-from mjstack.math import atan2
+from mjstack.math import atan2, norm
 from mjstack.mdp.geometry import jaw_forces, objects_in_hand, robot
 from mjstack.tasks.check import make_check
 
@@ -136,7 +135,7 @@ class ClosedLoopDriver(FeedbackDriver):
         force = [jaw_forces(env.index, env.sim, name).amin(1) for name in self._cfg.scene.objects]
         pressing = torch.stack(force, dim=1)[self._worlds, self._handled[self.phase]]
         point = self._ik.forward(robot(env).qpos.read(env.sim.qpos).float())[0]
-        left = torch.linalg.vector_norm(point - self._to[:, :3], dim=1)
+        left = norm(point - self._to[:, :3])
         near = left <= self._until_within[self.phase]
         return near | (pressing >= self._until_force[self.phase])
 
@@ -170,11 +169,8 @@ class ClosedLoopDriver(FeedbackDriver):
         yaw = self._last_seen(self._source, self.phase)[:, 2]
         off = yaw - atan2(closing[:, 1], closing[:, 0])
         oblong = self._oblong_anchor[self.phase]
-        apart = torch.where(oblong, 2.0 * _QUARTER, _QUARTER)
-        off = off - apart * torch.round(off / apart)
-        # Two faces are in question, a quarter turn apart, or half a turn; what has been turned so
-        # far counts for its own.
-        faces = torch.stack((off, off - torch.copysign(apart, off)))
+        # Two faces are in question; what has been turned so far counts for its own.
+        faces = torch.stack(_nearest_turns(off, oblong))
         upright = (-approach[:, 2]).clamp(min=0.2)
         rolls = self._roll + self._roll_sign * atan2(torch.sin(faces), torch.cos(faces) * upright)
         cost = (rolls - STAY * self._roll).abs()
@@ -184,10 +180,9 @@ class ClosedLoopDriver(FeedbackDriver):
         step = step.clamp(-_ROLL_STEP, _ROLL_STEP)
         self._roll += step * self._turns_jaws[self.phase]
         if self._any_align:
-            off = yaw - self._carried_pose()[:, 2]
-            apart = torch.where(self._oblong[self._carried[self.phase]], 2.0 * _QUARTER, _QUARTER)
-            off = self._roll_sign * (off - apart * torch.round(off / apart))
-            back = off - torch.copysign(apart, off)  # where the nearer one is out of range
+            off = self._roll_sign * (yaw - self._carried_pose()[:, 2])
+            off, back = _nearest_turns(off, self._oblong[self._carried[self.phase]])
+            # The farther one where the nearer one is out of range
             cost = off.abs() + self._beyond(self._roll + off)
             off = torch.where(cost <= back.abs() + self._beyond(self._roll + back), off, back)
             off = (_ALIGN * off).clamp(-_ROLL_STEP, _ROLL_STEP)
@@ -210,10 +205,7 @@ class ClosedLoopDriver(FeedbackDriver):
         names = [phase.name for phase in phases]
         objects = list(cfg.scene.objects)
         with_faces = [name for name, thing in cfg.scene.objects.items() if thing.has_faces]
-
-        def column(values: Iterable[object]) -> Tensor:
-            return torch.tensor(list(values), device=self.phase.device)
-
+        column = self._tensor
         self._length = column(float(phase.stop - phase.start) for phase in phases)
         # From its start to that of the last phase, where the arm rests
         self._needed = column(float(phases[-1].start - phase.start) for phase in phases)
@@ -239,6 +231,15 @@ class ClosedLoopDriver(FeedbackDriver):
         self._numbers = torch.arange(len(objects), device=self.phase.device)
         window = 0 if cfg.task.check is None else make_check(cfg).settle_steps
         self._rest = window + math.ceil(cfg.controller.rest_seconds / cfg.timing.step_dt)
+
+
+def _nearest_turns(off: Tensor, oblong: Tensor) -> tuple[Tensor, Tensor]:
+    """The nearest turn after which an angle [rad] is 0, and that to the other side: a box is alike
+    every quarter turn, an oblong one every half.
+    """
+    apart = torch.where(oblong, 2.0 * _QUARTER, _QUARTER)
+    nearest = off - apart * torch.round(off / apart)
+    return nearest, nearest - torch.copysign(apart, nearest)
 
 
 def _put(buffer: Tensor, mask: Tensor, values: Tensor) -> None:

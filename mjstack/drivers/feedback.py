@@ -3,7 +3,7 @@ there, and batched inverse kinematics.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -65,10 +65,8 @@ class FeedbackDriver(Driver):
             value = "worlds that have moved on"
             raise ArgumentError("env", value, "worlds at their start", "Call env.reset() before")
         self._plan = build_phases(cfg)
-        if clock:
-            super().__init__(env.nworld, self._plan[-1].stop, device, self._plan)
-        else:
-            super().__init__(env.nworld, cfg.task.episode_steps, device)
+        steps = self._plan[-1].stop if clock else cfg.task.episode_steps
+        super().__init__(env.nworld, steps, device, self._plan if clock else ())
         self._env = env
         self._cfg = cfg
         self._worlds = torch.arange(env.nworld, device=device)
@@ -80,13 +78,12 @@ class FeedbackDriver(Driver):
         for phase in self._plan:
             self._aimed.append(phase if phase.target else self._aimed[-1])
         targets = [phase.target for phase in self._aimed if phase.target]
-        self._target = torch.tensor([[*t.offset, t.z] for t in targets], device=device)
-        self._source = torch.tensor([t.source for t in targets], device=device)
-        self._toward = torch.tensor([max(t.toward, 0) for t in targets], device=device)
-        self._turns = torch.tensor([float(t.toward >= 0) for t in targets], device=device)
-        widths = [phase.width for phase in self._plan]
-        grips = gripper_targets(env.sim.model, cfg.robot, widths)
-        self._grip = torch.tensor(grips, dtype=torch.float32, device=device)
+        self._target = self._tensor([*t.offset, t.z] for t in targets)
+        self._source = self._tensor(t.source for t in targets)
+        self._toward = self._tensor(max(t.toward, 0) for t in targets)
+        self._turns = self._tensor(float(t.toward >= 0) for t in targets)
+        grips = gripper_targets(env.sim.model, cfg.robot, [phase.width for phase in self._plan])
+        self._grip = self._tensor(grips.tolist())
 
         # Inverse kinematics
         self._ik = BatchedIk(
@@ -106,7 +103,7 @@ class FeedbackDriver(Driver):
         # Jaws turn to a face, and to the narrower side of what is oblong in any case.
         grasped = {phase.grasps for phase in c.phases.values()}
         oblong = [thing.oblong and name in grasped for name, thing in cfg.scene.objects.items()]
-        self._oblong = torch.tensor(oblong, device=device)
+        self._oblong = self._tensor(oblong)
         self._aligns = c.yaw_alignment > 0.0 or (any(oblong) and bool(cfg.robot.roll_joint))
         self._roll_column, self._roll_sign = self._find_roll() if self._aligns else (0, 1.0)
         rolls = robot(env).ctrl_range[self._roll_column].float()
@@ -115,6 +112,10 @@ class FeedbackDriver(Driver):
         # Buffers: x, y and yaw of objects and places, and the last command
         self._seen = torch.zeros((env.nworld, len(source_names(cfg.scene)), 3), device=device)
         self._command = torch.zeros((env.nworld, len(cfg.robot.home)), device=device)
+
+    def _tensor(self, values: Iterable[object]) -> Tensor:
+        """Numbers or truth values, a row for each phase or thing, on the device."""
+        return torch.tensor(list(values), device=self.phase.device)
 
     def _observe(self, due: Tensor) -> None:
         """Measure the objects where that is due, shape ``(nworld, objects)``, bool; and all

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from enum import IntEnum
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 from mjstack.config.schema import Config
 from mjstack.errors import ConfigError
@@ -28,13 +28,14 @@ class ObjectRoles(NamedTuple):
 
     Attributes:
         name: The object.
-        way: The jaws grasp it, push it while they are closed, or the grasp point only goes there.
+        way: ``grasp``: the jaws grasp it; ``push``: they push it while they are closed;
+            ``approach``: the grasp point only goes there.
         phases: Number of the phase that plays each `Role`. One that nothing follows, such as the
             lift of an object that is kept, plays those after it too.
     """
 
     name: str
-    way: Literal["grasp", "push", "approach"]
+    way: str
     phases: list[int]
 
 
@@ -56,7 +57,6 @@ def find_roles(cfg: Config, phases: Sequence[Phase]) -> list[ObjectRoles]:
     names = source_names(cfg.scene)
     moves = [k for k, phase in enumerate(phases) if phase.target is not None]
     moved: dict[str, ObjectRoles] = {}
-    way: Literal["grasp", "push"]
     for close, phase in enumerate(phases):
         later = [k for k in moves if k > close]
         if phase.grasped >= 0:
@@ -118,6 +118,5 @@ def follows_anchor(phase: Phase, things: Sequence[str]) -> bool:
     carried.
     """
     spec = phase.spec
-    if phase.target is None or spec.level == "table" or spec.anchor not in things:
-        return False
-    return things.index(spec.anchor) != phase.carried
+    follows = phase.target is not None and spec.level != "table" and spec.anchor in things
+    return follows and things.index(str(spec.anchor)) != phase.carried

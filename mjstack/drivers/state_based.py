@@ -13,7 +13,7 @@ from typing_extensions import override
 from mjstack.drivers.feedback import STAY, FeedbackDriver, State, servo_lag
 from mjstack.drivers.roles import Role, find_roles, follows_anchor
 from mjstack.managers.view import EnvView
-from mjstack.math import atan2, quat_to_matrix
+from mjstack.math import atan2, norm, quat_to_matrix
 from mjstack.mdp.geometry import pose_w, robot
 from mjstack.tasks.check import make_check
 
@@ -115,29 +115,26 @@ class StateBasedDriver(FeedbackDriver):
         moved = find_roles(cfg, plan)
         things = list(cfg.scene.objects)
         judged = self._check.objects
+        tensor = self._tensor
         columns = [judged.index(r.name) if r.name in judged else len(judged) for r in moved]
-        self._judged = torch.tensor(columns, device=device)
-        self._moved = torch.tensor([things.index(r.name) for r in moved], device=device)
-        self._grasps = torch.tensor([r.way == "grasp" for r in moved], device=device)
+        self._judged = tensor(columns)
+        self._moved = tensor(things.index(r.name) for r in moved)
+        self._grasps = tensor(r.way == "grasp" for r in moved)
         self._pushed = [k for k, r in enumerate(moved) if r.way == "push"]
-        self._pushes = torch.tensor([r.way == "push" for r in moved], device=device)
-        self._opened = torch.tensor([p.spec.gripper == "open" for p in plan], device=device)
-        self._roles = torch.tensor([r.phases for r in moved], device=device)
+        self._pushes = tensor(r.way == "push" for r in moved)
+        self._opened = tensor(phase.spec.gripper == "open" for phase in plan)
+        self._roles = tensor(r.phases for r in moved)
         self._leaves = self._roles[:, Role.open] != self._roles[:, Role.place]
         self._lets_go = self._opened[self._roles[:, Role.open]]
-        size = [max(cfg.scene.objects[r.name].half) + _REACH for r in moved]
-        beside = self._target[self._roles[:, Role.down], :2].norm(dim=1) * self._pushes
-        self._reach = torch.tensor(size, device=device) + beside
-
-        has_faces = [thing.has_faces for thing in cfg.scene.objects.values()]
-        self._has_faces = torch.tensor(has_faces, device=device)
+        size = tensor(max(cfg.scene.objects[r.name].half) + _REACH for r in moved)
+        beside = norm(self._target[self._roles[:, Role.down], :2])
+        self._reach = size + beside * self._pushes
+        self._has_faces = tensor(thing.has_faces for thing in cfg.scene.objects.values())
 
         # Heights of targets: over an anchor that may stand anywhere, or over the table
-        above = [phase.target.above if phase.target else 0.0 for phase in self._aimed]
-        self._above = torch.tensor(above, device=device)
-        follows = [follows_anchor(phase, things) for phase in self._aimed]
-        self._follows = torch.tensor(follows, device=device)
-        self._off_center = torch.tensor(_OFF_CENTER, device=device)
+        self._above = tensor(phase.target.above if phase.target else 0.0 for phase in self._aimed)
+        self._follows = tensor(follows_anchor(phase, things) for phase in self._aimed)
+        self._off_center = tensor(_OFF_CENTER)
 
         # The robot
         names = cfg.robot.joints
@@ -208,7 +205,7 @@ class StateBasedDriver(FeedbackDriver):
         foreign = (state.in_hand.sum(1) > in_jaws) & ~grasped & ~letting_go
         offset = state.point - self._point(state, phases[:, Role.close])
         near = _NEAR_CLOSED + (_NEAR - _NEAR_CLOSED) * state.opening.clamp(0.0, 1.0)
-        there = torch.linalg.vector_norm(offset[:, :2], dim=1) <= near
+        there = norm(offset[:, :2]) <= near
         stuck = _STUCK * (1.0 - state.speed / _STILL).clamp(min=0.0)
         there &= (offset[:, 2] >= -_DEPTH) & (offset[:, 2] <= _DEPTH + stuck)
         role = torch.where(there, Role.close, Role.down)
@@ -243,7 +240,7 @@ class StateBasedDriver(FeedbackDriver):
             way = (beside - pos[:, k] - offsets[:, k])[:, :2]
             share = (off[:, :2] * way).sum(1) / way.square().sum(1).clamp(min=1e-9)
             miss = off[:, :2] - share.clamp(0.0, 1.0)[:, None] * way
-            near = torch.linalg.vector_norm(miss, dim=1) <= _BESIDE
+            near = norm(miss) <= _BESIDE
             between[:, k] = near & (off[:, 2] <= _BESIDE)
             grasped[:, k] = between[:, k] & (state.opening <= _SHUT)
         placed = self._check.placed(self._view.step())
@@ -251,7 +248,7 @@ class StateBasedDriver(FeedbackDriver):
         placed = torch.cat((placed, unknown), dim=1).index_select(1, self._judged)
         places = [self._point(state, row[Role.place].expand(len(pos))) for row in self._roles]
         offset = pos - (torch.stack(places, dim=1) - offsets)
-        across = torch.linalg.vector_norm(offset[..., :2], dim=2)
+        across = norm(offset[..., :2])
         there = (across <= _AT_GOAL) & (offset[..., 2] <= _ABOVE)
         return (there | placed & ~grasped) & self._leaves, grasped, between
 
@@ -266,8 +263,8 @@ class StateBasedDriver(FeedbackDriver):
         thing = state.pos[self._worlds, due.object]
         pushing = due.grasped & due.pushes
         off = point - thing - due.offset
-        touches = 1.0 - torch.linalg.vector_norm(off[:, :2], dim=1) / _BESIDE
-        far = torch.linalg.vector_norm(point - thing, dim=1) > self._reach.amax()
+        touches = 1.0 - norm(off[:, :2]) / _BESIDE
+        far = norm(point - thing) > self._reach.amax()
         off = torch.minimum(torch.maximum(off, -self._off_center), self._off_center)
         off[:, 2] *= ~due.pushes  # fingers of any height push
         end = self._point(state, phase) + off * due.led[:, None]
@@ -283,7 +280,7 @@ class StateBasedDriver(FeedbackDriver):
         clear = self._point(state, self._roles[0, Role.retreat].expand_as(phase))[:, 2]
         most = torch.maximum(self._point(state, before)[:, 2], end[:, 2])
         most = torch.where(due.later & ~due.grasped, torch.maximum(most, clear), most)
-        across = torch.linalg.vector_norm((end - point)[:, :2], dim=1)
+        across = norm((end - point)[:, :2])
         higher = _FUNNEL * (across - _NEAR).clamp(min=0.0)
         ready = _ROLL_FUNNEL * (due.turn.abs() - _TURNED).clamp(min=0.0)
         opens = self._opened[due.phases[:, Role.down]]
@@ -295,7 +292,7 @@ class StateBasedDriver(FeedbackDriver):
 
         # How far in this step
         move = torch.cat(((end - point)[:, :2] * level[:, None], (way - point[:, 2])[:, None]), 1)
-        distance = torch.linalg.vector_norm(move, dim=1)
+        distance = norm(move)
         slow = torch.where(due.pushes, _PUSH_SPEED, _CARRY_SPEED)
         speed = torch.where(due.grasped, slow, _SPEED) * self._cfg.timing.step_dt
         slowing = torch.where(pushing, _PUSH_SLOWING, _SLOWING)
@@ -363,7 +360,7 @@ class StateBasedDriver(FeedbackDriver):
     def _gap(self, state: State) -> Tensor:
         """Distance of the grasp point from each moved object [m], ``(nworld, objects)``."""
         pos = state.pos.index_select(1, self._moved)
-        return torch.linalg.vector_norm(state.point[:, None] - pos, dim=2)
+        return norm(state.point[:, None] - pos)
 
     def _point(self, state: State, phase: Tensor) -> Tensor:
         """Target of each world's phase, from where its anchor is [m], shape ``(nworld, 3)``."""

@@ -94,7 +94,7 @@ class CarryTilt:
         axis = self._there_ik.forward(self._there)[2]
         axis = torch.where(keeps[:, None], self._last_axis, axis)
         since = torch.where(keeps, self._last_turn, self._there[:, 0])
-        return self._turned(axis, command[:, 0] - since)
+        return turn_about_z(axis, self._sign * (command[:, 0] - since))
 
     def release_approach(self, command: Tensor, phase: Tensor, there: Tensor) -> Tensor:
         """Approach axis of the release pose, turned about the vertical to where the arm looks; from
@@ -102,11 +102,8 @@ class CarryTilt:
         """
         start = self._nominal[self.place[phase]]
         arm = self._there_ik.solve(start, there)[0]
-        return self._turned(self._there_ik.forward(arm)[2], command[:, 0] - arm[:, 0])
-
-    def _turned(self, axis: Tensor, turn: Tensor) -> Tensor:
-        """Axes, shape ``(nworld, 3)``, turned with the first joint [rad], shape ``(nworld,)``."""
-        return turn_about_z(axis, self._sign * turn)
+        axis = self._there_ik.forward(arm)[2]
+        return turn_about_z(axis, self._sign * (command[:, 0] - arm[:, 0]))
 
 
 def turn_about_z(vectors: Tensor, angle: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from mjstack.config.fields import Count, Fraction, NotNegative, Positive
 from mjstack.errors import ParameterError, UnknownName
 from mjstack.managers.action import ActionTerm
 from mjstack.managers.view import EnvView
-from mjstack.math import atan2
+from mjstack.math import atan2, norm
 from mjstack.mdp.geometry import Pose, robot
 from mjstack.scene.index import Columns
 
@@ -204,7 +204,7 @@ class EndEffectorDelta(_Commands):
         plane through the base and the grasp point.
         """
         goal = 0.5 * (action + 1.0) * self._tilt
-        away = point[:, :2] / torch.linalg.vector_norm(point[:, :2], dim=1, keepdim=True)
+        away = point[:, :2] / norm(point[:, :2])[:, None]
         now = atan2((approach[:, :2] * away).sum(1), -approach[:, 2])
         angle = now + (goal - now).clamp(-_TILT_STEP, _TILT_STEP)
         return torch.cat((torch.sin(angle)[:, None] * away, -torch.cos(angle)[:, None]), dim=1)

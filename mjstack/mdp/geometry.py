@@ -10,7 +10,7 @@ from torch import Tensor
 from mjstack.errors import UnknownName
 from mjstack.managers.term import shared
 from mjstack.managers.view import EnvView, episode_draw
-from mjstack.math import lowest_point, not_finite
+from mjstack.math import lowest_point, norm, not_finite
 from mjstack.scene.index import ALL, RobotTensors, Rows, SceneIndex
 from mjstack.sim.simulation import Simulation
 
@@ -61,7 +61,7 @@ def lost_state(env: EnvView) -> Tensor:
 
 def nearness(offset: Tensor, scale: float) -> Tensor:
     """``1 - tanh(distance / scale)`` of offsets [m], shape ``(nworld, d)``; shape ``(nworld,)``."""
-    return 1.0 - torch.tanh(torch.linalg.vector_norm(offset, dim=1) / scale)
+    return 1.0 - torch.tanh(norm(offset) / scale)
 
 
 def above_table(env: EnvView, name: str) -> Tensor:
@@ -126,4 +126,4 @@ def jaw_forces(index: SceneIndex, sim: Simulation, name: str) -> Tensor:
     if name not in index.jaw_force:
         raise UnknownName("object", name, index.jaw_force)
     parts = [sim.sensordata[:, a : a + 3] for a in index.jaw_force[name]]
-    return torch.linalg.vector_norm(torch.stack(parts, dim=1), dim=2)
+    return norm(torch.stack(parts, dim=1))

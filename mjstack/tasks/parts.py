@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from mjstack.math import quat_angle
+from mjstack.math import norm, quat_angle
 from mjstack.mdp.geometry import place_xy
 from mjstack.tasks.check import Judgement, Rule
 from mjstack.tasks.view import PhaseNames, Step, TaskView
@@ -98,7 +98,7 @@ def offset(step: Step, object: str, onto: str) -> tuple[Tensor, Tensor]:
     ``(nworld,)``.
     """
     apart = step.center(object) - step.center(onto)
-    return torch.linalg.vector_norm(apart[:, :2], dim=1), apart[:, 2]
+    return norm(apart[:, :2]), apart[:, 2]
 
 
 def on_top_of(step: Step, onto: str, object: str) -> Tensor:
@@ -116,7 +116,7 @@ def at_place(object: str, place: str, *, distance: float) -> Condition:
 def away(step: Step, object: str, place: str) -> Tensor:
     """Horizontal distance of an object's centre from a place [m], shape ``(nworld,)``."""
     apart = step.center(object)[:, :2] - place_xy(step.view.env, place).float()
-    return torch.linalg.vector_norm(apart, dim=1)
+    return norm(apart)
 
 
 def on_table(object: str, *, gap: float) -> Condition:
@@ -251,7 +251,7 @@ class Carried(Streak):
         begins = counts & (self.length == 0.0)
         self._from.copy_(torch.where(begins[..., None], xy, self._from))
         self.length.add_(1.0).mul_(counts)
-        away = torch.linalg.vector_norm(xy - self._from, dim=-1)
+        away = norm(xy - self._from)
         self._far.copy_(torch.where(counts, torch.maximum(self._far, away), 0.0))
         torch.maximum(self._longest, self.length, out=self._longest)
         far = torch.where(self.length >= self._steps, self._far, 0.0)
@@ -364,7 +364,7 @@ class AtRest(Rule):
             a = self._poses[:, : self.window - lag]
             b = self._poses[:, lag:]
             # amax hands NaN on, so that an unfilled or diverged window fails its rule.
-            apart = torch.linalg.vector_norm(a[..., :3] - b[..., :3], dim=-1)
+            apart = norm(a[..., :3] - b[..., :3])
             distance = torch.maximum(distance, apart.amax((1, 2)))
             angle = torch.maximum(angle, quat_angle(a[..., 3:], b[..., 3:]).amax((1, 2)))
         turn = math.radians(self.rotation_deg)

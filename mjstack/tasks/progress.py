@@ -6,6 +6,7 @@ from torch import Tensor
 from mjstack.config.fields import Fraction, Positive
 from mjstack.errors import ConfigError
 from mjstack.managers.view import EnvView
+from mjstack.math import norm
 from mjstack.mdp.observation import grasp_point_pos
 from mjstack.tasks.check import make_check
 
@@ -87,8 +88,8 @@ class Progress:
         # Which stages each object has got to
         offset = pos - goal
         above = offset[..., 2]
-        away = torch.linalg.vector_norm(pos - grasp_point_pos(env).float()[:, None], dim=-1)
-        across = torch.linalg.vector_norm(offset[..., :2], dim=-1)
+        away = norm(pos - grasp_point_pos(env).float()[:, None])
+        across = norm(offset[..., :2])
         grasped = in_hand & (away <= self._within)
         lifted = grasped & (low >= self._height)
         over = (across <= self._near) & (above >= -BELOW)

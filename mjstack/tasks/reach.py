@@ -3,11 +3,11 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 from typing_extensions import override
 
 from mjstack.config.fields import spec
+from mjstack.math import norm
 from mjstack.mdp.observation import grasp_point_to_object
 from mjstack.tasks.check import EpisodeCheck, Rule
 from mjstack.tasks.parts import InWindow
@@ -47,7 +47,7 @@ class ReachCheck(EpisodeCheck):
     def trace(self, step: Step) -> dict[str, Tensor]:
         t = self.t
         offset = grasp_point_to_object(step.view.env, object=t.object, height=t.height)
-        return {"distance_m": torch.linalg.vector_norm(offset, dim=1)}
+        return {"distance_m": norm(offset)}
 
     def headline(self, values: Mapping[str, float]) -> str:
         """How near it is."""

@@ -13,7 +13,7 @@ from torch import Tensor
 from mjstack.errors import UnknownName
 from mjstack.managers.term import known_values
 from mjstack.managers.view import EnvView
-from mjstack.math import lowest_point, quat_to_matrix
+from mjstack.math import lowest_point, norm, quat_to_matrix
 from mjstack.mdp.geometry import LOADED, gripper_opening, pose_w
 from mjstack.mdp.observation import object_velocity
 from mjstack.scene.index import Columns
@@ -221,7 +221,7 @@ class Step:
     @step_value
     def speed(self) -> Tensor:
         """Fastest that any point can be [m/s], shape ``(nworld, objects)``."""
-        parts = torch.linalg.vector_norm(self.velocity.unflatten(-1, (2, 3)), dim=-1)
+        parts = norm(self.velocity.unflatten(-1, (2, 3)))
         linear, angular = parts.unbind(-1)
         return linear + self.view.radius * angular
 
@@ -236,7 +236,7 @@ class Step:
         linear = (self.turn * self.velocity[..., :3, None]).sum(-2)
         spin = self.velocity[..., None, 3:].expand(-1, -1, 8, -1)
         swept = torch.linalg.cross(spin, arms.expand_as(spin))
-        return torch.linalg.vector_norm(linear[..., None, :] + swept, dim=-1).amax(-1)
+        return norm(linear[..., None, :] + swept).amax(-1)
 
     @step_value
     def pressed(self) -> Tensor:
@@ -292,4 +292,4 @@ class Step:
     def _sensed(self, columns: Columns) -> Tensor:
         shape = (len(self.view.objects), -1, 3)
         forces = self.view.env.sim.part("sensordata", columns, *shape)
-        return torch.linalg.vector_norm(forces, dim=-1) > self.view.force
+        return norm(forces) > self.view.force
