@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 _CONSTANT = 1e-6  # a column that varies less has no scale
 _UNBOUNDED = torch.finfo(torch.float32).max
-FARTHEST = 5.0  # standard deviations: an observation beyond is taken for one there
+_FARTHEST = 5.0  # standard deviations: an observation beyond is taken for one there
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,7 +124,7 @@ class PolicyNetwork(nn.Module):
         its images.
         """
         scaled = (observation - self.observation_mean) / self.observation_std
-        scaled = scaled.clamp(-FARTHEST, FARTHEST)
+        scaled = scaled.clamp(-_FARTHEST, _FARTHEST)
         scaled = torch.cat([scaled, *(part.to(scaled.dtype) for part in features)], dim=1)
         return self.layers(scaled).unflatten(1, (self.chunk, self.width))
 
