@@ -6,6 +6,7 @@ import time
 from collections import Counter
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,6 @@ import mjstack.train.rounds as rounds
 from mjstack.cli import run
 from mjstack.distributed import Ranks
 from mjstack.drivers.driver import Driver
-from mjstack.drivers.policy import QueryImages
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, FolderError
 from mjstack.math import wilson_interval
@@ -178,14 +178,14 @@ def test_gradients_are_cut_and_the_learning_rate_rises(tmp_path: Path, monkeypat
             cut()
 
         monkeypatch.setattr(learner._optimizer, "step", step)
-        learner.learn(0, 20)
+        learner.learn()
     np.testing.assert_allclose(lengths, 0.001, rtol=1e-3)
     share = np.arange(20) / 20
     cosine = 0.001 * (1.0 + np.cos(np.pi * share)) / 2
     np.testing.assert_allclose(rates, cosine * np.minimum(1.0, 2 * share), rtol=1e-5)
 
 
-def test_the_share_of_the_expert() -> None:
+def test_the_share_of_the_expert(monkeypatch: pytest.MonkeyPatch) -> None:
     """Worlds in which the policy drives alone get its targets; in the others the expert drives for
     about its share of the spells.
     """
@@ -199,14 +199,20 @@ def test_the_share_of_the_expert() -> None:
         def __init__(self, value: float) -> None:
             super().__init__(40, 150, env.device)
             self.value = torch.full((40, len(env.index.ctrl)), value)
+            self.query_images = None
 
         def command(self) -> torch.Tensor:
             return self.value
 
     expert, policy = Constant(1.0), Constant(2.0)
-    images = QueryImages(env, {}, [], 25)
-    options = {"beta": 0.5, "alone": 10, "spell": 25, "length": 0.5}
-    driver = rounds.MixedDriver(expert, policy, env, images, **options)  # type: ignore[arg-type]
+    monkeypatch.setattr(rounds, "PolicyDriver", lambda *args: policy)
+    job = SimpleNamespace(length=0.5, spell=25 * env.cfg.timing.step_dt, execute=1)
+    scene = SimpleNamespace(cameras={})
+    stage: Any = SimpleNamespace(
+        cfg=SimpleNamespace(job=job, scene=scene), driver=lambda env: expert
+    )
+    trained: Any = policy
+    driver = rounds.MixedDriver(stage, env, trained, beta=0.5, alone=10)
     assert driver.steps == 75
     seen = []
     for step in range(0, 1000, 25):

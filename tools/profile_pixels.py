@@ -27,6 +27,7 @@ from mjstack.train.rounds import make_round
 
 def measure(args: argparse.Namespace, cfg: Config, advance: Advance) -> Iterator[Table]:
     """Profile batches of the configured training."""
+    cfg.job.batches = args.batches
     stage = Stage(cfg)
     device = stage.backend[1]
     kinds = [ProfilerActivity.CPU, *[ProfilerActivity.CUDA] * device.startswith("cuda")]
@@ -36,10 +37,10 @@ def measure(args: argparse.Namespace, cfg: Config, advance: Advance) -> Iterator
         pool = ImagePool(sizes, pool_rows(stage, stage.episode_steps), device)
         episodes = make_round(stage, folder, None, 0, pool)
         learner = CloneLearner(stage, episodes, folder, pool)
-        learner.learn(0, 5)  # warms up
+        learner.learn(1)  # warms up
         before = learner.seconds
         with profile(activities=kinds) as found:
-            learner.learn(5, 5 + args.batches)
+            learner.learn(2)
     events = found.key_averages()
     device_times = [event.self_device_time_total for event in events]
     on_device = math.fsum(device_times) > 0.0

@@ -29,6 +29,8 @@ from mjstack.errors import FolderError
 from mjstack.files import read_inside, reading, write_atomic
 from mjstack.policy.network import PolicyNetwork, Vision
 
+Facts = dict[str, Any]
+"""Values in JSON's types, by name."""
 FORMAT = 5  # grows when an older mjstack could not read what is written
 _NAME_ANOTHER = "Name a policy that job=train has written, such as outputs/mine/last"
 # A stranger's files may ask for more than this.
@@ -62,9 +64,9 @@ class Policy:
     observation: ObservationGroupCfg
     widths: dict[str, int]
     execute: int
-    config: dict[str, Any]
+    config: Facts
     action: dict[str, TermCfg]
-    training: dict[str, Any] = field(default_factory=dict)
+    training: Facts = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)
     folder: Path | None = None
 
@@ -97,7 +99,7 @@ class Policy:
             *({key.format(name): terms[name] for name in terms} for terms in (self.widths, widths))
         )
 
-    def _compare(self, trained: Mapping[str, Any], here: Mapping[str, Any]) -> None:
+    def _compare(self, trained: Facts, here: Facts) -> None:
         for key in dict.fromkeys([*trained, *here]):
             before = trained.get(key, "missing")
             now = here.get(key, "missing")
@@ -118,7 +120,7 @@ _REQUIRED = (
 )
 
 
-def _requirements(config: Mapping[str, Any], cameras: Sequence[str]) -> dict[str, Any]:
+def _requirements(config: Facts, cameras: Sequence[str]) -> Facts:
     """The values that a policy depends on, by dotted key. Physics, solver and starts may differ."""
     keys = (key.split(".") for key in _REQUIRED)
     values = {f"{group}.{key}": config[group][key] for group, key in keys}
@@ -161,7 +163,7 @@ def save_policy(folder: Path, policy: Policy) -> None:
             path.unlink(missing_ok=True)
 
 
-def policy_facts(policy: Policy) -> dict[str, Any]:
+def policy_facts(policy: Policy) -> Facts:
     """Observation, action, network and training of a policy, in JSON's types."""
     vision = policy.network.vision
     images = {name: list(size) for name, size in vision.sizes.items()}
@@ -235,7 +237,7 @@ def load_policy(folder: Path) -> Policy:
     return policy
 
 
-def _from_facts(facts: Mapping[str, Any], path: Path) -> Policy:
+def _from_facts(facts: Facts, path: Path) -> Policy:
     """The policy of a file, its weights without memory, so that sizes of a stranger take none."""
     seen = facts["observation"]
     action = facts["action"]
@@ -274,7 +276,7 @@ def _from_facts(facts: Mapping[str, Any], path: Path) -> Policy:
     return policy
 
 
-def _read_vision(facts: Mapping[str, Any]) -> Vision:
+def _read_vision(facts: Facts) -> Vision:
     """The images that the policy of a file sees."""
     images = facts["observation"].get("images", {})
     if not images:
@@ -304,7 +306,7 @@ def _weights_name(digest: str) -> str:
     return f"weights-{digest[:12]}.safetensors"
 
 
-def _read_terms(key: str, nodes: Mapping[str, Any], model: type, path: Path) -> dict[str, Any]:
+def _read_terms(key: str, nodes: Facts, model: type, path: Path) -> Facts:
     """Terms of a policy's file at a dotted key, which it may name."""
     if len(nodes) > _MOST_TERMS:
         raise ValueError(f"{key} has {len(nodes)} terms, expected at most {_MOST_TERMS}")
@@ -329,7 +331,7 @@ def _writing(path: Path) -> Iterator[None]:
         ) from error
 
 
-def write_state(path: Path, tensors: Mapping[str, Tensor], facts: Mapping[str, Any]) -> None:
+def write_state(path: Path, tensors: Mapping[str, Tensor], facts: Facts) -> None:
     """Write tensors and facts in JSON's types as one file, at once or not at all.
 
     Raises:
@@ -340,7 +342,7 @@ def write_state(path: Path, tensors: Mapping[str, Tensor], facts: Mapping[str, A
         write_atomic(path, save(plain, metadata={"facts": json.dumps(facts)}))
 
 
-def read_state(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def read_state(path: Path) -> tuple[dict[str, Tensor], Facts]:
     """Tensors and facts of `write_state`.
 
     Raises:

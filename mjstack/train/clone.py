@@ -3,18 +3,16 @@ does, in the expert's episodes and, with rounds, in states to which the policy i
 """
 
 import math
-import time
 from collections import Counter
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from mjstack.config.schema import CloneJobCfg
 from mjstack.episodes.rollout import STATE_BASED
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, MjstackError, UnknownName
 from mjstack.math import rate_interval
+from mjstack.policy.checkpoint import Facts
 from mjstack.train.clone_learner import CloneLearner
 from mjstack.train.clone_network import vision_of
 from mjstack.train.dataset import check_dataset, read_demonstrations
@@ -103,9 +101,7 @@ def train_clone(stage: Stage, folder: Path) -> Trained:
         first = make_round(stage, folder, None, 0, pool)
         _judge(stage, "round 0: the expert" if job.rounds else "the expert", first)
     else:
-        began = time.perf_counter()
         first = read_demonstrations(stage, observed_widths(stage))
-        first = replace(first, seconds=time.perf_counter() - began)
     if len(first.ends) < 2:
         raise MjstackError(
             f"{first.source}: {len(first.ends)} of {first.played} episodes succeeded, expected two"
@@ -122,16 +118,15 @@ def train_clone(stage: Stage, folder: Path) -> Trained:
             learner.learn()
         for number in range(1, job.rounds + 1):
             learner.process(Demonstrations.join(parts))
-            learner.learn((number - 1) * job.batches, number * job.batches)
+            learner.learn(number)
             part = make_round(stage, folder, learner.policy, number, pool)
             parts.append(part)
             figures = _judge(stage, f"round {number}: the policy alone", part)
             if len(learner.curve) < number:
                 learner.conclude(number, figures)
     if stage.ranks.writes:  # the others have read theirs
-        for number in range(job.rounds + 1):
-            for rank in range(stage.ranks.size):
-                (folder / round_file(number, rank)).unlink(missing_ok=True)
+        for path in folder.glob(round_file("*", "*")):
+            path.unlink()
     return _trained(job, folder, learner.facts())
 
 
@@ -157,7 +152,7 @@ def _judge(stage: Stage, who: str, episodes: Demonstrations) -> dict[str, float]
     }
 
 
-def _trained(job: CloneJobCfg, folder: Path, facts: dict[str, Any]) -> Trained:
+def _trained(job: CloneJobCfg, folder: Path, facts: Facts) -> Trained:
     """The result of a complete training, from the facts of its state."""
     curve = facts["curve"]
     expert = dict(facts["expert"])

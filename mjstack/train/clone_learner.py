@@ -16,6 +16,7 @@ from mjstack.config.fingerprint import config_content
 from mjstack.config.schema import CloneJobCfg
 from mjstack.episodes.stage import Stage
 from mjstack.policy import Policy, PolicyNetwork
+from mjstack.policy.checkpoint import Facts
 from mjstack.sim.graph import StepGraph
 from mjstack.train.clone_network import Estimator, input_noise, make_network
 from mjstack.train.demonstrations import Demonstrations
@@ -88,15 +89,11 @@ class CloneLearner(Learner):
         self._widest = input_noise(cfg, stage.model, demonstrations.widths).to(device)
         self._generator = torch.Generator(device)
         self._augment = Augmentation(job.vision, len(job.vision.cameras), size, device)
-        seen = cfg.observation[job.group]
         facts = (demonstrations.widths, job.execute, config_content(cfg), cfg.controller.action)
-        self.policy = Policy(self._average, job.group, seen, *facts)
+        self.policy = Policy(self._average, job.group, cfg.observation[job.group], *facts)
 
         self._sum = torch.zeros((), device=device)  # of losses since the last row
         self._networks.register_buffer("sum", self._sum)  # so it is part of the state
-        self._first = 0
-        self._total = job.batches
-        self._batch: Callable[[], None] = self._fit
 
     def process(self, demonstrations: Demonstrations) -> None:
         """Learn from these demonstrations from now on, whose range of joint targets is the
@@ -110,6 +107,7 @@ class CloneLearner(Learner):
             "expert_s": demonstrations.seconds,
             "source": demonstrations.source,
         }
+        self._notes = {"episodes": int(counts[0])}
         ranges = self._ranks.gather([part.cpu() for part in demonstrations.labels.aminmax(dim=0)])
         low, high = (torch.stack(parts) for parts in zip(*ranges, strict=True))
         self._average.set_range(low.amin(0), high.amax(0))
@@ -133,16 +131,12 @@ class CloneLearner(Learner):
         if not len(self._validation):  # of few episodes the expert may drive no chunk that is one
             self._validation, self._validation_rows = self._training, self._rows
 
-    def learn(self, first: int = 0, total: int | None = None) -> None:
-        """Make the missing batches; see `Learner`.
-
-        Args:
-            first: Batch with which the learning rate begins.
-            total: Batch with which it has fallen to 0; the job's if None.
+    def learn(self, number: int = 1) -> None:
+        """Make the missing batches of a round, in which the learning rate falls to 0; see
+        `Learner`.
         """
-        self._first = first
-        self._total = self._job.batches if total is None else total
-        self._batch = self._fit
+        self._total = number * self._job.batches
+        self._batch: Callable[[], None] = self._fit
         if self._seen.is_cuda and self._ranks.size == 1:
             # Demonstrations and weights stay where they are in memory until the last batch.
             mode = self._cfg.graph
@@ -166,7 +160,8 @@ class CloneLearner(Learner):
         """One batch. What it draws follows from the seed and the batch's number, so training goes
         on after any of them.
         """
-        share = (self.done - self._first) / (self._total - self._first)
+        batches = self._job.batches
+        share = (self.done - (self._total - batches)) / batches
         rate = 0.5 * (1.0 + math.cos(math.pi * share))
         if self._job.warm_up > 0.0:
             rate *= min(1.0, share / self._job.warm_up)
@@ -255,7 +250,7 @@ class CloneLearner(Learner):
         self._ranks.sum_(total, count)
         return float(total / count)
 
-    def _new_row(self) -> dict[str, Any]:
+    def _new_row(self) -> Facts:
         """A row of the curve. The next one has other batches."""
         loss = self._validate()
         earlier = self.curve[-1]["batch"] if self.curve else 0
@@ -271,7 +266,7 @@ class CloneLearner(Learner):
         return row
 
     @override
-    def score(self, row: Mapping[str, Any]) -> tuple[float, ...]:
+    def score(self, row: Facts) -> tuple[float, ...]:
         if self._job.rounds:
             return row["success"], -row["round"]
         return (-row["validation_loss"],)
@@ -288,11 +283,8 @@ class CloneLearner(Learner):
         """End a round, with figures of its policy's episodes, ``success`` among them."""
         self._save(round=number, **figures)
 
-    def _notes(self) -> dict[str, Any]:
-        return {"episodes": self._expert["episodes"]}
-
     @override
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Facts:
         pool = {} if self._pool is None else {"pool": len(self._pool.steps)}
         made = {"made_with": made_with(self._stage), "expert": self._expert}
         return super().facts() | made | pool

@@ -3,10 +3,10 @@ that a policy sees.
 """
 
 import json
+import time
 from collections.abc import Mapping, Sequence
 from operator import index
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ from mjstack.datasets.reader import (
 from mjstack.datasets.spec import term_columns
 from mjstack.episodes.stage import Stage
 from mjstack.errors import FolderError
+from mjstack.policy.checkpoint import Facts
 from mjstack.train.demonstrations import Demonstrations
 
 _ACTION = "action"
@@ -47,15 +48,12 @@ def check_dataset(stage: Stage, widths: Mapping[str, int]) -> range:
             rate.
     """
     cfg = stage.cfg
-    folder = _folder(cfg)
-    info = _read_info(folder)
-    places = _find_columns(info, cfg, widths)
-    _task_number(cfg)
+    folder, info, places = _open(cfg, widths)
+    _task_number(cfg, folder)
     lengths, seeds = _rows(folder, info)
     check_frames(folder, info, lengths)
     # The ranges of the first file: degrees, say, are far out of them
-    path = data_files(folder, info)[0]
-    action = _read(path, {_ACTION: places[_ACTION]}, info)[_ACTION]
+    action = _read(data_files(folder, info)[0], {_ACTION: places[_ACTION]}, info)[_ACTION]
     low, high = stage.index.ctrl_range.T
     worst = np.maximum(low - action, action - high).max(0)
     joint = int(worst.argmax())
@@ -77,10 +75,8 @@ def read_demonstrations(stage: Stage, widths: dict[str, int]) -> Demonstrations:
     Raises:
         FolderError: A file is missing or damaged.
     """
-    cfg = stage.cfg
-    folder = _folder(cfg)
-    info = _read_info(folder)
-    places = _find_columns(info, cfg, widths)
+    began = time.perf_counter()
+    folder, info, places = _open(stage.cfg, widths)
     facts = [_EPISODE, _TASK, *({_SUCCESS} & info["features"].keys())]
     places |= {name: [(name, 0)] for name in facts}
     parts = [_read(path, places, info) for path in data_files(folder, info)]
@@ -89,7 +85,7 @@ def read_demonstrations(stage: Stage, widths: dict[str, int]) -> Demonstrations:
     # Episodes of the task that succeeded
     ends = np.flatnonzero(np.diff(columns[_EPISODE][:, 0], append=-1)) + 1
     starts = np.concatenate([[0], ends[:-1]])
-    usable = columns[_TASK][ends - 1, 0] == _task_number(cfg)
+    usable = columns[_TASK][ends - 1, 0] == _task_number(stage.cfg, folder)
     if _SUCCESS in columns:
         usable &= columns[_SUCCESS][ends - 1, 0] != 0.0
     ranks = stage.ranks
@@ -115,15 +111,12 @@ def read_demonstrations(stage: Stage, widths: dict[str, int]) -> Demonstrations:
         ),
         widths=widths,
         played=played,
+        seconds=time.perf_counter() - began,
         source=str(folder),
     )
 
 
-def _folder(cfg: Config) -> Path:
-    return Path(str(cfg.job.dataset))
-
-
-def _read_info(folder: Path) -> dict[str, Any]:
+def _read_info(folder: Path) -> Facts:
     """The content of info.json of a LeRobotDataset v3."""
     lerobot.require_pyarrow()
     path = folder / lerobot.INFO
@@ -148,15 +141,16 @@ def _read_info(folder: Path) -> dict[str, Any]:
     return info
 
 
-def _find_columns(
-    info: Mapping[str, Any], cfg: Config, widths: Mapping[str, int]
-) -> dict[str, list[Place]]:
-    """Where the numbers of the observation and of the action are.
+def _open(cfg: Config, widths: Mapping[str, int]) -> tuple[Path, Facts, dict[str, list[Place]]]:
+    """The folder of the job's dataset, its info.json, and where the numbers of the observation and
+    of the action are.
 
     Raises:
         FolderError: One is missing, or the dataset is of another robot or rate.
     """
-    folder = _folder(cfg)
+    job: CloneJobCfg = cfg.job
+    folder = Path(str(job.dataset))
+    info = _read_info(folder)
     expected = {"robot_type": cfg.robot.name, "fps": round(cfg.task.control_hz)}
     for key, value in expected.items():
         if (recorded := info.get(key)) != value:
@@ -182,7 +176,6 @@ def _find_columns(
                 )
         return [places[column] for column in columns]
 
-    job: CloneJobCfg = cfg.job
     terms = job.observation[job.group].terms
     numbers = [
         column
@@ -191,10 +184,11 @@ def _find_columns(
     ]
     name = f"observation.{job.group}"
     beside = [key for key in info["features"] if key.startswith("observation.") and key != name]
-    return {
+    places = {
         "observation": locate([name, *beside], numbers),
         _ACTION: locate([_ACTION], [f"{joint}.pos" for joint in cfg.robot.joints]),
     }
+    return folder, info, places
 
 
 def _names(value: object) -> list[object]:
@@ -206,7 +200,7 @@ def _names(value: object) -> list[object]:
     return value if isinstance(value, list) else []
 
 
-def _rows(folder: Path, info: dict[str, Any]) -> tuple[list[int], list[int]]:
+def _rows(folder: Path, info: Facts) -> tuple[list[int], list[int]]:
     """Length of every episode, and its seed as far as the dataset has any."""
     lengths: list[int] = []
     seeds: list[int] = []
@@ -218,13 +212,12 @@ def _rows(folder: Path, info: dict[str, Any]) -> tuple[list[int], list[int]]:
     return lengths, seeds
 
 
-def _task_number(cfg: Config) -> int:
-    """Number of the task in the dataset.
+def _task_number(cfg: Config, folder: Path) -> int:
+    """Number of the task in the dataset of a folder.
 
     Raises:
         FolderError: The dataset does not have it.
     """
-    folder = _folder(cfg)
     path = folder / lerobot.TASKS
     with readable(path):
         table = read_table(path)
@@ -240,9 +233,7 @@ def _task_number(cfg: Config) -> int:
     return tasks[cfg.task.instruction]
 
 
-def _read(
-    path: Path, columns: Mapping[str, Sequence[Place]], info: dict[str, Any]
-) -> dict[str, np.ndarray]:
+def _read(path: Path, columns: Mapping[str, Sequence[Place]], info: Facts) -> dict[str, np.ndarray]:
     """Numbers of a data file by name, each shape ``(frames, numbers)``; every row of a feature has
     its shape in info.json.
     """

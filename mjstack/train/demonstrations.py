@@ -116,7 +116,7 @@ class Demonstrations:
     def episode(self) -> Tensor:
         """The episode that each step belongs to, shape ``(steps,)``, int64."""
         lengths = self.ends.diff(prepend=self.ends.new_zeros(1))
-        return torch.arange(len(lengths), device=lengths.device).repeat_interleave(lengths)
+        return torch.repeat_interleave(lengths)
 
     def usable(self, job: CloneJobCfg) -> Tensor:
         """Steps to learn from, ascending, shape ``(n,)``, int64: the expert drove all steps of the

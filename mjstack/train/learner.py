@@ -5,7 +5,6 @@ state, and goes on where it was stopped.
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from mjstack.episodes.stage import Stage
 from mjstack.errors import MjstackError
 from mjstack.interrupt import check_interrupt, interrupted
 from mjstack.policy import Policy, save_policy
-from mjstack.policy.checkpoint import write_state
+from mjstack.policy.checkpoint import Facts, write_state
 from mjstack.train.trainer import BEST, LAST, STATE
 
 
@@ -56,8 +55,9 @@ class Learner(ABC):
         self._save_every = save_every
         self.done = 0
         self.seconds = 0.0
-        self.curve: list[dict[str, Any]] = []
+        self.curve: list[Facts] = []
         self._before = 0.0  # seconds of earlier calls
+        self._notes: Facts = {}  # what the policy's file says of its training beside the row
 
     def learn(self) -> None:
         """Make the missing steps, saving policies and state now and then.
@@ -102,7 +102,7 @@ class Learner(ABC):
             events.close()
 
     @abstractmethod
-    def score(self, row: Mapping[str, Any]) -> tuple[float, ...]:
+    def score(self, row: Facts) -> tuple[float, ...]:
         """How good the policy of a row is: the first number decides, equal ones go by the next."""
 
     @abstractmethod
@@ -118,12 +118,8 @@ class Learner(ABC):
         """Show the progress."""
 
     @abstractmethod
-    def _new_row(self) -> dict[str, Any]:
+    def _new_row(self) -> Facts:
         """Figures since the last row. The policy's network is up to date afterwards."""
-
-    def _notes(self) -> dict[str, Any]:
-        """What the policy's file says of its training beside the row."""
-        return {}
 
     def _save(self, **figures: Any) -> None:
         """Add a row to the curve, with figures in front of it, and write policies and state."""
@@ -134,7 +130,7 @@ class Learner(ABC):
         # JSON has no NaN
         known = {name: value for name, value in row.items() if not math.isnan(value)}
         names = {"trainer": self.trainer, "seed": self._cfg.seed}
-        self.policy.training = names | self._notes() | known
+        self.policy.training = names | self._notes | known
         if self._ranks.writes:
             for folder in [LAST, BEST] if best else [LAST]:
                 save_policy(self._folder / folder, self.policy)
@@ -153,7 +149,7 @@ class Learner(ABC):
                 "Lower job.learning_rate, or look at observations and rewards",
             )
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Facts:
         """Everything of the training that is no tensor, in JSON's types."""
         return {"done": self.done, "seconds": self.seconds, "curve": self.curve}
 
@@ -168,7 +164,7 @@ class Learner(ABC):
         if self._ranks.writes:
             write_state(self._folder / STATE, self._tensors(), self.facts())
 
-    def restore(self, state: dict[str, Tensor], facts: dict[str, Any]) -> None:
+    def restore(self, state: dict[str, Tensor], facts: Facts) -> None:
         """Go on from the state and facts of an earlier call."""
         self._networks.load_state_dict({name: state[name] for name in self._networks.state_dict()})
         moments: dict[int, dict[str, Tensor]] = {}

@@ -16,8 +16,7 @@ from mjstack.episodes.recorder import Channels, Read
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, MjstackError, renamed_keys
 from mjstack.managers.term import check_params
-from mjstack.mdp.starts.expert_states import STATE as STATE_VIEWS
-from mjstack.mdp.starts.expert_states import write_states
+from mjstack.mdp.starts.expert_states import VIEWS, write_states
 from mjstack.policy.checkpoint import read_state
 from mjstack.train.ppo_learner import PpoLearner
 from mjstack.train.trainer import (
@@ -43,12 +42,15 @@ def _environment(cfg: Config) -> Config:
 
 def _unrecorded(reset: dict[str, TermCfg]) -> dict[str, TermCfg]:
     """Terms that start worlds in the middle of an episode, and name no file of states."""
-    terms = {name: term for name, term in reset.items() if starts_midway(term)}
-    return {name: term for name, term in terms.items() if term.params.get("path") is None}
+    return {
+        name: term
+        for name, term in reset.items()
+        if starts_midway(term) and term.params.get("path") is None
+    }
 
 
 def _read_state(env: Env, driver: Driver) -> Read:
-    views = {name: getattr(env.sim, name) for name in STATE_VIEWS}
+    views = {name: getattr(env.sim, name) for name in VIEWS}
     return lambda: {name: view for name, view in views.items() if view.shape[1]}
 
 
@@ -116,13 +118,13 @@ def train_ppo(stage: Stage, folder: Path) -> Trained:
     for name, term in _unrecorded(reset).items():
         ranks.from_first(lambda: None if states.exists() else _record_states(stage, states))
         reset[name] = replace(term, params=term.params | {"path": str(states)})
-    cards = [device] if device.type == "cuda" else []
-    with torch.random.fork_rng(devices=cards):
-        environment = _environment(replace(cfg, reset=reset))
-        with closing(PpoLearner(stage, environment, folder)) as learner:
-            if (folder / STATE).exists():
-                learner.restore(*read_state(folder / STATE))
-            learner.learn()
+    with (
+        torch.random.fork_rng(devices=[device] if device.type == "cuda" else []),
+        closing(PpoLearner(stage, _environment(replace(cfg, reset=reset)), folder)) as learner,
+    ):
+        if (folder / STATE).exists():
+            learner.restore(*read_state(folder / STATE))
+        learner.learn()
     last = learner.curve[-1]
     return Trained(
         metrics={

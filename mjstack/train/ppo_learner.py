@@ -2,7 +2,7 @@
 
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from mjstack.envs.statistics import join_statistics
 from mjstack.episodes.rollout import Observer
 from mjstack.episodes.stage import Stage
 from mjstack.policy import Policy, PolicyNetwork
+from mjstack.policy.checkpoint import Facts
 from mjstack.train.learner import Learner
 
 
@@ -93,7 +94,7 @@ class PpoLearner(Learner):
             action=cfg.action,
         )
 
-    def _runner_config(self) -> dict[str, Any]:
+    def _runner_config(self) -> Facts:
         """The configuration of rsl_rl's runner."""
         job = self._job
         network = {
@@ -172,10 +173,10 @@ class PpoLearner(Learner):
         )
 
     @override
-    def score(self, row: Mapping[str, Any]) -> tuple[float, ...]:
+    def score(self, row: Facts) -> tuple[float, ...]:
         return (row["success"], row["return"]) if row["episodes"] > 0.0 else (0.0, -math.inf)
 
-    def _new_row(self) -> dict[str, Any]:
+    def _new_row(self) -> Facts:
         """Figures since the last row. Values of reward terms are means over the episodes' steps."""
         actor = self._alg.actor
         self.policy.network.layers.load_state_dict(actor.mlp.state_dict())
@@ -213,11 +214,11 @@ class PpoLearner(Learner):
         torch.manual_seed(int(numbers.generate_state(1)[0]))
 
     @override
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Facts:
         episode = int(self._env.episode.max())
         return super().facts() | {"learning_rate": self._alg.learning_rate, "episode": episode}
 
-    def restore(self, state: dict[str, Tensor], facts: dict[str, Any]) -> None:
+    def restore(self, state: dict[str, Tensor], facts: Facts) -> None:
         """See `Learner`. All worlds begin the episode after the latest one."""
         super().restore(state, facts)
         self._alg.learning_rate = facts["learning_rate"]

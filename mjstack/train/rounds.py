@@ -5,7 +5,7 @@ answers in the states to which that leads are recorded.
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -40,40 +40,37 @@ class MixedDriver(Driver):
     """
 
     def __init__(
-        self,
-        expert: Driver,
-        policy: PolicyDriver | None,
-        env: Env,
-        images: QueryImages,
-        *,
-        beta: float,
-        alone: int,
-        spell: int,
-        length: float,
+        self, stage: Stage, env: Env, policy: Policy | None, *, beta: float, alone: int
     ) -> None:
-        """Take the drivers.
+        """Make the drivers of worlds that have started.
 
         Args:
-            expert: Answers in every state.
-            policy: None where the expert drives alone.
+            stage: The stage, whose expert answers in every state.
             env: The environment.
-            images: Those of the policy, or of one that would see them.
+            policy: None where the expert drives alone.
             beta: Share of the time in which the expert drives.
             alone: Number of worlds, the first ones, in which the policy drives alone.
-            spell: Control steps for which one of them drives before it is drawn anew.
-            length: Share of the expert's steps that the episode has.
         """
-        steps = math.ceil(length * expert.steps)
+        job: CloneJobCfg = stage.cfg.job
+        cameras = stage.cfg.scene.cameras
+        self._policy = PolicyDriver(env, policy, cameras) if policy else None
+        # Those of the policy, or of one that would see them
+        self.query_images = (
+            self._policy.query_images
+            if self._policy
+            else QueryImages(env, cameras, job.vision.cameras, job.execute)
+        )
+        expert = stage.driver(env)
+        steps = math.ceil(job.length * expert.steps)
         super().__init__(env.nworld, steps, env.device, expert.phases)
         self.phase = expert.phase
         self.error = expert.error
         self.retries = expert.retries
         self._expert = expert
         self._env = env
-        self._policy = policy
         self._beta = beta
-        self._spell = spell
-        self.query_images = images
+        # Whole answers: the policy takes over where it is queried.
+        self._spell = job.execute * max(1, round(job.spell / env.cfg.timing.step_dt / job.execute))
         self.label = torch.zeros((env.nworld, len(env.index.ctrl)), device=env.device)
         self.driven = torch.ones(env.nworld, dtype=torch.int8, device=env.device)
         self._alone = env.world < alone
@@ -121,7 +118,7 @@ def _channels(job: CloneJobCfg) -> Sequence[Channels]:
     ]
 
 
-def round_file(number: int, rank: int) -> str:
+def round_file(number: object, rank: object) -> str:
     """Name of the file in which a rank keeps its part of a round."""
     return f"round-{number}-{rank}.safetensors"
 
@@ -154,7 +151,7 @@ def make_round(
     plays = ranks.any(not (folder / name).exists())
     if plays:
         played = _play_round(stage, policy, number, pool)
-        facts = {part.name: getattr(played, part.name) for part in fields(played)}
+        facts = {**vars(played)}
         facts |= {f"{_FIELD}{key}": values for key, values in facts.pop("fields").items()}
         tensors = {key: facts.pop(key) for key in [*facts] if isinstance(facts[key], Tensor)}
         write_state(folder / name, tensors, facts | {"made_with": made_with(stage)})
@@ -183,22 +180,9 @@ def _play_round(
     nworld = min(cfg.nworld, job.episodes)
     worlds = stage.ranks.share(nworld)
     beta = job.beta * job.beta_decay ** (number - 1) if policy else 1.0
-    share = 1.0 if number in (0, job.rounds) else job.alone
-    alone = math.ceil(share * nworld)
+    alone = math.ceil((1.0 if number in (0, job.rounds) else job.alone) * nworld)
     batches = math.ceil(job.episodes / nworld)
     first = cfg.seed + number * batches
-
-    def drive(plan: BatchPlan, env: Env) -> Driver:
-        cameras = cfg.scene.cameras
-        learner = PolicyDriver(env, policy, cameras) if policy else None
-        names = job.vision.cameras
-        images = learner.query_images if learner else QueryImages(env, cameras, names, job.execute)
-        # Whole answers: the policy takes over where it is queried.
-        spell = job.execute * max(1, round(job.spell / env.cfg.timing.step_dt / job.execute))
-        expert = stage.driver(env)
-        return MixedDriver(
-            expert, learner, env, images, beta=beta, alone=alone, spell=spell, length=job.length
-        )
 
     parts = []
     for batch in play_batches(
@@ -206,7 +190,7 @@ def _play_round(
         [BatchPlan(seed, worlds) for seed in range(first, first + batches)],
         _channels(job),
         cfg=training_config(stage),
-        driver=drive,
+        driver=lambda plan, env: MixedDriver(stage, env, policy, beta=beta, alone=alone),
         label=f"steps of round {number} of {job.rounds}" if job.rounds else "steps of the expert",
     ):
         # The last batch may have more worlds than episodes are missing.

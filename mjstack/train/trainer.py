@@ -12,7 +12,7 @@ from mjstack.config.check import starts_midway, with_region
 from mjstack.config.schema import CloneJobCfg, Config, ObservationGroupCfg, PpoJobCfg, TermCfg
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, FolderError, MjstackError, UnknownName, renamed_keys
-from mjstack.policy.checkpoint import read_state
+from mjstack.policy.checkpoint import Facts, read_state
 
 # In the folder of a training: two policies, and what it needs to go on.
 LAST = "last"
@@ -38,7 +38,7 @@ class Trained:
 
     metrics: dict[str, float]
     notes: dict[str, str]
-    curve: list[dict[str, Any]]
+    curve: list[Facts]
     lines: list[str] = field(default_factory=lambda: ["success"])
     abscissa: str = "batch"
     scale: str = "linear"
@@ -123,14 +123,14 @@ def observed_widths(stage: Stage) -> dict[str, int]:
         raise MjstackError(f"{error}", f"Or set job.wider=0, in place of {job.wider:g}") from error
 
 
-def made_with(stage: Stage) -> dict[str, Any]:
+def made_with(stage: Stage) -> Facts:
     """The machine's part of a training, which goes on only with the same."""
     return {"device": stage.backend[1].partition(":")[0], "processes": stage.ranks.size}
 
 
 def earlier_state(
     stage: Stage, folder: Path, name: str = STATE
-) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
+) -> tuple[dict[str, Tensor], Facts] | None:
     """A state that an earlier call has left in a training's folder; None without one.
 
     Raises:

@@ -12,7 +12,7 @@ from mjstack.errors import ParameterError, first_line
 from mjstack.files import read_npz, write_npz
 from mjstack.managers.view import EnvView, offers, random_uniform, rows_of
 
-STATE = ("qpos", "qvel", "act", "ctrl")
+VIEWS = ("qpos", "qvel", "act", "ctrl")
 FIELD = "field."  # in front of a model field's name
 EPISODE = "episode"
 
@@ -60,16 +60,17 @@ class ExpertStates:
             expected = f"a file of states; it cannot be read ({first_line(error)})"
             raise ParameterError("path", path, expected, "Record it anew") from error
         self._count = len(self._source)
-        self._views: list[tuple[Tensor, Tensor]] = []  # of the worlds, and the states
-        for name in STATE:
-            view = getattr(env.sim, name)
-            if view.shape[1]:
-                self._views.append((view, _matching(path, name, view, tensors.get(name))))
-        self._fields: list[tuple[Tensor, Tensor]] = []
-        for name, field in env.sim.fields.items():
-            if FIELD + name in tensors:
-                values = _matching(path, name, field, tensors[FIELD + name])
-                self._fields.append((field, values))
+        # Of the worlds, and the states
+        self._views = [
+            (view, _matching(path, name, view, tensors.get(name)))
+            for name in VIEWS
+            if (view := getattr(env.sim, name)).shape[1]
+        ]
+        self._fields = [
+            (field, _matching(path, name, field, tensors[FIELD + name]))
+            for name, field in env.sim.fields.items()
+            if FIELD + name in tensors
+        ]
         self._share = share
         self._fall = share - last_share
         self._episodes = episodes
@@ -98,7 +99,7 @@ def write_states(
 
     Args:
         path: The file.
-        states: The views of `STATE` by name, each ``(times * episodes, width)``: all episodes at
+        states: The views of `VIEWS` by name, each ``(times * episodes, width)``: all episodes at
             one time, then all at the next.
         fields: Model fields of the episodes' worlds by name, each ``(episodes, ...)``.
         episodes: Number of the episodes.
