@@ -118,10 +118,10 @@ def by_mink(
         anywhere = anywhere[anywhere[:, 2] > top][:MINK]
         assert len(anywhere) == MINK
         mink = GraspIk(arm.robot, stage.cfg.model, tolerance=TOLERANCE)
-        gripper = np.array(arm.robot.gripper_open)
+        start = np.array([*arm.home[: len(arm.robot.arm_joints)], *arm.robot.gripper_open])
         made = {}
         for where, targets in ((TABLE, workspace(robot)[1][:MINK]), ("anywhere", anywhere)):
-            solutions = [mink.solve(target, gripper, arm.home) for target in targets]
+            solutions = [mink.solve(target, start) for target in targets]
             commands, distance = (np.array(part) for part in zip(*solutions, strict=True))
             made[where] = Compared(targets, commands, distance <= TOLERANCE)
         return made

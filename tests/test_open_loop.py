@@ -203,7 +203,7 @@ def test_plans_are_those_that_mink_makes(stage: Stage) -> None:
     for knots in planner.plan(xy).knots.numpy():
         points = arm.grasp_point(knots)
         solved = [
-            planner.ik.solve(point, knot[n_arm:], start)
+            planner.ik.solve(point, np.array([*start[:n_arm], *knot[n_arm:]]))
             for point, knot, start in zip(points, knots, seed, strict=True)
         ]
         commands, distances = (np.array(part) for part in zip(*solved, strict=True))

@@ -27,7 +27,7 @@ from mjstack.sim.graph import StepGraph
 SOLVES = 10  # per measurement: a graph holds as many, as a step's graph holds other work beside one
 TOLERANCE = 0.0005  # m, within which a target is reached
 _GAIN = 0.1
-_HEADER = ["worlds", "iterations", "block", "gains", "eager, ms", "in a graph, ms"]
+_HEADER = ["worlds", "iterations", "gains", "eager, ms", "in a graph, ms"]
 _HEADER += ["share within 0.5 mm"]
 
 
@@ -35,9 +35,9 @@ def measure(args: argparse.Namespace, cfg: Config, advance: Advance) -> Iterator
     """Time every combination of the options."""
     device = resolve_device(cfg.sim.device)
     model = build_model(cfg)
-    cases = list(itertools.product(args.nworld, args.iterations, args.block_dim, (0.0, _GAIN)))
+    cases = list(itertools.product(args.nworld, args.iterations, (0.0, _GAIN)))
     rows = []
-    for number, (nworld, iterations, block_dim, gain) in enumerate(cases, 1):
+    for number, (nworld, iterations, gain) in enumerate(cases, 1):
         ik = BatchedIk(
             model,
             cfg.robot,
@@ -46,10 +46,9 @@ def measure(args: argparse.Namespace, cfg: Config, advance: Advance) -> Iterator
             iterations=iterations,
             posture_gain=gain,
             approach_gain=gain,
-            block_dim=block_dim,
         )
         times, reached = measure_solve(cfg, ik, args.repetitions)
-        numbers = [f"{nworld:,}", str(iterations), str(block_dim), f"{gain:g}"]
+        numbers = [f"{nworld:,}", str(iterations), f"{gain:g}"]
         rows.append([*numbers, *map(spread, times), f"{reached:.4f}"])
         advance("cases", number, len(cases))
     title = f"BatchedIk.solve: {cfg.robot.title}, {device}"
@@ -109,6 +108,5 @@ if __name__ == "__main__":
     parser = make_parser(__doc__)
     parser.add_argument("--nworld", type=count, nargs="+", default=[256, 2048, 8192])
     parser.add_argument("--iterations", type=count, nargs="+", default=[4, 8, 16, 40])
-    parser.add_argument("--block-dim", type=count, nargs="+", default=[32], help="CUDA threads")
     parser.add_argument("--repetitions", type=count, default=20, help=f"of {SOLVES} solves each")
     run(parser, measure)

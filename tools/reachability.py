@@ -23,6 +23,7 @@ from mjstack.kinematics.reach import STARTS, PointReach
 from mjstack.report.picture import figure, outline
 from mjstack.report.table import Table
 from mjstack.scene import build_model
+from mjstack.scene.index import approach_body, locked_home
 from mjstack.scene.phases import object_targets
 
 SHARE = 500  # points between two lines of progress
@@ -37,7 +38,13 @@ class Upright(PointReach):
         arguments = (model, cfg.robot, getattr(cfg.robot, f"gripper_{gripper}"))
         super().__init__(*arguments)
         self.point = PointReach(*arguments)
-        self.ahead = PointReach(*arguments, ahead=1.0)
+        self.ahead = PointReach(*arguments)  # of a point 1 m along the approach axis
+        data = mujoco.MjData(model)
+        joints = [model.joint(name).qposadr[0] for name in cfg.robot.joints]
+        data.qpos[joints] = locked_home(cfg.robot)
+        mujoco.mj_kinematics(model, data)
+        turned = data.xmat[approach_body(model, cfg.robot)].reshape(3, 3)
+        self.ahead.tip = self.ahead.tip + turned @ cfg.robot.approach_axis
         self.tolerance = cfg.controller.ik_tolerance
 
     def forward(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

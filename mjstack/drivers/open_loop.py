@@ -151,7 +151,7 @@ class OpenLoopPlanner:
 
     def _solve_nominal(self, q: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Solve one world with mink."""
-        command, distance = self.ik.solve(target[0], q[0, len(self._cfg.robot.arm_joints) :], q[0])
+        command, distance = self.ik.solve(target[0], q[0])
         return command[None], np.array([distance])
 
     def _batched_solve(self, nworld: int) -> _Solve:

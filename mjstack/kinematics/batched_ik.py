@@ -20,6 +20,8 @@ _NEAR = 0.00002
 # [m/rad] at the target; it grows with the distance. More is calmer near a stretched arm, and slower
 # there.
 _DAMPING = 0.005
+# CUDA threads per block. Few, because a world is one thread, and many processors share the worlds.
+_BLOCK_DIM = 32
 _MAX_STEP = 0.3  # [rad, m] largest change of any joint per iteration
 
 
@@ -54,7 +56,6 @@ class BatchedIk:
         iterations: int = 8,
         posture_gain: float = 0.0,
         approach_gain: float = 0.0,
-        block_dim: int = 32,
     ) -> None:
         """Read the chain from the model, allocate, and load the kernels.
 
@@ -71,8 +72,6 @@ class BatchedIk:
             posture_gain: Share per iteration of the way to the posture, from 0 to 1.
             approach_gain: Turn per iteration where the approach axis is a quarter turn off [rad],
                 from 0 to 1.
-            block_dim: CUDA threads per block. Few, because a world is one thread, and many
-                processors then share the worlds.
 
         Raises:
             MjstackError: A joint is neither hinge nor slide.
@@ -82,15 +81,15 @@ class BatchedIk:
         self.nworld = nworld
         self._device = wp.get_device(str(device))
         self.device = wp.device_to_torch(self._device)
-        self._block_dim = block_dim
         gained = posture_gain > 0.0 or approach_gain > 0.0
         if gained and iterations < 4:
             raise ArgumentError("iterations", iterations, "at least 4 where a gain is not 0")
         # In the last iterations no gain counts, so they undo what it cost in distance: measured, 2
         # of 4, 3 of 8, 10 of 40.
         guided = iterations - max(min(3, iterations // 2), iterations // 4) if gained else 0
-        self._settings = [iterations, guided, _DAMPING, _MAX_STEP, posture_gain, approach_gain]
-        self._settings.append(_NEAR if gained else -1.0)
+        near = _NEAR if gained else -1.0
+        gains = (posture_gain, approach_gain)
+        self._settings = [iterations, guided, _DAMPING, _MAX_STEP, *gains, near]
 
         # The chain and all buffers, each a Warp array and a torch view of it
         with wp.ScopedDevice(self._device):
@@ -174,10 +173,10 @@ class BatchedIk:
         self, kernel: wp.Kernel, names: list[str], settings: list[Any], results: list[str]
     ) -> None:
         """Run a kernel over the worlds, in torch's order."""
-        arrays = [self._array[name] for name in [*names, *results]]
-        inputs = [self._chain, *arrays[: len(names)], *settings, *arrays[len(names) :]]
+        get = self._array.__getitem__
+        inputs = [self._chain, *map(get, names), *settings, *map(get, results)]
         with torch_stream_scope(self._device):
-            wp.launch(kernel, dim=self.nworld, inputs=inputs, block_dim=self._block_dim)
+            wp.launch(kernel, dim=self.nworld, inputs=inputs, block_dim=_BLOCK_DIM)
 
     def _copy_in(self, name: str, values: Tensor) -> None:
         """Copy an argument into float32 memory that keeps its address."""

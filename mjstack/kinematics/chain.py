@@ -36,7 +36,7 @@ def build_chain(model: mujoco.MjModel, robot: RobotCfg) -> tuple[Chain, Shape]:
     first, second = (model.site(name).id for name in robot.grasp_sites)
     first_path = _path(model, model.site_bodyid[first])
     second_path = _path(model, model.site_bodyid[second])
-    shared = len([body for body in first_path if body in second_path])
+    shared = len({*first_path} & {*second_path})
     chain = Chain()
     links: list[_Link] = []
     turned: dict[int, np.ndarray] = {}  # quaternions of the bodies on the last link, seen from it
@@ -113,11 +113,7 @@ def _read_link(model: mujoco.MjModel, joint: int, pose: _Pose, column: int) -> _
 
 def _path(model: mujoco.MjModel, body: int) -> list[int]:
     """Bodies from the world, which is left out, to the given one."""
-    path: list[int] = []
-    while body:
-        path.insert(0, int(body))
-        body = model.body_parentid[body]
-    return path
+    return [*_path(model, model.body_parentid[body]), int(body)] if body else []
 
 
 def _compose(a: _Pose, b: _Pose) -> _Pose:

@@ -66,7 +66,6 @@ class GraspIk:
                         f"robot.{key} of {name}", value, f"a value within [{low:.4g}, {high:.4g}]"
                     )
         self._qpos = self.model.jnt_qposadr[joints]
-        self._n_arm = len(robot.arm_joints)
         self.home = locked_home(robot)
         self._configuration = mink.Configuration(self.model)
         moving = {int(self.model.joint(name).dofadr[0]) for name in robot.ik_joints}
@@ -79,24 +78,20 @@ class GraspIk:
         self._constraints = [mink.DofFreezingTask(self.model, frozen)]
         self._posture.set_target(self._to_qpos(self.home))
 
-    def solve(
-        self, target: np.ndarray, gripper: np.ndarray, start: np.ndarray
-    ) -> tuple[np.ndarray, float]:
+    def solve(self, target: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, float]:
         """Find joint positions.
 
         Args:
             target: Target of the grasp point [m], shape ``(3,)``.
-            gripper: Positions of the gripper joints [rad, m], held fixed.
-            start: Joint positions to start from [rad, m], shape ``(nu,)``, arm joints first.
+            start: Joint positions to start from [rad, m], shape ``(nu,)``, arm joints first; those
+                of the gripper stay.
 
         Returns:
             The joint positions, shape ``(nu,)``, and the distance [m] that is left.
         """
-        q = start.copy()
-        q[self._n_arm :] = gripper
         self._task.target[:] = target
         configuration = self._configuration
-        configuration.update(self._to_qpos(q))
+        configuration.update(self._to_qpos(start))
         nearest = configuration.q[self._qpos].copy()
         distance = math.inf
         for _ in range(_ITERATIONS):

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from mjstack.config.schema import RobotCfg
-from mjstack.scene.index import approach_body, joint_limits, locked_home
+from mjstack.scene.index import joint_limits, locked_home
 
 _ITERATIONS = 60  # at most, per start
 _DAMPING = 1e-3  # [m/rad] at the point; it grows with the distance
@@ -26,18 +26,18 @@ class PointReach:
 
     Arm joints are hinges and slides. Those that are not ik joints stay at the robot's home, or
     where they are locked.
+
+    Attributes:
+        tip: The grasp point at home [m], shape ``(3,)``.
     """
 
-    def __init__(
-        self, model: mujoco.MjModel, robot: RobotCfg, gripper: Sequence[float], ahead: float = 0.0
-    ) -> None:
+    def __init__(self, model: mujoco.MjModel, robot: RobotCfg, gripper: Sequence[float]) -> None:
         """Read axes and limits of the ik joints.
 
         Args:
             model: A compiled model that contains the robot, alone or in a scene. It is not kept.
             robot: The robot's profile.
             gripper: Joint positions of the gripper [rad, m].
-            ahead: How far along the approach axis the point is that stands for the grasp point [m].
         """
         data = mujoco.MjData(model)
         home = locked_home(robot)
@@ -53,8 +53,7 @@ class PointReach:
         self._anchors = data.xanchor[joints].copy()
         self._axes = data.xaxis[joints].copy()
         sites = [model.site(name).id for name in robot.grasp_sites]
-        turned = data.xmat[approach_body(model, robot)].reshape(3, 3)
-        self._tip = data.site_xpos[sites].mean(axis=0) + ahead * turned @ robot.approach_axis
+        self.tip = data.site_xpos[sites].mean(axis=0)
         self._low, self._high = joint_limits(model, [model.joint(j).name for j in joints])
 
     def solve(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -88,7 +87,7 @@ class PointReach:
         up = self._axes[0, 2]
         if abs(up) > 0.99 and self._hinges[0]:
             plane = np.array([1.0, 1.0j, 0.0])
-            arm = (self._tip - self._anchors[0]) @ plane
+            arm = (self.tip - self._anchors[0]) @ plane
             q[:, 0] += np.sign(up) * np.angle((points - self._anchors[0]) @ plane * arm.conj())
         return np.clip(q, self._low, self._high)
 
@@ -144,7 +143,7 @@ class PointReach:
                 shift = anchors[:, k] - rotation @ anchor
             else:
                 shift = shift + axes[:, k] * moved[:, None]
-        tip = rotation @ self._tip + shift
+        tip = rotation @ self.tip + shift
         rows = np.where(self._hinges[:, None], np.cross(axes, tip[:, None] - anchors), axes)
         return rows.swapaxes(1, 2), tip
 
