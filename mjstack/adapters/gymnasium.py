@@ -129,8 +129,8 @@ class GymnasiumVectorEnv(VectorEnv):
                 rows[world] = _row(final, world)
             infos |= {"final_obs": rows, "_final_obs": done.copy(), "_final_info": done.copy()}
             infos["final_info"] = {"success": success & done, "_success": done.copy()}
-        values = [value.cpu().numpy() for value in (reward, terminated, truncated)]
-        return _numpy(obs, self.group), values[0], values[1], values[2], infos
+        rewards, ends, cuts = (part.cpu().numpy() for part in (reward, terminated, truncated))
+        return _numpy(obs, self.group), rewards, ends, cuts, infos
 
     def close_extras(self, **kwargs: Any) -> None:
         """Give the simulation's threads and buffers back."""

@@ -1,8 +1,7 @@
 """RSL-RL's `VecEnv` over an environment, without leaving the device, and its runner."""
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stdout
+from contextlib import redirect_stdout
 from io import StringIO
 from typing import Any
 
@@ -110,8 +109,8 @@ class RslRlVecEnv(VecEnv):
         self._steps += 1
         if self._steps % self._log_interval == 0:
             # The slash keeps the runner's logger from putting other names in front.
-            statistics = self.env.read_statistics()
-            extras["log"] = {f"episode/{name}": statistics[name] for name in statistics}
+            statistics = self.env.read_statistics().items()
+            extras["log"] = {f"episode/{name}": value for name, value in statistics}
         return self._tensordict(obs), rewards, (terminated | truncated).long(), extras
 
     def close(self) -> None:
@@ -128,22 +127,16 @@ def make_runner(env: RslRlVecEnv, cfg: dict[str, Any], ranks: Ranks) -> OnPolicy
     """RSL-RL's runner of a configuration, which neither prints nor writes. In ranks its algorithm
     averages gradients over their group: a runner of its own would not take one that is there.
     """
-    with redirect_stdout(StringIO()), _one_process():
-        runner = OnPolicyRunner(env, cfg, device=str(env.device))
+    size = os.environ.pop("WORLD_SIZE", None)  # it takes itself for the only process
+    try:
+        with redirect_stdout(StringIO()):
+            runner = OnPolicyRunner(env, cfg, device=str(env.device))
+    finally:
+        if size is not None:
+            os.environ["WORLD_SIZE"] = size
     if ranks.size > 1:
         runner.alg.is_multi_gpu = True
         runner.alg.gpu_global_rank = ranks.rank
         runner.alg.gpu_world_size = ranks.size
         runner.alg.broadcast_parameters()
     return runner
-
-
-@contextmanager
-def _one_process() -> Iterator[None]:
-    """Hide from RSL-RL that torchrun has started several."""
-    size = os.environ.pop("WORLD_SIZE", None)
-    try:
-        yield
-    finally:
-        if size is not None:
-            os.environ["WORLD_SIZE"] = size

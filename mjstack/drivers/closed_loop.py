@@ -89,8 +89,7 @@ class ClosedLoopDriver(FeedbackDriver):
             start, target, posture if self._cfg.controller.posture_gain > 0.0 else None, approach
         )
         self._keep_finite(command)
-        last = self._time >= length - _DONE
-        _put(self.error, last, torch.maximum(self.error, distance))
+        _put(self.error, self._time >= length - _DONE, torch.maximum(self.error, distance))
         return self._command
 
     def _advance(self, fresh: Tensor) -> None:
@@ -120,8 +119,7 @@ class ClosedLoopDriver(FeedbackDriver):
         self._tried.masked_fill_(fresh[:, None], False)
 
         self._observe(fresh[:, None] | entering[:, None] & self._observes[phase])
-        holds = self._holds[phase][:, None]
-        target = torch.where(holds, self._to[:, :3], self._aim(phase))
+        target = torch.where(self._holds[phase][:, None], self._to[:, :3], self._aim(phase))
         if self._any_align:
             off = (self._to[:, :2] - self._carried_pose()[:, :2]).clamp(-_OFF, _OFF)
             target[:, :2] += off * self._alignment[phase][:, None]
@@ -136,8 +134,8 @@ class ClosedLoopDriver(FeedbackDriver):
         pressing = torch.stack(force, dim=1)[self._worlds, self._handled[self.phase]]
         point = self._ik.forward(robot(env).qpos.read(env.sim.qpos).float())[0]
         left = norm(point - self._to[:, :3])
-        near = left <= self._until_within[self.phase]
-        return near | (pressing >= self._until_force[self.phase])
+        pressed = pressing >= self._until_force[self.phase]
+        return (left <= self._until_within[self.phase]) | pressed
 
     def _judge_grasp(self, over: Tensor) -> tuple[Tensor, Tensor]:
         """Worlds that try their grasp again, ``(nworld,)`` bool, and how fast they go on,
@@ -194,8 +192,7 @@ class ClosedLoopDriver(FeedbackDriver):
         ``(nworld, 3)``.
         """
         poses = [measure_planar(self._env, name) for name in self._cfg.scene.objects]
-        carried = self._carried[self.phase]
-        return torch.stack(poses, dim=1)[self._worlds, carried]
+        return torch.stack(poses, dim=1)[self._worlds, self._carried[self.phase]]
 
     def _build_timetable(self) -> None:
         """Make tensors of when and how the phases follow each other, a row per phase."""
@@ -215,8 +212,7 @@ class ClosedLoopDriver(FeedbackDriver):
         self._turns_jaws = column(
             s.observe and s.gripper == "open" and s.anchor in with_faces for s in specs
         )
-        long = [name for name, oblong in zip(objects, self._oblong.tolist(), strict=True) if oblong]
-        self._oblong_anchor = column(s.anchor in long for s in specs)
+        self._oblong_anchor = column(s.anchor in self._long for s in specs)
         self._observes = column(
             [s.observe and name in (s.anchor, s.toward) for name in objects] for s in specs
         )

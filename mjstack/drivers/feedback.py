@@ -96,15 +96,15 @@ class FeedbackDriver(Driver):
             approach_gain=c.approach_gain,
         )
         # Where nothing is carried, the gripper points down as far as it can.
-        carries = any(phase.grasps is not None for phase in c.phases.values())
+        grasped = {phase.grasps for phase in c.phases.values()} - {None}
         self._tilt: CarryTilt | None = None
-        if c.approach_gain > 0.0 and carries:
+        if c.approach_gain > 0.0 and grasped:
             self._tilt = CarryTilt(env.sim.model, cfg, self._plan, self._ik, self._nominal)
         # Jaws turn to a face, and to the narrower side of what is oblong in any case.
-        grasped = {phase.grasps for phase in c.phases.values()}
-        oblong = [thing.oblong and name in grasped for name, thing in cfg.scene.objects.items()]
-        self._oblong = self._tensor(oblong)
-        self._aligns = c.yaw_alignment > 0.0 or (any(oblong) and bool(cfg.robot.roll_joint))
+        objects = cfg.scene.objects
+        self._long = [name for name, thing in objects.items() if thing.oblong and name in grasped]
+        self._oblong = self._tensor(name in self._long for name in objects)
+        self._aligns = c.yaw_alignment > 0.0 or bool(self._long and cfg.robot.roll_joint)
         self._roll_column, self._roll_sign = self._find_roll() if self._aligns else (0, 1.0)
         rolls = robot(env).ctrl_range[self._roll_column].float()
         self._rolls = (rolls - self._nominal[0, self._roll_column]).unbind(0)
@@ -123,9 +123,8 @@ class FeedbackDriver(Driver):
         """
         objects = self._cfg.scene.objects
         for number, name in enumerate(objects):
-            seen = measure_planar(self._env, name)
             last = self._seen[:, number]
-            last.copy_(torch.where(due[:, number, None], seen, last))
+            last.copy_(torch.where(due[:, number, None], measure_planar(self._env, name), last))
         for number, name in enumerate(self._cfg.scene.places, start=len(objects)):
             self._seen[:, number, :2] = place_xy(self._env, name).float()
 

@@ -83,8 +83,7 @@ class CarryTilt:
         Returns:
             Unit vectors, shape ``(nworld, 3)``, float32.
         """
-        nominal = self._nominal[self.place[phase]]
-        start = torch.where(fresh[:, None], nominal, self._there)
+        start = torch.where(fresh[:, None], self._nominal[self.place[phase]], self._there)
         self._there.copy_(self._there_ik.solve(start, there)[0])
         grasps = self._grasps[phase]
         keeps = self._keeps[phase]
@@ -100,8 +99,7 @@ class CarryTilt:
         """Approach axis of the release pose, turned about the vertical to where the arm looks; from
         these arguments alone, which are those of `desired_approach`. Fixed shapes, no host read.
         """
-        start = self._nominal[self.place[phase]]
-        arm = self._there_ik.solve(start, there)[0]
+        arm = self._there_ik.solve(self._nominal[self.place[phase]], there)[0]
         axis = self._there_ik.forward(arm)[2]
         return turn_about_z(axis, self._sign * (command[:, 0] - arm[:, 0]))
 
@@ -130,8 +128,7 @@ def _places(phases: Sequence[Phase]) -> list[int]:
     phase; after all of them, the last.
     """
     carries = [phase.carried >= 0 for phase in phases] + [False]
-    last = len(phases) - 1
-    ends = [k for k in range(len(phases)) if carries[k] and not carries[k + 1]] or [last]
+    ends = [k for k in range(len(phases)) if carries[k] and not carries[k + 1]] or [len(phases) - 1]
     out = []
     for k in range(len(phases)):
         place = next((end for end in ends if end >= k), ends[-1])

@@ -35,15 +35,13 @@ class _Part:
                 " computed twice where a world resets: use history, or keep it in a reward or"
                 " termination term",
             )
-        value = first_value(self.term, env, dims=(1, 2))
-        self._single = value.dim() == 1
-        self.width = 1 if self._single else value.shape[1]
+        self.width = first_value(self.term, env, dims=(1, 2))[0].numel()
         self.dim = self.width * cfg.history
 
     def value(self, env: EnvView) -> Tensor:
         """The term's value, shape ``(nworld, width)``."""
         value = self.term(env)
-        return value[:, None] if self._single else value
+        return value if value.dim() == 2 else value[:, None]
 
 
 class _Group:
@@ -70,7 +68,7 @@ class _Group:
         sizes = [size for p in parts for size in column_noise(p.cfg, p.width, slides)]
         noise = {first + n: size for n, size in enumerate(sizes) if size and cfg.noise}
         self._noise_columns = Columns([*noise], env.device)
-        self._noise = torch.tensor([*noise.values()], dtype=torch.float32, device=env.device)
+        self._noise = torch.tensor([*noise.values()], device=env.device)
         # Where each column of the group comes from: for `append` in the group before and the new
         # step behind it, where a part's steps move up by one; for `restart` in the new step.
         shift: list[int] = []
@@ -88,7 +86,7 @@ class _Group:
             torch.tensor(columns, dtype=torch.int64, device=env.device)
             for columns in (shift, repeat)
         )
-        self._past = torch.zeros((env.nworld, self.dim), dtype=torch.float32, device=env.device)
+        self._past = torch.zeros((env.nworld, self.dim), device=env.device)
 
     def add_noise(self, step: Tensor, at: Rows) -> None:
         """Add the group's noise to a step of some worlds."""
@@ -109,8 +107,7 @@ class _Group:
         if not self.remembers:
             out.copy_(step)
             return
-        longer = torch.cat((self._past, step), dim=1)
-        torch.index_select(longer, 1, self._shift, out=self._past)
+        torch.index_select(torch.cat((self._past, step), dim=1), 1, self._shift, out=self._past)
         out.copy_(self._past)
 
     def restart(self, out: Tensor, step: Tensor, mask: Tensor, at: Rows) -> None:
@@ -173,7 +170,7 @@ class ObservationManager:
             name: {term: p.dim for term, p in group.parts.items()}
             for name, group in self._groups.items()
         }
-        empty = torch.full((env.nworld, 1), math.nan, dtype=torch.float32, device=env.device)
+        empty = torch.full((env.nworld, 1), math.nan, device=env.device)
         self.groups = {name: empty.repeat(1, dim) for name, dim in self.group_dims.items()}
         self._parts = [p for group in self._groups.values() for p in group.parts.values()]
         self._clips = any(part.cfg.clip for part in self._parts)
@@ -185,7 +182,7 @@ class ObservationManager:
             for part in self._parts
             for _ in range(part.width)
         ]
-        table = torch.tensor(columns, dtype=torch.float32, device=env.device).view(-1, 3)
+        table = torch.tensor(columns, device=env.device).view(-1, 3)
         self._low, self._high, self._scale = table.T.contiguous()
 
     def compute(self) -> dict[str, Tensor]:
@@ -209,8 +206,7 @@ class ObservationManager:
 
     def _step(self, at: Rows) -> Tensor:
         """One step of all groups in some worlds, shape ``(n, sum of widths)``, float32."""
-        values = [part.value(self._env) for part in self._parts]
-        step = torch.cat(values, dim=1)
+        step = torch.cat([part.value(self._env) for part in self._parts], dim=1)
         if isinstance(at, Tensor):
             step = step.index_select(0, at)
         step = step.float()

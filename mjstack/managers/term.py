@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar, copy_context
 from functools import partial
-from types import UnionType
+from types import SimpleNamespace, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import torch
@@ -106,18 +106,8 @@ def blamed(label: str) -> Iterator[None]:
         raise TermError(label, f"raised {type(error).__name__}: {first_line(error)}") from error
 
 
-class CurrentTerm:
-    """The work of terms right now.
-
-    Attributes:
-        label: Dotted configuration key of the term that was called last: the one to name if a
-            capture fails.
-    """
-
-    label = ""
-
-
-current_term = CurrentTerm()
+# Dotted configuration key of the term that was called last: the one to name if a capture fails
+current_term = SimpleNamespace(label="")
 
 # Values computed from the state that a pass looks at, by function and environment; None outside.
 _pass_values: ContextVar[dict[Any, Any] | None] = ContextVar("_pass_values", default=None)
@@ -137,13 +127,9 @@ def in_one_pass(work: Callable[[], Result]) -> Result:
     Returns:
         The result of the work.
     """
-    values = dict(_pass_values.get() or {})
-
-    def do() -> Result:
-        _pass_values.set(values)
-        return work()
-
-    return copy_context().run(do)
+    context = copy_context()
+    context.run(_pass_values.set, dict(_pass_values.get() or {}))
+    return context.run(work)
 
 
 def known_values() -> dict[Any, Any]:

@@ -1,6 +1,5 @@
 """Action terms: classes that turn a slice of the action into actuator commands."""
 
-from collections.abc import Sequence
 from typing import Literal
 
 import torch
@@ -20,10 +19,10 @@ _TILT_STEP = 0.03  # rad: how far `EndEffectorDelta` tilts the gripper in a step
 class _Commands(ActionTerm):
     """Commands of some of the robot's actuators, from actions of -1 to 1."""
 
-    def _set_up(self, env: EnvView, chosen: Sequence[int], dim: int) -> None:
+    def _set_up(self, env: EnvView, chosen: list[int] | slice, dim: int) -> None:
         self._ctrl = env.sim.ctrl
-        self._columns = Columns(env.index.ctrl[list(chosen)], env.device)
-        self._low, self._high = robot(env).ctrl_range[list(chosen)].unbind(1)
+        self._columns = Columns(env.index.ctrl[chosen], env.device)
+        self._low, self._high = robot(env).ctrl_range[chosen].unbind(1)
         self.actuators = self._columns.indices
         self.dim = dim
         self.high = torch.ones(dim, dtype=self._ctrl.dtype, device=env.device)
@@ -105,7 +104,7 @@ class Gripper(_Commands):
             step: Share of the opening for an action of 1 [per step]; 0: the action is absolute.
         """
         self._step = step
-        self._set_up(env, range(env.index.n_arm, len(env.index.ctrl)), dim=1)
+        self._set_up(env, slice(env.index.n_arm, None), dim=1)
         self._closed = robot(env).gripper_closed
         self._half_travel = 0.5 * robot(env).gripper_travel
 
@@ -115,8 +114,7 @@ class Gripper(_Commands):
         if self._step:
             last = (self._columns.read(self._ctrl) - self._closed) / self._half_travel - 1.0
             action = (last + 2.0 * self._step * action).clamp(-1.0, 1.0)
-        opened = (action + 1.0) * self._half_travel
-        self._columns.write(self._ctrl, self._closed + opened)
+        self._columns.write(self._ctrl, self._closed + (action + 1.0) * self._half_travel)
 
 
 class EndEffectorDelta(_Commands):
@@ -160,7 +158,7 @@ class EndEffectorDelta(_Commands):
         from mjstack.kinematics.batched_ik import BatchedIk
 
         self._n_arm = env.index.n_arm
-        self._set_up(env, range(self._n_arm), dim=3 + bool(roll) + bool(tilt))
+        self._set_up(env, slice(self._n_arm), dim=3 + bool(roll) + bool(tilt))
         if tilt and not upright:
             raise ParameterError("tilt", tilt, "0, because upright is 0")
         self._tilt = tilt

@@ -7,14 +7,17 @@ from mjstack.managers.term import shared
 from mjstack.managers.view import EnvView, offers
 from mjstack.mdp.geometry import jaw_forces, place_xy, pose_w, robot
 
+_in_metres = offers("observation term", unit="m")
+_by_joint = offers("observation term", unit="joint")
 
-@offers("observation term", unit="joint")
+
+@_by_joint
 def joint_pos(env: EnvView) -> Tensor:
     """Joint positions [rad, m], arm then gripper, shape ``(nworld, n)``."""
     return env.sim.part("qpos", robot(env).qpos)
 
 
-@offers("observation term", unit="joint")
+@_by_joint
 def joint_pos_relative(env: EnvView) -> Tensor:
     """Joint positions less home [rad, m], shape ``(nworld, n)``."""
     return joint_pos(env) - robot(env).home
@@ -26,7 +29,7 @@ def joint_vel(env: EnvView) -> Tensor:
     return env.sim.part("qvel", robot(env).qvel)
 
 
-@offers("observation term", unit="m")
+@_in_metres
 def grasp_point_pos(env: EnvView) -> Tensor:
     """Midpoint between the jaws [m], world frame, shape ``(nworld, 3)``. Not to be written into."""
 
@@ -37,7 +40,7 @@ def grasp_point_pos(env: EnvView) -> Tensor:
     return shared((id(env), grasp_point_pos), compute)
 
 
-@offers("observation term", unit="m")
+@_in_metres
 def grasp_point_to_object(env: EnvView, *, object: str, height: float = 0.0) -> Tensor:
     """From the grasp point to a point above an object's centre [m], shape ``(nworld, 3)``.
 
@@ -52,13 +55,13 @@ def grasp_point_to_object(env: EnvView, *, object: str, height: float = 0.0) -> 
     return offset
 
 
-@offers("observation term", unit="m")
+@_in_metres
 def object_to_object(env: EnvView, *, a: str, b: str) -> Tensor:
     """From one object's centre to another's [m], shape ``(nworld, 3)``."""
     return pose_w(env, b)[:, :3] - pose_w(env, a)[:, :3]
 
 
-@offers("observation term", unit="m")
+@_in_metres
 def object_to_place(env: EnvView, *, object: str, place: str) -> Tensor:
     """From an object's centre to where it is when it stands at a place on the table [m], shape
     ``(nworld, 3)``.
@@ -74,7 +77,7 @@ def object_pose(env: EnvView, *, object: str) -> Tensor:
     return pose_w(env, object)
 
 
-@offers("observation term", unit="m")
+@_in_metres
 def positions(env: EnvView, *, objects: list[str] | None = None) -> Tensor:
     """Where objects are [m], world frame, shape ``(nworld, 3 * objects)``.
 
@@ -87,7 +90,7 @@ def positions(env: EnvView, *, objects: list[str] | None = None) -> Tensor:
     return torch.cat([env.sim.qpos[:, :0], *parts], dim=1)
 
 
-@offers("observation term", unit="m")
+@_in_metres
 def offsets(env: EnvView, *, objects: list[str] | None = None) -> Tensor:
     """From the grasp point to objects [m], shape ``(nworld, 3 * objects)``; arguments as of
     `positions`.
@@ -96,7 +99,7 @@ def offsets(env: EnvView, *, objects: list[str] | None = None) -> Tensor:
     return at - grasp_point_pos(env).repeat(1, at.shape[1] // 3)
 
 
-@offers("observation term", unit="m")
+@_in_metres
 def goals(env: EnvView) -> Tensor:
     """Where the scene's places are [m], shape ``(nworld, 2 * places)``."""
     places = [place_xy(env, name) for name in env.cfg.scene.places]
@@ -113,8 +116,7 @@ def headings(env: EnvView, *, objects: list[str] | None = None) -> Tensor:
         objects: The boxes; all boxes of the scene that can move if None.
     """
     if objects is None:
-        free = env.cfg.scene.free
-        objects = [name for name, thing in free.items() if thing.shape == "box"]
+        objects = [name for name, thing in env.cfg.scene.free.items() if thing.shape == "box"]
     if not objects:
         return env.sim.qpos[:, :0]
     w, x, y, z = torch.stack([pose_w(env, name)[:, 3:] for name in objects], dim=1).unbind(2)
@@ -144,7 +146,7 @@ def jaw_force(env: EnvView, *, object: str) -> Tensor:
     return jaw_forces(env.index, env.sim, object)
 
 
-@offers("observation term", unit="joint")
+@_by_joint
 def last_action(env: EnvView) -> Tensor:
     """The policy's last action, shape ``(nworld, action_dim)``."""
     return env.action

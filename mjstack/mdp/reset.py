@@ -70,15 +70,13 @@ class JointZeros:
         """Take the half-widths: of the arm's joints and of the gripper's [rad or m]."""
         self._width = torch.full_like(robot(env).home, gripper, dtype=torch.float64)
         self._width[: env.index.n_arm] = arm
-        nominal = env.sim.model.qpos0[env.index.robot_qpos]
-        self._nominal = torch.from_numpy(nominal).to(env.device)
+        self._nominal = torch.from_numpy(env.sim.model.qpos0[env.index.robot_qpos]).to(env.device)
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write qpos0, from which MuJoCo counts."""
         at = rows_of(mask)
         moved = self._width * random_uniform(env, self.label, len(self._width), at=at)
-        zeros = self._nominal - moved
-        robot(env).qpos.write_masked(env.sim.fields["qpos0"], mask, zeros, at)
+        robot(env).qpos.write_masked(env.sim.fields["qpos0"], mask, self._nominal - moved, at)
 
 
 @offers("reset term")
@@ -188,7 +186,7 @@ class ObjectMass(Randomized):
 
     def __init__(self, env: EnvView, *, scale: Sequence[float]) -> None:
         """Take the smallest and largest factor."""
-        super().__init__(env, scale=scale)
+        self.ends = bounds("scale", scale)
         bodies = [env.index.bodies[name] for name in env.index.objects]
         dofs = [dof + i for _, dof in env.index.objects.values() for i in range(6)]
         self._mass, *self._scaled, self._inverse, self._inverse_dofs = (
@@ -226,7 +224,7 @@ class ObjectFriction(Randomized):
 
     def __init__(self, env: EnvView, *, sliding: Sequence[float]) -> None:
         """Take the smallest and largest coefficient."""
-        super().__init__(env, scale=bounds("sliding", sliding))
+        self.ends = bounds("sliding", sliding)
         model = env.sim.model
         bodies = [model.body(name).id for name in env.cfg.robot.jaw_bodies]
         jaws = [g for g in range(model.ngeom) if model.geom_bodyid[g] in bodies]
@@ -262,7 +260,7 @@ class ActuatorGains(Randomized):
 
     def __init__(self, env: EnvView, *, scale: Sequence[float]) -> None:
         """Take the smallest and largest factor."""
-        super().__init__(env, scale=scale)
+        self.ends = bounds("scale", scale)
         servos = env.index.ctrl.tolist()
         # A position servo's gain is kp and its bias (0, -kp, -kv): scaling all of them scales both.
         self._gain, self._bias = (Elements(env, name, servos) for name in self.model_fields)

@@ -168,8 +168,7 @@ class Rule(ABC):
             name: Such as ``lift_steps{}``.
             value: Shape ``(nworld, objects)``.
         """
-        names = map(name.format, self.suffixes)
-        return dict(zip(names, value.unbind(1), strict=True))
+        return dict(zip(map(name.format, self.suffixes), value.unbind(1), strict=True))
 
 
 class EpisodeCheck(ABC):

@@ -75,8 +75,8 @@ def released(*objects: str, open_fraction: float) -> Condition:
     """
 
     def parts(step: Step) -> tuple[Tensor, ...]:
-        open_wide = step.narrowest >= open_fraction
-        return step.view.columns(objects).read(step.untouched), open_wide
+        untouched = step.view.columns(objects).read(step.untouched)
+        return untouched, step.narrowest >= open_fraction
 
     return AllOf(("untouched", "open_fraction"), parts)
 
@@ -305,8 +305,7 @@ class InWindow(Rule):
     def judge(self, end: Step) -> Judgement:
         total = self.length.amin(1)
         parts = dict(zip(self._values, self.length.unbind(1), strict=False))
-        values = {self._total: total, **parts, **self.measure(end)}
-        return total >= self.window, values
+        return total >= self.window, {self._total: total, **parts, **self.measure(end)}
 
 
 @dataclass(eq=False)
@@ -335,11 +334,14 @@ class AtRest(Rule):
             "REST_POSITION": "object drifting",
             "REST_ROTATION": "object turning",
         }
-        self.suffixes = ["speed_m_per_s", "position_m", "rotation_deg"]
-        limits = (self.speed, self.position, self.rotation_deg)
-        self.expected = [f"at most {limit:g}" for limit in limits]
-        names = [f"rest_{suffix}" for suffix in self.suffixes]
-        self.limits = [{name: (0.0, limit)} for name, limit in zip(names, limits, strict=True)]
+        limits = {
+            "speed_m_per_s": self.speed,
+            "position_m": self.position,
+            "rotation_deg": self.rotation_deg,
+        }
+        self.suffixes = [*limits]
+        self.expected = [f"at most {limit:g}" for limit in limits.values()]
+        self.limits = [{f"rest_{name}": (0.0, limit)} for name, limit in limits.items()]
 
     @override
     def start(self, view: TaskView) -> None:

@@ -99,6 +99,6 @@ class MjstackPolicy(PreTrainedPolicy):
         """Joint targets of the next step, shape ``(n, joints)``."""
         if not self._queue:
             chunk = self.predict_action_chunk(batch)
-            last = chunk.shape[1] - 1
-            self._queue.extend(chunk[:, min(k, last)] for k in range(self._execute))
+            steps = range(self._execute)
+            self._queue.extend(chunk[:, min(k, chunk.shape[1] - 1)] for k in steps)
         return self._queue.popleft()

@@ -28,7 +28,7 @@ _ARM_ROOM = 0.001
 _UNDER = 1e-5  # m: a box is under an object if its top is this much higher at most
 
 
-def may_meet(scene: SceneCfg, region: Sequence[float], gap: float = GAP) -> bool:
+def may_meet(scene: SceneCfg, region: Sequence[float], gap: float) -> bool:
     """Whether free objects in a region around their nominal positions, of these half-widths [m],
     can be closer together than a gap [m].
     """
@@ -173,8 +173,7 @@ class Placement:
 def _trials(size: int) -> Tensor:
     """Draws of the imaginary worlds, shape ``(_TRIALS, size)``: a check tries several regions."""
     world = torch.arange(_TRIALS)
-    zero = torch.zeros_like(world)
-    return uniform(0, 0, world, zero, None, size)
+    return uniform(0, 0, world, torch.zeros_like(world), None, size)
 
 
 _Boxes = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -196,8 +195,7 @@ def _around(thing: ObjectCfg, top: float, boxes: _Boxes, clear: float) -> np.nda
     under = centers[:, 2] + halves[:, 2] - (center - half) < _UNDER
     matters = ((above < clear) | (above == 0.0)) & ~under
     distance = thing.footprint + np.sqrt(np.maximum(clear**2 - above**2, 0.0)) + turned[:, 0]
-    columns = (centers[:, :2], halves[:, :2], distance, turned[:, 1:])
-    return np.column_stack(columns)[matters]
+    return np.column_stack((centers[:, :2], halves[:, :2], distance, turned[:, 1:]))[matters]
 
 
 def _fixed_boxes(data: mujoco.MjData, geoms: np.ndarray) -> _Boxes:

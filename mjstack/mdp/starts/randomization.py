@@ -30,12 +30,9 @@ class Randomized(ABC):
 
     label = "reset.model"
     model_fields: ClassVar[tuple[str, ...]]
+    ends: tuple[float, float]
     columns: list[str]
     nominal: Tensor
-
-    def __init__(self, env: EnvView, *, scale: Sequence[float]) -> None:
-        """Take the smallest and largest factor."""
-        self.ends = bounds("scale", scale)
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write the model fields."""
