@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy import ndarray
 
 from mjstack.envs import Env
 from mjstack.errors import ArgumentError, ConfigError, MissingExtra, UnknownName
@@ -18,7 +19,7 @@ try:
 except ImportError as error:
     raise MissingExtra("mjstack.adapters.gymnasium", str(error.name), "train") from error
 
-Observation = np.ndarray | dict[str, np.ndarray]
+Observation = ndarray | dict[str, ndarray]
 
 
 class GymnasiumVectorEnv(VectorEnv):
@@ -103,8 +104,8 @@ class GymnasiumVectorEnv(VectorEnv):
         return _numpy(obs, self.group), {}
 
     def step(
-        self, actions: np.ndarray
-    ) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        self, actions: ndarray
+    ) -> tuple[Observation, ndarray, ndarray, ndarray, dict[str, Any]]:
         """Advance every world by one control interval.
 
         Args:
@@ -124,11 +125,10 @@ class GymnasiumVectorEnv(VectorEnv):
         done = (terminated | truncated).cpu().numpy()
         if done.any():
             final = _numpy(extras["final_obs"], self.group)
-            rows = np.full(self.num_envs, None, dtype=object)
             for world in np.flatnonzero(done).tolist():
-                rows[world] = _row(final, world)
-            infos |= {"final_obs": rows, "_final_obs": done.copy(), "_final_info": done.copy()}
-            infos["final_info"] = {"success": success & done, "_success": done.copy()}
+                info = {"success": bool(success[world])}
+                last = {"final_obs": _row(final, world), "final_info": info}
+                infos = self._add_info(infos, last, world)
         rewards, ends, cuts = (part.cpu().numpy() for part in (reward, terminated, truncated))
         return _numpy(obs, self.group), rewards, ends, cuts, infos
 
@@ -191,7 +191,7 @@ class GymnasiumEnv(gymnasium.Env):
         super().reset(seed=seed)
         return _row(first, 0), {}
 
-    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Advance the world by one control interval.
 
         Args:
@@ -240,7 +240,7 @@ def _row(obs: Observation, world: int) -> Observation:
     return obs[world]
 
 
-def _array(action: Any, space: spaces.Space) -> np.ndarray:
+def _array(action: Any, space: spaces.Space) -> ndarray:
     expected = f"a float32 array of shape {space.shape}"
     try:
         array = np.asarray(action, np.float32)

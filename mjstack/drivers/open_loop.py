@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy import ndarray
 from torch import Tensor
 
 from mjstack.config.schema import Config
@@ -22,7 +23,7 @@ _POSTURE_GAIN = 0.3
 
 # Joint positions to start from, shape (nworld, nu), and targets [m], shape (nworld, 3), to the
 # solutions and the distances that are left [m], shape (nworld,).
-_Solve = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+_Solve = Callable[[ndarray, ndarray], tuple[ndarray, ndarray]]
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class JointTrajectory:
     knots: Tensor
     weights: Tensor
     numbers: Tensor
-    waypoint_error: np.ndarray
+    waypoint_error: ndarray
 
     @property
     def steps(self) -> int:
@@ -99,7 +100,7 @@ class OpenLoopPlanner:
         self._grips = gripper_targets(self.ik.model, cfg.robot, widths)
         self._nodes = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, cfg.controller.knots))
         self._weights, self._numbers = self._step_weights()
-        self._last: tuple[np.ndarray, JointTrajectory] | None = None
+        self._last: tuple[ndarray, JointTrajectory] | None = None
         self._xy = nominal_xy(cfg.scene)
         (first,), _ = self._solve_knots(self._xy[None], [0], self._solve_nominal)
         self.nominal = first[len(self._nodes) - 1 :: len(self._nodes)]
@@ -108,7 +109,7 @@ class OpenLoopPlanner:
         plan = self._solve_knots(self._xy[None], [0], self._solve_nominal, first)
         (self._knots,), (self._error,) = plan
 
-    def plan(self, sources_xy: np.ndarray, names: Sequence[int] | None = None) -> JointTrajectory:
+    def plan(self, sources_xy: ndarray, names: Sequence[int] | None = None) -> JointTrajectory:
         """Plan one trajectory per world, which does not depend on the other worlds.
 
         Args:
@@ -149,7 +150,7 @@ class OpenLoopPlanner:
             worst = max(worst, float(np.linalg.norm(at - (start + s * (end - start))[:3])))
         return worst
 
-    def _solve_nominal(self, q: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _solve_nominal(self, q: ndarray, target: ndarray) -> tuple[ndarray, ndarray]:
         """Solve one world with mink."""
         command, distance = self.ik.solve(target[0], q[0])
         return command[None], np.array([distance])
@@ -170,7 +171,7 @@ class OpenLoopPlanner:
         )
         moved = [robot.joints.index(name) for name in robot.ik_joints]
 
-        def solve(q: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        def solve(q: ndarray, target: ndarray) -> tuple[ndarray, ndarray]:
             rounded, distance = ik.solve(torch.from_numpy(q), torch.from_numpy(target))
             solution = q.copy()  # the other joints exactly, not in float32
             solution[:, moved] = rounded.numpy()[:, moved]
@@ -180,11 +181,11 @@ class OpenLoopPlanner:
 
     def _solve_knots(
         self,
-        xy: np.ndarray,
+        xy: ndarray,
         worlds: Sequence[int],
         solve: _Solve,
-        seed: np.ndarray | None = None,
-    ) -> tuple[np.ndarray, np.ndarray]:
+        seed: ndarray | None = None,
+    ) -> tuple[ndarray, ndarray]:
         """Commands at the knots, shape ``(nworld, n, nu)``, and the largest distance from a target
         at any [m], shape ``(nworld,)``.
 
@@ -228,7 +229,7 @@ class OpenLoopPlanner:
             raise Unreachable(worlds[row], phase.name, phase.spec.anchor, *facts)
         return knots, distances.max(axis=1)
 
-    def _targets(self, xy: np.ndarray) -> np.ndarray:
+    def _targets(self, xy: ndarray) -> ndarray:
         """Where each phase ends, after where the first one starts: the grasp point [m] and then the
         gripper's command, shape ``(nworld, phases + 1, 3 + n_gripper)``.
         """

@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 import warp as wp
+from numpy import ndarray
 
 from mjstack.config.schema import RobotCfg
 from mjstack.errors import ConfigError, MjstackError
@@ -11,8 +12,8 @@ from mjstack.scene.index import approach_body, joint_limits
 
 _NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
 
-_Pose = tuple[np.ndarray, np.ndarray]  # position and quaternion (wxyz)
-_Link = tuple[_Pose, np.ndarray, int, int]  # frame, axis, kind, column of the joint targets
+_Pose = tuple[ndarray, ndarray]  # position and quaternion (wxyz)
+_Link = tuple[_Pose, ndarray, int, int]  # frame, axis, kind, column of the joint targets
 
 
 def build_chain(model: mujoco.MjModel, robot: RobotCfg) -> tuple[Chain, Shape]:
@@ -39,7 +40,7 @@ def build_chain(model: mujoco.MjModel, robot: RobotCfg) -> tuple[Chain, Shape]:
     shared = len({*first_path} & {*second_path})
     chain = Chain()
     links: list[_Link] = []
-    turned: dict[int, np.ndarray] = {}  # quaternions of the bodies on the last link, seen from it
+    turned: dict[int, ndarray] = {}  # quaternions of the bodies on the last link, seen from it
 
     def extend(bodies: list[int], start: _Pose) -> _Pose:
         """Append the bodies' links; return the frame after them, seen from the last joint."""
@@ -123,7 +124,7 @@ def _compose(a: _Pose, b: _Pose) -> _Pose:
     return pos, quat
 
 
-def _round_inwards(limits: np.ndarray, sign: float) -> np.ndarray:
+def _round_inwards(limits: ndarray, sign: float) -> ndarray:
     """Limits as float32 that are not outside of the given ones; sign is 1 for low ones, else -1."""
     rounded = limits.astype(np.float32)
     inwards = np.nextafter(rounded, np.float32(sign * np.inf))

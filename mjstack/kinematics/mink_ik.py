@@ -5,6 +5,7 @@ import math
 import mink
 import mujoco
 import numpy as np
+from numpy import ndarray
 
 from mjstack.config.schema import ModelCfg, RobotCfg
 from mjstack.errors import ConfigError
@@ -30,11 +31,11 @@ class GraspPointTask(mink.Task):
         self._sites = sites
         self._jac = np.empty((2, 3, nv))
 
-    def compute_error(self, configuration: mink.Configuration) -> np.ndarray:
+    def compute_error(self, configuration: mink.Configuration) -> ndarray:
         """Grasp point minus target [m], shape ``(3,)``."""
         return configuration.data.site_xpos[self._sites].mean(axis=0) - self.target
 
-    def compute_jacobian(self, configuration: mink.Configuration) -> np.ndarray:
+    def compute_jacobian(self, configuration: mink.Configuration) -> ndarray:
         """Mean of the two sites' translational Jacobians, shape ``(3, nv)``."""
         for jac, site in zip(self._jac, self._sites, strict=True):
             mujoco.mj_jacSite(configuration.model, configuration.data, jac, None, site)
@@ -78,7 +79,7 @@ class GraspIk:
         self._constraints = [mink.DofFreezingTask(self.model, frozen)]
         self._posture.set_target(self._to_qpos(self.home))
 
-    def solve(self, target: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, float]:
+    def solve(self, target: ndarray, start: ndarray) -> tuple[ndarray, float]:
         """Find joint positions.
 
         Args:
@@ -118,12 +119,12 @@ class GraspIk:
                 break
         return nearest, distance
 
-    def grasp_point(self, q: np.ndarray) -> np.ndarray:
+    def grasp_point(self, q: ndarray) -> ndarray:
         """Grasp point [m] at joint positions of shape ``(nu,)``, shape ``(3,)``."""
         self._configuration.update(self._to_qpos(q))
         return self._task.compute_error(self._configuration) + self._task.target
 
-    def _to_qpos(self, q: np.ndarray) -> np.ndarray:
+    def _to_qpos(self, q: ndarray) -> ndarray:
         qpos = self.model.qpos0.copy()
         qpos[self._qpos] = q
         return qpos

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
+from numpy import ndarray
 
 from mjstack.config.schema import RobotCfg
 from mjstack.scene.index import joint_limits, locked_home
@@ -56,7 +57,7 @@ class PointReach:
         self.tip = data.site_xpos[sites].mean(axis=0)
         self._low, self._high = joint_limits(model, [model.joint(j).name for j in joints])
 
-    def solve(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def solve(self, points: ndarray) -> tuple[ndarray, ndarray]:
         """Bring the grasp point as near to each point as possible, from a few starts.
 
         Args:
@@ -78,7 +79,7 @@ class PointReach:
             distance[better] = left[better]
         return best, distance
 
-    def start(self, points: np.ndarray, off: float) -> np.ndarray:
+    def start(self, points: ndarray, off: float) -> ndarray:
         """Home with the other hinges bent by ``off`` [rad]; a first hinge that is upright turns
         towards the points.
         """
@@ -91,7 +92,7 @@ class PointReach:
             q[:, 0] += np.sign(up) * np.angle((points - self._anchors[0]) @ plane * arm.conj())
         return np.clip(q, self._low, self._high)
 
-    def descend(self, start: np.ndarray, goals: np.ndarray) -> np.ndarray:
+    def descend(self, start: ndarray, goals: ndarray) -> ndarray:
         """Damped least squares towards goals of `forward`, within the limits."""
         q = start.copy()
         left = np.arange(len(goals))
@@ -107,9 +108,7 @@ class PointReach:
             left = left[np.abs(q[left] - before).max(axis=1) >= _STILL]
         return q
 
-    def _step(
-        self, q: np.ndarray, jacobian: np.ndarray, error: np.ndarray, damping: np.ndarray
-    ) -> np.ndarray:
+    def _step(self, q: ndarray, jacobian: ndarray, error: ndarray, damping: ndarray) -> ndarray:
         """One step. A joint that would leave its range is held, and the others are solved again."""
         weight = np.square(damping)[:, None, None] * np.eye(q.shape[1])
         free = np.ones_like(q, dtype=bool)
@@ -122,7 +121,7 @@ class PointReach:
         largest = np.abs(step).max(axis=1, keepdims=True)
         return step * np.minimum(1.0, _MAX_STEP / np.maximum(largest, 1e-12))
 
-    def forward(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def forward(self, q: ndarray) -> tuple[ndarray, ndarray]:
         """The Jacobian of the grasp point, shape ``(n, 3, joints)``, and the grasp point [m], shape
         ``(n, 3)``.
 
@@ -148,7 +147,7 @@ class PointReach:
         return rows.swapaxes(1, 2), tip
 
 
-def _rotations(axis: np.ndarray, angles: np.ndarray) -> np.ndarray:
+def _rotations(axis: ndarray, angles: ndarray) -> ndarray:
     """Rotations about one axis, shape ``(n, 3, 3)``."""
     cross = np.cross(axis, np.eye(3)).T
     turns = angles[:, None, None]

@@ -1,6 +1,7 @@
 """Joint values in LeRobot's units, as its SO-101 follower has them after calibration."""
 
 import numpy as np
+from numpy import ndarray
 
 from mjstack.errors import ArgumentError
 
@@ -17,7 +18,7 @@ class LerobotUnits:
         units: Unit of each joint's numbers.
     """
 
-    def __init__(self, arm_joints: int, ranges: np.ndarray, units: str = LEROBOT) -> None:
+    def __init__(self, arm_joints: int, ranges: ndarray, units: str = LEROBOT) -> None:
         """Take the joints' ranges [rad, m], shape ``(joints, 2)``, the arm's first. With ``si``
         numbers stay as they are.
         """
@@ -29,15 +30,15 @@ class LerobotUnits:
             self._zero, self._scale = np.zeros_like(low), np.ones_like(low)
         self.units = tuple("deg" if joint else "%" for joint in arm)
 
-    def from_si(self, values: np.ndarray) -> np.ndarray:
+    def from_si(self, values: ndarray) -> ndarray:
         """Convert joint values [rad, m], shape ``(…, joints)``; float32, rounded once."""
         return ((values.astype(np.float64) - self._zero) * self._scale).astype(np.float32)
 
-    def to_si(self, values: np.ndarray) -> np.ndarray:
+    def to_si(self, values: ndarray) -> ndarray:
         """Convert back to rad and m, shape ``(…, joints)``; float32, rounded once."""
         return (values.astype(np.float64) / self._scale + self._zero).astype(np.float32)
 
-    def check_commands(self, commands: np.ndarray, positions: np.ndarray) -> None:
+    def check_commands(self, commands: ndarray, positions: ndarray) -> None:
         """Check the first commands of an episode, from where the arm stands in these units; both of
         shape ``(worlds, joints)``. An ArgumentError if they are radians: near to where the arm
         stands in those, and far from it in degrees.

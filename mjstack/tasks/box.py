@@ -154,10 +154,12 @@ class BoxCheck(EpisodeCheck):
         )
         text = "an object not at rest in the box at the end"
         rests = AllOf(("untouched", "inside", "rest_speed"), self.rests)
-        inside = InWindow("INSIDE", text, rests, t.window, measure=self.trace)
-        order = _Order(self.objects, release)
-        jaw_clear = _JawClear(self.cfg.robot.jaw_bodies, self._high[2], t.jaw_clearance)
-        return [grasp, lift, carry, drop, release, settled, order, inside, jaw_clear]
+        return [
+            *(grasp, lift, carry, drop, release, settled),
+            _Order(self.objects, release),
+            InWindow("INSIDE", text, rests, t.window, measure=self.trace),
+            _JawClear(self.cfg.robot.jaw_bodies, self._high[2], t.jaw_clearance),
+        ]
 
     def _during(self, *roles: str) -> list[list[str]]:
         """Names of each object's phases of some roles."""

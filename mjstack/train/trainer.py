@@ -78,8 +78,8 @@ def observed_group(job: CloneJobCfg | PpoJobCfg) -> ObservationGroupCfg:
     for name in job.leave_out:
         if name not in group.terms and not name.endswith("?"):
             raise UnknownName(f"job.leave_out: term of {job.group}", name, group.terms)
-    names = group.terms.keys() - {name.removesuffix("?") for name in job.leave_out}
-    terms = {name: term for name, term in group.terms.items() if name in names}
+    left_out = {name.removesuffix("?") for name in job.leave_out}
+    terms = {name: term for name, term in group.terms.items() if name not in left_out}
     return replace(group, noise=job.observation_noise, terms=terms)
 
 

@@ -9,6 +9,7 @@ from functools import lru_cache
 import mujoco
 import numpy as np
 import torch
+from numpy import ndarray
 from torch import Tensor
 
 from mjstack.config.schema import Config, ObjectCfg, SceneCfg
@@ -176,12 +177,12 @@ def _trials(size: int) -> Tensor:
     return uniform(0, 0, world, torch.zeros_like(world), None, size)
 
 
-_Boxes = tuple[np.ndarray, np.ndarray, np.ndarray]
+_Boxes = tuple[ndarray, ndarray, ndarray]
 """Upright boxes: centres and half sizes, shape ``(n, 3)`` each; radius around them, and cosine and
 sine of their yaw, ``(n, 3)``."""
 
 
-def _around(thing: ObjectCfg, top: float, boxes: _Boxes, clear: float) -> np.ndarray:
+def _around(thing: ObjectCfg, top: float, boxes: _Boxes, clear: float) -> ndarray:
     """Distance that boxes ask of an object: of its centre from a rectangle.
 
     Returns:
@@ -198,7 +199,7 @@ def _around(thing: ObjectCfg, top: float, boxes: _Boxes, clear: float) -> np.nda
     return np.column_stack((centers[:, :2], halves[:, :2], distance, turned[:, 1:]))[matters]
 
 
-def _fixed_boxes(data: mujoco.MjData, geoms: np.ndarray) -> _Boxes:
+def _fixed_boxes(data: mujoco.MjData, geoms: ndarray) -> _Boxes:
     """Boxes around geoms that are fixed to the world."""
     model = data.model
     centers, halves = world_boxes(data, geoms)
@@ -214,7 +215,7 @@ def _fixed_boxes(data: mujoco.MjData, geoms: np.ndarray) -> _Boxes:
     return centers, halves, turned
 
 
-def _arm_boxes(cfg: Config, data: mujoco.MjData, geoms: np.ndarray, noise: float) -> _Boxes:
+def _arm_boxes(cfg: Config, data: mujoco.MjData, geoms: ndarray, noise: float) -> _Boxes:
     """Boxes that hold the arm's colliding geoms, wherever noise puts them."""
     model = data.model
     joints = [model.joint(name).id for name in cfg.robot.arm_joints]
@@ -235,9 +236,7 @@ def _arm_boxes(cfg: Config, data: mujoco.MjData, geoms: np.ndarray, noise: float
     return centers, halves, np.tile([0.0, 1.0, 0.0], (len(geoms), 1))
 
 
-def world_boxes(
-    data: mujoco.MjData, geoms: Sequence[int] | np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def world_boxes(data: mujoco.MjData, geoms: Sequence[int] | ndarray) -> tuple[ndarray, ndarray]:
     """Centres and half sizes of the boxes along the world's axes that hold some geoms, shape ``(n,
     3)`` each.
     """

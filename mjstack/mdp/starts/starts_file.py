@@ -7,6 +7,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
+from numpy import ndarray
 from numpy.typing import ArrayLike
 from torch import Tensor
 
@@ -92,7 +93,7 @@ class StartsTable:
                 raise self.wrong(expected, fix, world, [name])
         self.arrays = {name: values.astype(np.float64) for name, values in arrays.items()}
 
-    def take(self, names: Sequence[str]) -> np.ndarray:
+    def take(self, names: Sequence[str]) -> ndarray:
         """Arrays side by side, NaN where the file has none, shape ``(worlds, n)``."""
         missing = np.full(self.worlds, np.nan)
         columns = [self.arrays.get(name, missing).reshape(self.worlds, -1) for name in names]
@@ -225,7 +226,7 @@ def write_starts(env: EnvView, path: str | Path) -> None:
     write_npz(Path(path), start_arrays(env))
 
 
-def start_arrays(env: EnvView) -> dict[str, np.ndarray]:
+def start_arrays(env: EnvView) -> dict[str, ndarray]:
     """How the worlds of an environment have just started, by the arrays of a starts file.
 
     Masses, friction and gains have arrays if they differ from the model's in some world.
@@ -270,14 +271,12 @@ def _drawn_places(env: EnvView) -> list[str]:
     return [name for name, place in env.cfg.scene.places.items() if any(place.random_xy)]
 
 
-def _on(env: EnvView, values: np.ndarray) -> Tensor:
+def _on(env: EnvView, values: ndarray) -> Tensor:
     """Numbers on the device of an environment, in the type of its floats."""
     return torch.from_numpy(values).to(env.device, env.sim.qpos.dtype)
 
 
-def _check_worlds(
-    env: EnvView, table: StartsTable, starts: np.ndarray, command: np.ndarray
-) -> None:
+def _check_worlds(env: EnvView, table: StartsTable, starts: ndarray, command: ndarray) -> None:
     """Every object stands upright above the table and touches nothing else."""
     model = env.sim.model
     scene = env.cfg.scene
