@@ -20,6 +20,7 @@ except ImportError as error:
     raise MissingExtra("mjstack.adapters.gymnasium", str(error.name), "train") from error
 
 Observation = ndarray | dict[str, ndarray]
+Info = dict[str, Any]
 
 
 class GymnasiumVectorEnv(VectorEnv):
@@ -76,8 +77,8 @@ class GymnasiumVectorEnv(VectorEnv):
         self.action_space = batch_space(self.single_action_space, env.nworld)
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
+        self, *, seed: int | None = None, options: Info | None = None
+    ) -> tuple[Observation, Info]:
         """Start new episodes.
 
         Args:
@@ -103,9 +104,7 @@ class GymnasiumVectorEnv(VectorEnv):
         super().reset(seed=seed)
         return _numpy(obs, self.group), {}
 
-    def step(
-        self, actions: ndarray
-    ) -> tuple[Observation, ndarray, ndarray, ndarray, dict[str, Any]]:
+    def step(self, actions: ndarray) -> tuple[Observation, ndarray, ndarray, ndarray, Info]:
         """Advance every world by one control interval.
 
         Args:
@@ -167,8 +166,8 @@ class GymnasiumEnv(gymnasium.Env):
         self._first: Observation | None = None
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
+        self, *, seed: int | None = None, options: Info | None = None
+    ) -> tuple[Observation, Info]:
         """Start a new episode.
 
         Args:
@@ -191,7 +190,7 @@ class GymnasiumEnv(gymnasium.Env):
         super().reset(seed=seed)
         return _row(first, 0), {}
 
-    def step(self, action: ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: ndarray) -> tuple[Observation, float, bool, bool, Info]:
         """Advance the world by one control interval.
 
         Args:

@@ -71,14 +71,14 @@ class ActionManager:
                     raise TermError(label, f"{problem}: leave one of them out")
             self.terms[name] = term
         terms = self.terms.values()
-        self._dims = [term.dim for term in terms]
-        self.action_dim = sum(self._dims)
+        dims = [term.dim for term in terms]
+        self.action_dim = sum(dims)
         shape = (env.nworld, self.action_dim)
         self.action = torch.zeros(shape, dtype=env.sim.qpos.dtype, device=env.device)
         self.previous_action = self.action.clone()
         self._processed = self.action.clone()
         self._whole = not self.action.is_cuda  # as far as it is known
-        self._parts = self.action.split(self._dims, dim=1) if terms else ()
+        self._parts = self.action.split(dims, dim=1) if terms else ()
         self.low = torch.cat([term.low for term in terms]) if terms else self.action[0]
         self.high = torch.cat([term.high for term in terms]) if terms else self.action[0]
         self.not_finite = torch.zeros(env.nworld, dtype=torch.bool, device=env.device)

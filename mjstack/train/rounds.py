@@ -24,7 +24,7 @@ from mjstack.policy import Policy
 from mjstack.policy.checkpoint import write_state
 from mjstack.train.demonstrations import Demonstrations
 from mjstack.train.images import ImagePool
-from mjstack.train.trainer import ESTIMATED, earlier_state, made_with, training_config
+from mjstack.train.trainer import earlier_state, made_with, training_config
 
 _FIELD = "field."  # before the name of a model field, in the file of a round
 
@@ -95,12 +95,10 @@ def _channels(job: CloneJobCfg) -> Sequence[Channels]:
     """
 
     def read_before(env: Env, driver: Driver) -> Read:
-        observations = env.observation_manager.groups[job.group]
-        if not job.vision.cameras:
-            return lambda: {"observation": observations}
-        rows = {"observation": observations, "qpos": env.sim.qpos}
-        if ESTIMATED in env.observation_manager.groups:
-            rows[ESTIMATED] = env.observation_manager.groups[ESTIMATED]
+        rows = {**env.observation_manager.groups}  # what it estimates among them
+        rows["observation"] = rows.pop(job.group)
+        if job.vision.cameras:
+            rows["qpos"] = env.sim.qpos
         return lambda: rows
 
     def read_answer(env: Env, driver: Driver) -> Read:

@@ -26,6 +26,7 @@ from mjstack.sim.cameras import with_outputs
 from mjstack.sim.sizes import resolve_env_sizes
 from mjstack.tasks.check import make_check
 
+Info = dict[str, Any]
 TIMINGS = {30: "hz30", 50: "default"}  # by control rate [Hz]
 _FILMED = 10  # worlds that are drawn at a time, as many as LeRobot films
 
@@ -142,9 +143,7 @@ class LerobotVectorEnv(VectorEnv):
         self.task_description = cfg.task.instruction or cfg.task.name
         self._max_episode_steps = cfg.task.episode_steps
 
-    def reset(
-        self, *, seed: Any = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Any], dict[str, Any]]:
+    def reset(self, *, seed: Any = None, options: Info | None = None) -> tuple[Info, Info]:
         """Start an episode in every world. World k starts as world ``seed[k]`` of any batch of
         mjstack does under the configured seed: the same number is the same start, wherever it
         stands. Without numbers every world goes on to its next episode.
@@ -158,9 +157,7 @@ class LerobotVectorEnv(VectorEnv):
         self._check.start(env, self._left, [])
         return self._observe(), {}
 
-    def step(
-        self, actions: np.ndarray
-    ) -> tuple[dict[str, Any], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(self, actions: np.ndarray) -> tuple[Info, np.ndarray, np.ndarray, np.ndarray, Info]:
         """Advance every world by one control step, or none if the episode is over, to joint targets
         in the environment's units, shape ``(num_envs, joints)``. Others are an ArgumentError.
         """
@@ -200,7 +197,7 @@ class LerobotVectorEnv(VectorEnv):
             self._renderer.close()
         self.inner.close()
 
-    def _observe(self) -> dict[str, Any]:
+    def _observe(self) -> Info:
         """Observations by the names that LeRobot expects of an environment."""
         seen = self.words.observe()
         numbers = {"agent_pos": seen.pop(STATE), "environment_state": seen.pop(SEEN)}
