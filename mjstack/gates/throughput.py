@@ -1,7 +1,6 @@
 """Gate *throughput*: the speed of physics, of the validated episode and of ``env.step``."""
 
 import gc
-import os
 import time
 from collections.abc import Callable
 from contextlib import closing
@@ -55,7 +54,7 @@ def _measure(run: Run, gate: str, backend: Backend, device: str) -> GateResult:
         return result
     began = time.perf_counter()
     on_cuda = device.startswith("cuda")
-    result.metrics = {"worlds": cfg.nworld, "cpu_count": os.cpu_count() or 1}
+    result.metrics = {"worlds": cfg.nworld}
 
     # The measurements
     worlds = (run, backend, device, result)

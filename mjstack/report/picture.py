@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -18,9 +18,6 @@ from mjstack.errors import MissingExtra
 from mjstack.interrupt import check_interrupt
 from mjstack.report.gl import open_renderer
 from mjstack.report.page import frame_stride
-
-if TYPE_CHECKING:
-    from matplotlib.patches import Rectangle
 
 _FACES = [[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]]
 """Corners of a box in the order of their signs, by its faces."""
@@ -52,7 +49,7 @@ def figure(
     picture.savefig(path, dpi=100)
 
 
-def outline(centre: Sequence[float], half: Sequence[float], **style: Any) -> "Rectangle":
+def outline(centre: Sequence[float], half: Sequence[float], **style: Any) -> Any:
     """A rectangle around a point, of which the border is drawn."""
     from matplotlib.patches import Rectangle
 
@@ -187,7 +184,7 @@ def require_video(ending: str) -> Write:
         MissingExtra: The mp4 writer is not installed.
     """
     if ending in _LOOPS:
-        return partial(_write_loop, options=_LOOPS[ending])
+        return _write_loop
     if find_spec("imageio_ffmpeg") is None:
         raise MissingExtra("video=true", "imageio-ffmpeg", "video")
     return _write_mp4
@@ -209,9 +206,7 @@ _LOOPS: dict[str, dict[str, Any]] = {".gif": {"optimize": True}, ".webp": {"qual
 _COLORS = 96  # of a GIF; with 255 it is 40 % larger, and looks the same
 
 
-def _write_loop(
-    path: Path, frames: Iterator[Image.Image], count: int, dt: float, options: Mapping[str, Any]
-) -> None:
+def _write_loop(path: Path, frames: Iterator[Image.Image], count: int, dt: float) -> None:
     """Write a GIF or a WebP. All frames of a GIF have the first one's colours, without dithering,
     so that what does not move keeps its colour.
     """
@@ -227,7 +222,7 @@ def _write_loop(
         append_images=frames,
         duration=np.diff(ends).tolist(),
         loop=0,
-        **options,
+        **_LOOPS[path.suffix],
     )
 
 
