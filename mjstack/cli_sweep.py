@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import cast
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.hydra_config import HydraConfig
@@ -72,8 +71,7 @@ def claim_sweep(master: DictConfig, jobs: Sequence[list[str]]) -> Iterator[Path]
     queued = _launcher(master).endswith(".GpuLauncher")
     if queued:
         Queueing.of(master.hydra.launcher).slots()
-    named = cast(dict, OmegaConf.to_container(master.hydra.sweep, resolve=False))
-    hourly = "${now:" in str(named["dir"])
+    hourly = "${now:" in OmegaConf.to_yaml(master.hydra.sweep)
     marker = "" if hourly else SWEEP
     key = "hydra.sweep.dir"
     with claim_folder(folder, marker=marker, numbered=hourly, shared=queued, key=key) as claimed:

@@ -41,7 +41,7 @@ class SolverGateCfg(GateFuncCfg):
     def __post_init__(self) -> None:
         """Check that the solver has such keys, and that they take these values."""
         if isinstance(self.changes, dict):  # OmegaConf makes one without
-            self.apply(asdict(SolverCfg(None, None, None, None, "elliptic", None)))
+            self.apply(asdict(SolverCfg()))
 
     def apply(self, solver: Mapping[str, Any]) -> SolverCfg:
         """The variant of a solver."""

@@ -44,13 +44,17 @@ def read_report(folder: Path, overrides: Sequence[str] = ()) -> Report | None:
     report = Report(folder=folder, overrides=list(overrides))
     try:
         data = json.loads((folder / "report.json").read_text())
-        for gate in data["gates"]:
-            result = GateResult(name=gate["name"], status=Status(gate["status"]))
-            result.reason = gate["reason"]
-            result.seconds = float(gate.get("seconds", 0.0))
-            result.metrics = dict(gate.get("metrics", {}))
-            result.notes = dict(gate.get("notes", {}))
-            report.gates.append(result)
+        report.gates = [
+            GateResult(
+                name=gate["name"],
+                status=Status(gate["status"]),
+                reason=gate["reason"],
+                seconds=float(gate.get("seconds", 0.0)),
+                metrics=dict(gate.get("metrics", {})),
+                notes=dict(gate.get("notes", {})),
+            )
+            for gate in data["gates"]
+        ]
         report.status = Status(data["status"])
         report.resumes = str(data["resumes"])
         report.provenance = dict(data.get("provenance", {}))
