@@ -173,7 +173,7 @@ class MjwarpSimulation(Simulation):
     @override
     def option_values(self) -> dict[str, float | int | str]:
         opt = self._m.opt
-        primitive = bool(int(opt.disableflags) & int(mjw.DisableBit.NATIVECCD))
+        primitive = opt.disableflags & mjw.DisableBit.NATIVECCD
         return {
             "timestep": float(opt.timestep.numpy()[0]),
             "impratio": float(opt.impratio_invsqrt.numpy()[0]) ** -2,

@@ -34,7 +34,7 @@ _SAMEFRAME = {
     "site_sameframe": {"site_pos", "site_quat"},
 }
 # Without these the position stage is little more than `mj_kinematics`.
-_POSES_ONLY = int(
+_POSES_ONLY = (
     mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     | mujoco.mjtDisableBit.mjDSBL_CONTACT
     | mujoco.mjtDisableBit.mjDSBL_SENSOR
@@ -69,7 +69,7 @@ class NativeSimulation(Simulation):
         """
         names = check_fields(fields)
         self.model = m = copy.copy(model)
-        m.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        m.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.nworld = nworld
         self.device = torch.device("cpu")
         self.nthread = nthread = min(available_cores(), nworld)
@@ -81,7 +81,7 @@ class NativeSimulation(Simulation):
         # MuJoCo skips an offset that was zero when it compiled: these flags make it read the field.
         for kind, offsets in _SAMEFRAME.items():
             if not offsets.isdisjoint(names):
-                getattr(stepped, kind)[:] = int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE)
+                getattr(stepped, kind)[:] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
         try:
             self.batch = batch = Batch(stepped, nworld, nthread)
         except ValueError as error:
@@ -222,7 +222,7 @@ class NativeSimulation(Simulation):
             counts[:, :2] = self._contacts(worlds)
             np.maximum(peaks, counts[:, :2], out=peaks)
             for warning, bit in _OVERFLOWS.items():
-                counts[batch.warning[worlds, int(warning), 1] > 0, 4] |= int(bit)
+                counts[batch.warning[worlds, warning, 1] > 0, 4] |= bit
             self._counts[worlds] = counts
             if kinematics:
                 self._pose(worlds)

@@ -61,9 +61,9 @@ def convex_kinds(model: mujoco.MjModel) -> np.ndarray:
     sphere with a cylinder.
     """
     g = mujoco.mjtGeom
-    shapes = sorted({*model.geom_type.tolist()} - {int(g.mjGEOM_PLANE), int(g.mjGEOM_SDF)})
-    primitive = {int(g.mjGEOM_SPHERE), int(g.mjGEOM_CAPSULE), int(g.mjGEOM_BOX)}
-    round_ = {int(g.mjGEOM_SPHERE), int(g.mjGEOM_CYLINDER)}
+    shapes = sorted({*model.geom_type.tolist()} - {g.mjGEOM_PLANE, g.mjGEOM_SDF})
+    primitive = {g.mjGEOM_SPHERE, g.mjGEOM_CAPSULE, g.mjGEOM_BOX}
+    round_ = {g.mjGEOM_SPHERE, g.mjGEOM_CYLINDER}
     kinds = np.full(2 * (model.geom_type.max(initial=0) + 1,), -1, dtype=np.int32)
     pairs = list(combinations_with_replacement(shapes, 2))
     convex = [pair for pair in pairs if not ({*pair} <= primitive or {*pair} == round_)]

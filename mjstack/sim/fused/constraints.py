@@ -25,7 +25,7 @@ def why_not(m: mjw.Model, d: mjw.Data) -> str:
         "there is no room for constraint rows": not d.njmax,
         f"{d.njmax} rows need {size:,} {shared}": size > SHARED_BYTES,
         "noslip is on": opt.noslip_iterations > 0,
-        "bodies may sleep": bool(int(opt.enableflags) & int(mujoco.mjtEnableBit.mjENBL_SLEEP)),
+        "bodies may sleep": int(opt.enableflags) & mujoco.mjtEnableBit.mjENBL_SLEEP,
         "qacc_smooth is not computed": not opt.run_qacc_smooth,
         "the integrator is discrete": opt.integrator == mjw.IntegratorType.DISCRETE,
     }

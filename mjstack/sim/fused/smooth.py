@@ -25,7 +25,7 @@ def why_not(m: mjw.Model) -> str:
     size = _shared_bytes(m)
     shared = f"bytes of shared memory, of {SHARED_BYTES:,}"
     joints = m.jnt_type.numpy()
-    of_joints = np.isin(m.actuator_trntype.numpy(), [int(kind) for kind in _TRANSMISSIONS])
+    of_joints = np.isin(m.actuator_trntype.numpy(), _TRANSMISSIONS)
     driven = joints[m.actuator_trnid.numpy()[of_joints, 0]]
     reasons = {
         "there are ball joints": not _only(joints, (mujoco.mjtJoint.mjJNT_FREE, *_AXES)),
@@ -68,7 +68,7 @@ def advance(m: mjw.Model, d: mjw.Data) -> None:
 
 
 def _only(values: np.ndarray, allowed: Iterable[int]) -> bool:
-    return {int(value) for value in allowed}.issuperset(values.tolist())
+    return set(allowed).issuperset(values.tolist())
 
 
 def _shared_bytes(m: mjw.Model) -> int:

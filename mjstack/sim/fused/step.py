@@ -60,19 +60,17 @@ def can_rearrange(model: mujoco.MjModel, m: mjw.Model) -> bool:
     the step before, adhesion reads contacts among the smooth forces, and sensors of acceleration or
     of a camera need stages of their own.
     """
-    equalities = {int(kind) for kind in model.eq_type}
-    seen_by = {int(kind) for kind in (*model.sensor_objtype, *model.sensor_reftype)}
     return (
         m.opt.run_collision_detection
         and not m.nacttrnbody
         and not m.flg_adhesion
-        and int(mujoco.mjtObj.mjOBJ_CAMERA) not in seen_by
-        and model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+        and mujoco.mjtObj.mjOBJ_CAMERA not in (*model.sensor_objtype, *model.sensor_reftype)
+        and model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         and model.ntendon == model.nflex == 0
         and model.nhistory == 0
         and not model.opt.enableflags
-        & int(mujoco.mjtEnableBit.mjENBL_SLEEP | mujoco.mjtEnableBit.mjENBL_ENERGY)
-        and equalities <= {int(mujoco.mjtEq.mjEQ_JOINT)}
+        & (mujoco.mjtEnableBit.mjENBL_SLEEP | mujoco.mjtEnableBit.mjENBL_ENERGY)
+        and (model.eq_type == mujoco.mjtEq.mjEQ_JOINT).all()
         and not m.sensor_rne_postconstraint
         and not m.opt.run_rne_postconstraint
         and not any((m.callback.control, m.callback.contactfilter))
@@ -182,7 +180,7 @@ def _draw(model: mujoco.MjModel, rng: np.random.Generator) -> np.ndarray:
     for kind, at, (low, high) in zip(
         model.jnt_type, model.jnt_qposadr, model.jnt_range, strict=True
     ):
-        if kind == int(mujoco.mjtJoint.mjJNT_FREE):
+        if kind == mujoco.mjtJoint.mjJNT_FREE:
             qpos[at + 2] -= rng.uniform(0.0, 1e-3)
         elif low < high:
             qpos[at] = np.clip(rng.uniform(low - 0.1, high + 0.1), low - 0.01, high + 0.01)
