@@ -201,6 +201,6 @@ def name_worlds(
     worlds: Sequence[int | str], nworld: int, limit: int = 8, what: str = "worlds"
 ) -> str:
     """Say how many worlds and name the first ones: ``17 of 4096 worlds (first: 3, 41, 96)``."""
-    first = ", ".join(str(w) for w in worlds[:limit])
+    first = ", ".join(map(str, worlds[:limit]))
     label = "first: " if len(worlds) > limit else ""
     return f"{len(worlds)} of {nworld} {what} ({label}{first})"

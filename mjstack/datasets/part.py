@@ -70,7 +70,7 @@ class PartWriter:
         for video in spec.videos:
             path = lerobot.shard_path(folder, lerobot.VIDEO, 0, video)
             self.part.videos[video] = path.with_name(f".file-{name}.mp4")
-        most = int(images_gib * 2**30)
+        most = images_gib * 2**30
         self._videos = VideoEncoder(spec.videos, spec.fps, self.part.videos, most)
 
     def is_full(self) -> bool:

@@ -136,7 +136,7 @@ class VideoEncoder:
     """
 
     def __init__(
-        self, videos: Mapping[str, Video], fps: int, paths: Mapping[str, Path], most: int
+        self, videos: Mapping[str, Video], fps: int, paths: Mapping[str, Path], most: float
     ) -> None:
         """Begin.
 

@@ -105,7 +105,7 @@ def recommend_sizes(peaks: Peaks, margin: float, source: str) -> BatchSizes:
     convex = peaks.convex_share
     return BatchSizes(
         nconmax=nconmax,
-        njmax=size(float(peaks.rows.max())),
+        njmax=size(peaks.rows.max()),
         nccdmax=None if convex is None else min(nconmax, size(convex)),
         source=source,
     )

@@ -103,7 +103,7 @@ def show_batch(
     moving: list[World] = []
     stride = frame_stride(stage.cfg.timing.step_dt)
     for world, motion in zip(chosen, motions, strict=True):
-        problem = rules.describe(int(failed[world]))
+        problem = rules.describe(failed[world])
         label = f"{world}: {problem}" if problem else str(world)
         seen = draw_seen(stage, motion, sim, world, stride) if len(moving) < MOST_SEEN else {}
         moving.append(World(label=label, qpos=motion, failed=bool(problem), images=seen))

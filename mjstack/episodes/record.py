@@ -174,7 +174,7 @@ class EpisodeRecord:
             {
                 "seed": self.seed,
                 "world": world,
-                "rules": " ".join(rules.broken(int(self.failed[world]))),
+                "rules": " ".join(rules.broken(self.failed[world])),
                 **(self._sign_cells(world) if "sign" in self.worlds else {}),
                 **{name: f"{values[world]:.6g}" for name, values in self.values.items()},
             }

@@ -91,7 +91,7 @@ class EpisodeTally:
     def names(self, episodes: Sequence[int] | np.ndarray) -> list[str]:
         """Names of episodes, counted over all seeds, as ``world=`` of job=replay takes them."""
         seeds = [f"{record.seed}:" if self.several else "" for record in self.records]
-        places = (divmod(int(episode), len(self.records[0].failed)) for episode in episodes)
+        places = (divmod(episode, len(self.records[0].failed)) for episode in episodes)
         return [f"{seeds[seed]}{world}" for seed, world in places]
 
     def write_failing(self) -> None:

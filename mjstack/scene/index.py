@@ -31,7 +31,7 @@ class Columns:
 
     def __init__(self, indices: Sequence[int] | np.ndarray, device: torch.device) -> None:
         """Take the columns."""
-        self.indices = tuple(int(i) for i in indices)
+        self.indices = tuple(map(int, indices))
         first = min(self.indices, default=0)
         stop = first + len(self.indices)
         self.at: Rows = slice(first, stop)

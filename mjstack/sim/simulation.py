@@ -50,7 +50,7 @@ def describe_overflow(bits: int) -> str:
     return ", ".join(flag.name or "" for flag in Overflow if bits & flag)
 
 
-LOST_PHYSICS = int(sum(Overflow))
+LOST_PHYSICS = sum(Overflow)
 
 
 class Simulation(ABC):
