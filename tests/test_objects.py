@@ -22,7 +22,6 @@ from mjstack.managers import episode_draw
 from mjstack.math import lowest_point
 from mjstack.mdp.geometry import above_table, place_xy, pose_w, source_xy
 from mjstack.mdp.observation import object_to_place
-from mjstack.mdp.reward import near_place
 from mjstack.mdp.starts.starts_file import write_starts
 from mjstack.scene.phases import build_phases, nominal_xy, target_xy
 
@@ -75,8 +74,8 @@ policy:
 """
 REWARD = """
 near:
-  func: mjstack.mdp.reward.near_place
-  params: {{object: {0}, place: goal, scale: 0.1}}
+  func: mjstack.mdp.reward.reach
+  params: {{object: {0}, scale: 0.1}}
   weight: 1.0
 """
 
@@ -323,9 +322,6 @@ def test_a_place_is_drawn_once_an_episode(folder: Callable[[str], Path]) -> None
     torch.testing.assert_close(observed, away.float(), rtol=0.0, atol=2e-3)
     to_goal = object_to_place(env, object="puck", place="goal").float()
     torch.testing.assert_close(to_goal, observed, rtol=0.0, atol=1e-6)
-    near = 1.0 - torch.tanh(observed[:, :2].norm(dim=1) / 0.1)
-    reward = near_place(env, object="puck", place="goal", scale=0.1)
-    torch.testing.assert_close(reward.float(), near, rtol=0.0, atol=1e-5)
     draw = episode_draw(env, "goal", 2)
     torch.testing.assert_close(draw * torch.tensor([0.03, 0.02]) + torch.tensor([0.33, 0.08]), goal)
 

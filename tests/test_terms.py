@@ -65,7 +65,7 @@ TERMINATIONS = {
     "non_finite": {},
     "overflow": {},
 }
-OF_PLACES = ("object_to_place", "near_place")  # in test_objects.py
+OF_PLACES = ("object_to_place",)  # in test_objects.py
 RESETS = ("home", "JointNoise", "JointZeros", "JitterObjects", "RandomizeObjects")
 RESETS += ("ObjectMass", "ObjectFriction", "ActuatorGains")
 

@@ -59,11 +59,6 @@ def lost_state(env: EnvView) -> Tensor:
     return shared((id(env), lost_state), lambda: not_finite(sim.qpos, sim.qvel))
 
 
-def nearness(offset: Tensor, scale: float) -> Tensor:
-    """``1 - tanh(distance / scale)`` of offsets [m], shape ``(nworld, d)``; shape ``(nworld,)``."""
-    return 1.0 - torch.tanh(norm(offset) / scale)
-
-
 def above_table(env: EnvView, name: str) -> Tensor:
     """Height of an object's lowest point above the table [m], shape ``(nworld,)``. Not to be
     written into.

@@ -5,8 +5,9 @@ from torch import Tensor
 
 from mjstack.config.fields import Positive
 from mjstack.managers.view import EnvView
+from mjstack.math import norm
 from mjstack.mdp import observation
-from mjstack.mdp.geometry import above_table, nearness, place_xy, pose_w
+from mjstack.mdp.geometry import above_table
 
 
 def reach(env: EnvView, *, object: str, scale: Positive, height: float = 0.0) -> Tensor:
@@ -18,7 +19,8 @@ def reach(env: EnvView, *, object: str, scale: Positive, height: float = 0.0) ->
         scale: Distance over which the reward falls [m].
         height: How far above the object's centre the point is [m].
     """
-    return nearness(observation.grasp_point_to_object(env, object=object, height=height), scale)
+    offset = observation.grasp_point_to_object(env, object=object, height=height)
+    return 1.0 - torch.tanh(norm(offset) / scale)
 
 
 def lift(env: EnvView, *, object: str, height: Positive) -> Tensor:
@@ -26,11 +28,6 @@ def lift(env: EnvView, *, object: str, height: Positive) -> Tensor:
     1.
     """
     return (above_table(env, object) / height).clamp(0.0, 1.0)
-
-
-def near_place(env: EnvView, *, object: str, place: str, scale: Positive) -> Tensor:
-    """Horizontal nearness of an object to a place: ``1 - tanh(distance / scale)``."""
-    return nearness(place_xy(env, place) - pose_w(env, object)[:, :2], scale)
 
 
 def success(env: EnvView) -> Tensor:

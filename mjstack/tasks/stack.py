@@ -102,13 +102,12 @@ class StackCheck(EpisodeCheck):
             phases=[[t.carry_phase]],
             after=lift,
         )
-        rest = (t.rest_speed, t.rest_position, t.rest_rotation_deg)
         return [
             lift,
             carry,
             InWindow("STACKED", "not stacked", self.stacked, t.window, measure=self.trace),
             InWindow("SUPPORTED", f"{t.onto} not on the table", self.supported, t.window),
-            AtRest(t.window, *rest),
+            AtRest(t.window, t.rest_speed, t.rest_position, t.rest_rotation_deg),
             InWindow("RELEASED", f"{t.object} not released", self.released, t.window),
         ]
 
