@@ -182,7 +182,7 @@ class ObservationManager:
             for part in self._parts
             for _ in range(part.width)
         ]
-        table = torch.tensor(columns, device=env.device).view(-1, 3)
+        table = torch.tensor(columns, dtype=torch.float32, device=env.device).view(-1, 3)
         self._low, self._high, self._scale = table.T.contiguous()
 
     def compute(self) -> dict[str, Tensor]:
