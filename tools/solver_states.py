@@ -7,8 +7,8 @@ import mujoco
 import torch
 
 from mjstack.envs import Env
-from mjstack.episodes.rollout import Observer, rollout
-from mjstack.episodes.stage import Stage, lacks_episode
+from mjstack.episodes.rollout import Observer, lacks_episode, rollout
+from mjstack.episodes.stage import Stage
 from mjstack.errors import MjstackError
 from mjstack.math import not_finite
 from mjstack.sim import LOST_PHYSICS

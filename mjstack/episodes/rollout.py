@@ -11,10 +11,11 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from mjstack.config.schema import TermCfg
+from mjstack.config.schema import Config, TermCfg
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.envs.buffers import Advance
+from mjstack.errors import ConfigError
 from mjstack.sim import Simulation
 from mjstack.sim.graph import StepGraph
 from mjstack.tasks.check import CheckResult, make_check
@@ -278,3 +279,23 @@ class Hook(Observer):
     @override
     def after_step(self, step: int) -> None:
         self._function(step, self.env.sim)
+
+
+def lacks_episode(cfg: Config) -> str:
+    """Why no driver can play a judged episode of the task; empty if one can."""
+    if not cfg.controller.phases and cfg.controller.name != POLICY:
+        return f"task {cfg.task.name} has no phases: no open- or closed-loop driver"
+    if cfg.task.check is None:
+        return f"task {cfg.task.name} has no check"
+    return ""
+
+
+def require_episode(cfg: Config) -> None:
+    """Refuse a job that plays episodes of a task that has none.
+
+    Raises:
+        ConfigError: The task has no phases, or no check.
+    """
+    if reason := lacks_episode(cfg):
+        expected = f"a task with phases and a check, which job={cfg.job.name} plays ({reason})"
+        raise ConfigError("task", cfg.task.name, expected, "Train it: mjstack.make_env")

@@ -359,23 +359,3 @@ class Stage:
         chosen = with_outputs(scene.cameras, ["rgb"], cameras)
         cfg = replace(self.cfg, scene=replace(scene, cameras=chosen))
         return StateRenderer(self.model, cfg, count, fields=fields)
-
-
-def lacks_episode(cfg: Config) -> str:
-    """Why no driver can play a judged episode of the task; empty if one can."""
-    if not cfg.controller.phases and cfg.controller.name != POLICY:
-        return f"task {cfg.task.name} has no phases: no open- or closed-loop driver"
-    if cfg.task.check is None:
-        return f"task {cfg.task.name} has no check"
-    return ""
-
-
-def require_episode(cfg: Config) -> None:
-    """Refuse a job that plays episodes of a task that has none.
-
-    Raises:
-        ConfigError: The task has no phases, or no check.
-    """
-    if reason := lacks_episode(cfg):
-        expected = f"a task with phases and a check, which job={cfg.job.name} plays ({reason})"
-        raise ConfigError("task", cfg.task.name, expected, "Train it: mjstack.make_env")

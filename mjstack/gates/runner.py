@@ -11,8 +11,8 @@ from mjstack.config.functions import resolve_func
 from mjstack.config.schema import Config
 from mjstack.distributed import Ranks
 from mjstack.episodes.earlier_run import archive_starts, archived_starts
+from mjstack.episodes.rollout import lacks_episode
 from mjstack.episodes.run import Run
-from mjstack.episodes.stage import lacks_episode
 from mjstack.errors import MjstackError, RankError, describe_error
 from mjstack.interrupt import check_interrupt
 from mjstack.report.record import GateResult, Status

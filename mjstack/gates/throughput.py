@@ -12,8 +12,8 @@ from mjstack.bench.physics import measure_physics
 from mjstack.bench.timing import Measurement
 from mjstack.config.schema import Backend
 from mjstack.envs import build_env, decided_every_step, without_images
+from mjstack.episodes.rollout import lacks_episode
 from mjstack.episodes.run import Run, each_rank
-from mjstack.episodes.stage import lacks_episode
 from mjstack.errors import MjstackError
 from mjstack.gates.runner import log_error
 from mjstack.report.gl import require_offscreen

@@ -19,8 +19,9 @@ from mjstack.datasets import DatasetWriter, lerobot
 from mjstack.datasets.part import Part
 from mjstack.envs import demonstration_config
 from mjstack.episodes.batches import Batch, BatchPlan, play_batches
+from mjstack.episodes.rollout import require_episode
 from mjstack.episodes.run import Run
-from mjstack.episodes.stage import Stage, require_episode
+from mjstack.episodes.stage import Stage
 from mjstack.episodes.tally import rate_metrics
 from mjstack.errors import RankError
 from mjstack.files import write_atomic

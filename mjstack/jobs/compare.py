@@ -18,8 +18,9 @@ from mjstack.config.schema import Backend, Config
 from mjstack.episodes.batches import BatchPlan, play_batches
 from mjstack.episodes.motion import motion_recorder
 from mjstack.episodes.replay import simulate_alone
+from mjstack.episodes.rollout import require_episode
 from mjstack.episodes.run import Run
-from mjstack.episodes.stage import Stage, require_episode
+from mjstack.episodes.stage import Stage
 from mjstack.episodes.tally import rate_metrics
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.files import to_csv, write_atomic

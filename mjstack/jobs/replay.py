@@ -15,9 +15,8 @@ from mjstack.config.schema import Backend, Config
 from mjstack.episodes.batches import BatchPlan, play_batches
 from mjstack.episodes.failures import FailureMonitor, describe_sign
 from mjstack.episodes.replay import WorldTrace, simulate_alone
-from mjstack.episodes.rollout import Episode
+from mjstack.episodes.rollout import Episode, require_episode
 from mjstack.episodes.run import Run
-from mjstack.episodes.stage import require_episode
 from mjstack.episodes.tally import rate_cells
 from mjstack.errors import ConfigError
 from mjstack.files import to_csv, write_atomic, write_npz

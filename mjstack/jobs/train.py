@@ -12,9 +12,9 @@ from pathlib import Path
 from mjstack.config.fingerprint import WITHOUT_EFFECT, config_content, config_hash, differences
 from mjstack.config.functions import find_object
 from mjstack.config.schema import Config, TrainJobCfg
-from mjstack.episodes.rollout import POLICY
+from mjstack.episodes.rollout import POLICY, require_episode
 from mjstack.episodes.run import Run
-from mjstack.episodes.stage import Assets, Stage, require_episode
+from mjstack.episodes.stage import Assets, Stage
 from mjstack.errors import ConfigError, FolderError
 from mjstack.files import made_by, reading, to_csv, write_atomic
 from mjstack.gates.runner import run_guarded

@@ -16,7 +16,6 @@ from mjstack.mdp.geometry import place_xy
 from mjstack.scene.index import lowest_height
 from mjstack.tasks.check import EpisodeCheck, Judgement, Rule
 from mjstack.tasks.parts import (
-    AllOf,
     AtLeast,
     Carried,
     Condition,
@@ -27,7 +26,7 @@ from mjstack.tasks.parts import (
     released,
 )
 from mjstack.tasks.placed import HeldSuccess
-from mjstack.tasks.view import PhaseNames, Step, TaskView, once_per_step
+from mjstack.tasks.view import AllOf, PhaseNames, Step, TaskView, once_per_step
 
 
 class BoxCheck(EpisodeCheck):

@@ -7,8 +7,6 @@ A condition is a function of a `Step` that returns a bool tensor, shape ``(nworl
 import math
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, field
-from functools import reduce
-from operator import and_
 
 import torch
 from torch import Tensor
@@ -17,38 +15,12 @@ from typing_extensions import override
 from mjstack.math import norm, quat_angle
 from mjstack.mdp.geometry import place_xy
 from mjstack.tasks.check import Judgement, Rule
-from mjstack.tasks.view import PhaseNames, Step, TaskView
+from mjstack.tasks.view import AllOf, PhaseNames, Step, TaskView
 
 Condition = Callable[[Step], Tensor]
 
 
 # Conditions
-
-
-@dataclass(frozen=True, slots=True)
-class AllOf:
-    """A condition that holds where all its parts do, each of which keeps a threshold.
-
-    Attributes:
-        names: Those of the thresholds.
-        parts: Whether each part holds, each ``(nworld, n)`` or ``(nworld,)``, bool; or one tensor
-            of all, in its last dimension.
-    """
-
-    names: tuple[str, ...]
-    parts: Callable[[Step], Tensor | tuple[Tensor, ...]]
-
-    def __call__(self, step: Step) -> Tensor:
-        """Shape ``(nworld, n)`` or ``(nworld,)``, bool."""
-        holds = self.parts(step)  # in as few calls of torch as there are
-        return holds.all(-1) if isinstance(holds, Tensor) else reduce(and_, holds)
-
-    def apart(self, step: Step) -> Tensor:
-        """Whether each part holds, shape ``(nworld, n, parts)`` or ``(nworld, parts)``, bool."""
-        holds = self.parts(step)
-        if isinstance(holds, Tensor):
-            return holds
-        return torch.stack(torch.broadcast_tensors(*holds), dim=-1)
 
 
 def airborne(*objects: str, height: float) -> Condition:

@@ -4,7 +4,9 @@ alone, which are never stale.
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property, wraps
+from dataclasses import dataclass
+from functools import cached_property, reduce, wraps
+from operator import and_
 from typing import Any
 
 import torch
@@ -293,3 +295,29 @@ class Step:
         shape = (len(self.view.objects), -1, 3)
         forces = self.view.env.sim.part("sensordata", columns, *shape)
         return norm(forces) > self.view.force
+
+
+@dataclass(frozen=True, slots=True)
+class AllOf:
+    """A condition that holds where all its parts do, each of which keeps a threshold.
+
+    Attributes:
+        names: Those of the thresholds.
+        parts: Whether each part holds, each ``(nworld, n)`` or ``(nworld,)``, bool; or one tensor
+            of all, in its last dimension.
+    """
+
+    names: tuple[str, ...]
+    parts: Callable[[Step], Tensor | tuple[Tensor, ...]]
+
+    def __call__(self, step: Step) -> Tensor:
+        """Shape ``(nworld, n)`` or ``(nworld,)``, bool."""
+        holds = self.parts(step)  # in as few calls of torch as there are
+        return holds.all(-1) if isinstance(holds, Tensor) else reduce(and_, holds)
+
+    def apart(self, step: Step) -> Tensor:
+        """Whether each part holds, shape ``(nworld, n, parts)`` or ``(nworld, parts)``, bool."""
+        holds = self.parts(step)
+        if isinstance(holds, Tensor):
+            return holds
+        return torch.stack(torch.broadcast_tensors(*holds), dim=-1)
