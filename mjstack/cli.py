@@ -93,6 +93,10 @@ def _dispatch(flags: Namespace, overrides: list[str]) -> int:
             from mjstack.robots.new import write_new  # it loads MuJoCo
 
             print("\n".join(map(str, write_new(overrides[1:]))))
+        elif overrides[:1] == ["doctor"]:
+            from mjstack.jobs.doctor import doctor_text  # it loads Warp
+
+            print(doctor_text(overrides[1:]), flush=True)
         elif flags.help:
             _print_help(overrides)
         elif flags.hydra_help:
