@@ -488,7 +488,7 @@ def test_contacts_and_convex_pairs_are_held_against_their_keys() -> None:
     cfg = load_config(["nworld=4", "batch.nconmax=15", "batch.nccdmax=3"])
     seen = peaks(nworld=4, contacts=20, ccd_pairs=40)
     wanted = recommend_sizes(seen, 1.25, "")
-    facts = {"title": "", "runs": {}, "lost": "", "peaks": seen, "advice": wanted}
+    facts = {"runs": {}, "lost": "", "peaks": seen, "advice": wanted}
     group = capacity_module._Group(**facts, sizes=resolve_sizes(cfg))
     texts = [text for _, text in capacity_module._shortages(group)]
     assert any("contact pool overflow" in text and "batch.nconmax=32" in text for text in texts)
