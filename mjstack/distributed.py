@@ -108,7 +108,7 @@ class Ranks:
         first: Callable[[], Any] = work if self.writes else lambda: None
         return self.in_all(first)[0]
 
-    def in_all(self, work: Callable[[], T]) -> Sequence[T]:
+    def in_all(self, work: Callable[[], T]) -> list[T]:
         """The results of work that every rank does, by rank. If it fails in one, it fails in all.
 
         Raises:
@@ -126,7 +126,7 @@ class Ranks:
         problems, results = zip(*self.gather((text, result)), strict=True)
         failed = [rank for rank, problem in enumerate(problems) if problem is not None]
         if not failed:
-            return results
+            return list(results)
         if failure is not None and self.writes:
             raise failure
         who = "" if 0 in failed else f"rank {failed[0]} of {self.size}: "

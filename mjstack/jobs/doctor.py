@@ -73,10 +73,10 @@ def _findings(overrides: Sequence[str]) -> Iterator[tuple[str, str]]:
     cache = Path(wp.config.kernel_cache_dir)
     files = [path for path in cache.rglob("*") if path.is_file()]
     size = sum(path.stat().st_size for path in files) / _GIB
-    kept = f"{cache}, {size:.2f} GiB"
+    cached = f"{cache}, {size:.2f} GiB"
     if not os.access(cache, os.W_OK):
-        kept += ", not writable: kernels are compiled in every run. Set WARP_CACHE_PATH"
-    yield "kernel cache", kept
+        cached += ", not writable: kernels are compiled in every run. Set WARP_CACHE_PATH"
+    yield "kernel cache", cached
 
     # Pictures
     model = build_model(cfg)
