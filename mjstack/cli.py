@@ -94,9 +94,10 @@ def _dispatch(flags: Namespace, overrides: list[str]) -> int:
 
             print("\n".join(map(str, write_new(overrides[1:]))))
         elif overrides[:1] == ["doctor"]:
-            from mjstack.jobs.doctor import doctor_text  # it loads Warp
+            from mjstack.jobs.doctor import findings  # it loads Warp
 
-            print(doctor_text(overrides[1:]), flush=True)
+            for name, words in findings(overrides[1:]):
+                print(f"{name:<14} {words}", flush=True)
         elif flags.help:
             _print_help(overrides)
         elif flags.hydra_help:
@@ -187,13 +188,19 @@ def _sweep(hydra: Any, overrides: list[str]) -> int:
     """Compose and check every job of a sweep, then run those that are left."""
     if is_rank():
         raise MjstackError("torchrun: expected one job, and -m makes several. Leave one out.")
-    if any(re.search("hydra[./]sweeper", override) for override in overrides):
+    if any(re.match("[+~]*hydra[./]sweeper", override) for override in overrides):
         raise MjstackError(
             "hydra.sweeper: expected Hydra's own. Give the values on the command line, as in"
             " -m nworld=1,2."
         )
     overrides = [*overrides, "hydra.mode=MULTIRUN"]
     master = compose(overrides, RunMode.MULTIRUN)
+    subdir = OmegaConf.to_container(master.hydra)["sweep"]["subdir"]  # type: ignore[index,call-overload]
+    if subdir != "${hydra.job.num}":
+        raise MjstackError(
+            f"hydra.sweep.subdir={subdir}: expected none, because a job's folder is its"
+            " number. Leave it out, also of your YAML."
+        )
     jobs = expand(master, overrides)
     check_jobs(master, jobs, _check)
     begin_job()

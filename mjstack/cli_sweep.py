@@ -6,7 +6,6 @@ from pathlib import Path
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.types import ValueType
 from omegaconf import DictConfig, OmegaConf
 
 from mjstack.config.explain import own_overrides, parse
@@ -24,7 +23,7 @@ def expand(master: DictConfig, overrides: Sequence[str]) -> list[list[str]]:
     params = OmegaConf.select(master, "hydra.sweeper.params") or {}
     texts = [*(f"{key}={value}" for key, value in params.items()), *own_overrides(overrides)]
     parsed = list(map(parse, texts))
-    if any(override.value_type is ValueType.GLOB_CHOICE_SWEEP for override in parsed):
+    if any(part.is_sweep_override() and not part.is_discrete_sweep() for part in parsed):
         raise MjstackError(f"{' '.join(overrides)}: expected a list of values.")
     (jobs,) = BasicSweeper.split_arguments(parsed, None)
     if not jobs:

@@ -97,6 +97,7 @@ LINES = [
     ("-m hydra.sweeper.params={seed:1}", "hydra.sweeper: expected Hydra's own. Give the values"),
     ("-m seed=1 +hydra.sweeper.params.nworld=2", "hydra.sweeper: expected Hydra's own."),
     ("-m seed=1,2 hydra/sweeper=optuna", "hydra.sweeper: expected Hydra's own."),
+    ("-m nworld=interval(1,2)", "hydra.mode=MULTIRUN: expected a list of values."),
     ("hydra/launcher=nope", "hydra/launcher=nope: 'nope' does not exist. Available: basic, gpus"),
     ("cameras=[front,wirst]", "cameras=wirst: 'wirst' does not exist. Did you mean 'wrist'?"),
     ("-sc install=bash", "flag '-sc' does not exist."),

@@ -360,6 +360,25 @@ def test_the_whole_job_is_checked_before_its_folder_exists(
     refusal(lambda: check_machine(load_config(["gates=[baseline]", *overrides])), words)
 
 
+def test_a_swapped_function_does_not_inherit_parameters() -> None:
+    same = "reward.reach.func=mjstack.mdp.reward.reach"
+    swap = "reward.reach.func=mjstack.mdp.reward.action_rate"
+    task = "task=reach"
+    home = "gate.success.reset.joint_noise.func=mjstack.mdp.reset.home"
+    cfg = load_config([task, same, home])
+    assert cfg.reward["reach"].params
+    assert cfg.gate.success.reset["joint_noise"].params == {}
+    check = ["task.check.func=mine.Check", "task.check.window=7"]
+    cfg = load_config([task, swap, "reward.reach.weight=3.0", *check])
+    assert cfg.reward["reach"].params == {}
+    assert cfg.task.check == {"func": "mine.Check", "window": 7}
+    values = ["+reward.reach.params.mine=2", "reward.reach.params={scale: 1}"]
+    term = load_config([task, swap, *values]).reward["reach"]
+    assert term.params == {"mine": 2, "scale": 1}
+    whole = "{func: mjstack.mdp.reward.action_rate, params: {mine: 3}}"
+    assert load_config([task, f"+reward.reach={whole}"]).reward["reach"].params == {"mine": 3}
+
+
 @pytest.mark.full
 def test_every_field_says_what_it_means() -> None:
     keys = list(list_keys(load_config()))

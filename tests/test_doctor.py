@@ -35,12 +35,15 @@ def test_a_page_on_this_machine(capsys: Capture, monkeypatch: Patch, refused: Re
     assert torch.__version__ in lines["torch"]
     assert lines["OpenGL"].endswith("rendering fails. Set MUJOCO_GL=egl or osmesa.")
     sizes = resolve_sizes(load_config(["robot=rebot"]))
-    assert "rebot, task stack, 3 worlds on native (cpu)" in lines["buffers"]
+    assert "rebot, task stack, 3 worlds: " in lines["buffers"]
+    assert lines["backend"] == "native on cpu"
     assert f"batch.nconmax={sizes.nconmax}" in lines["buffers"]
     assert "'robt' does not exist. Did you mean 'robot'?" in refused("doctor", "robt=so101")
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a CUDA device is here")
 def test_no_gpu_has_a_reason(capsys: Capture) -> None:
-    assert run(["doctor"]) == 0
-    assert re.search(r"(?m)^GPU +none that torch can use \(driver: ", capsys.readouterr().out)
+    assert run(["doctor", "sim.device=cuda:0"]) == 0
+    text = capsys.readouterr().out
+    assert re.search(r"(?m)^GPU +none that torch can use \(driver: ", text)
+    assert re.search(r"(?m)^backend +none: .*cuda:0", text)

@@ -150,9 +150,15 @@ def test_sweeps_of_one_hour_have_a_folder_each(begin: Callable[..., int]) -> Non
 
 def test_a_jobs_folder_in_a_sweep_is_its_number(begin: Callable[..., int], capsys: Capture) -> None:
     assert begin("-m", "seed=1,2", "hydra.sweep.subdir=same") == 2
-    err = capsys.readouterr().err
-    assert err.startswith("mjstack: hydra.sweep.subdir=same: expected the configured one")
+    assert "hydra.sweep.subdir=same: expected none" in capsys.readouterr().err
     assert contents(Path()) == {}
+    text = "# @package _global_\nhydra: {sweep: {subdir: same}}\n"
+    put(Path(), {"conf/experiment/same.yaml": text})
+    command = ["-m", "--config-dir", "conf", "experiment=same", "seed=1,2"]
+    assert begin(*command) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("mjstack: hydra.sweep.subdir=same: expected none")
+    assert list(contents(Path())) == ["conf", "conf/experiment", "conf/experiment/same.yaml"]
 
 
 @pytest.mark.full

@@ -124,7 +124,7 @@ def _robot(cfg: Config) -> Checks:
 
 
 def _scene(cfg: Config) -> Checks:
-    """Objects, places and the box are on the table; `scene.build_scene` sees what they touch."""
+    """Objects, places and the box are on the table; `scene.build` sees what they touch."""
     scene = cfg.scene
     needs_free = cfg.task.check is not None or any(map(places_objects, cfg.reset.values()))
     expected = "at least one object that is not fixed, for the check and for random starts"

@@ -35,10 +35,10 @@ TERM_GROUPS = ("action", "observation", "reset", "termination", "reward")
 def check_overrides(overrides: Sequence[str]) -> None:
     """Raise a `MjstackError` for the first override that cannot be used alone."""
     for override in overrides:
-        if re.match(r"[+~]*hydra([./]job_logging|\.output_subdir|\.sweep\.subdir)", override):
+        if re.match(r"[+~]*hydra([./]job_logging|\.output_subdir)", override):
             raise MjstackError(
-                f"{override}: expected the configured one, because every run has run.log and"
-                " .hydra, and a job's folder in a sweep its number. Leave it out."
+                f"{override}: expected Hydra's own, because every run has run.log and .hydra. Leave"
+                " it out."
             )
     for override in own_overrides(overrides):
         parsed = parse(override)

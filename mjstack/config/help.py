@@ -32,8 +32,7 @@ mjstack: a task of a robot arm, from native MuJoCo to thousands of MuJoCo Warp w
 Usage: mjstack [group=choice ...] [key=value ...] [flags]
        mjstack list [tasks|robots|terms|conditions|gates|trainers]
        mjstack new task NAME | robot NAME FILE.xml    a folder of your own
-       mjstack doctor [key=value ...]    what this machine has, for a bug report
-In a checkout: python scripts/run.py ...
+In a checkout: python scripts/run.py ...  What this machine has: mjstack doctor
 
 Examples:
   mjstack robot=rebot nworld=64

@@ -12,13 +12,13 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError  # type: ignore[import-untyped]
 
 from mjstack.config.check import validate
 from mjstack.config.complete import complete
-from mjstack.config.explain import check_added, check_overrides, explain, parse
+from mjstack.config.explain import check_added, check_overrides, explain, own_overrides, parse
 from mjstack.config.fingerprint import POLICY_FILE
 from mjstack.config.schema import JOB_SCHEMAS, TRAINER_SCHEMAS, Backend, Config
 from mjstack.config.session import (
@@ -172,11 +172,48 @@ def compose(overrides: Sequence[str], run_mode: RunMode = RunMode.RUN) -> DictCo
         )
         if run_mode is RunMode.RUN:
             check_added(without_hydra(cfg), overrides)
+            _drop_inherited(cfg, overrides)
     except (HydraException, OmegaConfBaseException, AssertionError, TypeError, ValueError) as error:
         raise explain(error, overrides) from error
     except YAMLError as error:
         raise MjstackError(f"{' '.join(str(error).split())}.") from error
     return cfg
+
+
+def _drop_inherited(cfg: DictConfig, overrides: Sequence[str]) -> None:
+    """Leave a term whose ``func`` an override swaps with the parameters that overrides give it:
+    those of the other function are not its own.
+    """
+    if not any("func" in override for override in overrides):
+        return
+    values = {o.key_or_group: o.value() for o in map(parse, own_overrides(overrides))}
+    # Other keys of a job or a gate are no parameters of its function.
+    terms = {
+        key: key.removesuffix(".func")
+        for key, value in values.items()
+        if (key.endswith(".func") or (isinstance(value, dict) and "func" in value))
+        and not re.match(r"job\.|gate\.(?!.*\.reset\.)", key)
+    }
+    rest = [o for o in overrides if o.lstrip("+").partition("=")[0] not in terms]
+    before = (
+        GlobalHydra.instance()
+        .config_loader()
+        .load_configuration(config_name=CONFIG_NAME, overrides=rest, run_mode=RunMode.RUN)
+    )
+    for term in terms.values():
+        old = OmegaConf.select(before, f"{term}.func")
+        if old is None or old == OmegaConf.select(cfg, f"{term}.func"):
+            continue
+        section = term if term == "task.check" else f"{term}.params"
+        changes = OmegaConf.create()
+        for key, value in values.items():
+            if f"{key}.".startswith(f"{term}."):
+                OmegaConf.update(changes, key, value)
+        params = {"func", *(OmegaConf.select(changes, section) or ())}
+        node = OmegaConf.select(cfg, section) or {}
+        with open_dict(cfg):
+            for name in node.keys() - params:
+                del node[name]
 
 
 def load_saved(path: Path) -> Config:

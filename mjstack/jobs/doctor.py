@@ -23,6 +23,7 @@ from mjstack.sim.warp_setup import wp
 
 # Packages of the extras, by the one that needs them
 _EXTRAS = {
+    "cluster": "submitit",
     "datasets": "pyarrow",
     "export": "onnx",
     "gpu": "nvidia-ml-py",
@@ -34,17 +35,13 @@ _EXTRAS = {
 _GIB = 2**30
 
 
-def doctor_text(overrides: Sequence[str]) -> str:
+def findings(overrides: Sequence[str]) -> Iterator[tuple[str, str]]:
     """Versions, processor, GPUs, OpenGL, the kernel cache, and the memory that the buffers of a
-    configuration take, a line each. It compiles no kernel.
+    configuration take: a name and a sentence each. No kernel is compiled.
 
     Raises:
         MjstackError: The configuration is wrong.
     """
-    return "\n".join(f"{name:<14} {words}" for name, words in _findings(overrides))
-
-
-def _findings(overrides: Sequence[str]) -> Iterator[tuple[str, str]]:
     cfg = load_config(overrides)
     facts = collect_provenance()
     versions = cast(dict[str, str], facts["versions"])
@@ -90,9 +87,12 @@ def _findings(overrides: Sequence[str]) -> Iterator[tuple[str, str]]:
     # Buffers
     sizes = resolve_sizes(cfg)
     need = data_bytes(model, cfg.nworld, sizes) / _GIB
-    backend, device = resolve_backend(cfg)
-    what = f"{cfg.robot.name}, task {cfg.task.name}, {cfg.nworld} worlds on {backend} ({device})"
+    what = f"{cfg.robot.name}, task {cfg.task.name}, {cfg.nworld} worlds"
     yield "buffers", f"{what}: {sizes}; MJWarp's data of {need:.2f} GiB, and what a step borrows"
+    try:
+        yield "backend", " on ".join(resolve_backend(cfg))
+    except MjstackError as error:
+        yield "backend", f"none: {error}"
 
 
 def _version(package: str) -> str:

@@ -15,7 +15,7 @@ import torch
 from mjstack.config import spec
 from mjstack.config.complete import typed
 from mjstack.config.session import quoted, search_path_args
-from mjstack.errors import ConfigError
+from mjstack.errors import ConfigError, FolderError
 from mjstack.files import move_aside
 from mjstack.interrupt import interrupted
 from mjstack.jobs.sweep_folder import LOG, SweepJob, add_jobs, lock_file
@@ -60,6 +60,7 @@ class Queueing:
 
         Raises:
             ConfigError: There are not as many GPUs or cores.
+            FolderError: The home folder cannot have the GPUs' locks.
         """
         count = self.jobs
         if gpus := torch.cuda.device_count():
@@ -68,6 +69,13 @@ class Queueing:
             visible = os.environ.get("CUDA_VISIBLE_DEVICES") or ",".join(map(str, range(gpus)))
             # Below the home: in a shared folder, others could hold a lock for ever.
             locks = Path.home() / ".cache/mjstack/gpus" / socket.gethostname()
+            try:
+                locks.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise FolderError(
+                    f"{locks}: {error.strerror}, expected a folder for the GPUs' locks",
+                    "Set HOME to a folder of yours",
+                ) from error
             return [
                 Slot(f"GPU {name}", {"CUDA_VISIBLE_DEVICES": name}, lock=locks / name)
                 for name in visible.split(",")[: count or gpus]

@@ -88,7 +88,7 @@ class RewardManager(_ValueManager):
         super().__init__("reward", env, cfg, torch.float32)
         self._cfg = dict(cfg)
         weights = [term.weight * env.cfg.timing.step_dt for term in cfg.values()]
-        self.weights = torch.tensor(weights, device=env.device)
+        self.weights = torch.tensor(weights, dtype=torch.float32, device=env.device)
         self.reward = self.values.sum(1)
         self.episode_sums = torch.zeros_like(self.values)
 

@@ -68,7 +68,7 @@ class _Group:
         sizes = [size for p in parts for size in column_noise(p.cfg, p.width, slides)]
         noise = {first + n: size for n, size in enumerate(sizes) if size and cfg.noise}
         self._noise_columns = Columns([*noise], env.device)
-        self._noise = torch.tensor([*noise.values()], device=env.device)
+        self._noise = torch.tensor([*noise.values()], dtype=torch.float32, device=env.device)
         # Where each column of the group comes from: for `append` in the group before and the new
         # step behind it, where a part's steps move up by one; for `restart` in the new step.
         shift: list[int] = []
@@ -86,7 +86,7 @@ class _Group:
             torch.tensor(columns, dtype=torch.int64, device=env.device)
             for columns in (shift, repeat)
         )
-        self._past = torch.zeros((env.nworld, self.dim), device=env.device)
+        self._past = torch.zeros((env.nworld, self.dim), dtype=torch.float32, device=env.device)
 
     def add_noise(self, step: Tensor, at: Rows) -> None:
         """Add the group's noise to a step of some worlds."""
@@ -170,7 +170,7 @@ class ObservationManager:
             name: {term: p.dim for term, p in group.parts.items()}
             for name, group in self._groups.items()
         }
-        empty = torch.full((env.nworld, 1), math.nan, device=env.device)
+        empty = torch.full((env.nworld, 1), math.nan, dtype=torch.float32, device=env.device)
         self.groups = {name: empty.repeat(1, dim) for name, dim in self.group_dims.items()}
         self._parts = [p for group in self._groups.values() for p in group.parts.values()]
         self._clips = any(part.cfg.clip for part in self._parts)

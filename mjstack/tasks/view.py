@@ -140,7 +140,7 @@ class TaskView:
     def zeros(self, *shape: int, fill: float = 0.0) -> Tensor:
         """A buffer, shape ``(nworld, *shape)``, float32."""
         size = (self.env.nworld, *shape)
-        return torch.full(size, fill, device=self.env.device)
+        return torch.full(size, fill, dtype=torch.float32, device=self.env.device)
 
     def counter(self, size: int) -> Tensor:
         """A buffer that `clear` clears, shape ``(nworld, size)``, float32."""

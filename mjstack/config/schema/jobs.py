@@ -141,7 +141,7 @@ class CloneJobCfg(TrainJobCfg):
     """Joint targets of one answer."""
     execute: int = spec(unit="steps", ge=1, le=1000)
     """Control steps between two answers."""
-    warm_up: float = spec(ge=0.0, le=1.0)
+    warm_up: float = spec(0.0, ge=0.0, le=1.0)
     """Share of a round's batches in which the learning rate rises to ``learning_rate``, before a
     cosine brings it to 0."""
     max_grad_norm: float | None = spec(None, gt=0.0)

@@ -86,7 +86,8 @@ class StartsTable:
                 expected = f"numbers of shape {shape}, not {values.dtype} of shape {values.shape}"
                 raise self.wrong(expected, "Correct it; row w is world w", names=[name])
             slack = 1e-6 * np.maximum(abs(low), abs(high))  # float32 does not hold the ends exactly
-            fits = (values >= low - slack) & (values <= high + slack)
+            # A joint may have no limit
+            fits = np.isfinite(values) & (values >= low - slack) & (values <= high + slack)
             for world, *at in np.argwhere(~fits).tolist():
                 expected = f"{low[*at]:.6g} to {high[*at]:.6g}, it is {values[world, *at]:.6g}"
                 fix = "Correct it; ranges of mass, friction and gain are in reset.starts.params"
