@@ -178,8 +178,9 @@ class ClosedLoopDriver(FeedbackDriver):
         step = step.clamp(-_ROLL_STEP, _ROLL_STEP)
         self._roll += step * self._turns_jaws[self.phase]
         if self._any_align:
-            off = self._roll_sign * (yaw - self._carried_pose()[:, 2])
-            off, back = _nearest_turns(off, self._oblong[self._carried[self.phase]])
+            off = yaw - self._carried_pose()[:, 2]
+            turns = _nearest_turns(off, self._oblong[self._carried[self.phase]])
+            off, back = (self._roll_sign * turn for turn in turns)
             # The farther one where the nearer one is out of range
             cost = off.abs() + self._beyond(self._roll + off)
             off = torch.where(cost <= back.abs() + self._beyond(self._roll + back), off, back)

@@ -56,10 +56,7 @@ def findings(overrides: Sequence[str]) -> Iterator[tuple[str, str]]:
     # GPUs
     yield "torch", f"{torch.__version__}, built for CUDA {torch.version.cuda or 'not at all'}"
     if not torch.cuda.is_available():
-        fix = (
-            "" if torch.version.cuda else ". Install a build of torch with CUDA, if there is a GPU"
-        )
-        yield "GPU", f"none that torch can use (driver: {cuda_driver()}){fix}"
+        yield "GPU", f"none that torch can use (driver: {cuda_driver()})"
     for number in range(torch.cuda.device_count()):
         left, total = (size / _GIB for size in torch.cuda.mem_get_info(number))
         name = torch.cuda.get_device_name(number)

@@ -177,8 +177,8 @@ def _side_by_side(images: Sequence[np.ndarray], columns: int, wide: int) -> Imag
 
 
 def require_video(ending: str) -> Write:
-    """What writes a video by the ending of its name: called with the file, its frames, their
-    number, and the time between two of them [s].
+    """The function that writes a video whose name ends so. It takes the file, the frames, their
+    number, and the time between two frames [s].
 
     Raises:
         MissingExtra: The mp4 writer is not installed.

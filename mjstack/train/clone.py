@@ -125,8 +125,9 @@ def train_clone(stage: Stage, folder: Path) -> Trained:
             if len(learner.curve) < number:
                 learner.conclude(number, figures)
     if stage.ranks.writes:  # the others have read theirs
-        for path in folder.glob(round_file("*", "*")):
-            path.unlink()
+        for number in range(job.rounds + 1):
+            for rank in range(stage.ranks.size):
+                (folder / round_file(number, rank)).unlink(missing_ok=True)
     return _trained(job, folder, learner.facts())
 
 
