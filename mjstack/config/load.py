@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 
-import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
@@ -196,7 +195,11 @@ def _drop_inherited(cfg: DictConfig, overrides: Sequence[str]) -> None:
         and not re.match(r"job\.|gate\.(?!.*\.reset\.)", key)
     }
     rest = [o for o in overrides if o.lstrip("+").partition("=")[0] not in terms]
-    before = hydra.compose(CONFIG_NAME, rest)
+    before = (
+        GlobalHydra.instance()
+        .config_loader()
+        .load_configuration(config_name=CONFIG_NAME, overrides=rest, run_mode=RunMode.RUN)
+    )
     for term in terms.values():
         old = OmegaConf.select(before, f"{term}.func")
         if old is None or old == OmegaConf.select(cfg, f"{term}.func"):

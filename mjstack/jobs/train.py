@@ -127,6 +127,7 @@ def _train(trainer: Trainer, folder: Path, run: Run) -> list[GateResult]:
     """The training as a result of the report."""
     began = time.perf_counter()
     trained = trainer.train(run.stage, folder)
+    run.stage.ranks.gather(None)  # rank 0 has written the policy that all read next
     rows = trained.curve
     last = rows[-1]
     words = {name: name.replace("_", " ") for name in last}
