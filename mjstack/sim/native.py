@@ -24,9 +24,10 @@ _COUNTS = ("ncon", "nefc")
 _RESULTS = ("qfrc_actuator", "sensordata")
 _COUNTERS = ("contact_count", "constraint_count", "peak_contacts", "peak_constraints", "overflow")
 _POSES = ("xpos", "xquat", "site_xpos", "geom_xpos")
+# Plain numbers: NumPy looks for attributes of an enum's class, and drops an interrupt meanwhile.
 _OVERFLOWS = {
-    mujoco.mjtWarning.mjWARN_CONTACTFULL: Overflow.NARROWPHASE,
-    mujoco.mjtWarning.mjWARN_CNSTRFULL: Overflow.NEFC,
+    int(mujoco.mjtWarning.mjWARN_CONTACTFULL): int(Overflow.NARROWPHASE),
+    int(mujoco.mjtWarning.mjWARN_CNSTRFULL): int(Overflow.NEFC),
 }
 _SAMEFRAME = {
     "body_sameframe": {"body_ipos", "body_iquat"},
