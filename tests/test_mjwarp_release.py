@@ -4,6 +4,7 @@ Where they are not, see docs/design.md, "A new release of MuJoCo Warp".
 
 import ast
 import dataclasses
+import importlib.util
 import inspect
 import os
 import shutil
@@ -16,6 +17,7 @@ import pytest
 import warp as wp
 
 import mjstack.sim
+from mjstack.sim import compiling
 from mjstack.sim.fused import launch
 from mjstack.sim.mujoco_warp import mjw
 
@@ -113,6 +115,12 @@ def test_private_functions() -> None:
         value = getattr(value, "func", value)  # of one for kernels
         actual = " ".join(inspect.signature(value).parameters) if value else "nothing"
         assert actual == parameters, changed(f"_src.{name}", f"({parameters})", f"({actual})")
+
+
+def test_modules_that_are_compiled_ahead() -> None:
+    for name in compiling.SHARED:
+        full = f"mujoco_warp._src.{name}"
+        assert importlib.util.find_spec(full), changed(full, "a module", "none")
 
 
 def test_the_narrow_phase(world: tuple[mjw.Model, mjw.Data]) -> None:

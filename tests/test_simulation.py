@@ -1,8 +1,12 @@
 """One contract for every backend."""
 
+import os
 import re
+import subprocess
+import sys
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -454,3 +458,37 @@ def test_twice_the_same_run(backend: str, make_sim: MakeSim, get_stage: GetStage
     for a, b in zip(*finals, strict=True):
         assert_same_run(a, b, backend)
     assert not torch.equal(finals[0][0][0], finals[0][0][1])
+
+
+@pytest.mark.full
+def test_kernels_are_compiled_ahead(tmp_path: Path) -> None:
+    """With an empty cache, all that a step, its forward and resets launch is compiled before."""
+    script = """
+import logging
+from mjstack.config.load import load_config
+from mjstack.scene import build_model
+from mjstack.sim import compiling, make_simulation, mjwarp
+from mjstack.sim.mujoco_warp import wp
+
+logging.basicConfig(level=logging.INFO)
+ahead = mjwarp.compile_step
+
+def compile_step(*args):
+    ahead(*args)
+    wp.config.log_level = wp.LOG_INFO
+    print("AHEAD", flush=True)
+
+mjwarp.compile_step = compile_step
+cfg = load_config(["sim=mjwarp", "sim.device=cpu"])
+sim = make_simulation(build_model(cfg), cfg, 2)
+sim.step(2, kinematics=True)
+sim.forward()
+"""
+    (tmp_path / "script.py").write_text(script)
+    env = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "cache")}
+    command = [sys.executable, str(tmp_path / "script.py")]
+    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=300, check=True)
+    *_, after = done.stdout.partition("AHEAD")
+    assert "compiling MJWarp's kernels" in done.stderr
+    compiled = re.findall(r"Module (\S+) .*\(compiled\)", after)
+    assert compiled == ["mjstack.sim.usage"], after  # the rest of a simulation's step

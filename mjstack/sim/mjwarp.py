@@ -15,9 +15,17 @@ from typing_extensions import override
 from mjstack.config.schema import CameraCfg, Config
 from mjstack.errors import MjstackError, first_line
 from mjstack.sim.cameras import Cameras
+from mjstack.sim.compiling import compile_step
 from mjstack.sim.fused.launch import arguments
 from mjstack.sim.fused.smooth import positions
-from mjstack.sim.fused.step import RELEASES, StepPlan, disagreement, plan_step, rearranged_step
+from mjstack.sim.fused.step import (
+    RELEASES,
+    StepPlan,
+    disagreement,
+    plan_step,
+    rearranged_forward,
+    rearranged_step,
+)
 from mjstack.sim.graph import StepGraph, side_by_side
 from mjstack.sim.mjwarp_cameras import MjwarpCameras
 from mjstack.sim.model_fields import PLACING_FIELDS, Fields, check_fields
@@ -133,6 +141,8 @@ class MjwarpSimulation(Simulation):
         self._selected = wp.from_torch(self._mask)
 
         # Compile and load every kernel, then leave the worlds as new
+        self._compile = partial(compile_step, model, self._m, sizes, self._device)
+        self._compile(self.plan)
         with torch_stream_scope(self._device):
             self._decimation(1, kinematics=True)
         self.synchronize()
@@ -148,7 +158,10 @@ class MjwarpSimulation(Simulation):
     def forward(self) -> None:
         with torch_stream_scope(self._device):
             self._place()
-            mjw.forward(self._m, self._d)
+            if self.plan.name == "stock":
+                mjw.forward(self._m, self._d)
+            else:  # the same kernels as a step's, so that no others are compiled
+                rearranged_forward(self._m, self._d, self.device, self.plan, sensors=True)
         self.latch()
 
     def kinematics(self, mask: Tensor | None = None) -> None:
@@ -190,6 +203,7 @@ class MjwarpSimulation(Simulation):
         """One plain ``mujoco_warp.step``, captured and replayed with nothing else: what the rest is
         measured by.
         """
+        self._compile(StepPlan())
 
         def work() -> None:
             with torch_stream_scope(self._device):

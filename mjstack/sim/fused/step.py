@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -77,7 +78,7 @@ def can_rearrange(model: mujoco.MjModel, m: mjw.Model) -> bool:
     )
 
 
-def rearranged_step(
+def rearranged_forward(
     m: mjw.Model,
     d: mjw.Data,
     device: torch.device,
@@ -86,7 +87,7 @@ def rearranged_step(
     sensors: bool,
     beside_kinematics: tuple[Callable[[], None], ...] = (),
 ) -> None:
-    """`mujoco_warp.step`, with contacts and smooth dynamics as parallel branches of a captured
+    """`mujoco_warp.forward`, with contacts and smooth dynamics as parallel branches of a captured
     graph: neither needs the other.
 
     Args:
@@ -130,6 +131,13 @@ def rearranged_step(
         mjw.sensor_pos(m, d)
         mjw.sensor_vel(m, d)
         mjw.sensor_acc(m, d)
+
+
+def rearranged_step(
+    m: mjw.Model, d: mjw.Data, device: torch.device, plan: StepPlan, **options: Any
+) -> None:
+    """`mujoco_warp.step`; arguments as of `rearranged_forward`."""
+    rearranged_forward(m, d, device, plan, **options)
     (smooth.advance if plan.smooth else mjw.implicit)(m, d)
 
 

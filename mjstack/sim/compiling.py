@@ -1,0 +1,72 @@
+"""Kernels of a physics step, compiled at the same time instead of one after the other."""
+
+import logging
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
+from functools import partial
+
+import mujoco
+
+from mjstack.process import available_cores
+from mjstack.sim.fused import constraints, smooth
+from mjstack.sim.fused.step import StepPlan
+from mjstack.sim.mujoco_warp import mjw, wp
+from mjstack.sim.sizes import BatchSizes
+
+log = logging.getLogger(__name__)
+
+Stage = Callable[[mjw.Model, mjw.Data], object]
+
+# Modules of MJWarp that several stages of its own step launch, slowest first
+SHARED = ("forward", "passive", "sensor", "smooth", "solver", "support", "constraint")
+_SILENT = 3.0  # s: from the cache it takes less
+_done: set[tuple] = set()
+
+
+def compile_step(
+    model: mujoco.MjModel, m: mjw.Model, sizes: BatchSizes, device: wp.Device, plan: StepPlan
+) -> None:
+    """Compile what a planned step launches, as many modules at once as there are cores: a launch
+    waits for its own module alone, and the step makes one launch after the other.
+
+    Every stage works on a world of its own, which nobody reads. One that fails here fails in the
+    step again, which tells. Once in a process for a model's sizes.
+    """
+    key = (model.nbody, model.ngeom, model.nv, model.nsensor, sizes.njmax, str(device), plan)
+    if key in _done:
+        return
+    _done.add(key)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+
+    def play(stage: Stage) -> None:
+        stage(m, mjw.put_data(model, data, **sizes.as_kwargs()))
+
+    collision, *later = [partial(play, stage) for stage in _stages(m, plan)]
+    with wp.ScopedDevice(device), ThreadPoolExecutor(available_cores()) as pool:
+        futures = [pool.submit(collision)]
+        if plan.name != "fused":
+            modules = [f"mujoco_warp._src.{name}" for name in SHARED]
+            wait([pool.submit(wp.load_module, name, device=device) for name in modules])
+        futures += [pool.submit(stage) for stage in later]
+        if wait(futures, timeout=_SILENT).not_done:
+            log.info("compiling MJWarp's kernels; later runs on this machine load them")
+    wp.synchronize_device(device)
+
+
+def _stages(m: mjw.Model, plan: StepPlan) -> list[Stage]:
+    """Stages of a step: collision, which shares no module with the others, then the slowest."""
+    rows = constraints if plan.name == "fused" else mjw
+    stages: list[Stage] = [rows.collision, mjw.sensor_acc, rows.solve, rows.make_constraint]
+    stages += [mjw.sensor_pos, mjw.sensor_vel, _reset]
+    if plan.smooth:
+        return [*stages, smooth.positions, smooth.forces, smooth.advance]
+    stages += [mjw.kinematics, mjw.com_pos, mjw.crb, mjw.transmission, mjw.fwd_velocity]
+    stages += [mjw.fwd_actuation, partial(mjw.fwd_acceleration, factorize=True)]
+    if m.opt.integrator == mjw.IntegratorType.IMPLICITFAST:
+        stages.append(mjw.implicit)
+    return stages
+
+
+def _reset(m: mjw.Model, d: mjw.Data) -> None:
+    mjw.reset_data(m, d, reset=wp.zeros(1, dtype=bool))
