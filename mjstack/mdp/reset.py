@@ -15,9 +15,8 @@ from mjstack.errors import ParameterError
 from mjstack.managers.view import EnvView, offers, random_uniform, rows_of, uses_fields, zero_rows
 from mjstack.math import quat_from_yaw, quat_mul
 from mjstack.mdp.geometry import Pose, robot, write_robot
-from mjstack.mdp.starts.placement import GAP, Placement, may_meet
+from mjstack.mdp.starts.placement import GAP, Placement, may_meet, require_reach
 from mjstack.mdp.starts.randomization import Elements, Randomized, bounds
-from mjstack.mdp.starts.reach import require_reach
 from mjstack.scene.index import ALL, Columns, Rows, joint_limits
 
 

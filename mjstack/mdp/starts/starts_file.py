@@ -18,9 +18,8 @@ from mjstack.math import quat_mul
 from mjstack.mdp.geometry import Pose, place_xy, pose_w, robot, write_robot
 from mjstack.mdp.observation import joint_pos
 from mjstack.mdp.reset import ActuatorGains, ObjectFriction, ObjectMass
-from mjstack.mdp.starts.placement import world_boxes
+from mjstack.mdp.starts.placement import out_of_reach, world_boxes
 from mjstack.mdp.starts.randomization import Randomized, bounds
-from mjstack.mdp.starts.reach import out_of_reach
 from mjstack.scene.index import joint_limits
 
 _FLAT = 1e-5  # [m], and of a quaternion: how far off upright an object on the table may be
