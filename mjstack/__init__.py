@@ -39,9 +39,7 @@ _HOMES = {
 if not TYPE_CHECKING:  # a type checker would take any name for one of these
 
     def __getattr__(name: str) -> Any:
-        """Load what takes seconds, torch and Warp, when it is asked for: the command line has
-        things to do before.
-        """
+        """Load torch and Warp, which take seconds, when they are asked for."""
         if name in _HOMES:
             return getattr(import_module(_HOMES[name]), name)
         if find_spec(f"mjstack.{name}"):

@@ -74,9 +74,7 @@ def quat_angle(a: Tensor, b: Tensor) -> Tensor:
 
 
 def quat_z_row(quat: Tensor) -> Tensor:
-    """Third row of the rotation matrix: the world-z components of the body's axes, shape ``(...,
-    3)``.
-    """
+    """Third row of the rotation matrix: world z of the body's axes, shape ``(..., 3)``."""
     left, right, signs, added = _z_row_constants(quat.device, quat.dtype)
     terms = quat.index_select(-1, left) * quat.index_select(-1, right) * signs
     return terms[..., :3] + terms[..., 3:] + added
@@ -91,9 +89,7 @@ def _z_row_constants(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, 
 
 
 def quat_to_matrix(quat: Tensor) -> Tensor:
-    """Rotation matrix of a unit quaternion: its columns are the body's axes in the world, shape
-    ``(..., 3, 3)``.
-    """
+    """Rotation matrix, with the body's axes as columns, shape ``(..., 3, 3)``."""
     w = quat[..., :1]
     v = quat[..., 1:]
     outer = 2.0 * v[..., :, None] * v[..., None, :]

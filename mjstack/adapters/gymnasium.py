@@ -1,6 +1,4 @@
-"""Gymnasium's interfaces with numpy arrays: many worlds as a `VectorEnv`, or one world as
-an `Env`.
-"""
+"""Gymnasium's interfaces with NumPy arrays: worlds as a `VectorEnv`, or one as an `Env`."""
 
 from typing import Any
 

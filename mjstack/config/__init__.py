@@ -1,6 +1,4 @@
-"""Typed configuration: `schema` has the dataclasses, `load` composes them, `check` checks their
-values.
-"""
+"""Typed configuration: dataclasses in `schema`, composed by `load`, checked by `check`."""
 
 from mjstack.config.fields import spec
 from mjstack.config.load import load_config

@@ -138,9 +138,7 @@ def _complete_scene(scene: SceneCfg) -> None:
 
 
 def _find_file(key: str, file: str | None, *groups: str) -> str | None:
-    """An MJCF file, absolute; relative to some groups of a search path, or to the working
-    folder.
-    """
+    """An MJCF file, absolute: below groups of the search path, or the working folder."""
     if file is None:
         return None
     folders = [folder / group for folder in config_folders() for group in groups]

@@ -145,9 +145,7 @@ def _explain(error: Exception, overrides: Sequence[str]) -> MjstackError:
 
 
 def _unknown_key(key: str, known: Iterable[str], overrides: Sequence[str]) -> MjstackError:
-    """A key that does not exist, with the one that may have been meant: one beside it (*known*), or
-    one elsewhere.
-    """
+    """A key that does not exist, with one that may have been meant, beside it (*known*) or not."""
     parent, _, leaf = key.rpartition(".")
     job = ["job=gates", *(o for o in overrides if o.startswith("job="))][-1]
     owners = [f"job={name}" for name, schema in JOB_SCHEMAS.items() if leaf in _field_names(schema)]

@@ -1,6 +1,4 @@
-"""A configuration as plain values that say what it leads to: files count by what is in them,
-wherever they are.
-"""
+"""A configuration as plain values, in which files count by their content, wherever they are."""
 
 import hashlib
 import json

@@ -166,9 +166,7 @@ def _declared_keys(key: str, node: dict[str, Any], attribute: str) -> Iterator[K
 
 
 def help_text(cfg: Config, width: int) -> str:
-    """The whole text, in lines that are not longer than ``width``, with a configuration's
-    values.
-    """
+    """The whole text with a configuration's values, in lines of at most ``width``."""
     groups = {group.name: f"{group.words}: {', '.join(group.choices)}" for group in list_groups()}
     keys = {key.name: f"{key.words} ({key.value})" for key in list_keys(cfg) if "." not in key.name}
     for name in groups:

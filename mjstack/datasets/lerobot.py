@@ -64,9 +64,7 @@ def shard_path(folder: Path, files: str, shard: int, video: str = "") -> Path:
 
 
 def columns_of(spec: DatasetSpec) -> dict[str, tuple[str, int]]:
-    """Type and dimension of every column of the frames, in the order of info.json and of
-    the files.
-    """
+    """Type and dimension of every column of the frames, in the order of the files."""
     columns = {name: (feature.dtype, feature.dim) for name, feature in spec.features.items()}
     return columns | {name: (dtype, 1) for name, dtype in INDICES.items()}
 
@@ -161,9 +159,7 @@ def frames_table(schema: Any, columns: Mapping[str, np.ndarray]) -> Any:
 
 
 def tasks_table(tasks: Sequence[str]) -> Any:
-    """Task texts as pandas keeps a data frame whose index is the text, which is how LeRobot reads
-    them.
-    """
+    """Task texts as a pandas data frame whose index is the text: so LeRobot reads them."""
     pa, _ = require_pyarrow()
     fields = ("name", "field_name", "pandas_type", "numpy_type", "metadata")
     columns = (

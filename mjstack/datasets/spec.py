@@ -1,6 +1,4 @@
-"""Content of a dataset and of one episode: names, units and types, checked before anything is
-written.
-"""
+"""Content of a dataset and of one episode: names, units and types, checked before writing."""
 
 import numbers
 from collections.abc import Mapping

@@ -94,9 +94,7 @@ class DatasetWriter:
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Commit what was added, also where something else went wrong: those episodes are
-        finished.
-        """
+        """Commit what was added, also after an error: those episodes are finished."""
         self.close()
 
     def add(self, episodes: Sequence[EpisodeData]) -> None:

@@ -1,6 +1,4 @@
-"""The closed-loop driver: every world goes through its phases by itself, observes its objects, and
-needs no host.
-"""
+"""The closed-loop driver: each world goes through its phases and observes its objects."""
 
 import math
 
@@ -93,9 +91,7 @@ class ClosedLoopDriver(FeedbackDriver):
         return self._command
 
     def _advance(self, fresh: Tensor) -> None:
-        """Time goes on by a step; worlds whose phase is over enter the next one, or try their grasp
-        again.
-        """
+        """A step later: worlds whose phase is over enter the next one, or retry their grasp."""
         length = self._length[self.phase]
         over = (self._time >= length - _DONE) & (self.phase < len(self.phases) - 1) & ~fresh
         if self._any_until:  # a phase that has met its condition ends where it is
@@ -138,9 +134,7 @@ class ClosedLoopDriver(FeedbackDriver):
         return (left <= self._until_within[self.phase]) | pressed
 
     def _judge_grasp(self, over: Tensor) -> tuple[Tensor, Tensor]:
-        """Worlds that try their grasp again, ``(nworld,)`` bool, and how fast they go on,
-        ``(nworld,)``.
-        """
+        """Worlds that retry their grasp, bool, and how fast they go on, each ``(nworld,)``."""
         in_hand = objects_in_hand(self._env.index, self._env.sim)
         grasps = self._grasps[self.phase]
         number = grasps.clamp(min=0)
@@ -189,9 +183,7 @@ class ClosedLoopDriver(FeedbackDriver):
         command[:, self._roll_column] = column + self._roll
 
     def _carried_pose(self) -> Tensor:
-        """x, y [m] and yaw [rad] of the object that each world carries, shape
-        ``(nworld, 3)``.
-        """
+        """x, y [m] and yaw [rad] of the carried object, shape ``(nworld, 3)``."""
         poses = [measure_planar(self._env, name) for name in self._cfg.scene.objects]
         return torch.stack(poses, dim=1)[self._worlds, self._carried[self.phase]]
 

@@ -118,9 +118,7 @@ class FeedbackDriver(Driver):
         return torch.tensor(list(values), device=self.phase.device)
 
     def _observe(self, due: Tensor) -> None:
-        """Measure the objects where that is due, shape ``(nworld, objects)``, bool; and all
-        places.
-        """
+        """Measure objects where due, shape ``(nworld, objects)``, bool; and all places."""
         objects = self._cfg.scene.objects
         for number, name in enumerate(objects):
             last = self._seen[:, number]
@@ -129,9 +127,7 @@ class FeedbackDriver(Driver):
             self._seen[:, number, :2] = place_xy(self._env, name).float()
 
     def _aim(self, phase: Tensor) -> Tensor:
-        """Target of each world's phase, from where its anchor was last seen [m], shape ``(nworld,
-        3)``.
-        """
+        """Target of each world's phase, from its anchor as last seen [m], ``(nworld, 3)``."""
         table = self._target[phase]
         seen = self._last_seen(self._source, phase)[:, :2]
         offset = table[:, :2]
@@ -164,9 +160,7 @@ class FeedbackDriver(Driver):
         return _BEYOND * ((low - rolls).clamp(min=0.0) + (rolls - high).clamp(min=0.0))
 
     def _detour(self, rolls: Tensor, roll: Tensor) -> Tensor:
-        """What rolls cost that lead back over the nominal one: without it, a roll at the end of the
-        range would go to and fro.
-        """
+        """Cost of rolls that lead back over the nominal one, lest they go to and fro."""
         return _BACK * (rolls * roll < -0.01)
 
     def _keep_finite(self, command: Tensor) -> Tensor:
@@ -176,9 +170,7 @@ class FeedbackDriver(Driver):
         return self._command.copy_(torch.where(torch.isfinite(command), command, self._command))
 
     def _find_roll(self) -> tuple[int, float]:
-        """Column of the joint that rolls the gripper, and which way it turns the closing axis, seen
-        from above.
-        """
+        """Column of the roll joint, and its sign: how it turns the closing axis from above."""
         column = self._cfg.robot.joints.index(str(self._cfg.robot.roll_joint))
         command = self._nominal[:1].expand(self._env.nworld, -1).clone()
         closing = []

@@ -138,9 +138,7 @@ class OpenLoopPlanner:
         return trajectory
 
     def path_error(self) -> float:
-        """Largest distance [m] of the grasp point from its straight path at any step of the nominal
-        plan.
-        """
+        """Largest distance [m] of the nominal plan's grasp point from its straight path."""
         trajectory = self.plan(self._xy[None])
         (ends,) = self._targets(self._xy[None])
         worst = 0.0
@@ -259,9 +257,7 @@ class OpenLoopPlanner:
                 yield number, smoothstep((step + 1) / steps)
 
     def _step_weights(self) -> tuple[Tensor, Tensor]:
-        """Barycentric Lagrange weights of the Chebyshev points, and their numbers, for every
-        step.
-        """
+        """Barycentric weights of the Chebyshev points, and their numbers, for every step."""
         n = len(self._nodes)
         bary = (-1.0) ** np.arange(n)
         bary[[0, -1]] *= 0.5

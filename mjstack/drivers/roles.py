@@ -114,9 +114,7 @@ def _refusal(cfg: Config, why: str) -> ConfigError:
 
 
 def follows_anchor(phase: Phase, things: Sequence[str]) -> bool:
-    """Whether the height of a phase's target follows its anchor: an object, but not the one that is
-    carried.
-    """
+    """Whether a phase's height follows its anchor: an object, but not the carried one."""
     spec = phase.spec
     follows = phase.target is not None and spec.level != "table" and spec.anchor in things
     return follows and things.index(str(spec.anchor)) != phase.carried

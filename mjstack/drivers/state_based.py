@@ -253,9 +253,7 @@ class StateBasedDriver(FeedbackDriver):
         return (there | placed & ~grasped) & self._leaves, grasped, between
 
     def _lead_point(self, state: State, due: _Due) -> tuple[Tensor, Tensor]:
-        """Where the grasp point is led in this step [m], shape ``(nworld, 3)``, and the number of
-        the phase, shape ``(nworld,)``.
-        """
+        """Where the grasp point is led [m], ``(nworld, 3)``, and the phase, ``(nworld,)``."""
         point = state.point
 
         # Where it goes: an object in the jaws is what arrives, one of another goal is let go here

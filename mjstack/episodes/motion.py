@@ -1,6 +1,4 @@
-"""Worlds of an episode in motion, for the run's 3-D page: recorded on the device, failing ones
-first.
-"""
+"""Worlds in motion, for the run's 3-D page: recorded on the device, failing ones first."""
 
 from contextlib import closing
 from pathlib import Path

@@ -1,6 +1,4 @@
-"""Recording of rollouts: named channels of every world, a row each at the chosen steps, on the
-device.
-"""
+"""Recording of rollouts: channels of every world, with rows at chosen steps, on the device."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,6 +1,4 @@
-"""Where an episode started against how it ended: success rates over cells of the objects' starts,
-as a table and a file.
-"""
+"""Success rates over cells of the objects' starts, as a table and a file."""
 
 import math
 from collections.abc import Sequence

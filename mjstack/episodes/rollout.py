@@ -1,6 +1,4 @@
-"""The rollout: the only loop over an episode. Everything else observes it, such as the check of a
-judged episode.
-"""
+"""The rollout: the only loop over an episode, which everything else observes."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -180,9 +178,7 @@ def snapshot(sim: Simulation) -> State:
 
 
 def restore(sim: Simulation, state: State) -> None:
-    """Put every world into a kept state: counters cleared, warm starts zero, derived arrays
-    current.
-    """
+    """Put every world into a kept state: counters and warm starts cleared, all current."""
     sim.reset()
     for name, values in state._asdict().items():
         getattr(sim, name).copy_(torch.from_numpy(values))

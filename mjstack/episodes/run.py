@@ -106,9 +106,7 @@ class Run:
 
     @cached_property
     def nominal(self) -> NominalRun:
-        """One native world's episode from the nominal starts: the reference of baseline
-        and parity.
-        """
+        """One native world from the nominal start: the reference of baseline and parity."""
         stage = self.stage
         sim = make_simulation(stage.model, self.cfg, 1, backend=Backend.native)
         world = WorldRecorder()

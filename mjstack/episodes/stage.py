@@ -332,9 +332,7 @@ class Stage:
         return self.simulation(self.measuring_nworld, *self.backend, sizes=sizes)
 
     def play_task(self, reset: Reset, sizes: BatchSizes | None = None) -> Workload:
-        """Play the driven task once, in worlds of exactly these sizes; without, with room to
-        spare.
-        """
+        """Play the driven task once, at these buffer sizes; without, with room to spare."""
         stage = self.with_config(replace(self.cfg, reset=reset))
         make = stage.measuring_simulation
         return play_workload(self.cfg, make, lambda sim: stage.play(sim, reset).failed, sizes)

@@ -95,9 +95,7 @@ class EpisodeTally:
         return [f"{seeds[seed]}{world}" for seed, world in places]
 
     def write_failing(self) -> None:
-        """Write the table of failing episodes, if there are any. A full disk takes no result
-        back.
-        """
+        """Write the table of failing episodes, if any. A full disk takes no result back."""
         rows = [row for record in self.records for row in record.failing_rows(self.check.rules)]
         if rows and self.path is not None:
             problem = safely_write(self.path, Path.write_text, to_csv(rows), stops=False)

@@ -242,9 +242,7 @@ class Collection:
         )
 
     def result(self, status: Status, problem: str) -> GateResult:
-        """The dataset and the expert's success, as a result of the report; ``problem`` says why it
-        did not pass.
-        """
+        """The dataset and the expert's success as a result, with why it did not pass."""
         seconds = time.perf_counter() - self._began
         new = self.committed - self._episodes_before
         size = sum(path.stat().st_size for path in self.path.rglob("*") if path.is_file()) / 1e6

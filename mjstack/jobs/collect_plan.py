@@ -108,9 +108,7 @@ def plan_collection(stage: Stage) -> CollectPlan:
 
 
 def _check_starts(env: Env) -> None:
-    """Refuse starts that are the same in every world or under every seed: an episode would be in
-    the dataset twice.
-    """
+    """Refuse starts that repeat over worlds or seeds: an episode would be there twice."""
     starts = []
     seed = env.cfg.seed
     for start_seed in (seed, seed - 1 if seed else 1):

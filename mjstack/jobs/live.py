@@ -1,6 +1,4 @@
-"""The live view: worlds of a running environment in a browser, with pause, plots and camera
-images.
-"""
+"""The live view: worlds of a running environment in a browser, with plots and images."""
 
 import re
 import time

@@ -1,6 +1,4 @@
-"""Job *play*: worlds with a policy or the expert, one after another in MuJoCo's viewer or side by
-side in a video.
-"""
+"""Job *play*: worlds with a policy or the expert, in MuJoCo's viewer or in a video."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import closing

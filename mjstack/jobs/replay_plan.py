@@ -1,6 +1,4 @@
-"""Which worlds of an earlier run are played again, on which backends, and whether they start as
-they did.
-"""
+"""Which worlds of an earlier run are played again, where, and whether they start alike."""
 
 import math
 from contextlib import closing, suppress

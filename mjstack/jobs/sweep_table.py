@@ -33,9 +33,7 @@ def sweep_config(master: DictConfig) -> SweepCfg:
 
 
 def update_summary(folder: Path, master: DictConfig, reports: Mapping[int, Report]) -> None:
-    """Write the tables when a job has ended, for a command that may be killed before its end. A
-    full disk ends no job.
-    """
+    """Write the tables after a job, lest the command be killed. A full disk ends no job."""
     with suppress(OSError):
         write_summary(folder, sweep_config(master), reports)
 

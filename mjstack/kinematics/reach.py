@@ -80,9 +80,7 @@ class PointReach:
         return best, distance
 
     def start(self, points: ndarray, off: float) -> ndarray:
-        """Home with the other hinges bent by ``off`` [rad]; a first hinge that is upright turns
-        towards the points.
-        """
+        """Home, other hinges bent by ``off`` [rad], a first upright one towards the points."""
         q = np.tile(self._home + off * self._hinges, (len(points), 1))
         q[:, 0] = self._home[0]
         up = self._axes[0, 2]

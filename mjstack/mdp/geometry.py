@@ -1,6 +1,4 @@
-"""Where things are, read from the simulation's views: what observations, rewards and terminations
-share.
-"""
+"""Where things are, read from the simulation's views, for all kinds of terms."""
 
 from typing import Literal
 
@@ -34,35 +32,27 @@ def write_robot(env: EnvView, mask: Tensor, command: Tensor, at: Rows = ALL) -> 
 
 
 def gripper_opening(env: EnvView) -> Tensor:
-    """How far each gripper joint is open as measured, 0 closed to 1 open, shape ``(nworld,
-    n_gripper)``.
-    """
+    """Opening of each gripper joint as measured, 0 to 1, shape ``(nworld, n_gripper)``."""
     tensors = robot(env)
     q = env.sim.part("qpos", tensors.gripper_qpos)
     return (q - tensors.gripper_closed) / tensors.gripper_travel
 
 
 def pose_w(env: EnvView, name: str) -> Tensor:
-    """Position [m] and quaternion (wxyz) of an object, from qpos, which is never stale, shape
-    ``(nworld, 7)``.
-    """
+    """Position [m] and quaternion (wxyz) of an object, never stale, shape ``(nworld, 7)``."""
     if name in env.index.fixed:
         return env.index.constant(env.index.fixed[name], env.sim.qpos).expand(env.nworld, -1)
     return env.sim.part("qpos", env.index.object_columns(name)[0])
 
 
 def lost_state(env: EnvView) -> Tensor:
-    """Whether a position or velocity is NaN or infinite, shape ``(nworld,)``, bool. Not to be
-    written into.
-    """
+    """Whether a state is not finite, shape ``(nworld,)``, bool. Do not write into it."""
     sim = env.sim
     return shared((id(env), lost_state), lambda: not_finite(sim.qpos, sim.qvel))
 
 
 def above_table(env: EnvView, name: str) -> Tensor:
-    """Height of an object's lowest point above the table [m], shape ``(nworld,)``. Not to be
-    written into.
-    """
+    """Height of an object's lowest point over the table [m], ``(nworld,)``; only to be read."""
 
     def compute() -> Tensor:
         pose = pose_w(env, name)
@@ -98,26 +88,20 @@ def place_xy(env: EnvView, name: str) -> Tensor:
 
 
 def source_xy(env: EnvView) -> Tensor:
-    """Position of every object, then of every place, in the scene's order [m], shape ``(nworld,
-    sources, 2)``.
-    """
+    """Position of every object, then place, in order [m], shape ``(nworld, sources, 2)``."""
     objects = [pose_w(env, name)[:, :2] for name in env.cfg.scene.objects]
     places = [place_xy(env, name) for name in env.cfg.scene.places]
     return torch.stack([*objects, *places], dim=1)
 
 
 def objects_in_hand(index: SceneIndex, sim: Simulation) -> Tensor:
-    """Whether all jaws press on each object of the scene, at the last physics step, shape
-    ``(nworld, objects)``, bool.
-    """
+    """Whether all jaws press on each object of the scene, ``(nworld, objects)``, bool."""
     forces = torch.stack([jaw_forces(index, sim, name) for name in index.bodies], dim=1)
     return (forces > LOADED).all(2)
 
 
 def jaw_forces(index: SceneIndex, sim: Simulation, name: str) -> Tensor:
-    """Size of the contact force [N] of each jaw on an object, at the last physics step, shape
-    ``(nworld, 2)``.
-    """
+    """Contact force of each jaw on an object [N], at the last physics step, ``(nworld, 2)``."""
     if name not in index.jaw_force:
         raise UnknownName("object", name, index.jaw_force)
     parts = [sim.sensordata[:, a : a + 3] for a in index.jaw_force[name]]

@@ -140,9 +140,7 @@ def object_velocity(env: EnvView, *, object: str) -> Tensor:
 
 @offers("observation term", unit="N")
 def jaw_force(env: EnvView, *, object: str) -> Tensor:
-    """Size of each jaw's contact force on an object [N], at the last physics step, shape ``(nworld,
-    2)``.
-    """
+    """Size of each jaw's contact force on an object [N], shape ``(nworld, 2)``."""
     return jaw_forces(env.index, env.sim, object)
 
 

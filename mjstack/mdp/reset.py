@@ -1,6 +1,4 @@
-"""Reset terms: they write the start of an episode into the masked worlds, from the model's nominal
-values each time.
-"""
+"""Reset terms: they write starts into masked worlds, from the model's nominal values."""
 
 import math
 from collections.abc import Sequence

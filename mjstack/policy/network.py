@@ -120,9 +120,7 @@ class PolicyNetwork(nn.Module):
         return [encode(image) for encode, image in zip(self.encoders, images, strict=True)]
 
     def normalized(self, observation: Tensor, features: Sequence[Tensor] = ()) -> Tensor:
-        """Normalised actions, shape ``(n, chunk, width)``, from an observation and the features of
-        its images.
-        """
+        """Normalised actions, ``(n, chunk, width)``, from observation and image features."""
         scaled = (observation - self.observation_mean) / self.observation_std
         scaled = scaled.clamp(-_FARTHEST, _FARTHEST)
         scaled = torch.cat([scaled, *(part.to(scaled.dtype) for part in features)], dim=1)

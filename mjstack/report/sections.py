@@ -190,9 +190,7 @@ def _beside_limits(
 
 
 def _limits_of(name: str, thresholds: Mapping[str, float]) -> list[str]:
-    """Names of a measurement's thresholds: its own name, without or with ``_min`` and ``_max``
-    before the unit.
-    """
+    """Thresholds of a measurement: its name, or with ``_min``, ``_max`` before the unit."""
     unit = unit_ending(name)
     stem = name.removesuffix(unit)
     for base in (stem, re.sub("_(min|max)$", "", stem)):

@@ -59,9 +59,7 @@ def histogram(name: str, values: np.ndarray, failed: np.ndarray, limits: Sequenc
 def table_map(
     plan: Map, names: Sequence[str], broken: Sequence[Sequence[str]], rows: Sequence[int]
 ) -> str:
-    """A figure of the table from above: x up, y to the left, as one who stands behind the arm
-    sees it.
-    """
+    """A figure of the table from above: x up, y to the left, as seen from behind the arm."""
     (x0, y0), (hx, hy) = plan.table[0][:2], plan.table[1][:2]
     scale = _TALL / (x0 + hx - (min(0.0, x0 - hx) - 0.02))
 

@@ -138,9 +138,7 @@ def _draw_curves(path: Path, plot: Plot, rows: Sequence[Row]) -> None:
 
 
 def _draw_bars(path: Path, plot: Plot, rows: Sequence[Row]) -> None:
-    """A bar for each job with a figure, with whiskers where it has a range; red where worlds
-    failed.
-    """
+    """A bar for each job, with whiskers where it has a range; red where worlds failed."""
     rows = [row for row in rows if plot.shows([row])]
     keys = dict.fromkeys((plot.over, *plot.lines))
     names = [", ".join(str(row.get(key, "")) for key in keys) for row in rows]

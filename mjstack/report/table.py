@@ -69,9 +69,7 @@ class Table:
     def of(
         cls, columns: Mapping[str, str], rows: Iterable[Mapping[str, object]], title: str = ""
     ) -> Self:
-        """Make a table from records, with the key of each column's values; "-" where a record has
-        none.
-        """
+        """Make a table from records, by the key of each column; "-" where one has none."""
         cells = [[format_value(row.get(key, "-")) for key in columns.values()] for row in rows]
         return cls(header=list(columns), rows=cells, title=title)
 

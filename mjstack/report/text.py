@@ -20,9 +20,7 @@ _UNITS = {
 
 
 def format_value(value: object) -> str:
-    """A number with as many digits as a reader needs, a mapping as a list; other values as they
-    are.
-    """
+    """A number with as many digits as a reader needs, a mapping as a list."""
     if isinstance(value, Mapping):
         return ", ".join(f"{name} {item}" for name, item in value.items())
     if isinstance(value, bool):

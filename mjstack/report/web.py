@@ -152,9 +152,7 @@ class Stage:
 
 
 def choose_worlds(parts: Mapping[str, Sequence[World]]) -> list[World]:
-    """At most 64 worlds of the parts of a run: those that were played alone, and equal shares of
-    the rest.
-    """
+    """At most 64 worlds of a run's parts: those alone, and equal shares of the rest."""
     alone = [part[0] for part in parts.values() if len(part) == 1][:MOST_WORLDS]
     batches = [part for part in parts.values() if len(part) > 1]
     share = (MOST_WORLDS - len(alone)) // max(1, len(batches))
@@ -285,9 +283,7 @@ def stop_server(server: Any) -> None:
 
 
 def _fill(world: World, worlds: Sequence[World]) -> np.ndarray:
-    """A world's positions at every frame of the page: it stays where it ended, or where numbers
-    ceased.
-    """
+    """A world's positions at the page's frames: it stays where it, or its numbers, ended."""
     count = max(len(member.qpos) for member in worlds)
     finite = np.isfinite(world.qpos).all(1)
     last = np.maximum.accumulate(np.where(finite, np.arange(len(finite)), -1))

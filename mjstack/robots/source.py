@@ -169,9 +169,7 @@ def _split_tendon_servos(spec: mujoco.MjSpec, joints: Sequence[str]) -> None:
 
 
 def _prepare_joint(spec: mujoco.MjSpec, name: str) -> None:
-    """Name a joint's servo after it, and let it take targets in the joint's range unless it has its
-    own.
-    """
+    """Name a joint's servo after it, with the joint's range unless it has its own."""
     low, high = spec.joint(name).range
     if not low < high:
         raise ConfigError(

@@ -1,6 +1,4 @@
-"""Builds a scene around a robot: floor, table, objects and perhaps a box, timestep and solver, all
-set before compilation.
-"""
+"""Builds a scene around a robot: floor, table, objects, box, timestep and solver."""
 
 import itertools
 import math
@@ -161,9 +159,7 @@ def _add_object(spec: mujoco.MjSpec, name: str, thing: ObjectCfg, top: float) ->
 
 
 def _require_clear(model: mujoco.MjModel, scene: SceneCfg) -> None:
-    """Raise a `ConfigError` for the first object that moves and starts inside of something else of
-    the scene, by their shapes.
-    """
+    """Raise a `ConfigError` for the first moving object that starts inside of another thing."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     root = model.body_rootid[model.geom_bodyid]
@@ -206,9 +202,7 @@ def _add_camera(spec: mujoco.MjSpec, name: str, camera: CameraCfg, scene: SceneC
 
 
 def _add_box(spec: mujoco.MjSpec, box: BoxCfg, top: float) -> None:
-    """Add a box to the world, its floor and walls on a surface at height top [m]. Every geom's
-    name begins with ``box_``.
-    """
+    """Add a box on a surface at height top [m]; names of its geoms begin with ``box_``."""
     x, y = box.center
     half_x, half_y = box.half
     thick = 0.5 * box.wall

@@ -39,9 +39,7 @@ class Columns:
             self.at = torch.tensor(self.indices, dtype=torch.int64, device=device)
 
     def read(self, view: Tensor) -> Tensor:
-        """The columns, shape ``(nworld, n, ...)``. It may be the view's own memory: do not write
-        into it.
-        """
+        """The columns, shape ``(nworld, n, ...)``, perhaps the view's memory: only read it."""
         if isinstance(self.at, slice):
             return view[:, self.at]
         return view.index_select(1, self.at)
@@ -287,9 +285,7 @@ def turn_sign(model: mujoco.MjModel, robot: RobotCfg) -> float:
 
 
 def geom_corners(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray:
-    """Corners of the boxes that hold some geoms, in the model's own state [m], shape ``(n, 8, 3)``,
-    in the order of their signs.
-    """
+    """Corners of the boxes around some geoms, by signs [m], shape ``(n, 8, 3)``."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     signs = np.array(list(product((-1.0, 1.0), repeat=3)))

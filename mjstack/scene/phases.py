@@ -118,9 +118,7 @@ def build_phases(cfg: Config) -> list[Phase]:
 
 
 def target_xy(target: Target, sources: np.ndarray) -> np.ndarray:
-    """Where a target is, from where all sources are [m], shape ``(..., sources, 2)``; shape
-    ``(..., 2)``.
-    """
+    """Where targets are, from all sources [m], ``(..., sources, 2)``; shape ``(..., 2)``."""
     at = sources[..., target.source, :]
     along, left = target.offset
     if target.toward < 0:
@@ -133,9 +131,7 @@ def target_xy(target: Target, sources: np.ndarray) -> np.ndarray:
 
 
 def object_targets(cfg: Config) -> dict[str, list[tuple[Phase, Target]]]:
-    """The phases that go to each free object, in their order; each height, offset and opening
-    once.
-    """
+    """Phases to each free object, in order; each height, offset and opening once."""
     out: dict[str, dict[tuple, tuple[Phase, Target]]] = {name: {} for name in cfg.scene.free}
     names = source_names(cfg.scene)
     for phase in build_phases(cfg):

@@ -195,9 +195,7 @@ class BoxCheck(EpisodeCheck):
 
     @once_per_step
     def resting(self, step: Step) -> Tensor:
-        """Whether each object is out of the jaws, inside and slow, shape ``(nworld, objects)``,
-        bool.
-        """
+        """Whether each object is let go of, inside and slow, ``(nworld, objects)``, bool."""
         return self.rests(step).all(-1)
 
     @once_per_step
@@ -216,9 +214,7 @@ class BoxCheck(EpisodeCheck):
         return torch.maximum(constant(*self._low) - low, high - constant(*self._high))
 
     def high(self, step: Step) -> Tensor:
-        """Whether each object is higher than it may be let go of, shape ``(nworld, objects)``,
-        bool.
-        """
+        """Whether each object is too high to be let go of, ``(nworld, objects)``, bool."""
         heights = [self._low[2] + thing.half_height for thing in step.view.things]
         return step.pos[..., 2] - step.view.constant(*heights) > self.t.drop_height
 

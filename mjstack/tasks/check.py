@@ -350,9 +350,7 @@ class EpisodeCheck(ABC):
         return numbers
 
     def report(self, result: CheckResult) -> dict[str, tuple[str, str]]:
-        """Report the values of the first world, and the expected ones, by the name of each of the
-        task's rules.
-        """
+        """Measured and expected values of the first world, by the task's rules."""
         report = {}
         for rule in self._rules:
             phases = rule.phases if result.phased and rule.phases else [()] * len(rule.texts)

@@ -264,9 +264,7 @@ class Step:
 
     @step_value
     def narrowest(self) -> Tensor:
-        """How far the least open gripper joint is open as measured, 0 closed to 1 open, shape
-        ``(nworld, 1)``, float32.
-        """
+        """Opening of the least open gripper joint as measured, 0 to 1, shape ``(nworld, 1)``."""
         return gripper_opening(self.view.env).float().amin(1, keepdim=True)
 
     @step_value
@@ -282,9 +280,7 @@ class Step:
 
     @cached_property
     def _judged(self) -> Tensor:
-        """Every column of every key, shape ``(nworld, n)``; without phases whether the step
-        counts, shape ``(1, 1)``.
-        """
+        """Every column of every key, ``(nworld, n)``; without phases ``(1, 1)``."""
         view = self.view
         going = (view.count < view.stop)[:, None]
         if self._phase is None or not view.phased:

@@ -165,9 +165,7 @@ class ObjectCfg(ShapeCfg):
 
     @property
     def level_axes(self) -> list[int]:
-        """Numbers of its two most level axes as it starts, the one along which it is narrower
-        first.
-        """
+        """Numbers of its two most level axes as it starts, the narrower one first."""
         up = max(range(3), key=lambda k: abs(self.axes[2][k]))
         return sorted((k for k in range(3) if k != up), key=lambda k: self.half[k])
 
@@ -186,9 +184,7 @@ class ObjectCfg(ShapeCfg):
 
     @property
     def heading(self) -> tuple[int, float]:
-        """Number of its axis whose heading is its yaw, and the turn from there to the way the jaws
-        close [rad].
-        """
+        """Number of the axis whose heading is its yaw, and from there to the jaws' way [rad]."""
         if not self.oblong:
             return (0 if self.upright else self.level_axes[0]), 0.0
         narrow, wide = self.level_axes

@@ -240,9 +240,7 @@ def _arm_boxes(cfg: Config, data: mujoco.MjData, geoms: ndarray, noise: float) -
 
 
 def world_boxes(data: mujoco.MjData, geoms: Sequence[int] | ndarray) -> tuple[ndarray, ndarray]:
-    """Centres and half sizes of the boxes along the world's axes that hold some geoms, shape ``(n,
-    3)`` each.
-    """
+    """Centres and half sizes, ``(n, 3)``, of the world-aligned boxes that hold some geoms."""
     geoms = np.asarray(geoms, dtype=int)
     model = data.model
     rotation = data.geom_xmat[geoms].reshape(-1, 3, 3)

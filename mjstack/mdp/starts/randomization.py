@@ -1,6 +1,4 @@
-"""Domain randomisation: quantities of the model, and elements of its fields, that differ between
-worlds.
-"""
+"""Domain randomisation: quantities and model fields that differ between worlds."""
 
 import math
 from abc import ABC, abstractmethod
@@ -73,9 +71,7 @@ class Elements:
     def __init__(
         self, env: EnvView, name: str, elements: Sequence[int], *, exact: bool = True
     ) -> None:
-        """Find them; nominal values are float64 if they are to be ``exact``, else of the field's
-        type.
-        """
+        """Find them; nominal values are ``exact`` in float64, or of the field's type."""
         self._view = env.sim.fields[name]
         self._columns = Columns(elements, env.device)
         self.dtype = self._view.dtype
