@@ -2,8 +2,8 @@
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from operator import mul
 
 from mjstack.config.fields import spec
 
@@ -15,10 +15,6 @@ SHAPES = {  # and the sizes of each
     "sphere": (1, "the radius"),
     "capsule": _ROUND,
 }
-
-
-def _dot(a: Iterable[float], b: Iterable[float]) -> float:
-    return sum(x * y for x, y in zip(a, b, strict=True))
 
 
 @dataclass(slots=True)
@@ -83,14 +79,22 @@ class ShapeCfg:
     @property
     def half_height(self) -> float:
         """Height of the centre above what it stands on [m]."""
-        return self.half[2] if self.upright else self.reach((0.0, 0.0, 1.0))
+        if self.upright:
+            return self.half[2]
+        up = [abs(part) for part in self.axes[2]]
+        if self.shape == "box":
+            return sum(map(mul, up, self.size))
+        radius = self.size[0]
+        if self.shape == "cylinder":
+            return radius * math.hypot(*up[:2]) + self.size[1] * up[2]
+        return radius + (self.size[1] * up[0] if self.shape == "capsule" else 0.0)
 
     @property
     def footprint(self) -> float:
         """Radius of the disc that it covers at any yaw [m]."""
         if not self.upright:  # around a box that holds it, turned about its own axes alone
             corners = itertools.product(*((-half, half) for half in self.half))
-            return max(math.hypot(*(_dot(row, at) for row in self.axes[:2])) for at in corners)
+            return max(math.hypot(*(sum(map(mul, r, at)) for r in self.axes[:2])) for at in corners)
         if self.shape == "box":
             return math.hypot(1.0, self.size[1] / self.size[0]) * self.size[0]
         return sum(self.size) if self.shape == "capsule" else self.size[0]
@@ -104,16 +108,6 @@ class ShapeCfg:
             [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
             [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
         ]
-
-    def reach(self, direction: Sequence[float]) -> float:
-        """How far it reaches from its centre in a direction, a unit vector [m]."""
-        x, y, z = (abs(_dot(direction, axis)) for axis in zip(*self.axes, strict=True))
-        if self.shape == "box":
-            return _dot((x, y, z), self.size)
-        radius = self.size[0]
-        if self.shape == "cylinder":
-            return radius * math.hypot(x, y) + self.size[1] * z
-        return radius + (self.size[1] * x if self.shape == "capsule" else 0.0)
 
 
 @dataclass(slots=True)
@@ -177,8 +171,6 @@ class ObjectCfg(ShapeCfg):
     @property
     def oblong(self) -> bool:
         """Whether jaws fit it across its narrower side alone, as it starts."""
-        if self.parts or self.file:
-            return False
         narrow, wide = (self.half[axis] for axis in self.level_axes)
         return wide - narrow > 1e-6
 
