@@ -476,7 +476,7 @@ def test_jobs_serve_the_live_view(job: str, tmp_path: Path, port: int, monkeypat
 
     after_step = LiveView.after_step
     monkeypatch.setattr(LiveView, "after_step", look)
-    monkeypatch.setattr(showing, "start_server", start)
+    monkeypatch.setattr(showing.web, "start_server", start)
     where = ["view=web", f"web.port={port}"]
     folder = f"hydra.run.dir={tmp_path}" if job == "play" else f"job.folder={tmp_path}"
     assert run([*command, *where, folder]) == 0

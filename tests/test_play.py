@@ -73,7 +73,7 @@ def test_the_expert_plays_without_a_policy_in_the_viewer(
 
     hook = Hook(lambda step, sim: shown.append(step))
     monkeypatch.setattr(runner, "find_viewers", lambda stage: [hook])
-    monkeypatch.setattr(showing, "opens_windows", lambda: True)
+    monkeypatch.setattr(showing.picture, "opens_windows", lambda: True)
     out = tmp_path / "out"
     names = configure("task=reach").controller.phases
     fast = [f"controller.phases.{name}.seconds=0.2" for name in names]

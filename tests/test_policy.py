@@ -461,7 +461,7 @@ def test_a_policy_that_succeeds_is_timed_and_shown(tmp_path: Path, monkeypatch: 
         path.touch()
         shown.append(qpos)
 
-    monkeypatch.setattr(showing, "save_video", save)
+    monkeypatch.setattr(showing.picture, "save_video", save)
     policy = hold_above_red(tmp_path / "policy")
     out = tmp_path / "run"
     drive = ["task=reach", "reset=jitter", "controller=policy", f"policy={policy}"]

@@ -10,30 +10,22 @@ from typing import Any
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from mjstack.config import schema
 from mjstack.config.fields import accepted, check_fields
-from mjstack.config.schema import (
-    Config,
-    ObservationGroupCfg,
-    ObservationTermCfg,
-    RewardTermCfg,
-    SceneCfg,
-    TermCfg,
-    TerminationTermCfg,
-)
 from mjstack.config.session import config_folders
 from mjstack.errors import ConfigError, TermError, UnknownName
 
 # Terms are untyped in the schema: OmegaConf would not let a command line add one to a typed dict.
 _TERMS = {
-    "action": TermCfg,
-    "controller.action": TermCfg,
-    "reset": TermCfg,
-    "gate.capacity.reset": TermCfg,
-    "gate.success.reset": TermCfg,
-    "termination": TerminationTermCfg,
-    "reward": RewardTermCfg,
-    "observation": ObservationGroupCfg,
-    "job.observation": ObservationGroupCfg,
+    "action": schema.TermCfg,
+    "controller.action": schema.TermCfg,
+    "reset": schema.TermCfg,
+    "gate.capacity.reset": schema.TermCfg,
+    "gate.success.reset": schema.TermCfg,
+    "termination": schema.TerminationTermCfg,
+    "reward": schema.RewardTermCfg,
+    "observation": schema.ObservationGroupCfg,
+    "job.observation": schema.ObservationGroupCfg,
 }
 
 
@@ -41,7 +33,7 @@ _schema = cache(OmegaConf.structured)  # made once: terms are many
 _values: dict[tuple[type, str], Any] = {}  # of terms by their content: most are in any composition
 
 
-def complete(cfg: Config) -> None:
+def complete(cfg: schema.Config) -> None:
     """Give every term its type, and fill in the robot and the phases that gates name, in place. A
     term that is null is left out.
 
@@ -72,9 +64,9 @@ def _typed_all(key: str, nodes: dict[str, Any], kind: type) -> dict[str, Any]:
     values = {
         name: typed(f"{key}.{name}", node, kind) for name, node in nodes.items() if node is not None
     }
-    if kind is ObservationGroupCfg:
+    if kind is schema.ObservationGroupCfg:
         for name, group in values.items():
-            group.terms = _typed_all(f"{key}.{name}.terms", group.terms, ObservationTermCfg)
+            group.terms = _typed_all(f"{key}.{name}.terms", group.terms, schema.ObservationTermCfg)
     return values
 
 
@@ -106,7 +98,7 @@ def typed(key: str, node: Any, kind: type) -> Any:
     return value
 
 
-def _complete_scene(scene: SceneCfg) -> None:
+def _complete_scene(scene: schema.SceneCfg) -> None:
     """Find the files of fixed objects, and turn all positions into the world's."""
     check_fields("scene", scene)
     origin = [0.0, 0.0, 0.0]
@@ -149,7 +141,7 @@ def _find_file(key: str, file: str | None, *groups: str) -> str | None:
     raise ConfigError(key, file, f"an MJCF file; there is no {' and no '.join(paths)}")
 
 
-def _choose_phases(cfg: Config) -> None:
+def _choose_phases(cfg: schema.Config) -> None:
     """Fill in the phases that gates name, where the task's YAML leaves them open."""
     phases = list(cfg.controller.phases.values())
     if not phases:

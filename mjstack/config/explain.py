@@ -17,15 +17,9 @@ from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError
 
+from mjstack.config import session
 from mjstack.config.fields import accepted, find_field
 from mjstack.config.schema import JOB_SCHEMAS, Config, GateCfg
-from mjstack.config.session import (
-    CONFIG_NAME,
-    config_folders,
-    hydra_session,
-    list_choices,
-    list_items,
-)
 from mjstack.errors import MjstackError, UnknownName, first_line, suggest
 
 LISTS = ("cameras", "experiment")  # groups of which several may be chosen
@@ -54,7 +48,9 @@ def check_overrides(overrides: Sequence[str]) -> None:
                     f"~{key}: expected a term of {', '.join(TERM_GROUPS)}, such as ~reward.success."
                     f" Keys and groups at the top are always there: set {key}=VALUE."
                 )
-        elif isinstance(parsed.value(), list) and key in list_choices() and key not in LISTS:
+        elif (
+            isinstance(parsed.value(), list) and key in session.list_choices() and key not in LISTS
+        ):
             raise MjstackError(f"{override}: expected one choice, no list.")
         elif key == "gate":
             raise MjstackError(
@@ -102,18 +98,23 @@ def explain(error: Exception, overrides: Sequence[str] = ()) -> MjstackError:
     else:
         problem = _explain(error, overrides)
     inside = re.match(r"In '([^']+)': ", str(error))
-    if inside is None or inside[1] in (CONFIG_NAME, "hydra/config"):  # an override does not fit
+    if inside is None or inside[1] in (
+        session.CONFIG_NAME,
+        "hydra/config",
+    ):  # an override does not fit
         return problem
     name = f"{inside[1]}.yaml"
-    paths = [folder / name for folder in config_folders() if (folder / name).is_file()]
+    paths = [folder / name for folder in session.config_folders() if (folder / name).is_file()]
     return MjstackError(f"{paths[0] if paths else name}: {problem}")
 
 
 def _unknown_choice(path: str, options: Sequence[str] | None) -> MjstackError:
     group, _, name = path.rpartition("/")
     # Of a list of choices Hydra names none.
-    unknown = UnknownName(f"{group}={name}:", name, options or list_choices().get(group, []))
-    if config_folders() or group.startswith("hydra/"):
+    unknown = UnknownName(
+        f"{group}={name}:", name, options or session.list_choices().get(group, [])
+    )
+    if session.config_folders() or group.startswith("hydra/"):
         return unknown
     return MjstackError(f"{unknown} A choice of your own needs --config-dir DIR.")
 
@@ -157,7 +158,7 @@ def _unknown_key(key: str, known: Iterable[str], overrides: Sequence[str]) -> Mj
         return MjstackError(
             f"{key} is a key of {' and '.join(owners)}, and this is {job}. Set {owners[0]}."
         )
-    groups = list_choices()
+    groups = session.list_choices()
     keys = [*_keys(o for o in overrides if o.partition("=")[0] in groups), *groups]
     keys += [f"{parent}.{name}".lstrip(".") for name in known]
     keys = [name for name in keys if not f"{key}.".startswith(f"{name}.")]
@@ -184,9 +185,9 @@ def _field_names(owner: Any) -> list[str]:
 
 def _keys(overrides: Iterable[str]) -> list[str]:
     """Dotted keys of a composition, mappings included."""
-    with hydra_session():
+    with session.hydra_session():
         try:
-            cfg = compose(CONFIG_NAME, list(overrides))
+            cfg = compose(session.CONFIG_NAME, list(overrides))
         except HydraException:
-            cfg = compose(CONFIG_NAME)
-    return [key for key, _ in list_items(cfg)]
+            cfg = compose(session.CONFIG_NAME)
+    return [key for key, _ in session.list_items(cfg)]

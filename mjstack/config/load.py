@@ -16,22 +16,12 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError  # type: ignore[import-untyped]
 
+from mjstack.config import session
 from mjstack.config.check import validate
 from mjstack.config.complete import complete
 from mjstack.config.explain import check_added, check_overrides, explain, own_overrides, parse
 from mjstack.config.fingerprint import POLICY_FILE
 from mjstack.config.schema import JOB_SCHEMAS, TRAINER_SCHEMAS, Backend, Config
-from mjstack.config.session import (
-    CONFIG_NAME,
-    add_folder,
-    check_beside,
-    check_replayed,
-    hydra_session,
-    list_choices,
-    read_yaml,
-    search_path,
-    without_hydra,
-)
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.files import read_inside, reading
 
@@ -97,7 +87,7 @@ def load_config(
         MjstackError: An override does not fit; the message says which and what would.
     """
     folders = [] if config_dir is None else [config_dir]
-    with extended_search_path(overrides, folders) as composed, hydra_session():
+    with extended_search_path(overrides, folders) as composed, session.hydra_session():
         return to_config(compose(composed))
 
 
@@ -117,7 +107,7 @@ def extended_search_path(
     for override in [override for override in overrides if override not in remaining]:
         value = parse(override).value()
         entries += map(str, value if isinstance(value, list) else [value])
-    with search_path(entries):
+    with session.search_path(entries):
         remaining = [_CHOICE.sub(r"\1@\g<0>", o) for o in remaining]
         yield [*remaining, *_starts_alone(remaining), *_policy_choices(remaining)]
 
@@ -151,7 +141,7 @@ def _policy_choices(overrides: Sequence[str]) -> list[str]:
         trained["cameras"] = list(facts["observation"].get("images", {}))
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return []
-    choices = list_choices()
+    choices = session.list_choices()
     return [
         f"{group}={names[0] if len(names) == 1 else names}".replace("'", "").replace(" ", "")
         for group, names in trained.items()
@@ -168,10 +158,10 @@ def compose(overrides: Sequence[str], run_mode: RunMode = RunMode.RUN) -> DictCo
     loader = GlobalHydra.instance().config_loader()
     try:
         cfg = loader.load_configuration(
-            config_name=CONFIG_NAME, overrides=list(overrides), run_mode=run_mode
+            config_name=session.CONFIG_NAME, overrides=list(overrides), run_mode=run_mode
         )
         if run_mode is RunMode.RUN:
-            check_added(without_hydra(cfg), overrides)
+            check_added(session.without_hydra(cfg), overrides)
             _drop_inherited(cfg, overrides)
     except (HydraException, OmegaConfBaseException, AssertionError, TypeError, ValueError) as error:
         raise explain(error, overrides) from error
@@ -198,7 +188,7 @@ def _drop_inherited(cfg: DictConfig, overrides: Sequence[str]) -> None:
     before = (
         GlobalHydra.instance()
         .config_loader()
-        .load_configuration(config_name=CONFIG_NAME, overrides=rest, run_mode=RunMode.RUN)
+        .load_configuration(config_name=session.CONFIG_NAME, overrides=rest, run_mode=RunMode.RUN)
     )
     for term in terms.values():
         old = OmegaConf.select(before, f"{term}.func")
@@ -225,29 +215,29 @@ def load_saved(path: Path) -> Config:
             functions or a robot that are not in the search path.
     """
     with reading(path, "Name another folder"):
-        plain = read_yaml(path)
+        plain = session.read_yaml(path)
         if "${" in str(plain):
             raise ValueError("it has ${...}")
         merged = cast(DictConfig, OmegaConf.merge(_schema, plain))
         if missing := sorted(OmegaConf.missing_keys(merged)):
             raise MjstackError(f"{missing[0]} is missing, expected every key of this version.")
-        check_replayed(merged, path)
+        session.check_replayed(merged, path)
         try:
             cfg = to_config(merged)
         except ConfigError as error:
             if not error.key.endswith(".file"):
                 raise
-            raise MjstackError(f"{error} {add_folder(path)}") from error
-        check_beside("robot.file", cfg.robot.file)
+            raise MjstackError(f"{error} {session.add_folder(path)}") from error
+        session.check_beside("robot.file", cfg.robot.file)
         for name, thing in cfg.scene.objects.items():
-            check_beside(f"scene.objects.{name}.file", thing.file)
+            session.check_beside(f"scene.objects.{name}.file", thing.file)
     return cfg
 
 
 def to_config(cfg: DictConfig) -> Config:
     """Turn a composed configuration into dataclasses and check their values."""
     try:
-        config = cast(Config, OmegaConf.to_object(without_hydra(cfg)))
+        config = cast(Config, OmegaConf.to_object(session.without_hydra(cfg)))
     except (OmegaConfBaseException, AttributeError, TypeError) as error:
         raise explain(error) from error
     complete(config)

@@ -13,16 +13,8 @@ from typing import Any, cast
 
 import numpy as np
 
-from mjstack.datasets import lerobot
+from mjstack.datasets import lerobot, reader
 from mjstack.datasets.part import Part, PartWriter
-from mjstack.datasets.reader import (
-    check_same,
-    read_info,
-    read_rows,
-    read_tasks,
-    readable,
-    uncommitted,
-)
 from mjstack.datasets.spec import DatasetSpec, EpisodeData, typed_episode
 from mjstack.errors import FolderError
 from mjstack.files import lock_folder, write_atomic
@@ -161,17 +153,19 @@ class DatasetWriter:
                     f"{path} is a link, expected a folder or file of the dataset's own",
                     "Write into another folder",
                 )
-        info = read_info(self.folder)
+        info = reader.read_info(self.folder)
         if info is not None:
-            check_same(self.folder, info, self.spec)
-            self._tasks = {task: index for index, task in enumerate(read_tasks(self.folder, info))}
+            reader.check_same(self.folder, info, self.spec)
+            self._tasks = {
+                task: index for index, task in enumerate(reader.read_tasks(self.folder, info))
+            }
             self._provenance = info["mjstack"]["provenance"]
-            if rows := read_rows(self.folder, info):  # else there are no files of them
-                with readable(self.folder / "meta/episodes"):
+            if rows := reader.read_rows(self.folder, info):  # else there are no files of them
+                with reader.readable(self.folder / "meta/episodes"):
                     for row in rows:
                         self._count(row)
             self._shards = info["mjstack"]["shards"]
-        for path in uncommitted(self.folder, self._shards):
+        for path in reader.uncommitted(self.folder, self._shards):
             path.unlink()
         # Where the last writer and this one differ, such as in a version, both are on record.
         count = len(self.committed)
@@ -255,10 +249,10 @@ class DatasetWriter:
             if self._part is not None:
                 self._part.abandon()
                 self._part = None
-            info = cast(dict[str, Any], read_info(self.folder))
+            info = cast(dict[str, Any], reader.read_info(self.folder))
             del self.committed[info["total_episodes"] :]
             self.frames = info["total_frames"]
-            for path in uncommitted(self.folder, info["mjstack"]["shards"]):
+            for path in reader.uncommitted(self.folder, info["mjstack"]["shards"]):
                 path.unlink()
             if isinstance(error, OSError):
                 raise self._unwritten(error) from error

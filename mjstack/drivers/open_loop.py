@@ -160,12 +160,7 @@ class OpenLoopPlanner:
 
         robot = self._cfg.robot
         ik = BatchedIk(
-            self.ik.model,
-            robot,
-            nworld,
-            "cpu",
-            iterations=_ITERATIONS,
-            posture_gain=_POSTURE_GAIN,
+            self.ik.model, robot, nworld, "cpu", iterations=_ITERATIONS, posture_gain=_POSTURE_GAIN
         )
         moved = [robot.joints.index(name) for name in robot.ik_joints]
 
@@ -178,11 +173,7 @@ class OpenLoopPlanner:
         return solve
 
     def _solve_knots(
-        self,
-        xy: ndarray,
-        worlds: Sequence[int],
-        solve: _Solve,
-        seed: ndarray | None = None,
+        self, xy: ndarray, worlds: Sequence[int], solve: _Solve, seed: ndarray | None = None
     ) -> tuple[ndarray, ndarray]:
         """Commands at the knots, shape ``(nworld, n, nu)``, and the largest distance from a target
         at any [m], shape ``(nworld,)``.

@@ -3,15 +3,9 @@
 import math
 import time
 
+from rich import progress
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
 from mjstack.interrupt import check_interrupt
 from mjstack.report.record import GateResult, Status
@@ -31,13 +25,9 @@ class ProgressBar:
     """
 
     def __init__(self, console: Console) -> None:
-        self._progress = Progress(
-            "{task.description}",
-            BarColumn(),
-            MofNCompleteColumn(),
-            "{task.fields[rate]}",
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
+        self._progress = progress.Progress(
+            *("{task.description}", progress.BarColumn(), progress.MofNCompleteColumn()),
+            *("{task.fields[rate]}", progress.TimeElapsedColumn(), progress.TimeRemainingColumn()),
             console=console,
             transient=True,
             disable=not console.is_terminal,

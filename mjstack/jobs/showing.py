@@ -14,24 +14,9 @@ from mjstack.episodes.rollout import Hook, Observer
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError
 from mjstack.jobs.live import LiveView
+from mjstack.report import picture, web
 from mjstack.report.page import Page, frame_stride
-from mjstack.report.picture import (
-    opens_windows,
-    require_video,
-    save_scene,
-    save_trajectories,
-    save_video,
-)
 from mjstack.report.table import Console
-from mjstack.report.web import (
-    EPISODE,
-    check_address,
-    choose_worlds,
-    lacks_viser,
-    save_episode,
-    start_server,
-    stop_server,
-)
 from mjstack.report.write import safely_write
 from mjstack.scene.index import geom_corners
 from mjstack.sim import Simulation
@@ -42,13 +27,13 @@ def check_showing(cfg: Config, ending: str = ".mp4") -> None:
     a name of this ending.
     """
     if cfg.view == "web":
-        check_address(cfg.web.host, cfg.web.port)
-    elif cfg.view == "true" and not opens_windows():
+        web.check_address(cfg.web.host, cfg.web.port)
+    elif cfg.view == "true" and not picture.opens_windows():
         display = os.environ.get("DISPLAY", "not set")
         expected = f"a display that opens windows (DISPLAY={display})"
         raise ConfigError("view", "true", expected, "Use view=web or video=true instead")
     if cfg.video:
-        require_video(ending)
+        picture.require_video(ending)
 
 
 def draw_episode(
@@ -63,15 +48,15 @@ def draw_episode(
     objects = {name: (thing.half, thing.color) for name, thing in cfg.scene.free.items()}
     positions = np.stack([qpos[:, a : a + 3] for a in stage.index.object_qpos], axis=1)
     title = f"{cfg.robot.title}, {cfg.task.name}: {world}"
-    draw("scene.png", save_scene, model, qpos[-1])
+    draw("scene.png", picture.save_scene, model, qpos[-1])
     bodies = [stage.index.bodies[name] for name in stage.index.fixed]
     geoms = np.flatnonzero(np.isin(model.body_rootid[model.geom_bodyid], bodies))
     fixed = geom_corners(model, geoms)
     places = {name: (place.xy, place.random_xy) for name, place in cfg.scene.places.items()}
-    draw("trajectories.png", save_trajectories, positions, objects, fixed, places, title)
+    draw("trajectories.png", picture.save_trajectories, positions, objects, fixed, places, title)
     if cfg.video:
         path = folder / "episode.mp4"
-        problem = safely_write(path, save_video, model, qpos[None], cfg.timing.step_dt)
+        problem = safely_write(path, picture.save_video, model, qpos[None], cfg.timing.step_dt)
         stage.progress.print_line(problem or f"video: {path}")
 
 
@@ -80,14 +65,14 @@ def save_page(stage: Stage, folder: Path, page: Page) -> str:
     cfg = stage.cfg
     if not cfg.web.episode:
         return "web.episode=false: no 3-D page"
-    path = folder / EPISODE
-    worlds = choose_worlds(page.worlds3d)
-    problem = lacks_viser()
+    path = folder / web.EPISODE
+    worlds = web.choose_worlds(page.worlds3d)
+    problem = web.lacks_viser()
     if worlds and not problem:
         frame_dt = frame_stride(cfg.timing.step_dt) * cfg.timing.step_dt
-        problem = safely_write(path, save_episode, stage.assets.visual_model, worlds, frame_dt)
+        problem = safely_write(path, web.save_episode, stage.assets.visual_model, worlds, frame_dt)
     if path.exists():  # perhaps an earlier call's, of seeds that were read back
-        page.episode = EPISODE
+        page.episode = web.EPISODE
     if problem:
         stage.progress.print_line(problem)
     return problem
@@ -101,13 +86,13 @@ def serve_live_view(stage: Stage, console: Console) -> Iterator[LiveView | None]
         yield None
         return
     token = secrets.token_urlsafe()
-    server = start_server(cfg.web.host, cfg.web.port, token)
+    server = web.start_server(cfg.web.host, cfg.web.port, token)
     try:
         console.print(f"live view: http://{cfg.web.host}:{server.get_port()}/?token={token}")
         with closing(LiveView(server, stage)) as live:
             yield live
     finally:
-        stop_server(server)
+        web.stop_server(server)
 
 
 def find_viewers(stage: Stage) -> list[Observer]:

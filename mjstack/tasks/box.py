@@ -14,17 +14,8 @@ from mjstack.errors import ConfigError, UnknownName
 from mjstack.managers.view import EnvView
 from mjstack.mdp.geometry import place_xy
 from mjstack.scene.index import lowest_height
+from mjstack.tasks import parts
 from mjstack.tasks.check import EpisodeCheck, Judgement, Rule
-from mjstack.tasks.parts import (
-    AtLeast,
-    Carried,
-    Condition,
-    InWindow,
-    Streak,
-    away,
-    in_hand,
-    released,
-)
 from mjstack.tasks.placed import HeldSuccess
 from mjstack.tasks.view import AllOf, PhaseNames, Step, TaskView, once_per_step
 
@@ -101,14 +92,14 @@ class BoxCheck(EpisodeCheck):
                 f"settled_steps_{name}_min": (f"settled_steps_{name}", "min"),
             }
 
-        grasp = Streak(
+        grasp = parts.Streak(
             *("GRASP", "{object} not grasped", self.objects),
-            in_hand(*self.objects),
+            parts.in_hand(*self.objects),
             t.grasp_steps,
             phases=self._during("close"),
             anew=self._during("approach"),
         )
-        lift = Streak(
+        lift = parts.Streak(
             *("LIFT", "{object} not lifted", self.objects),
             self.airborne,
             t.lift_steps,
@@ -127,7 +118,7 @@ class BoxCheck(EpisodeCheck):
         )
         drop = _Drop(
             *("DROP", "{object} dropped", self.objects),
-            in_hand(*self.objects),
+            parts.in_hand(*self.objects),
             0,
             value="unloaded_steps{}",
             phases=self._during("close", "lift", "carry", "hold"),
@@ -156,7 +147,7 @@ class BoxCheck(EpisodeCheck):
         return [
             *(grasp, lift, carry, drop, release, settled),
             _Order(self.objects, release),
-            InWindow("INSIDE", text, rests, t.window, measure=self.trace),
+            parts.InWindow("INSIDE", text, rests, t.window, measure=self.trace),
             _JawClear(self.cfg.robot.jaw_bodies, self._high[2], t.jaw_clearance),
         ]
 
@@ -239,7 +230,10 @@ class BoxCheck(EpisodeCheck):
     @override
     def trace(self, step: Step) -> dict[str, Tensor]:
         return {
-            **{f"slot_err_{name}_m": away(step, name, slot) for name, slot in self.slots.items()},
+            **{
+                f"slot_err_{name}_m": parts.away(step, name, slot)
+                for name, slot in self.slots.items()
+            },
             "beyond_m": self.outside(step).amax((1, 2)),
             "corner_speed_m_per_s": step.corner_speed.amax(1),
         }
@@ -252,10 +246,10 @@ class BoxCheck(EpisodeCheck):
 
 
 @dataclass(eq=False, kw_only=True)
-class _CarriedOver(Carried):
+class _CarriedOver(parts.Carried):
     """CARRY: carried, and over the box when it is let go of."""
 
-    inside: Condition
+    inside: parts.Condition
     hold: PhaseNames
 
     def start(self, view: TaskView) -> None:
@@ -274,13 +268,13 @@ class _CarriedOver(Carried):
 
 
 @dataclass(eq=False, kw_only=True)
-class _Drop(AtLeast):
+class _Drop(parts.AtLeast):
     """DROP: no step without load between the last grasp and the release."""
 
-    grasp: Streak
-    lift: Streak
+    grasp: parts.Streak
+    lift: parts.Streak
     carry: _CarriedOver
-    high: Condition
+    high: parts.Condition
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -308,7 +302,7 @@ class _Drop(AtLeast):
         return self.best == 0.0
 
 
-class _Release(AtLeast):
+class _Release(parts.AtLeast):
     """RELEASE: out of the jaws, the gripper open."""
 
     def update(self, step: Step) -> None:
@@ -317,7 +311,7 @@ class _Release(AtLeast):
         torch.maximum(self.best, wide, out=self.best)
 
 
-class _Settled(AtLeast):
+class _Settled(parts.AtLeast):
     """SETTLED: at rest in the box after the release."""
 
     def start(self, view: TaskView) -> None:
@@ -384,5 +378,5 @@ class BoxSuccess(HeldSuccess):
             MjstackError: The task has another check.
         """
         check = BoxCheck(env.cfg)
-        let_go = released(*check.objects, open_fraction=check.t.open_fraction)
+        let_go = parts.released(*check.objects, open_fraction=check.t.open_fraction)
         super().__init__(env, check.view(env), [check.resting, let_go], check.settle_steps)

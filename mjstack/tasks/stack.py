@@ -10,19 +10,8 @@ from typing_extensions import override
 
 from mjstack.config.fields import spec
 from mjstack.managers.view import EnvView
+from mjstack.tasks import parts
 from mjstack.tasks.check import EpisodeCheck, Rule
-from mjstack.tasks.parts import (
-    AtRest,
-    Carried,
-    InWindow,
-    Streak,
-    airborne,
-    offset,
-    on_table,
-    on_top,
-    on_top_of,
-    released,
-)
 from mjstack.tasks.placed import HeldSuccess
 from mjstack.tasks.view import Step, once_per_step
 
@@ -89,14 +78,16 @@ class StackCheck(EpisodeCheck):
     def build(self) -> list[Rule]:
         t = self.t
         self.objects = [t.object, t.onto]
-        up = airborne(t.object, height=t.airborne_height)
-        self.stacked = on_top(t.object, t.onto, xy_err=t.xy_err, dz_min=t.dz_min, dz_max=t.dz_max)
-        self.supported = on_table(t.onto, gap=t.support_gap)
-        self.released = released(t.object, open_fraction=t.open_fraction)
-        lift = Streak(
+        up = parts.airborne(t.object, height=t.airborne_height)
+        self.stacked = parts.on_top(
+            t.object, t.onto, xy_err=t.xy_err, dz_min=t.dz_min, dz_max=t.dz_max
+        )
+        self.supported = parts.on_table(t.onto, gap=t.support_gap)
+        self.released = parts.released(t.object, open_fraction=t.open_fraction)
+        lift = parts.Streak(
             "LIFT", "{object} not lifted", [t.object], up, t.lift_steps, phases=[t.lift_phases]
         )
-        carry = Carried(
+        carry = parts.Carried(
             *("CARRY", "{object} not carried", [t.object], up, t.carry_steps),
             distance=t.carry_distance,
             phases=[[t.carry_phase]],
@@ -105,10 +96,10 @@ class StackCheck(EpisodeCheck):
         return [
             lift,
             carry,
-            InWindow("STACKED", "not stacked", self.stacked, t.window, measure=self.trace),
-            InWindow("SUPPORTED", f"{t.onto} not on the table", self.supported, t.window),
-            AtRest(t.window, t.rest_speed, t.rest_position, t.rest_rotation_deg),
-            InWindow("RELEASED", f"{t.object} not released", self.released, t.window),
+            parts.InWindow("STACKED", "not stacked", self.stacked, t.window, measure=self.trace),
+            parts.InWindow("SUPPORTED", f"{t.onto} not on the table", self.supported, t.window),
+            parts.AtRest(t.window, t.rest_speed, t.rest_position, t.rest_rotation_deg),
+            parts.InWindow("RELEASED", f"{t.object} not released", self.released, t.window),
         ]
 
     @once_per_step
@@ -118,11 +109,11 @@ class StackCheck(EpisodeCheck):
 
     @override
     def goals(self, step: Step) -> dict[str, Tensor]:
-        return {self.t.object: on_top_of(step, self.t.onto, self.t.object)}
+        return {self.t.object: parts.on_top_of(step, self.t.onto, self.t.object)}
 
     @override
     def trace(self, step: Step) -> dict[str, Tensor]:
-        xy_err, dz = offset(step, *self.objects)
+        xy_err, dz = parts.offset(step, *self.objects)
         return {"xy_err_m": xy_err, "dz_m": dz}
 
     def headline(self, values: Mapping[str, float]) -> str:

@@ -19,14 +19,7 @@ from mjstack.train.dataset import check_dataset, read_demonstrations
 from mjstack.train.demonstrations import Demonstrations
 from mjstack.train.images import ImagePool, pool_rows
 from mjstack.train.rounds import make_round, round_file
-from mjstack.train.trainer import (
-    FAILED,
-    LAST,
-    Trained,
-    Trainer,
-    earlier_state,
-    observed_widths,
-)
+from mjstack.train.trainer import FAILED, LAST, Trained, Trainer, earlier_state, observed_widths
 
 
 def check_clone(stage: Stage) -> range:

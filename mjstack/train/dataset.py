@@ -12,15 +12,7 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import CloneJobCfg, Config
-from mjstack.datasets import lerobot
-from mjstack.datasets.reader import (
-    check_frames,
-    check_types,
-    data_files,
-    read_columns,
-    read_table,
-    readable,
-)
+from mjstack.datasets import lerobot, reader
 from mjstack.datasets.spec import term_columns
 from mjstack.episodes.stage import Stage
 from mjstack.errors import FolderError
@@ -51,9 +43,9 @@ def check_dataset(stage: Stage, widths: Mapping[str, int]) -> range:
     folder, info, places = _open(cfg, widths)
     _task_number(cfg, folder)
     lengths, seeds = _rows(folder, info)
-    check_frames(folder, info, lengths)
+    reader.check_frames(folder, info, lengths)
     # The ranges of the first file: degrees, say, are far out of them
-    action = _read(data_files(folder, info)[0], {_ACTION: places[_ACTION]}, info)[_ACTION]
+    action = _read(reader.data_files(folder, info)[0], {_ACTION: places[_ACTION]}, info)[_ACTION]
     low, high = stage.index.ctrl_range.T
     worst = np.maximum(low - action, action - high).max(0)
     joint = int(worst.argmax())
@@ -79,7 +71,7 @@ def read_demonstrations(stage: Stage, widths: dict[str, int]) -> Demonstrations:
     folder, info, places = _open(stage.cfg, widths)
     facts = [_EPISODE, _TASK, *({_SUCCESS} & info["features"].keys())]
     places |= {name: [(name, 0)] for name in facts}
-    parts = [_read(path, places, info) for path in data_files(folder, info)]
+    parts = [_read(path, places, info) for path in reader.data_files(folder, info)]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in places}
 
     # Episodes of the task that succeeded
@@ -125,7 +117,7 @@ def _read_info(folder: Path) -> Facts:
             f"job.dataset={folder}: has no {lerobot.INFO}, expected a LeRobotDataset v3. Give the"
             " folder dataset of job=collect"
         )
-    with readable(path):
+    with reader.readable(path):
         info = json.loads(path.read_text(encoding="utf-8"))
         version = str(info["codebase_version"])
         if not version.startswith("v3"):
@@ -133,7 +125,7 @@ def _read_info(folder: Path) -> Facts:
                 f"job.dataset={folder}: is a LeRobotDataset {version}, expected v3.0. Convert it"
                 " with LeRobot"
             )
-        check_types(info, written_here="mjstack" in info)
+        reader.check_types(info, written_here="mjstack" in info)
         if info["total_episodes"] < 1:
             raise ValueError("it has no episodes")
         for feature in info["features"].values():
@@ -204,9 +196,9 @@ def _rows(folder: Path, info: Facts) -> tuple[list[int], list[int]]:
     """Length of every episode, and its seed as far as the dataset has any."""
     lengths: list[int] = []
     seeds: list[int] = []
-    for path in data_files(folder, info, lerobot.EPISODES):
-        with readable(path):
-            columns = read_table(path, ["length", "seed"]).to_pydict()  # if it has seeds
+    for path in reader.data_files(folder, info, lerobot.EPISODES):
+        with reader.readable(path):
+            columns = reader.read_table(path, ["length", "seed"]).to_pydict()  # if it has seeds
             lengths += map(index, columns["length"])
             seeds += map(index, columns.get("seed", ()))
     return lengths, seeds
@@ -219,8 +211,8 @@ def _task_number(cfg: Config, folder: Path) -> int:
         FolderError: The dataset does not have it.
     """
     path = folder / lerobot.TASKS
-    with readable(path):
-        table = read_table(path)
+    with reader.readable(path):
+        table = reader.read_table(path)
         names = table.column_names
         text = "task" if "task" in names else next(n for n in names if n != "task_index")
         numbers = map(index, table["task_index"].to_pylist())
@@ -238,8 +230,8 @@ def _read(path: Path, columns: Mapping[str, Sequence[Place]], info: Facts) -> di
     its shape in info.json.
     """
     features = sorted({feature for places in columns.values() for feature, _ in places})
-    with readable(path):
-        read = read_columns(path, info, features)
+    with reader.readable(path):
+        read = reader.read_columns(path, info, features)
         values = {name: column.astype(float) for name, column in read.items()}
         arrays = {
             name: np.stack([values[feature][:, number] for feature, number in places], axis=1)

@@ -19,14 +19,7 @@ from mjstack.managers.term import check_params
 from mjstack.mdp.starts.expert_states import VIEWS, write_states
 from mjstack.policy.checkpoint import read_state
 from mjstack.train.ppo_learner import PpoLearner
-from mjstack.train.trainer import (
-    LAST,
-    STATE,
-    Trained,
-    Trainer,
-    observed_group,
-    whole_starts,
-)
+from mjstack.train.trainer import LAST, STATE, Trained, Trainer, observed_group, whole_starts
 
 _STATES = "expert_states.npz"  # in the training's folder
 _STRIDE = 5  # control steps between two states

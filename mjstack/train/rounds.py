@@ -122,11 +122,7 @@ def round_file(number: object, rank: object) -> str:
 
 
 def make_round(
-    stage: Stage,
-    folder: Path,
-    policy: Policy | None,
-    number: int,
-    pool: ImagePool | None = None,
+    stage: Stage, folder: Path, policy: Policy | None, number: int, pool: ImagePool | None = None
 ) -> Demonstrations:
     """Play a round, or read it where an earlier call has played it in every rank. Each rank keeps
     its own part.
