@@ -181,24 +181,20 @@ def _add_camera(spec: mujoco.MjSpec, name: str, camera: CameraCfg, scene: SceneC
     """Add a camera to what carries it."""
     pose = camera.pose
     assert pose is not None, "configurations are complete"
-    origin = np.zeros(3)
-    mount = pose.mount
-    if mount == TABLE:
-        mount = WORLD
-        origin[:] = [*scene.table_center[:2], scene.table_top]
-    body = spec.body(mount)
+    on_table = pose.mount == TABLE
+    origin = [*scene.table_center[:2], scene.table_top] if on_table else [0.0, 0.0, 0.0]
+    body = spec.body(WORLD if on_table else pose.mount)
     if body is None:
         known = [TABLE, *(named.name for named in spec.bodies if named.name)]
-        raise UnknownName(f"scene.cameras.{name}.pose.mount: body", mount, known)
+        raise UnknownName(f"scene.cameras.{name}.pose.mount: body", pose.mount, known)
     # A camera looks along its -z, and its y points up in the image.
-    axes = np.zeros((3, 3))
-    axes[2] = np.subtract(pose.pos, pose.target)
-    axes[0] = np.cross(pose.up, axes[2])
-    axes[1] = np.cross(axes[2], axes[0])
+    back = np.subtract(pose.pos, pose.target)
+    right = np.cross(pose.up, back)
+    axes = np.array([right, np.cross(back, right), back])
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
     quat = np.zeros(4)
     mujoco.mju_mat2Quat(quat, axes.T.ravel())
-    body.add_camera(name=name, pos=origin + pose.pos, quat=quat, fovy=camera.fovy)
+    body.add_camera(name=name, pos=np.add(origin, pose.pos), quat=quat, fovy=camera.fovy)
 
 
 def _add_box(spec: mujoco.MjSpec, box: BoxCfg, top: float) -> None:

@@ -73,6 +73,7 @@ def build_phases(cfg: Config) -> list[Phase]:
     for name, thing in scene.objects.items():
         if thing.pos is not None:
             bottom[name] = thing.pos[2] - thing.half_height - scene.table_top
+    halves = {name: thing.half_height for name, thing in scene.objects.items()}
     phases: list[Phase] = []
     start = 0
     load = ""  # the object that was grasped last
@@ -84,24 +85,20 @@ def build_phases(cfg: Config) -> list[Phase]:
             in_hand = False
         target = None
         if spec.anchor is not None:
-            known = spec.anchor in scene.objects
-            half = scene.objects[spec.anchor].half_height if known else 0.0
+            half = halves.get(spec.anchor, 0.0)  # a place has none
             centre = bottom[spec.anchor] + half
             up = 0.0 if spec.level == "table" else centre
             rest = 0.0
             if spec.level == "on_top":
                 rest = up + half
-                up = rest + scene.objects[load].half_height
-            above = (
-                spec.h_scale * cfg.robot.approach_height
-                + spec.offset[2]
-                + (scene.grasp_offset if spec.in_hand else 0.0)
-            )
+                up = rest + halves[load]
+            x, y, rise = spec.offset
+            grip = scene.grasp_offset if spec.in_hand else 0.0
+            above = spec.h_scale * cfg.robot.approach_height + rise + grip
             toward = -1 if spec.toward is None else sources.index(spec.toward)
-            offset = (spec.offset[0], spec.offset[1])
             z = scene.table_top + up + above
             over = up + above - centre
-            target = Target(sources.index(spec.anchor), toward, offset, z, over)
+            target = Target(sources.index(spec.anchor), toward, (x, y), z, over)
         stop = start + round(spec.seconds / cfg.timing.step_dt)
         grasped = -1 if spec.grasps is None else sources.index(spec.grasps)
         carried = sources.index(load) if in_hand and spec.grasps is None else -1
