@@ -36,6 +36,15 @@ INFO = "meta/info.json"
 STATS = "meta/stats.json"
 TASKS = "meta/tasks.parquet"
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
+# What pandas writes of a data frame of task indices whose index is the text
+_PANDAS = (
+    '{"index_columns": ["task"], "column_indexes": [{"name": null, "field_name": null,'
+    ' "pandas_type": "unicode", "numpy_type": "object", "metadata": {"encoding": "UTF-8"}}],'
+    ' "columns": [{"name": "task_index", "field_name": "task_index", "pandas_type": "int64",'
+    ' "numpy_type": "int64", "metadata": null}, {"name": "task", "field_name": "task",'
+    ' "pandas_type": "unicode", "numpy_type": "object", "metadata": null}],'
+    ' "pandas_version": "2.3.3"}'
+)
 STATISTICS = ("min", "max", "mean", "std", *QUANTILES)  # `count` stands beside them
 
 
@@ -161,20 +170,8 @@ def frames_table(schema: Any, columns: Mapping[str, np.ndarray]) -> Any:
 def tasks_table(tasks: Sequence[str]) -> Any:
     """Task texts as a pandas data frame whose index is the text: so LeRobot reads them."""
     pa, _ = require_pyarrow()
-    fields = ("name", "field_name", "pandas_type", "numpy_type", "metadata")
-    columns = (
-        ("task_index", "task_index", "int64", "int64", None),
-        ("task", "task", "unicode", "object", None),
-    )
-    label = (None, None, "unicode", "object", {"encoding": "UTF-8"})
-    pandas = {
-        "index_columns": ["task"],
-        "column_indexes": [dict(zip(fields, label, strict=True))],
-        "columns": [dict(zip(fields, column, strict=True)) for column in columns],
-        "pandas_version": "2.3.3",
-    }
     table = pa.table({"task_index": range(len(tasks)), "task": list(tasks)})
-    return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
+    return table.replace_schema_metadata({"pandas": _PANDAS})
 
 
 def episode_statistics(frames: np.ndarray) -> np.ndarray:

@@ -109,33 +109,36 @@ def _compare(sides: Sides, notes: Mapping[str, str], folder: Path, run: Run) -> 
         raise MjstackError("a and b did not start alike", "Leave what worlds start from unchanged")
 
     # Episodes that only one side won, and the rules that the other one broke there
-    won = {"a": failed_a == 0, "b": failed_b == 0}
-    only = {"a": won["a"] & ~won["b"], "b": won["b"] & ~won["a"]}
     rules = run.stage.check.rules
-    rows: list[dict[str, Any]] = []
+    episodes = failed_a.size
+    rates: dict[str, dict[str, float]] = {}
+    only: dict[str, int] = {}
     broken: dict[str, dict[str, int]] = {}
-    for name, bits in (("a", failed_b[only["a"]]), ("b", failed_a[only["b"]])):
-        broken[name] = {rule: len(worlds) for rule, worlds in rules.failing(bits).items()}
-        for (seed, world), failed in zip(np.argwhere(only[name]).tolist(), bits, strict=True):
+    rows: list[dict[str, Any]] = []
+    moving: list[dict[str, Any]] = []
+    for name, bits, lost in (("a", failed_a, failed_b), ("b", failed_b, failed_a)):
+        alone = (bits == 0) & (lost != 0)
+        rates[name] = rate_metrics(int((bits == 0).sum()), episodes)
+        only[name] = int(alone.sum())
+        first = len(rows)
+        broken[name] = {rule: len(worlds) for rule, worlds in rules.failing(lost[alone]).items()}
+        for seed, world in np.argwhere(alone).tolist():
             row = {"seed": run.cfg.seed + seed, "world": world, "succeeded": name}
-            rows.append(row | {"rules": " ".join(rules.broken(failed))})
+            rows.append(row | {"rules": " ".join(rules.broken(lost[seed, world]))})
+        moving += rows[first:][:_PAGE_WORLDS]
     write_atomic(folder / TABLE, to_csv(rows, ("seed", "world", "succeeded", "rules")))
-    counts = {name: int(mask.sum()) for name, mask in only.items()}
     if run.page.motion:
-        moving = [*rows[: counts["a"]][:_PAGE_WORLDS], *rows[counts["a"] :][:_PAGE_WORLDS]]
         run.page.worlds3d[NAME] = _replay(sides, moving)
 
     # The result
-    episodes = failed_a.size
-    rates = {name: rate_metrics(int(mask.sum()), episodes) for name, mask in won.items()}
-    p_value = mcnemar_p_value(counts["a"], counts["b"])
+    p_value = mcnemar_p_value(only["a"], only["b"])
     verdict = "no difference is shown"
     if p_value < _LEVEL:
-        verdict = f"{'a' if counts['a'] > counts['b'] else 'b'} is better"
+        verdict = f"{'a' if only['a'] > only['b'] else 'b'} is better"
     bars = []
     for name, rate in rates.items():
         ends = {f"success_rate_{end}": rate[f"success_rate_{at}95"] for end, at in _ENDS.items()}
-        bars.append({"side": name, "status": "pass", "only": counts[name]} | rate | ends)
+        bars.append({"side": name, "status": "pass", "only": only[name]} | rate | ends)
     plot = Plot(title=f"{run.page.title}: {verdict}", over="side", lines=[], panels=_PANELS)
     run.draw(f"{NAME}.png", save_sweep, plot, bars)
     table = Table(
@@ -153,12 +156,12 @@ def _compare(sides: Sides, notes: Mapping[str, str], folder: Path, run: Run) -> 
             status=Status.passed,
             reason=f"{verdict} (McNemar's exact test, p = {p_value:.3g}): of {episodes} episodes a"
             f" succeeded in {rates['a']['succeeded']} and b in {rates['b']['succeeded']}, only a in"
-            f" {counts['a']}, only b in {counts['b']}",
+            f" {only['a']}, only b in {only['b']}",
             metrics={
                 "episodes": episodes,
-                "both": int((won["a"] & won["b"]).sum()),
-                **{f"only_{name}": count for name, count in counts.items()},
-                "neither": int((~won["a"] & ~won["b"]).sum()),
+                "both": rates["a"]["succeeded"] - only["a"],
+                **{f"only_{name}": count for name, count in only.items()},
+                "neither": episodes - rates["a"]["succeeded"] - only["b"],
                 "p_value": p_value,
                 **{f"{name}.{key}": v for name, rate in rates.items() for key, v in rate.items()},
                 **{f"only_{s}.failed.{r}": n for s in _SIDES for r, n in broken[s].items()},
