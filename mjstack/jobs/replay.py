@@ -1,9 +1,8 @@
-"""Job *replay*: worlds of an earlier run again. One world alone, with its trajectory kept and every
-rule explained; or all failing ones, with a table that says whether they fail again.
-"""
+"""Job *replay*: one world of an earlier run again, rule by rule, or all failing ones as a table."""
 
-from contextlib import closing
-from dataclasses import replace
+import math
+from contextlib import closing, suppress
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,59 +10,207 @@ from typing import Any
 import numpy as np
 from omegaconf import OmegaConf
 
-from mjstack.config.schema import Backend, Config
+from mjstack.config.schema import Backend, Config, SimCfg
+from mjstack.envs import driven_config
 from mjstack.episodes.batches import BatchPlan, play_batches
+from mjstack.episodes.earlier_run import EarlierRun, archived_starts
 from mjstack.episodes.failures import FailureMonitor, describe_sign
+from mjstack.episodes.record import STEMS, EpisodeRecord
 from mjstack.episodes.replay import WorldTrace, simulate_alone
 from mjstack.episodes.rollout import Episode, require_episode
 from mjstack.episodes.run import Run
+from mjstack.episodes.stage import Stage
 from mjstack.episodes.tally import rate_cells
-from mjstack.errors import ConfigError
+from mjstack.errors import ConfigError, DeviceError, FolderError
 from mjstack.files import to_csv, write_atomic, write_npz
 from mjstack.gates.runner import run_guarded
+from mjstack.gates.success import success_config
 from mjstack.jobs.gates import check_task
-from mjstack.jobs.replay_plan import ReplayPlan, check_start, plan_replay
 from mjstack.jobs.runner import VIEWS, CheckedJob, Job, run_provenance
 from mjstack.jobs.showing import check_showing
+from mjstack.policy.lerobot import PREFIX
 from mjstack.report.record import GateResult, Status
 from mjstack.report.table import Table
-from mjstack.sim import resolve_device
+from mjstack.sim import resolve_backend, resolve_device
 
 TABLE = "replayed_worlds.csv"
 _TABLE_ROWS = 100  # worlds in report.md
 # Besides versions, what arithmetic depends on
 _PLACES = {"git_commit": "mjstack's commit", "cpu": "the processor"}
+# [m, rad], and of quaternions: backends differ by rounding, another start by more
+_SAME_START = 1e-6
+_NATIVE = (Backend.native, "cpu")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayPlan:
+    """One world, or all failing ones, to be played again.
+
+    Attributes:
+        run: The earlier run.
+        gate: Whose worlds they are, ``batch`` or ``success``.
+        failing: Whether they are all failing ones.
+        bits: Bits of the rules that each world broke, by seed and world.
+        seed: The first seed.
+        world: Its first world.
+        record: The results of the first seed.
+        where: Backend and device, each played once; the first is the earlier run's unless ``sim``
+            says otherwise.
+        stage: The configuration that the gate played under, on the first backend here.
+    """
+
+    run: EarlierRun
+    gate: str
+    failing: bool
+    bits: dict[int, dict[int, int]]
+    seed: int
+    world: int
+    record: EpisodeRecord
+    where: list[tuple[Backend, str]]
+    stage: Stage
+
+
+def _plan_replay(cfg: Config) -> ReplayPlan:
+    """Read what ``run`` and ``world`` name.
+
+    Raises:
+        ConfigError: The run has no such worlds.
+        FolderError: The run, or its record, cannot be read.
+    """
+    for key, expected in (("run", "the folder of an earlier run"), ("world", "one of its worlds")):
+        if getattr(cfg, key) is None:
+            fix = "Write job=replay run=outputs/<date>/<time> world=17"
+            raise ConfigError(key, "null", f"{expected}, because job=replay plays one again", fix)
+    resolve_backend(cfg)  # what this command line asks for must be there
+    run = EarlierRun.read(str(cfg.run))
+    if (run.cfg.policy or "").startswith(PREFIX):
+        problem = f"run={cfg.run}: its policy is LeRobot's, whose folder may run code"
+        raise FolderError(f"{problem}: expected a run without", "Look at its episode.html")
+
+    # The worlds: [gate:][seed:]number or [gate:]failing
+    *heads, tail = str(cfg.world).split(":")
+    failing = tail == "failing"
+    played_gates = [gate for gate in STEMS if gate in run.cfg.gates]
+    gate = heads.pop(0) if heads and not heads[0].isdigit() else (played_gates or ["batch"])[0]
+    seeds = range(run.cfg.seed, run.cfg.seed + run.cfg.gate[gate].seeds)
+    seed = int(heads[0]) if heads else seeds[0]
+    bits: dict[int, dict[int, int]] = {}
+    expected = ""
+    if gate not in played_gates:
+        noun = "failing worlds" if failing else "a world"
+        names = " or ".join(played_gates) or "but it had none"
+        expected = f"{noun} of a gate that run had, {names}"
+    elif failing:
+        bits, episodes = run.failing(gate)
+        if not bits:
+            expected = f"a world such as 17, as none of gate {gate}'s {episodes} failed"
+    elif seed not in seeds:
+        expected = f"a seed from {seeds[0]} to {seeds[-1]}, as that run has (seed:world)"
+    elif int(tail) >= run.cfg.nworld:
+        expected = f"a world from 0 to {run.cfg.nworld - 1}, as that run has"
+    if expected:
+        raise ConfigError("world", cfg.world, expected)
+    if failing:
+        seed = next(iter(bits))
+    record = run.record(seed, gate)
+    if not failing:
+        bits = {seed: {int(tail): int(record.failed[int(tail)])}}
+
+    # How they are played here
+    played = archived_starts(run.cfg, run.folder)
+    if gate == "success":
+        played = success_config(played)
+    where = _choose(cfg.sim, record)
+    backend, device = where[0]
+    sim = SimCfg(backend=backend, device=device, step=cfg.sim.step)
+    # The folder may be a stranger's: what a replay does not play is not built.
+    played = replace(driven_config(played), sim=sim, view=cfg.view, video=cfg.video, web=cfg.web)
+    return ReplayPlan(
+        run=run,
+        gate=gate,
+        failing=failing,
+        bits=bits,
+        seed=seed,
+        world=next(iter(bits[seed])),
+        record=record,
+        where=where,
+        stage=Stage(played),
+    )
+
+
+def _choose(requested: SimCfg, record: EpisodeRecord) -> list[tuple[Backend, str]]:
+    """Backends and devices to play on."""
+    auto = requested.backend is Backend.auto
+    backend = Backend(record.backend) if auto else requested.backend
+    if backend is Backend.native:
+        return [_NATIVE]
+    device = resolve_device(requested.device)
+    if requested.device == "auto" and record.backend == "mjwarp":
+        with suppress(DeviceError):  # it is not here
+            device = resolve_device(record.device)
+    return [(backend, device), *([_NATIVE] if auto else [])]
+
+
+def _check_start(plan: ReplayPlan) -> None:
+    """Check that the first world would start where it did in that run.
+
+    Raises:
+        FolderError: It would start elsewhere.
+    """
+    stage = plan.stage
+    recorded = plan.record.worlds["start_qpos"][plan.world]
+    # MJWarp takes longer to load than the native start does to compute, and rounding may have it
+    # draw otherwise.
+    for backend, device in dict.fromkeys([_NATIVE, plan.where[0]]):
+        with closing(simulate_alone(stage, backend, device)) as sim:
+            stage.start(sim, stage.cfg.reset, seed=plan.seed, worlds=[plan.world])
+            start = sim.qpos[0].cpu().numpy()
+            same = start.shape == recorded.shape
+            off = float(np.abs(start - recorded).max()) if same else math.inf
+        if off <= _SAME_START:
+            return
+    raise FolderError(
+        f"run={plan.run.folder}: world {plan.world} of seed {plan.seed} would start up to {off:.3g}"
+        " (m, rad) from where it did, expected its own start",
+        f"Use mjstack at {plan.run.provenance.get('git_commit')}",
+    )
 
 
 def check_replay(cfg: Config) -> CheckedJob:
     """Raise for what cannot be replayed, before anything is written."""
-    plan = plan_replay(cfg)
+    plan = _plan_replay(cfg)
     stage = plan.stage
     require_episode(stage.cfg)
     check_task(stage)
     check_showing(stage.cfg)
-    check_start(plan)
-    nworld = stage.cfg.nworld
-    title = f"replay of world {plan.world} of {nworld}, seed {plan.seed}, of {plan.run.folder}"
+    _check_start(plan)
+    title = f"replay of world {plan.world} of seed {plan.seed} of {plan.run.folder}"
     if plan.failing:
         if cfg.view != "false" or cfg.video:
             expected = "one world, such as 17, which view and video show"
             raise ConfigError("world", cfg.world, expected)
         count = sum(map(len, plan.bits.values()))
         title = f"replay of {count} failing worlds of {plan.run.folder}"
-    work = partial(_replay_failing if plan.failing else _replay_one, plan)
-    return CheckedJob(stage=stage, title=title, work=work, spreads=plan.failing)
+    return CheckedJob(
+        stage=stage, title=title, work=partial(_replay_all, plan), spreads=plan.failing
+    )
 
 
-def _replay_one(plan: ReplayPlan, run: Run, folder: Path) -> None:
-    """Play the world on its run's backend and, where that was MJWarp, on native MuJoCo too."""
-    played = OmegaConf.structured(replace(run.cfg, seed=plan.seed))
-    write_atomic(folder / "replayed_config.yaml", OmegaConf.to_yaml(played))
-    changes = _changes(plan.run.provenance, run_provenance(run.stage))
+def _replay_all(plan: ReplayPlan, run: Run, folder: Path) -> None:
+    """Play on the run's backend and, where that was MJWarp, on native MuJoCo too."""
+    rows: dict[tuple[int, int], dict[str, Any]] = {}
+    changes: list[str] = []
+    if not plan.failing:
+        played = OmegaConf.structured(replace(run.cfg, seed=plan.seed))
+        write_atomic(folder / "replayed_config.yaml", OmegaConf.to_yaml(played))
+        changes = _changes(plan.run.provenance, run_provenance(run.stage))
     for line in changes:
         run.print_line(line)
     for number, (backend, _) in enumerate(plan.where):
-        run_guarded(run, f"replay_{backend}", partial(_replay, plan, number, changes, folder))
+        play = partial(_replay, plan, number, changes, folder)
+        if plan.failing:
+            play = partial(_play_failing, plan, number, rows, folder)
+        run_guarded(run, f"replay_{backend}", play, "worlds" * plan.failing)
 
 
 def _changes(recorded: dict, current: dict) -> list[str]:
@@ -139,9 +286,7 @@ def _first_sign(monitor: FailureMonitor, episode: Episode) -> str:
 def _compare(
     plan: ReplayPlan, number: int, episode: Episode, end: np.ndarray, changes: list[str], run: Run
 ) -> tuple[bool, str]:
-    """Whether the world did what is promised after its record, and how it compares; ``end`` are its
-    positions at the end.
-    """
+    """Whether the world did as promised, and how it, at ``end``, compares with its record."""
     backend, device = plan.where[number]
     record = plan.record
     rules = run.stage.check.rules
@@ -175,18 +320,10 @@ def _compare(
     return bool(reasons), f"{agrees} {ends}{why}"
 
 
-def _replay_failing(plan: ReplayPlan, run: Run, folder: Path) -> None:
-    """Play all failing worlds on each backend, and leave a table; ranks share the seeds."""
-    rows: dict[tuple[int, int], dict[str, Any]] = {}
-    for number, (backend, _) in enumerate(plan.where):
-        play = partial(_play_failing, plan, number, rows, folder)
-        run_guarded(run, f"replay_{backend}", play, "worlds")
-
-
 def _play_failing(
     plan: ReplayPlan, number: int, rows: dict[tuple[int, int], dict], folder: Path, run: Run
 ) -> list[GateResult]:
-    """Play them on one backend: worlds of a seed together, and apart from those that succeeded."""
+    """Play the failing worlds of each seed together, on one backend; ranks share the seeds."""
     backend, device = plan.where[number]
     stage = run.stage
     ranks = stage.ranks
