@@ -159,8 +159,7 @@ class GymnasiumEnv(gymnasium.Env):
         self.metadata = {"render_modes": [], "render_fps": round(1.0 / env.cfg.timing.decision_dt)}
         self.observation_space = self._worlds.single_observation_space
         self.action_space = self._worlds.single_action_space
-        # The inner environment starts the next episode in the step that ends one; this is what it
-        # saw first.
+        # What the next episode has shown first: it starts in the step that ends one
         self._first: Observation | None = None
 
     def reset(

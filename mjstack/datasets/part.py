@@ -59,8 +59,7 @@ class PartWriter:
         self.part = Part(path=path.with_name(f".file-{name}.parquet"))
         self.part.path.parent.mkdir(parents=True, exist_ok=True)
         self._file = open(self.part.path, "wb")  # noqa: SIM115
-        # Few floats occur twice: a dictionary of them takes three times the time and half again
-        # the room.
+        # Few floats occur twice: a dictionary of them takes three times the time, and more room.
         self._writer = lerobot.require_pyarrow()[1].ParquetWriter(
             self._file,
             lerobot.frames_schema(spec),

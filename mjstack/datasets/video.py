@@ -18,8 +18,7 @@ import numpy as np
 from mjstack.datasets.spec import Video
 from mjstack.errors import FolderError, MissingExtra, first_line
 
-# Settings of each codec. One thread for each encoder: there are as many as cores, and the result is
-# the same everywhere.
+# Settings of each codec. One thread each: encoders are as many as cores, and results are alike.
 _ENCODERS = {
     "h264": ["libx264", "-preset", "veryfast", "-crf", "20", "-bf", "0", "-threads", "1"],
     "av1": ["libsvtav1", "-preset", "12", "-crf", "30", "-svtav1-params", "lp=1"],

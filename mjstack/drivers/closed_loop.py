@@ -67,8 +67,7 @@ class ClosedLoopDriver(FeedbackDriver):
         length = self._length[self.phase]
         u = (self._time / length).clamp(max=1.0)
         s = smoothstep(u)[:, None]
-        # After an empty grasp straight up first, and only then to where the object is now: it may
-        # stand beside the jaws.
+        # After an empty grasp straight up, then to where the object is: perhaps beside the jaws.
         up = smoothstep((2.0 * u).clamp(max=1.0))
         over = smoothstep((2.0 * u - 1.0).clamp(min=0.0))
         share = torch.where(self._again[:, None], torch.stack((over, over, up), dim=1), s)

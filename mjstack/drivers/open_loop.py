@@ -72,8 +72,7 @@ class JointTrajectory:
         if isinstance(step, int):
             step = torch.tensor([step], device=self.numbers.device)
         knots = self.knots.index_select(1, self.numbers.index_select(0, step)[0])
-        # Not einsum, whose rounding depends on nworld: a world's commands would not be those it
-        # gets alone.
+        # Not einsum, whose rounding depends on nworld: a world alone gets the same commands.
         return (self.weights.index_select(0, step)[0][:, None] * knots).sum(1)
 
 
@@ -104,8 +103,7 @@ class OpenLoopPlanner:
         self._xy = nominal_xy(cfg.scene)
         (first,), _ = self._solve_knots(self._xy[None], [0], self._solve_nominal)
         self.nominal = first[len(self._nodes) - 1 :: len(self._nodes)]
-        # Once more from there: mink stops when the target is near, and spare joints have farther
-        # to go.
+        # Once more from there: mink stops near the target, where spare joints still move.
         plan = self._solve_knots(self._xy[None], [0], self._solve_nominal, first)
         (self._knots,), (self._error,) = plan
 

@@ -333,9 +333,8 @@ class StateBasedDriver(FeedbackDriver):
         roll = state.q[:, self._roll_column] - self._nominal[0, self._roll_column]
         yaw = self._seen[self._worlds, thing, 2]
 
-        # The closing axis as it would be at a roll of zero degrees about the approach axis:
-        # horizontal. From there on the way to a face does not depend on the roll now. So the face
-        # that is chosen is still the nearer one after the next step.
+        # The closing axis at a roll of zero: horizontal. The way from there to a face is the same
+        # at any roll. So the face that is chosen is still the nearer one after the next step.
         x, y, z = state.approach.unbind(1)
         level = torch.where(torch.hypot(x, y) > _UPRIGHT, atan2(x, -y), 0.0)
         axis = torch.stack((torch.cos(level), torch.sin(level), torch.zeros_like(z)), dim=1)

@@ -77,14 +77,12 @@ class FailureMonitor(Observer):
         device = env.device
         self._check = make_check(env.cfg)
         self._view = self._check.view(env)
-        # Objects are numbered as by the check. Without phases there is one, in which nothing is
-        # grasped or carried.
+        # Numbers of objects are the check's. Without phases there is one, which moves nothing.
         names = list(env.cfg.scene.objects)
         column = {names.index(name): place for place, name in enumerate(self._check.objects)}
         grasped = [column.get(phase.grasped, -1) for phase in driver.phases] or [-1]
         carried = [column.get(phase.carried, -1) for phase in driver.phases] or [-1]
-        # Number of the phase in which each object is let go for the last time; one that never comes
-        # for one that is not carried.
+        # The phase that lets go of each object last; one that never comes for what is not carried
         last = {place: number for number, place in enumerate(carried)}
         released = [last.get(place, len(carried) - 1) + 1 for place in column.values()]
         self._grasped = torch.tensor(grasped, device=device)

@@ -57,8 +57,7 @@ class EpisodeTally:
 
     def add(self, record: EpisodeRecord) -> None:
         """Count one seed. Of a world 200 to 300 bytes are kept, without its final positions."""
-        # Rounded: on CUDA even identical worlds differ in the last digits. Adding 0 makes -0 the
-        # same as 0.
+        # Rounded: on CUDA identical worlds differ in the last digits. Plus 0: -0 is the same as 0.
         rounded = np.round(record.qpos, 4) + 0.0
         worlds = record.worlds | {"end": np.array([hash(row.tobytes()) for row in rounded])}
         del worlds["qpos"]

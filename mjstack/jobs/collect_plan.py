@@ -35,8 +35,7 @@ STATE = "observation.state"
 ACTION = "action"
 REWARD = "next.reward"
 IMAGES = "observation.images"
-# Changing one of these changes no episode. The action terms are the controller's, and nothing ends
-# an episode early.
+# These change no episode: action terms are the controller's, and nothing ends one early.
 _WITHOUT_EFFECT = (*WITHOUT_EFFECT, "action", "termination", "nworld")
 
 

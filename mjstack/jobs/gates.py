@@ -27,8 +27,7 @@ from mjstack.sim.cameras import check_image_memory
 from mjstack.sim.memory import available_memory
 from mjstack.sim.native import NativeSimulation
 
-# Bytes of a whole run (environment, plan, check) over those of its native worlds: measured 3.2 to
-# 4.6, for both drivers.
+# Bytes of a run over those of its native worlds: measured 3.2 to 4.6, for both drivers.
 _SHARE = 4
 _GATES_IN = {  # gates whose worlds a value of view or video shows
     "true": ["baseline", "parity"],

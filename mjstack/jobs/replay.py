@@ -159,8 +159,7 @@ def _check_start(plan: ReplayPlan) -> None:
     """
     stage = plan.stage
     recorded = plan.record.worlds["start_qpos"][plan.world]
-    # MJWarp takes longer to load than the native start does to compute, and rounding may have it
-    # draw otherwise.
+    # Native first, which takes less time to load. Rounding may have MJWarp draw otherwise.
     for backend, device in dict.fromkeys([_NATIVE, plan.where[0]]):
         with closing(simulate_alone(stage, backend, device)) as sim:
             stage.start(sim, stage.cfg.reset, seed=plan.seed, worlds=[plan.world])

@@ -17,8 +17,7 @@ from mjstack.sim.warp_setup import torch_stream_scope
 
 # m: with a gain, an iterate this close to the target replaces a closer one that came before
 _NEAR = 0.00002
-# [m/rad] at the target; it grows with the distance. More is calmer near a stretched arm, and slower
-# there.
+# [m/rad] at the target, more with distance. A larger one is calmer near a stretched arm, but slow.
 _DAMPING = 0.005
 # CUDA threads per block. Few, because a world is one thread, and many processors share the worlds.
 _BLOCK_DIM = 32
@@ -84,8 +83,7 @@ class BatchedIk:
         gained = posture_gain > 0.0 or approach_gain > 0.0
         if gained and iterations < 4:
             raise ArgumentError("iterations", iterations, "at least 4 where a gain is not 0")
-        # In the last iterations no gain counts, so they undo what it cost in distance: measured, 2
-        # of 4, 3 of 8, 10 of 40.
+        # The last iterations have no gain and undo its cost: measured, 2 of 4, 3 of 8, 10 of 40.
         guided = iterations - max(min(3, iterations // 2), iterations // 4) if gained else 0
         near = _NEAR if gained else -1.0
         gains = (posture_gain, approach_gain)

@@ -47,8 +47,7 @@ class Light:
         self._move = pos
         self._brightness = bounds("brightness", brightness)
         self._tint = tint
-        # The points on the table at which they are aimed; a light that points elsewhere is turned
-        # about a point 1 m away.
+        # Points on the table at which they are aimed; of a light aimed elsewhere, 1 m away
         top = env.cfg.scene.table_top
         down = self._dir.nominal[:, 2:]
         far = (top - self._pos.nominal[:, 2:]) / torch.where(down < -0.1, down, -1.0)

@@ -29,8 +29,7 @@ def write_report(report: Report) -> None:
         "gates": [asdict(gate) for gate in report.gates],
         "pictures": report.pictures,
     }
-    # A gate may return NumPy scalars. JSON has no NaN: a number that is not finite becomes its
-    # name.
+    # A gate may return NumPy scalars. A number that is not finite becomes its name: JSON has none.
     text = json.dumps(data, default=lambda value: value.item())
     finite = json.loads(text, parse_constant=lambda name: str(float(name)))
     text = json.dumps(finite, indent=2) + "\n"

@@ -101,8 +101,7 @@ def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> m
     for name, camera in scene.cameras.items():
         _add_camera(spec, name, camera, scene)
     if visuals or scene.cameras:
-        # Light that no camera sees as white, and without highlights, which OpenGL and a ray caster
-        # draw differently
+        # Light too weak for white, without highlights, which renderers draw differently
         matte = [0.0, 0.0, 0.0]
         world.add_light(
             pos=[0.2, -0.6, 1.6], dir=[0.1, 0.4, -1.0], diffuse=[0.55, 0.55, 0.55], specular=matte

@@ -67,9 +67,8 @@ class Progress:
         self._within = within
         self._height = height
         self._near = near
-        # How far each stage has got is computed side by side, those that are measured by a distance
-        # first: reach, carry and place, then lift and release. An open_fraction of 0 takes any
-        # opening.
+        # Ranges of the stages: those measured by a distance first (reach, carry, place), then lift
+        # and release. An open_fraction of 0 takes any opening.
         constant = self._view.constant
         self._ranges = constant(scale, scale, scale, height, max(open_fraction, 1e-6))
         self._number = constant(0.0, 2.0, 3.0, 1.0, 4.0)

@@ -168,8 +168,7 @@ class Step:
     def __init__(self, view: TaskView, phase: Tensor | None) -> None:
         """Take the view, and the phase of every world."""
         self.view = view
-        # What is known of this state, see `once_per_step`; within a pass of an environment's terms
-        # all of them share it.
+        # What is known of this state, see `once_per_step`; terms of one pass share it.
         self.known = known_values()
         self._phase = phase
 
@@ -233,8 +232,7 @@ class Step:
         view = self.view
         signs = view.constant(*itertools.chain(*itertools.product((-1.0, 1.0), repeat=3)))
         arms = view.half[:, None] * signs.view(8, 3)
-        # A free joint's linear velocity is the world's, its angular velocity the body's: all of it
-        # in the body's frame.
+        # A free joint's linear velocity is the world's, the angular one the body's, as all here.
         linear = (self.turn * self.velocity[..., :3, None]).sum(-2)
         spin = self.velocity[..., None, 3:].expand(-1, -1, 8, -1)
         swept = torch.linalg.cross(spin, arms.expand_as(spin))

@@ -30,8 +30,7 @@ def make_network(cfg: Config, demonstrations: Demonstrations, ranks: Ranks) -> P
         network = PolicyNetwork(*sizes, vision_of(cfg, job))
     mean, std = _moments(labels, ranks)
     network.set_scale("action", mean.cpu(), std.cpu())
-    # A column that hardly moves would count as much as the others of its term, and the policy would
-    # follow its noise.
+    # A column that hardly moves would count as much as others: its noise would be followed.
     mean, std = _moments(seen, ranks)
     parts = [part for part in std.split(list(demonstrations.widths.values())) if len(part)]
     std = torch.cat([torch.maximum(part, _LEAST * part.amax()) for part in parts])

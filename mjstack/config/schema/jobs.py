@@ -108,8 +108,7 @@ class VisionCfg:
     """Weight of the error with which it estimates the group *estimated* of its observation from the
     images, beside that of the actions."""
     pool: int | None = spec(None, unit="steps", ge=1)
-    """Steps whose images are kept on the device, of all rounds; null: as many as half of its free
-    memory has place for."""
+    """Steps whose images the device keeps, of all rounds; null: as fit half of its free memory."""
 
 
 @dataclass(slots=True)

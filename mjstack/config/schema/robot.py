@@ -13,8 +13,7 @@ class ModelCfg:
     """Source of the robot's MJCF file."""
 
     source: str = spec(choices=("builtin", "menagerie"))
-    """``builtin``: ``robot.file``, or mjstack's own file of the robot. ``menagerie``: MuJoCo
-    Menagerie's."""
+    """``builtin``: ``robot.file``, or mjstack's own file. ``menagerie``: MuJoCo Menagerie's."""
 
 
 @dataclass(slots=True)
@@ -120,16 +119,13 @@ class RobotCfg:
     ik_joints: list[str] = spec([])
     """Arm joints for inverse kinematics, each moves both grasp sites. Empty: all not locked."""
     approach_body: str = ""
-    """Body with the approach axis: the last that carries both jaws. Empty: the body of the last arm
-    joint."""
+    """Body with the approach axis: the last that carries both jaws. Empty: the last arm joint's."""
     approach_axis: list[float] = spec([0.0, 0.0, -1.0], length=3)
     """Direction from the wrist towards the grasped object, in that body's frame."""
     roll_joint: str | None = None
-    """Arm joint that turns the gripper about the approach axis. null: there is none, and no yaw
-    alignment."""
+    """Arm joint that turns the gripper about the approach axis. null: none, so no yaw alignment."""
     posture_gain: float = spec(0.0, ge=0.0, le=1.0)
-    """Closed loop: share per iteration of the way to the nominal joint values, in the null
-    space."""
+    """Closed loop: share per iteration of the way to the nominal joints, in the null space."""
     approach_gain: float = spec(0.0, unit="rad", ge=0.0, le=1.0)
     """Closed loop: turn per iteration of the approach axis towards the desired one."""
     yaw_alignment: float = spec(0.0, ge=0.0, le=1.0)

@@ -86,11 +86,9 @@ class Config:
     run: str | None = spec(None)
     """job=replay: the folder of an earlier run."""
     resume: str | None = spec(None)
-    """job=gates: the folder of an earlier run of this configuration, whose finished seeds of batch
-    and success are read back."""
+    """job=gates: folder of a run of this configuration, whose seeds of batch and success count."""
     devices: str | None = spec(None)
     """GPUs that share the job's worlds, a process for each: all, or how many. null: as torchrun
     has it, or one."""
     world: str | None = spec(None)
-    """job=replay: a world of it, 17; of seed 3, 3:17; success:3:17 where batch ran too; failing:
-    all that failed."""
+    """job=replay: 17; of seed 3, 3:17; success:3:17 where batch ran too; failing: all those."""

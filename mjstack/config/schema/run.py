@@ -211,8 +211,7 @@ class ThroughputCfg(GateFuncCfg):
     env_steps: int = spec(unit="steps", ge=1)
     """env_step and cameras: steps per repetition."""
     action_share: float = spec(gt=0.0, le=1.0)
-    """env_step and cameras: share of the action range from which actions are drawn, about its
-    middle."""
+    """env_step and cameras: share of the action range, about its middle, that actions come from."""
     max_seconds: float = spec(unit="s", gt=0.0)
     """Time budget of each measurement on CUDA."""
     cpu_max_seconds: float = spec(unit="s", gt=0.0)

@@ -137,8 +137,7 @@ class ObjectCfg(ShapeCfg):
     parts: dict[str, PartCfg] = spec({})
     """Shapes of a fixed object that has several, by name, in place of ``shape`` and ``size``."""
     file: str | None = None
-    """A fixed object's MJCF file, in place of them: relative to the YAML, or to the working
-    folder."""
+    """A fixed object's MJCF file, in place of them: relative to the YAML or the working folder."""
 
     @property
     def pieces(self) -> dict[str, PartCfg]:

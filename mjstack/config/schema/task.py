@@ -94,8 +94,7 @@ class PhaseCfg:
     h_scale: float = 0.0
     """How many ``robot.approach_height`` higher the target is."""
     toward: str | None = None
-    """Object or place at which the offset's x axis points, as seen from the anchor; null: world
-    axes."""
+    """Object or place to which the offset's x axis points from the anchor; null: world axes."""
     in_hand: bool = False
     """Whether ``scene.grasp_offset`` is added to the height."""
     gripper: str = spec(choices=("open", "closed"))
@@ -136,13 +135,11 @@ class ControllerCfg:
     ik_tolerance: float = spec(unit="m", gt=0.0)
     """Largest distance of the grasp point from a target."""
     step_iterations: int = spec(ge=1, le=1000)
-    """Iterations of batched inverse kinematics per control step of closed_loop and
-    state_based."""
+    """Iterations of batched inverse kinematics per step of closed_loop and state_based."""
     posture_gain: float = spec(ge=0.0, le=1.0)
     """How strongly redundant joints follow the nominal plan per iteration."""
     approach_gain: float = spec(ge=0.0, le=1.0)
-    """How strongly the gripper takes the approach tilt that the release needs per
-    iteration."""
+    """How strongly the gripper takes the tilt that the release needs, per iteration."""
     yaw_alignment: float = spec(ge=0.0, le=1.0)
     """Share of the turn of the jaws to an object's nearest face."""
     speed_limit: float = spec(ge=1.0, le=100.0)

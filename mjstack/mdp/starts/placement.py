@@ -232,8 +232,7 @@ def _arm_boxes(cfg: Config, data: mujoco.MjData, geoms: ndarray, noise: float) -
         for corner in corners:
             mujoco.mj_jac(model, data, jac, None, corner, model.geom_bodyid[g])
             moved = np.maximum(moved, noise * np.abs(jac[:, dofs]).sum(axis=1))
-        # A Jacobian leaves out at most half the square of the angle, all joints together, times
-        # the longest lever.
+        # A Jacobian leaves out at most half the square of all joints' angle, times the lever.
         lever = np.linalg.norm(data.xanchor[joints][None] - corners[:, None], axis=2).max()
         halves[k] += moved + 0.5 * (noise * len(joints)) ** 2 * lever
     return centers, halves, np.tile([0.0, 1.0, 0.0], (len(geoms), 1))
