@@ -16,38 +16,7 @@ _DIGITS = r"([-+]?[\d,.]+(e[-+]?\d+)?( [^\d\s]{1,4})?|[-+]?(nan|inf))"
 _NUMBER = re.compile(rf"{_DIGITS}( / {_DIGITS})?|-")
 
 # "Passed" and "failed" have a colour and a word each: no meaning hangs on the colour alone.
-_STYLE = """
-:root{--bg:#fff;--fg:#1c2128;--dim:#656d76;--line:#d8dee4;--soft:#f4f6f8;--good:#1a7f4b;
---bad:#c93434;--near:#9a6700;--bar:#4478b8}
-@media(prefers-color-scheme:dark){:root{--bg:#14181d;--fg:#e4e8ec;--dim:#98a2ad;--line:#343c46;
---soft:#1d232a;--good:#4cc38a;--bad:#ff7b72;--near:#e0b050;--bar:#79a8e0}}
-*{box-sizing:border-box}
-body{margin:0 auto;max-width:1180px;padding:1.5rem;background:var(--bg);color:var(--fg);
-font:15px/1.5 system-ui,sans-serif}
-h1{font-size:1.6rem;margin:0}h2{font-size:1.25rem;margin:2.5rem 0 .3rem;padding-top:.8rem;
-border-top:1px solid var(--line)}h3{font-size:1rem;margin:1.4rem 0 .4rem}
-.dim,figcaption{color:var(--dim);font-size:.85rem;font-weight:400}
-a{color:var(--bar)}code{font-size:.85rem;overflow-wrap:anywhere}
-.scroll{overflow-x:auto}.side{display:flex;flex-wrap:wrap;gap:0 2.5rem;align-items:flex-start}
-table{border-collapse:collapse;font-size:.88rem;margin:.2rem 0 1rem}
-th,td{padding:.22rem .7rem;border-bottom:1px solid var(--line);text-align:left;vertical-align:top}
-th{font-weight:600;background:var(--soft);white-space:nowrap}
-.n{text-align:right;font-variant-numeric:tabular-nums;white-space:nowrap}
-.pass,.good{color:var(--good)}.fail,.bad{color:var(--bad)}.skip{color:var(--dim)}
-.interrupted,.near{color:var(--near)}b.pass,b.fail,b.skip,b.interrupted{text-transform:uppercase;
-font-size:.75rem;letter-spacing:.04em}
-i.rate{display:inline-block;width:12rem;
-height:.7rem;border-radius:3px;background:linear-gradient(90deg,var(--c) var(--w),var(--line) 0)}
-figure{margin:.5rem 0}.pictures{display:flex;flex-wrap:wrap;gap:1rem}
-.pictures figure{flex:1 1 440px}img{max-width:100%;height:auto;border:1px solid var(--line)}
-.plots{display:flex;flex-wrap:wrap;gap:.4rem 1.4rem}svg{display:block;overflow:visible}
-svg text{font-size:11px;fill:var(--dim)}.g{fill:var(--bar)}.b{fill:var(--bad)}
-.o{fill:var(--bar);fill-opacity:.5}.x{stroke:var(--bad);stroke-width:2}
-.w{fill:none;stroke:var(--bar);stroke-opacity:.4}.w.x{stroke:var(--bad);stroke-width:1}
-.axis{stroke:var(--line)}.limit{stroke:var(--near);stroke-dasharray:4 3}
-p a{display:inline-block;padding:.4rem .9rem;border:1px solid var(--bar);border-radius:6px;
-text-decoration:none}
-"""
+_STYLE = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
 
 
 def to_html(sections: Sequence[Section]) -> str:
