@@ -179,10 +179,8 @@ def claim_folder(
                     path.rmdir()
         if not isinstance(error, OSError):
             raise
-        raise FolderError(
-            f"{folder} cannot be written ({error.strerror or error}). Make room, or set {key} to"
-            " another"
-        ) from error
+        problem = f"{folder} cannot be written ({error.strerror or error})"
+        raise FolderError(problem, f"Make room, or set {key} to another") from error
     finally:
         if handle is not None:
             os.close(handle)
@@ -273,10 +271,8 @@ def lock_folder(folder: Path, *, shared: bool = False) -> int:
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     if not lock(handle, shared=shared):
         os.close(handle)
-        raise FolderError(
-            f"{folder} is open in another writer, expected one at a time. Wait, or give another"
-            " folder"
-        )
+        problem = f"{folder} is open in another writer, expected one at a time"
+        raise FolderError(problem, "Wait, or give another folder")
     return handle
 
 

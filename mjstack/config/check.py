@@ -79,12 +79,12 @@ def _run(cfg: Config) -> Checks:
     yield "sim.device", not _DEVICE.fullmatch(cfg.sim.device), "auto, cpu or cuda:N, such as cuda:0"
     step_dt = 1.0 / cfg.task.control_hz
     if not math.isclose(cfg.timing.step_dt, step_dt, rel_tol=1e-9):
-        raise ConfigError(
-            "timing.physics_dt x timing.decimation",
-            f"{cfg.timing.step_dt:g}",
-            f"{step_dt:g} s, because task.control_hz={cfg.task.control_hz:g}",
-            "Change both together, with timing.control_hz; a task that works at any rate sets none",
+        key = "timing.physics_dt x timing.decimation"
+        expected = f"{step_dt:g} s, because task.control_hz={cfg.task.control_hz:g}"
+        fix = (
+            "Change both together, with timing.control_hz; a task that works at any rate sets none"
         )
+        raise ConfigError(key, f"{cfg.timing.step_dt:g}", expected, fix)
     wrong = cfg.world is not None and not _WORLD.fullmatch(cfg.world)
     yield "world", wrong, "a world such as 17, a seed and a world such as 3:17, or failing"
     for key in ("run", "world"):

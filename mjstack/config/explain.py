@@ -30,33 +30,27 @@ def check_overrides(overrides: Sequence[str]) -> None:
     """Raise a `MjstackError` for the first override that cannot be used alone."""
     for override in overrides:
         if re.match(r"[+~]*hydra([./]job_logging|\.output_subdir)", override):
-            raise MjstackError(
-                f"{override}: expected Hydra's own, because every run has run.log and .hydra. Leave"
-                " it out."
-            )
+            problem = f"{override}: expected Hydra's own, because every run has run.log and .hydra"
+            raise MjstackError(problem, "Leave it out")
     for override in own_overrides(overrides):
         parsed = parse(override)
         key = parsed.key_or_group
         if parsed.is_sweep_override():
-            raise MjstackError(
-                f"'{override}': several values are a sweep. Add -m, or give one value; a list has"
-                f" brackets: '{key}=[a,b]'."
-            )
+            fix = f"Add -m, or give one value; a list has brackets: '{key}=[a,b]'"
+            raise MjstackError(f"'{override}': several values are a sweep", fix)
         if parsed.is_delete():
             if "." not in key and key not in (*TERM_GROUPS, "experiment"):
-                raise MjstackError(
-                    f"~{key}: expected a term of {', '.join(TERM_GROUPS)}, such as ~reward.success."
-                    f" Keys and groups at the top are always there: set {key}=VALUE."
-                )
+                expected = f"a term of {', '.join(TERM_GROUPS)}, such as ~reward.success"
+                fix = f"Keys and groups at the top are always there: set {key}=VALUE"
+                raise MjstackError(f"~{key}: expected {expected}", fix)
         elif (
             isinstance(parsed.value(), list) and key in session.list_choices() and key not in LISTS
         ):
             raise MjstackError(f"{override}: expected one choice, no list.")
         elif key == "gate":
-            raise MjstackError(
-                "gate: expected no choice, because the thresholds of all gates are in use."
-                " gates=[...] chooses what runs, gate.batch.seeds=10 sets a value."
-            )
+            problem = "gate: expected no choice, because the thresholds of all gates are in use"
+            fix = "gates=[...] chooses what runs, gate.batch.seeds=10 sets a value"
+            raise MjstackError(problem, fix)
 
 
 def parse(override: str) -> Override:

@@ -332,15 +332,11 @@ def _checked_folder(text: str) -> Path:
             " in folders such as task/. Name an existing one."
         )
     if (folder / "conf").is_dir() and not any(folder.glob("*/*.yaml")):
-        raise MjstackError(
-            f"configuration folder {folder}: has no group such as task/, and its folder conf may."
-            f" Name {folder / 'conf'}."
-        )
+        problem = f"configuration folder {folder}: has no group such as task/, and its conf may"
+        raise MjstackError(problem, f"Name {folder / 'conf'}")
     for path in sorted(folder.rglob("*.yaml")):
         name = path.relative_to(folder)
         if (CONFIG_FOLDER / name).exists():
-            raise MjstackError(
-                f"{path}: {name} is mjstack's own, expected a name that mjstack does not have."
-                " Rename the file."
-            )
+            problem = f"{path}: {name} is mjstack's own, expected a name that mjstack does not have"
+            raise MjstackError(problem, "Rename the file")
     return folder.resolve()

@@ -122,10 +122,9 @@ def read_info(folder: Path) -> dict[str, Any] | None:
         begun = f".{path.name}."
         for file in folder.rglob("*"):
             if file.is_file() and not file.name.startswith(begun):
-                raise FolderError(
-                    f"{folder} has {file.relative_to(folder)} and no {lerobot.INFO}, expected a"
-                    " dataset or an empty folder. Give another"
-                )
+                name = file.relative_to(folder)
+                expected = "expected a dataset or an empty folder. Give another"
+                raise FolderError(f"{folder} has {name} and no {lerobot.INFO}, {expected}")
         return None
     with readable(path):
         info = json.loads(path.read_text(encoding="utf-8"))

@@ -238,10 +238,8 @@ class DatasetWriter:
             FolderError: The writer is closed, or something cannot be written.
         """
         if not self._open:
-            raise FolderError(
-                f"{self.folder}: the writer is closed, expected an open one. Make another, which"
-                " goes on"
-            )
+            problem = f"{self.folder}: the writer is closed, expected an open one"
+            raise FolderError(problem, "Make another, which goes on")
         try:
             yield
         except BaseException as error:

@@ -87,11 +87,12 @@ class LerobotDriver(Driver):
         here = {name: part.shape[1:] for name, part in self._words.observe().items()}
         for name, shape in inputs.items():
             if here.get(name) not in (shape, (*shape[1:], *shape[:1])):  # images are (…, 3) here
-                raise FolderError(
-                    f"policy={cfg.policy}: takes {name} of shape {shape}, and here it is"
-                    f" {here.get(name, 'missing')}: expected the same",
-                    "Set cameras, scene.cameras.NAME.size and observation as in its training",
+                there = f"{here.get(name, 'missing')}: expected the same"
+                problem = (
+                    f"policy={cfg.policy}: takes {name} of shape {shape}, and here it is {there}"
                 )
+                fix = "Set cameras, scene.cameras.NAME.size and observation as in its training"
+                raise FolderError(problem, fix)
         self._policy.reset()
 
     def command(self) -> Tensor:

@@ -56,17 +56,13 @@ class EarlierRun:
         with suppress(Exception):  # `load_saved` says what is wrong with it
             job = str(read_yaml(saved)["job"]["name"]).partition("\n")[0]
         if job != "gates":  # before the rest, which has keys of that job alone
-            raise FolderError(
-                f"{key}={name}: is a run of job={job}, expected one of job=gates. Name that run's"
-                " folder."
-            )
+            problem = f"{key}={name}: is a run of job={job}, expected one of job=gates"
+            raise FolderError(problem, "Name that run's folder")
         try:
             cfg = load_saved(saved)
         except MjstackError as error:
-            raise FolderError(
-                f"{key}={name}: .hydra/config.yaml{made_by(folder)} is no configuration of this"
-                f" mjstack: {error}"
-            ) from error
+            problem = f".hydra/config.yaml{made_by(folder)} is no configuration of this mjstack"
+            raise FolderError(f"{key}={name}: {problem}: {error}") from error
         with reading(report, "Name another folder"):
             provenance = dict(json.loads(report.read_text())["provenance"])
             provenance["versions"] = dict(provenance["versions"])

@@ -116,13 +116,9 @@ def _check_starts(env: Env) -> None:
         rows = torch.cat([part.double().flatten(1) for part in parts], dim=1)
         starts += [row.numpy().tobytes() for row in rows]
     if len(set(starts)) < len(starts):
-        raise ConfigError(
-            "reset",
-            f"[{', '.join(env.cfg.reset)}]",
-            "starts that differ from world to world and from seed to seed, so that no episode is"
-            " there twice",
-            "Use reset=randomized or reset=jitter",
-        )
+        expected = "starts that differ between worlds and seeds, so that no episode is there twice"
+        fix = "Use reset=randomized or reset=jitter"
+        raise ConfigError("reset", f"[{', '.join(env.cfg.reset)}]", expected, fix)
 
 
 def check_folder(dataset: Path, spec: DatasetSpec) -> None:
@@ -140,10 +136,8 @@ def check_folder(dataset: Path, spec: DatasetSpec) -> None:
     if info["mjstack"]["config_sha256"] != spec.config_sha256:
         recorded = (info["mjstack"]["provenance"] or [{}])[-1].get("config", {})
         changes = differences(recorded, spec.provenance["config"])
-        raise FolderError(
-            f"{dataset} has episodes of another configuration: {changes}. Set job.folder to another"
-            " folder, or these keys back"
-        )
+        problem = f"{dataset} has episodes of another configuration: {changes}"
+        raise FolderError(problem, "Set job.folder to another folder, or these keys back")
     check_same(dataset, info, spec)
     read_batches(dataset.parent / BATCHES)
 
@@ -224,11 +218,8 @@ def make_spec(env: Env, cfg: Config, provenance: Mapping[str, Any]) -> DatasetSp
     for group in cfg.observation:
         name = f"observation.{group}"
         if name in features:
-            raise ConfigError(
-                f"observation.{group}",
-                "a group",
-                f"another name, because {name} are the measured joints",
-            )
+            expected = f"another name, because {name} are the measured joints"
+            raise ConfigError(f"observation.{group}", "a group", expected)
         features[name] = group_feature(env, group)
     features |= {
         ACTION: positions,

@@ -62,10 +62,10 @@ def export_policy(stage: Stage, folder: Path) -> list[GateResult]:
     except OSError as error:
         for name in files:
             (folder / name).unlink(missing_ok=True)
-        raise FolderError(
-            f"{folder} cannot be written ({error.strerror or error}), and nothing was exported",
-            "Make room, or set hydra.run.dir to another",
-        ) from error
+        problem = (
+            f"{folder} cannot be written ({error.strerror or error}), and nothing was exported"
+        )
+        raise FolderError(problem, "Make room, or set hydra.run.dir to another") from error
     width = sum(policy.widths.values())
     shape = f"{policy.network.chunk} x {policy.network.width} numbers of its action terms"
     sizes = {f"{name.replace('.', '_')}_mb": len(data) / 1e6 for name, data in files.items()}

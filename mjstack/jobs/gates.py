@@ -176,16 +176,11 @@ def _check_resumed(stage: Stage, name: str) -> list[str]:
     run = EarlierRun.read(name, "resume")
     earlier, asked = (_played_config(cfg) for cfg in (run.cfg, stage.cfg))
     if keys := differences(earlier, asked):
-        raise FolderError(
-            f"resume={name}: has a run of another configuration: {keys}.",
-            "Name another folder, or set these keys back",
-        )
+        problem = f"resume={name}: has a run of another configuration: {keys}"
+        raise FolderError(problem, "Name another folder, or set these keys back")
     if run.provenance.get("model_sha256") != run_provenance(stage)["model_sha256"]:
-        raise FolderError(
-            f"resume={name}: the compiled model is not the same as in that run, expected the same"
-            " physics.",
-            "Name another folder",
-        )
+        problem = f"resume={name}: the compiled model is not the same as in that run"
+        raise FolderError(f"{problem}, expected the same physics", "Name another folder")
     call = ", ".join(str(run.provenance.get(key)) for key in ("date", "git_commit", "device"))
     return [*run.provenance.get("earlier_calls", []), call]
 

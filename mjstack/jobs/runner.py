@@ -243,15 +243,12 @@ def check_ranks(stage: Stage) -> None:
     holders: dict[tuple[str, str], int] = {}
     for rank, (place, values, unit) in enumerate(gathered):
         if changes := differences(values, gathered[0][1]):
-            raise MjstackError(
-                f"rank {rank} ({place}) has {changes} as in rank 0 ({gathered[0][0]})",
-                "Install and start the same everywhere",
-            )
+            problem = f"rank {rank} ({place}) has {changes} as in rank 0 ({gathered[0][0]})"
+            raise MjstackError(problem, "Install and start the same everywhere")
         if unit and (holder := holders.setdefault((place, unit), rank)) != rank:
-            raise MjstackError(
-                f"ranks {holder} and {rank} ({place}) have one GPU, {unit}, expected one each",
-                "Start as many ranks as there are GPUs, with sim.device=auto",
-            )
+            problem = f"ranks {holder} and {rank} ({place}) have one GPU, {unit}, expected one each"
+            fix = "Start as many ranks as there are GPUs, with sim.device=auto"
+            raise MjstackError(problem, fix)
     _check_share(cfg, ranks.size)
 
 

@@ -72,10 +72,8 @@ class Queueing:
             try:
                 locks.mkdir(parents=True, exist_ok=True)
             except OSError as error:
-                raise FolderError(
-                    f"{locks}: {error.strerror}, expected a folder for the GPUs' locks",
-                    "Set HOME to a folder of yours",
-                ) from error
+                problem = f"{locks}: {error.strerror}, expected a folder for the GPUs' locks"
+                raise FolderError(problem, "Set HOME to a folder of yours") from error
             return [
                 Slot(f"GPU {name}", {"CUDA_VISIBLE_DEVICES": name}, lock=locks / name)
                 for name in visible.split(",")[: count or gpus]

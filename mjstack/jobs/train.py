@@ -82,10 +82,8 @@ def _check_folder(folder: Path, cfg: Config) -> None:
     with reading(path, "Set job.folder to another folder"):
         changes = differences(json.loads(path.read_text()), training_config(cfg))
     if changes:
-        raise FolderError(
-            f"{folder} has a training{made_by(folder)} of another configuration: {changes}. Set"
-            " job.folder to another folder, or these keys back"
-        )
+        problem = f"{folder} has a training{made_by(folder)} of another configuration: {changes}"
+        raise FolderError(problem, "Set job.folder to another folder, or these keys back")
 
 
 def _run(trainer: Trainer, run: Run, folder: Path) -> None:

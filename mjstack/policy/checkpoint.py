@@ -325,10 +325,8 @@ def _writing(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise FolderError(
-            f"{path}: cannot be written ({error.strerror or error}), and stays as it was",
-            "Make room, and run the same command again",
-        ) from error
+        problem = f"{path}: cannot be written ({error.strerror or error}), and stays as it was"
+        raise FolderError(problem, "Make room, and run the same command again") from error
 
 
 def write_state(path: Path, tensors: Mapping[str, Tensor], facts: Facts) -> None:

@@ -96,11 +96,9 @@ def train_clone(stage: Stage, folder: Path) -> Trained:
     else:
         first = read_demonstrations(stage, observed_widths(stage))
     if len(first.ends) < 2:
-        raise MjstackError(
-            f"{first.source}: {len(first.ends)} of {first.played} episodes succeeded, expected two"
-            " at least",
-            "Ask for more (job.episodes), or look at why with gates=[success]",
-        )
+        counts = f"{len(first.ends)} of {first.played} episodes succeeded, expected two at least"
+        fix = "Ask for more (job.episodes), or look at why with gates=[success]"
+        raise MjstackError(f"{first.source}: {counts}", fix)
 
     # Rounds: in the worlds of the next one the policy of a round shows its success.
     parts = [first]

@@ -113,18 +113,14 @@ def _read_info(folder: Path) -> Facts:
     lerobot.require_pyarrow()
     path = folder / lerobot.INFO
     if not path.is_file():
-        raise FolderError(
-            f"job.dataset={folder}: has no {lerobot.INFO}, expected a LeRobotDataset v3. Give the"
-            " folder dataset of job=collect"
-        )
+        problem = f"job.dataset={folder}: has no {lerobot.INFO}, expected a LeRobotDataset v3"
+        raise FolderError(problem, "Give the folder dataset of job=collect")
     with reader.readable(path):
         info = json.loads(path.read_text(encoding="utf-8"))
         version = str(info["codebase_version"])
         if not version.startswith("v3"):
-            raise FolderError(
-                f"job.dataset={folder}: is a LeRobotDataset {version}, expected v3.0. Convert it"
-                " with LeRobot"
-            )
+            problem = f"job.dataset={folder}: is a LeRobotDataset {version}, expected v3.0"
+            raise FolderError(problem, "Convert it with LeRobot")
         reader.check_types(info, written_here="mjstack" in info)
         if info["total_episodes"] < 1:
             raise ValueError("it has no episodes")
@@ -218,10 +214,9 @@ def _task_number(cfg: Config, folder: Path) -> int:
         numbers = map(index, table["task_index"].to_pylist())
         tasks = dict(zip(table[text].to_pylist(), numbers, strict=True))
     if cfg.task.instruction not in tasks:
-        raise FolderError(
-            f"job.dataset={folder}: has the task {', '.join(map(repr, tasks)) or 'none'}, expected"
-            f" {cfg.task.instruction!r}. Give another dataset, or set task"
-        )
+        there = f"{', '.join(map(repr, tasks)) or 'none'}, expected {cfg.task.instruction!r}"
+        problem = f"job.dataset={folder}: has the task {there}"
+        raise FolderError(problem, "Give another dataset, or set task")
     return tasks[cfg.task.instruction]
 
 

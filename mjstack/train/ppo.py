@@ -70,10 +70,8 @@ def _record_states(stage: Stage, path: Path) -> None:
             f"train: {len(accepted)} of {worlds} episodes of the expert succeeded"
         )
         if not len(accepted):
-            raise MjstackError(
-                f"the expert succeeded in none of {worlds} episodes, expected some to start from",
-                "Look at why with gates=[success]",
-            )
+            problem = f"the expert succeeded in none of {worlds} episodes, expected some"
+            raise MjstackError(f"{problem} to start from", "Look at why with gates=[success]")
         states = {name: rows[:, accepted].flatten(0, 1) for name, rows in batch.rows.items()}
         fields = {name: field[accepted] for name, field in batch.env.sim.fields.items()}
         write_states(path, states, fields, len(accepted))

@@ -143,10 +143,8 @@ def earlier_state(
     now = made_with(stage)
     before = facts["made_with"]
     if before != now:
-        raise FolderError(
-            f"{folder} has a training with {before}, and this one has {now}. Set job.folder to"
-            " another folder"
-        )
+        problem = f"{folder} has a training with {before}, and this one has {now}"
+        raise FolderError(problem, "Set job.folder to another folder")
     if type(done := facts.get("done", 0)) is not int or done < 0:
         raise FolderError(f"{path}: done is {done}", "Remove it to train anew")
     return tensors, facts
