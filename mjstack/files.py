@@ -10,7 +10,7 @@ import shutil
 import stat
 import tempfile
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -227,14 +227,9 @@ def check_unused(folder: Path, job: str = "", *, marker: str = "", key: str = _K
     Raises:
         FolderError: It has another run, or other files, or links in place of files to be written.
     """
-    for path in (*folder.glob("*"), *folder.glob(".hydra/*")):
-        # A folder for data may be on another disk.
-        data = path.parent == folder and path.name != ".hydra" and path.is_dir()
-        if path.is_symlink() and not data:
-            raise FolderError(
-                f"{path} is a link, and what it leads to would be overwritten",
-                f"Remove it, or set {key} to another folder",
-            )
+    # A folder for data may be on another disk.
+    paths = [path for path in folder.glob("*") if path.name == ".hydra" or not path.is_dir()]
+    refuse_links([*paths, *folder.glob(".hydra/*")], f"Remove it, or set {key} to another folder")
     used = _run_files(folder)
     if not used or (marker and (folder / marker).is_file()):
         return
@@ -246,6 +241,13 @@ def check_unused(folder: Path, job: str = "", *, marker: str = "", key: str = _K
         f"{folder} has {used[0].name}{made_by(folder)}, expected a new or an empty folder, or one"
         f" with which this job can go on. Set {key} to another"
     )
+
+
+def refuse_links(paths: Iterable[Path], fix: str) -> None:
+    """Raise a `FolderError` for the first of some paths that is a link; ``fix`` says what to do."""
+    for path in paths:
+        if path.is_symlink():
+            raise FolderError(f"{path} is a link, and what it leads to would be overwritten", fix)
 
 
 def made_by(folder: Path) -> str:

@@ -17,7 +17,7 @@ from mjstack.datasets import lerobot, reader
 from mjstack.datasets.part import Part, PartWriter
 from mjstack.datasets.spec import DatasetSpec, EpisodeData, typed_episode
 from mjstack.errors import FolderError
-from mjstack.files import lock_folder, write_atomic
+from mjstack.files import lock_folder, refuse_links, write_atomic
 
 
 class DatasetWriter:
@@ -147,12 +147,8 @@ class DatasetWriter:
     def _resume(self) -> None:
         """Count what is committed, and clear away what is not."""
         patterns = "data data/* meta meta/* meta/episodes/* videos videos/* videos/*/*"
-        for path in [path for name in patterns.split() for path in self.folder.glob(name)]:
-            if path.is_symlink():
-                raise FolderError(
-                    f"{path} is a link, expected a folder or file of the dataset's own",
-                    "Write into another folder",
-                )
+        paths = (path for name in patterns.split() for path in self.folder.glob(name))
+        refuse_links(paths, "Write into another folder")
         info = reader.read_info(self.folder)
         if info is not None:
             reader.check_same(self.folder, info, self.spec)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import IO
 
 from mjstack.errors import FolderError
-from mjstack.files import check_unused, lock, move_aside, write_atomic
+from mjstack.files import check_unused, lock, move_aside, refuse_links, write_atomic
 from mjstack.report.record import Report, Status
 from mjstack.report.write import read_report
 
@@ -67,11 +67,7 @@ def add_jobs(folder: Path, jobs: Sequence[SweepJob]) -> None:
                 f"{folder} has another sweep, whose job {job.number} is {overrides}, expected the"
                 f" same jobs, which are in {SWEEP}. Set hydra.sweep.dir to another folder"
             )
-        if job.folder.is_symlink():
-            raise FolderError(
-                f"{job.folder} is a link, expected a folder of the sweep's own",
-                "Remove it, or set hydra.sweep.dir to another folder",
-            )
+        refuse_links([job.folder], "Remove it, or set hydra.sweep.dir to another folder")
         if job.number not in before or job.report() is None:
             check_unused(job.folder, key="hydra.sweep.dir")
     if listed != before or not (folder / SWEEP).exists():

@@ -3,6 +3,7 @@
 import json
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ PREFIX = "lerobot:"  # of such a policy's folder
 STATE = "observation.state"
 SEEN = "observation.environment_state"
 IMAGES = "observation.images"
+_PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")  # beside this module
 _JOINTS = "mjstack.mdp.observation.joint_pos"  # its terms are computed from the measured joints
 
 
@@ -57,16 +59,9 @@ def lerobot_files(policy: Policy, ctrl_range: np.ndarray) -> dict[str, str]:
         "device": "cpu",
         "joint_range": ctrl_range.tolist(),
     }
-    options: dict[str, Any] = {
-        "rename_observations_processor": {"rename_map": {}},
-        "to_batch_processor": {},
-        "device_processor": {"device": "cpu", "float_dtype": None},
-    }
-    steps = [{"registry_name": name, "config": values} for name, values in options.items()]
-    files: dict[str, Any] = {"config.json": config}
-    for name, part in {"policy_preprocessor": steps, "policy_postprocessor": steps[-1:]}.items():
-        files[f"{name}.json"] = {"name": name, "steps": part}
-    return {name: json.dumps(data, indent=2) + "\n" for name, data in files.items()}
+    here = Path(__file__)
+    files = {name: here.with_name(name).read_text(encoding="utf-8") for name in _PROCESSORS}
+    return {"config.json": json.dumps(config, indent=2) + "\n"} | files
 
 
 def load_lerobot(name: str, device: str) -> tuple[Any, Any, Any]:
