@@ -89,7 +89,9 @@ def _z_row_constants(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, 
 
 
 def quat_to_matrix(quat: Tensor) -> Tensor:
-    """Rotation matrix, with the body's axes as columns, shape ``(..., 3, 3)``."""
+    """Rotation matrix of a unit quaternion: its columns are the body's axes in the world, shape
+    ``(..., 3, 3)``.
+    """
     w = quat[..., :1]
     v = quat[..., 1:]
     outer = 2.0 * v[..., :, None] * v[..., None, :]

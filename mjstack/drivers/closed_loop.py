@@ -1,4 +1,6 @@
-"""The closed-loop driver: each world goes through its phases and observes its objects."""
+"""The closed-loop driver: every world goes through its phases by itself, observes its objects, and
+needs no host.
+"""
 
 import math
 

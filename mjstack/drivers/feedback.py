@@ -170,7 +170,9 @@ class FeedbackDriver(Driver):
         return self._command.copy_(torch.where(torch.isfinite(command), command, self._command))
 
     def _find_roll(self) -> tuple[int, float]:
-        """Column of the roll joint, and its sign: how it turns the closing axis from above."""
+        """Column of the joint that rolls the gripper, and which way it turns the closing axis, seen
+        from above.
+        """
         column = self._cfg.robot.joints.index(str(self._cfg.robot.roll_joint))
         command = self._nominal[:1].expand(self._env.nworld, -1).clone()
         closing = []

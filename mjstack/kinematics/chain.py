@@ -91,7 +91,9 @@ def build_chain(model: mujoco.MjModel, robot: RobotCfg) -> tuple[Chain, Shape]:
 
 
 def _read_link(model: mujoco.MjModel, joint: int, pose: _Pose, column: int) -> _Link:
-    """Read a joint whose frame at qpos0 is ``pose``; at 0 it is back by qpos0."""
+    """Read a joint whose frame at qpos0 is ``pose``; its frame at 0 is turned, or shifted, back by
+    qpos0.
+    """
     kind = int(model.jnt_type[joint])
     axis = model.jnt_axis[joint].copy()
     if kind not in (HINGE, SLIDE):

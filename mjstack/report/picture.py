@@ -258,10 +258,11 @@ def save_trajectories(
             for box in 1e3 * fixed:
                 for face in box[_FACES][..., [1, row]]:
                     axes.fill(*face.T, color="0.75", zorder=0)
-        for name, ((x, y), (wide, deep)) in places.items():
-            above.plot(1e3 * y, 1e3 * x, "x", color="0.3")
-            above.annotate(name, (1e3 * y, 1e3 * x), color="0.3")
-            above.add_patch(outline((1e3 * y, 1e3 * x), (1e3 * deep, 1e3 * wide), linestyle=":"))
+        for name, place in places.items():
+            at, half = 1e3 * np.fliplr(place)
+            above.plot(*at, "x", color="0.3")
+            above.annotate(name, at, color="0.3")
+            above.add_patch(outline(at, half, linestyle=":"))
         for number, (name, (half, color)) in enumerate(objects.items()):
             mm = 1e3 * positions[:, number]
             for axes, row in ((side, 2), (above, 0)):

@@ -283,7 +283,9 @@ def stop_server(server: Any) -> None:
 
 
 def _fill(world: World, worlds: Sequence[World]) -> np.ndarray:
-    """A world's positions at the page's frames: it stays where it, or its numbers, ended."""
+    """A world's positions at every frame of the page: it stays where it ended, or where numbers
+    ceased.
+    """
     count = max(len(member.qpos) for member in worlds)
     finite = np.isfinite(world.qpos).all(1)
     last = np.maximum.accumulate(np.where(finite, np.arange(len(finite)), -1))

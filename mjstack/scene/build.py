@@ -1,4 +1,6 @@
-"""Builds a scene around a robot: floor, table, objects, box, timestep and solver."""
+"""Builds a scene around a robot: floor, table, objects and perhaps a box, timestep and solver, all
+set before compilation.
+"""
 
 import itertools
 import math

@@ -115,7 +115,9 @@ def build_phases(cfg: Config) -> list[Phase]:
 
 
 def target_xy(target: Target, sources: np.ndarray) -> np.ndarray:
-    """Where targets are, from all sources [m], ``(..., sources, 2)``; shape ``(..., 2)``."""
+    """Where a target is, from where all sources are [m], shape ``(..., sources, 2)``; shape
+    ``(..., 2)``.
+    """
     at = sources[..., target.source, :]
     along, left = target.offset
     if target.toward < 0:

@@ -54,7 +54,9 @@ def released(*objects: str, open_fraction: float) -> Condition:
 
 
 def on_top(object: str, onto: str, *, xy_err: float, dz_min: float, dz_max: float) -> Condition:
-    """An object above another: distance of the centres across, and between heights [m]."""
+    """An object above another one: horizontal distance of the centres and difference of their
+    heights [m].
+    """
 
     def parts(step: Step) -> tuple[Tensor, ...]:
         apart, dz = offset(step, object, onto)
@@ -64,7 +66,9 @@ def on_top(object: str, onto: str, *, xy_err: float, dz_min: float, dz_max: floa
 
 
 def offset(step: Step, object: str, onto: str) -> tuple[Tensor, Tensor]:
-    """Horizontal distance and height of a centre over another [m], each ``(nworld,)``."""
+    """Horizontal distance of the centres [m], and height of the first above the second [m], each
+    ``(nworld,)``.
+    """
     apart = step.center(object) - step.center(onto)
     return norm(apart[:, :2]), apart[:, 2]
 
