@@ -9,7 +9,7 @@ READY_DEV := $(VENV)/.installed-dev
 READY_DOCS := $(VENV)/.installed-docs
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt
 
-.PHONY: run test test-rest test-long test-all test-lerobot fuzz docs setup clean
+.PHONY: run test test-rest test-long test-all test-lerobot fuzz docs dist setup clean
 
 run: $(READY)
 	$(BIN)/python scripts/run.py robot=so101 nworld=32 $(ARGS)
@@ -49,6 +49,10 @@ test-lerobot:
 docs: $(READY_DOCS)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
+# Wheel and sdist in dist/, tried in empty environments of three Pythons: half an hour, and some 7 GB for a while.
+dist: $(READY_DEV)
+	$(BIN)/python tools/check_dist.py $(ARGS)
+
 setup: $(READY_DEV)
 
 # Installed again only when what is to be installed changes.
@@ -69,4 +73,4 @@ $(READY_DOCS): $(READY)
 	touch $@
 
 clean:
-	rm -rf $(VENV) build *.egg-info
+	rm -rf $(VENV) build dist *.egg-info

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from mjstack.jobs.runner import verify
 
 __all__ = ["Config", "Env", "MjstackError", "load_config", "make_env", "verify"]
-__version__ = "0.2.0.dev0"
+__version__ = "0.2.0"
 
 _HOMES = {
     "Config": "mjstack.config",
