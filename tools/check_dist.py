@@ -122,7 +122,7 @@ def check_content(file: Path, version: str) -> Row:
 
 def check_python(name: str, files: list[Path], work: Path) -> str:
     """What a Python's empty environment did with both files, as Markdown."""
-    sdist, wheel = files
+    wheel, sdist = files
     python, _, constraint = name.partition(":")
     own = work / "own"
     unpacked = work / "sdist"
