@@ -66,7 +66,7 @@ def main() -> None:
         rows = [check_content(file, version) for file in files]
         text = table(["file", "size", "files"], rows)
         for python in args.python:
-            text += f"\n\n## {python}\n\n" + check_python(python, files, work)
+            text += f"\n\n{check_python(python, files, work)}"
             print(text, flush=True)
     if args.log:
         title = f"# Distribution of {version}, checked {datetime.now(UTC):%Y-%m-%d}"
@@ -129,6 +129,7 @@ def check_python(name: str, files: list[Path], work: Path) -> str:
     with tarfile.open(sdist) as archive:
         archive.extractall(unpacked, filter="data")
     (source,) = unpacked.iterdir()
+    release = subprocess.check_output([python, "-V"], text=True).strip()
     began = time.perf_counter()
     interpreter = make_environment(python, own)
     pip = [interpreter, "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
@@ -154,7 +155,10 @@ def check_python(name: str, files: list[Path], work: Path) -> str:
     size = sum(path.lstat().st_size for path in own.rglob("*") if not path.is_dir())
     shutil.rmtree(own)
     shutil.rmtree(unpacked)
-    return f"{', '.join(packages)}; {size / 1e9:.1f} GB in all\n\n" + table(["step", "time"], rows)
+    versions = f"versions of {constraint}" if constraint else "newest versions"
+    head = f"## Python {release.removeprefix('Python ')}, {versions}\n\n"
+    head += f"{', '.join(packages)}; {size / 1e9:.1f} GB in all\n\n"
+    return head + table(["step", "time"], rows)
 
 
 def use(python: str, source: Path, folder: Path) -> list[Row]:
