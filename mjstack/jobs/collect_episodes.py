@@ -20,7 +20,7 @@ from mjstack.episodes.recorder import Channels, Read, read_commands, start_and_e
 from mjstack.episodes.stage import Stage
 from mjstack.jobs.collect_plan import ACTION, IMAGES, REWARD, STATE
 from mjstack.managers.episode import required_fields
-from mjstack.robots.units import LerobotUnits
+from mjstack.robots.units import LEROBOT, LerobotUnits
 from mjstack.sim import StateRenderer
 from mjstack.sim.cameras import with_outputs
 
@@ -69,8 +69,9 @@ class EpisodeSource:
         self._spec = spec
         self._folder = folder
         self.drawing = 0.0
-        index = stage.index
-        self._units = LerobotUnits(index.n_arm, index.ctrl_range, stage.cfg.job.units)
+        self._units: LerobotUnits | None = None
+        if stage.cfg.job.units == LEROBOT:
+            self._units = LerobotUnits(stage.index.n_arm, stage.index.ctrl_range)
         self._most_rendered = 0  # states at once
         self._renderer: StateRenderer | None = None
         self._cameras = with_outputs(stage.cfg.scene.cameras, ["rgb"])
@@ -151,7 +152,8 @@ class EpisodeSource:
             rendered = self._render(batch, worlds, rendered_steps) if self._cameras else {}
             for number, row in enumerate(chunk):
                 arrays = {name: values[number, : len(steps)] for name, values in host.items()}
-                arrays |= {name: self._units.from_si(arrays[name]) for name in (STATE, ACTION)}
+                if self._units is not None:
+                    arrays |= {name: self._units.from_si(arrays[name]) for name in (STATE, ACTION)}
                 images = {}
                 for name, stride in self._strides.items():
                     frame = np.array(steps) // stride * stride // rendered_steps.step
