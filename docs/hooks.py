@@ -5,6 +5,7 @@ and the pictures of the examples, which lie outside of the folder of the pages.
 from __future__ import annotations
 
 import re
+import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,8 +17,34 @@ from mjstack.config.schema import JOB_SCHEMAS, Config
 if TYPE_CHECKING:  # the reference is made where MkDocs is not, too
     from mkdocs.config.defaults import MkDocsConfig
     from mkdocs.structure.files import Files
+    from mkdocs.structure.nav import Navigation
 
 MARKER = "<!-- reference -->"
+
+
+def on_config(config: MkDocsConfig, **_: Any) -> MkDocsConfig:
+    """Take the addresses of repository and site from pyproject.toml, which may have none."""
+    text = (Path(config.docs_dir).parent / "pyproject.toml").read_text(encoding="utf-8")
+    urls = tomllib.loads(text)["project"].get("urls", {})
+    config.repo_url = urls.get("Repository")
+    config.site_url = urls.get("Documentation", "")
+    return config
+
+
+def on_nav(nav: Navigation, config: MkDocsConfig, **_: Any) -> Navigation:
+    """Write llms.txt: a line for each page but those of the past, with its first sentence."""
+    lines = [f"# {config.site_name}", "", f"> {config.site_description}", ""]
+    for page in nav.pages:
+        text = Path(page.file.abs_src_path or "").read_text(encoding="utf-8")
+        first = re.search(r"(?m)^(?![#!<:]|\s*$|```).+(?:\n.+)*", text)
+        if not page.url.startswith("history/"):
+            words = " ".join(first[0].split()).partition(". ")[0].rstrip(".") if first else ""
+            address = (config.site_url or "") + page.url
+            lines.append(f"- [{page.title or page.file.name}]({address}): {words}".rstrip(": "))
+    site = Path(config.site_dir)
+    site.mkdir(parents=True, exist_ok=True)
+    (site / "llms.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return nav
 
 
 def on_files(files: Files, config: MkDocsConfig, **_: Any) -> Files:
