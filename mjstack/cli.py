@@ -86,6 +86,13 @@ def run(args: list[str]) -> int:
 
 def _dispatch(flags: Namespace, overrides: list[str]) -> int:
     """Do what the flags ask for, on the current search path."""
+    demonstrates = overrides[:1] == ["demo"]
+    if demonstrates:
+        if any(override.startswith("experiment=") for override in overrides):
+            raise MjstackError(
+                "demo: expected no experiment=NAME, because it is one. Leave it out."
+            )
+        overrides = ["experiment=demo", *overrides[1:]]
     with hydra_session() as hydra:
         if overrides[:1] == ["list"]:
             print(list_text(overrides[1:]), flush=True)
@@ -107,7 +114,12 @@ def _dispatch(flags: Namespace, overrides: list[str]) -> int:
         elif flags.multirun:
             return _sweep(hydra, overrides)
         else:
-            return _run_one(hydra, overrides)
+            status = _run_one(hydra, overrides)
+            if demonstrates and _results:
+                from mjstack.jobs.demo import show_demo  # the other commands need no browser
+
+                show_demo(_results[-1].folder)
+            return status
     return 0
 
 

@@ -15,7 +15,15 @@ def test_everything_has_a_line(capsys: Capture) -> None:
     text = capsys.readouterr().out
     parts = dict(re.findall(r"(?m)^(\w+):\n((?:  .+\n)+)", text))
     assert "tasks.parts.offset" not in parts["conditions"]  # a helper, which takes a step
-    assert list(parts) == ["tasks", "robots", "terms", "conditions", "gates", "trainers"]
+    assert list(parts) == [
+        "tasks",
+        "robots",
+        "terms",
+        "conditions",
+        "gates",
+        "trainers",
+        "policies",
+    ]
     for kind, group in (("robots", "robot"), ("gates", "gate"), ("trainers", "trainer")):
         assert re.findall(r"(?m)^  (\w+) +\S.+$", parts[kind]) == list_choices()[group], kind
     assert re.findall(r"(?m)^  (\w+) +\S", parts["tasks"]) == ["box", "reach", "stack", "push"]

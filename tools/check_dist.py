@@ -2,9 +2,9 @@
 
 Each Python of ``--python`` gets an empty environment outside of the checkout, where the wheel is
 installed by pip alone; ``python3.11:constraints.txt`` with versions of that file, else the newest.
-There run the gates, an example in its own folder and the tests that need no checkout. Then the same
-with the sdist in the wheel's place. ``--log`` writes the tables as a page. ``--quick`` builds the
-wheel alone, and tries it among the packages of this environment.
+There run the gates, ``mjstack demo``, an example in its own folder and the tests that need no
+checkout. Then the same with the sdist in the wheel's place. ``--log`` writes the tables as a page.
+``--quick`` builds the wheel alone, and tries it among the packages of this environment.
 """
 
 import argparse
@@ -23,6 +23,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 MOST = 12_000_000  # bytes of either file
+DEMO = ["demo", "nworld=4"]
 GATES = ["gates=[baseline,parity]", "nworld=4"]
 TESTS = (  # they read nothing of the checkout, and need pytest alone
     *("test_rng_math", "test_managers", "test_stack_check", "test_open_loop", "test_simulation"),
@@ -32,6 +33,7 @@ MARKED = "not full and not long"
 IN_WHEEL = (
     *("mjstack/py.typed", "mjstack/conf/config.yaml", "mjstack/conf/new/task.txt"),
     *("mjstack/robots/so101.xml", "mjstack/robots/rebot.xml"),
+    *("policies/so101_stack/card.md", "policies/rebot_stack/card.md"),
     *("licenses/LICENSE", "licenses/NOTICE"),
 )
 IN_SDIST = (
@@ -171,6 +173,7 @@ def use(python: str, source: Path, folder: Path) -> list[Row]:
     files = [f"tests/{name}.py" for name in TESTS]
     steps = {
         "`mjstack gates=[baseline,parity] nworld=4`": ([*mjstack, *GATES], folder),
+        "`mjstack demo nworld=4`": ([*mjstack, *DEMO], folder),
         "`mjstack --config-dir conf robot=scara` in `examples/scara`": (
             [*mjstack, *example],
             scara,
@@ -193,7 +196,8 @@ def try_quickly(work: Path) -> None:
     os.environ["PYTHONPATH"] = str(work / "site")
     code = "import mjstack, sys; sys.exit(not mjstack.__file__.startswith(sys.argv[1]))"
     call([sys.executable, "-c", code, str(work / "site")], work)
-    call([sys.executable, "-m", "mjstack", *GATES], work)
+    for words in (GATES, DEMO):
+        call([sys.executable, "-m", "mjstack", *words], work)
 
 
 def make_environment(python: str, folder: Path) -> str:

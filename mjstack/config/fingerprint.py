@@ -18,6 +18,7 @@ _OF_THE_CALL = ("resume", "devices", "sweep", "web")  # they change no result
 # Changing one of these changes no dataset and no training.
 WITHOUT_EFFECT = ("batch", "gates", "gate", "graph", "view", "video", "run", "world")
 POLICY_FILE = "policy.json"  # of a policy's folder; it names the weights by their SHA-256
+SHIPPED = Path(__file__).parents[1] / "policies"  # verified policies that come with mjstack
 
 
 def config_content(cfg: Config, without: Iterable[str] = ()) -> dict[str, Any]:
@@ -37,7 +38,7 @@ def config_content(cfg: Config, without: Iterable[str] = ()) -> dict[str, Any]:
     else:
         folder = cfg.policy.removeprefix("lerobot:")
         file = POLICY_FILE if folder == cfg.policy else "model.safetensors"
-        config["policy"] = _content("policy", str(Path(folder) / file))
+        config["policy"] = _content("policy", str(policy_folder(folder) / file))
     for name, term in cfg.reset.items():
         path = term.params.get("path")
         params = config["reset"][name]["params"]
@@ -48,6 +49,19 @@ def config_content(cfg: Config, without: Iterable[str] = ()) -> dict[str, Any]:
             else:
                 params["path"] = _content(f"reset.{name}.params.path", path)
     return config
+
+
+def policy_folder(name: str | Path) -> Path:
+    """The policy's folder of that name; if there is none, that of the shipped policy."""
+    shipped = SHIPPED / name
+    is_shipped = shipped.parent == SHIPPED and shipped.is_dir() and not Path(name).exists()
+    return shipped if is_shipped else Path(name)
+
+
+def shipped_policies() -> dict[str, str]:
+    """The policies that come with mjstack: the first sentence of each card, by name."""
+    cards = {path.parent.name: path.read_text() for path in sorted(SHIPPED.glob("*/card.md"))}
+    return {name: text.splitlines()[2] for name, text in cards.items()}
 
 
 def config_hash(config: Mapping[str, Any]) -> str:

@@ -7,20 +7,21 @@ import inspect
 import json
 import re
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from importlib import import_module
 from typing import Any, NamedTuple
 
 from mjstack.config.complete import typed
 from mjstack.config.fields import accepted, field_docs
+from mjstack.config.fingerprint import shipped_policies
 from mjstack.config.functions import find_object, offered
 from mjstack.config.schema import Config
 from mjstack.config.session import CONFIG_FOLDER, config_folders, list_choices
 from mjstack.errors import UnknownName
 
 _GROUP = re.compile(r"^  - (\w+): (\[.*\]|\S+) # (.+)$", re.MULTILINE)  # name, default, words
-_LISTED = ("tasks", "robots", "terms", "conditions", "gates", "trainers")
+_LISTED = ("tasks", "robots", "terms", "conditions", "gates", "trainers", "policies")
 _FUNCTIONS = ("terms", "conditions")  # the others are groups
 _TERMS = ("action", "observation", "reward", "reset", "termination", "looks")
 _RANGE = re.compile(r"(?:typing\.)?Annotated\[(\w+), Range\(.*?\)\]")
@@ -30,7 +31,8 @@ mjstack: a task of a robot arm, from native MuJoCo to thousands of MuJoCo Warp w
  verified in gates.
 
 Usage: mjstack [group=choice ...] [key=value ...] [flags]
-       mjstack list [tasks|robots|terms|conditions|gates|trainers]
+       mjstack list [tasks|robots|terms|conditions|gates|trainers|policies]
+       mjstack demo    16 worlds stack by a shipped policy, shown in a browser
        mjstack new task NAME | robot NAME FILE.xml    a folder of your own
 In a checkout: python scripts/run.py ...  What this machine has: mjstack doctor
 
@@ -205,7 +207,10 @@ def list_text(kinds: Sequence[str]) -> str:
         raise UnknownName("list", kind, _LISTED)
     lines = []
     for kind in kinds or _LISTED:
-        named = _functions(kind, len(kinds) == 1) if kind in _FUNCTIONS else _files(kind[:-1])
+        named: Iterable[tuple[str, str]] = shipped_policies().items()
+        if kind != "policies":
+            one_kind = len(kinds) == 1
+            named = _functions(kind, one_kind) if kind in _FUNCTIONS else _files(kind[:-1])
         lines += [f"{kind}:", *(f"  {name:<12} {words}".rstrip() for name, words in named)]
     return "\n".join(lines)
 

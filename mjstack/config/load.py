@@ -20,7 +20,7 @@ from mjstack.config import session
 from mjstack.config.check import validate
 from mjstack.config.complete import complete
 from mjstack.config.explain import check_added, check_overrides, explain, own_overrides, parse
-from mjstack.config.fingerprint import POLICY_FILE
+from mjstack.config.fingerprint import POLICY_FILE, policy_folder
 from mjstack.config.schema import JOB_SCHEMAS, TRAINER_SCHEMAS, Backend, Config
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.files import read_inside, reading
@@ -136,7 +136,7 @@ def _policy_choices(overrides: Sequence[str]) -> list[str]:
     if not isinstance(folder, str):
         return []
     try:
-        facts = json.loads(read_inside(Path(folder) / POLICY_FILE))
+        facts = json.loads(read_inside(policy_folder(folder) / POLICY_FILE))
         trained = {group: [facts["config"][group]["name"]] for group in ("robot", "task")}
         trained["cameras"] = list(facts["observation"].get("images", {}))
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):

@@ -22,7 +22,7 @@ from torch import Tensor
 
 import mjstack
 from mjstack.config.complete import typed
-from mjstack.config.fingerprint import POLICY_FILE, config_content
+from mjstack.config.fingerprint import POLICY_FILE, config_content, policy_folder, shipped_policies
 from mjstack.config.schema import Config, ObservationGroupCfg, ObservationTermCfg, TermCfg
 from mjstack.config.session import check_term
 from mjstack.errors import FolderError
@@ -32,7 +32,10 @@ from mjstack.policy.network import PolicyNetwork, Vision
 Facts = dict[str, Any]
 """Values in JSON's types, by name."""
 FORMAT = 5  # grows when an older mjstack could not read what is written
-_NAME_ANOTHER = "Name a policy that job=train has written, such as outputs/mine/last"
+_NAME_ANOTHER = ", or ".join(
+    ["Name a policy that job=train has written, such as outputs/mine/last", *shipped_policies()]
+)
+_FLOATS = (torch.float32, torch.float16)  # of weights in a file
 # A stranger's files may ask for more than this.
 _MOST_COUNT = 1_000_000
 _MOST_LAYERS = 100
@@ -194,12 +197,14 @@ def policy_facts(policy: Policy) -> Facts:
 
 
 def load_policy(folder: Path) -> Policy:
-    """Read a policy's folder, which may be a stranger's.
+    """Read a policy's folder, which may be a stranger's, or a shipped policy by its name. Weights
+    in float16 become float32.
 
     Raises:
         FolderError: It is no policy, of another version, damaged, or names functions that are not
             in the search path.
     """
+    folder = policy_folder(folder)
     path = folder / POLICY_FILE
     if not path.is_file():
         reason = f"has no {POLICY_FILE}, expected the folder of a policy"
@@ -226,9 +231,10 @@ def load_policy(folder: Path) -> Policy:
                 raise ValueError(f"its content is not that of {POLICY_FILE}")
             tensors = load(content)
             for name, value in tensors.items():
-                if value.dtype != torch.float32 or not bool(value.isfinite().all()):
+                if value.dtype not in _FLOATS or not bool(value.isfinite().all()):
                     raise ValueError(f"{name} has other values than finite ones in float32")
             policy.network.load_state_dict(tensors, assign=True)
+            policy.network.float()
     except FolderError:
         if digest in path.read_text():
             raise
