@@ -15,7 +15,7 @@ nbclient = pytest.importorskip("nbclient")
 NOTEBOOK = ROOT / "docs" / "quickstart.ipynb"
 
 
-@pytest.mark.full
+@pytest.mark.long
 def test_the_notebook_runs(tmp_path: Path, monkeypatch: Patch) -> None:
     """In a folder of its own; it ends with a clip and a picture of the policy."""
     monkeypatch.setenv("PATH", str(Path(sys.executable).parent), prepend=os.pathsep)

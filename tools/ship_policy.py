@@ -9,7 +9,7 @@ policy that passes is kept.
 import argparse
 import json
 import shlex
-import shutil
+import tempfile
 from pathlib import Path
 
 import common
@@ -51,18 +51,19 @@ def main() -> None:
             if not bool(value.isfinite().all()):
                 raise MjstackError(f"{name}: expected weights that fit into float16")
         policy.config["job"]["folder"] = None  # of this machine
-        save_policy(folder, policy)
-        judged = {
-            reset: judge(folder, reset, args.seeds, args.nworld, args.rate)
-            for reset in ("randomized", "jitter")
-        }
+        with tempfile.TemporaryDirectory() as trial:
+            save_policy(Path(trial) / args.name, policy)
+            judged = {
+                reset: judge(Path(trial) / args.name, reset, args.seeds, args.nworld, args.rate)
+                for reset in ("randomized", "jitter")
+            }
         card = write_card(args.training, args.name, policy, judged)
     except MjstackError as error:
         parser.exit(error.exit_code, f"{parser.prog}: {error}\n")
     print(card)
     if any(gate.status is not Status.passed for gate in judged.values()):
-        shutil.rmtree(folder)
         parser.exit(1, f"{parser.prog}: it has not passed, and is not kept\n")
+    save_policy(folder, policy)
     (folder / "card.md").write_text(card, encoding="utf-8")
 
 

@@ -9,7 +9,7 @@ from mjstack.report.web import EPISODE, lacks_viser
 
 _NEXT = """\
 Go on with:
-  mjstack demo robot=rebot                   # another arm, by a policy of its own
+  mjstack demo robot=rebot                   # another arm and its policy
   mjstack nworld=64                          # the expert's plan in every gate of this machine
   mjstack job=train task=reach sim=native nworld=64 job.folder=outputs/mine    # train one"""
 

@@ -17,7 +17,7 @@ log = logging.getLogger(__name__)
 
 Stage = Callable[[mjw.Model, mjw.Data], object]
 
-# Modules of MJWarp that several stages of its own step launch, slowest first
+# Modules of which several stages of `mujoco_warp.step` launch kernels, the slowest first
 SHARED = ("forward", "passive", "sensor", "smooth", "solver", "support", "constraint")
 _SILENT = 3.0  # s: from the cache it takes less
 _done: set[tuple] = set()
@@ -29,8 +29,8 @@ def compile_step(
     """Compile what a planned step launches, as many modules at once as there are cores: a launch
     waits for its own module alone, and the step makes one launch after the other.
 
-    Every stage works on a world of its own, which nobody reads. One that fails here fails in the
-    step again, which tells. Once in a process for a model's sizes.
+    Every stage works on one scratch world. A stage that fails here fails in the step again, which
+    says so. Once in a process for a model's sizes.
     """
     key = (model.nbody, model.ngeom, model.nv, model.nsensor, sizes.njmax, str(device), plan)
     if key in _done:
