@@ -195,5 +195,9 @@ def mcnemar_p_value(only_a: int, only_b: int) -> float:
         only_b: Pairs that the second side alone won.
     """
     pairs = only_a + only_b
-    tail = sum(math.comb(pairs, won) for won in range(min(only_a, only_b) + 1))
+    ways = 1  # binomial coefficient of the pairs; integers are exact
+    tail = 1
+    for won in range(min(only_a, only_b)):
+        ways = ways * (pairs - won) // (won + 1)
+        tail += ways
     return min(1.0, 2 * tail / 2**pairs)
