@@ -30,8 +30,9 @@ test: $(READY_DEV)
 test-rest: $(READY_DEV)
 	$(PYTEST) -m full
 
-# Trainings that take minutes.
+# Trainings that take minutes, and the notebook.
 test-long: $(READY_DEV)
+	$(PIP) --editable '.[notebook]'
 	$(PYTEST) -m long
 
 test-all: test test-rest test-long

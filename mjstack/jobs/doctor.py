@@ -28,6 +28,7 @@ _EXTRAS = {
     "export": "onnx",
     "gpu": "nvidia-ml-py",
     "lerobot": "lerobot",
+    "notebook": "nbclient",
     "train": "rsl-rl-lib",
     "video": "imageio-ffmpeg",
     "web": "viser",
