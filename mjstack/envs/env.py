@@ -22,7 +22,7 @@ from mjstack.mdp.geometry import lost_state
 from mjstack.rng import check_seed
 from mjstack.scene import SceneIndex
 from mjstack.sim import Simulation
-from mjstack.sim.graph import StepGraph, side_by_side
+from mjstack.sim.graph import StepGraph, side_by_side, where_any
 
 
 class Env:
@@ -295,21 +295,24 @@ class Env:
             lost = lost_state(self)
             # None where the host can see that there are none
             broken = lost if lost.is_cuda or bool(lost.any()) else None
-            if self._success is not None:
+            ends = self.termination_manager
+            rewards = self.reward_manager
+
+            def succeed() -> None:
+                if self._success is None:
+                    return
                 achieved = self._success(self)
                 if ended is not None:  # their success stays
                     achieved = torch.where(ended, self.success, achieved)
                 self.success.copy_(achieved if broken is None else achieved & ~broken)
 
-            def reward() -> None:
-                self.termination_manager.compute(ended)
-                self.reward_manager.compute(void=broken, ended=ended)
-
+            self._branches(succeed, ends.begin, rewards.begin)
+            works: list[Callable[[], object]] = [partial(ends.compute, ended)]
+            works.append(partial(rewards.compute, broken, ended))
             # A held step is seen by what remembers it alone.
-            observes = last or self.observation_manager.remembers
-            works = (reward, self.observation_manager.compute) if observes else (reward,)
-            # Both branches go on with what success has computed.
-            side_by_side(self.device, *(partial(in_one_pass, work) for work in works))
+            if last or self.observation_manager.remembers:
+                works.append(self.observation_manager.compute)
+            self._branches(*works)
             return lost, broken
 
         lost, broken = in_one_pass(look)
@@ -321,13 +324,20 @@ class Env:
             self._reset_ended(done, broken)
         return None if last else done
 
+    def _branches(self, *works: Callable[[], object]) -> None:
+        """Independent works of one pass. Values that terms share are known to all works that begin
+        later, except on CUDA, where these are branches of a graph.
+        """
+        if self.device.type == "cuda":
+            works = tuple(partial(in_one_pass, work) for work in works)
+        side_by_side(self.device, *works)
+
     def _reset_ended(self, done: Tensor, broken: Tensor | None) -> None:
         """The terminal observation, the statistics, the reset of the worlds that are ``done``, and
         the observation to go on with. ``broken`` are worlds whose state is not finite, None if
         there are none; both of shape ``(nworld,)``, bool.
         """
-        # On CUDA, where looking would stop the device, worlds are always reset: those of an empty
-        # mask, if need be.
+        # On CUDA the host cannot look, because that would stop the device: the graph does.
         ending = self.termination_manager.values.shape[1] > 0 and (done.is_cuda or bool(done.any()))
 
         def keep() -> None:
@@ -342,11 +352,14 @@ class Env:
             if done.is_cuda and broken is not None:
                 self.faults.record(broken)
 
-        side_by_side(self.device, keep, count, record)
-        if ending:
+        def restart() -> None:
             self._start_worlds(done)
             self._reset_managers(done)
             in_one_pass(partial(self.observation_manager.refresh, done))
+
+        side_by_side(self.device, keep, count, record)
+        if ending:
+            where_any(done, restart)
         elif broken is not None:
             self._outputs.restore_observations()
 

@@ -57,7 +57,20 @@ class _ValueManager:
         for term in self._terms.values():
             first_value(term, env, boolean=dtype is torch.bool)
         self.names = list(self._terms)
+        self._early: dict[str, Tensor] = {}
         self.values = torch.zeros((env.nworld, len(cfg)), dtype=dtype, device=env.device)
+
+    def begin(self) -> None:
+        """Compute the terms that do not read the task's success, which may be computed beside."""
+        early = {name: term for name, term in self._terms.items() if term.ignores_success}
+        self._early = {name: term(self._env) for name, term in early.items()}
+
+    def _term_values(self) -> list[Tensor]:
+        """What every term says, in order; those that `begin` has computed are taken from it."""
+        early, self._early = self._early, {}
+        return [
+            early[name] if name in early else term(self._env) for name, term in self._terms.items()
+        ]
 
     def reset(self, mask: Tensor) -> None:
         """Clear what the terms keep of the masked worlds."""
@@ -104,7 +117,7 @@ class RewardManager(_ValueManager):
         """
         before = None if ended is None else self.values.clone()
         if self._terms:
-            values = torch.stack([term(self._env) for term in self._terms.values()], dim=1)
+            values = torch.stack(self._term_values(), dim=1)
             torch.mul(values.float(), self.weights, out=self.values)
         for worthless in (void, ended):
             if worthless is not None:
@@ -156,7 +169,7 @@ class TerminationManager(_ValueManager):
         """
         if not self._terms:
             return
-        values = [term(self._env) for term in self._terms.values()]
+        values = self._term_values()
         if ended is not None:
             earlier = self.values.unbind(1)
             values = [torch.where(ended, *pair) for pair in zip(earlier, values, strict=True)]

@@ -64,7 +64,8 @@ def offers(kind: str = "", /, **attributes: Any) -> Callable[[Any], Any]:
     where it ends such worlds; of a reset term ``reads_file``, where its parameter ``path`` names a
     file of starts, ``places_objects``, where its parameter ``xy`` is a region, ``joint_noise``,
     where its parameter ``arm`` moves the arm's joints; ``starts_midway``, where worlds start in the
-    middle of an episode.
+    middle of an episode; ``ignores_success`` of a reward or termination that does not read
+    ``env.success``, so that CUDA may compute both at once.
 
     Example:
         >>> @offers("observation term", unit="m")

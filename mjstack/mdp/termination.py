@@ -11,6 +11,7 @@ from mjstack.mdp.observation import joint_pos, positions
 from mjstack.sim import LOST_PHYSICS
 
 
+@offers(ignores_success=True)
 def time_out(env: EnvView, *, steps: Count) -> Tensor:
     """After this many steps."""
     return env.episode_step >= steps
@@ -21,6 +22,7 @@ def success(env: EnvView) -> Tensor:
     return env.success
 
 
+@offers(ignores_success=True)
 class ObjectOffTable:
     """When an object's centre is beside the table or below its top."""
 
@@ -38,6 +40,7 @@ class ObjectOffTable:
         return ((offset < self._low) | (offset > self._high)).flatten(1).any(1)
 
 
+@offers(ignores_success=True)
 class JointLimit:
     """When a joint of the robot is outside its range by more than a part of it: MuJoCo's limits are
     soft.
@@ -61,13 +64,13 @@ class JointLimit:
         return ((q < self._low) | (q > self._high)).any(1)
 
 
-@offers(ends_on="non_finite")
+@offers(ends_on="non_finite", ignores_success=True)
 def non_finite(env: EnvView) -> Tensor:
     """When a position or velocity is NaN or infinite: such a world cannot go on."""
     return lost_state(env)
 
 
-@offers(ends_on="overflow")
+@offers(ends_on="overflow", ignores_success=True)
 def overflow(env: EnvView) -> Tensor:
     """When a buffer of the world was too small, so that physics was lost."""
     return (env.sim.overflow & LOST_PHYSICS) != 0

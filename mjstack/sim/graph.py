@@ -281,3 +281,25 @@ def side_by_side(device: torch.device, *works: Callable[[], object]) -> None:
             main.wait_stream(stream)
     finally:
         free.extend(used)
+
+
+def where_any(mask: Tensor, work: Callable[[], None]) -> None:
+    """Do work that changes the masked worlds alone, where there are some. A CUDA graph that is
+    captured looks in each replay. An eager step on CUDA does not look: that would stop the device.
+
+    Args:
+        mask: Shape ``(nworld,)``, bool.
+        work: Changes nothing if the mask is empty.
+    """
+    if not mask.is_cuda and not bool(mask.any()):
+        return
+    if not mask.is_cuda or not torch.cuda.is_current_stream_capturing():
+        work()
+        return
+    from mjstack.sim.warp_setup import torch_stream_scope, wp
+
+    if not wp.is_conditional_graph_supported():
+        work()
+        return
+    with torch_stream_scope(wp.get_device(str(mask.device))):
+        wp.capture_if(wp.from_torch(mask.sum(dtype=torch.int32).view(1)), work)

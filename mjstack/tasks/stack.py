@@ -3,13 +3,16 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
 from typing_extensions import override
 
 from mjstack.config.fields import spec
+from mjstack.managers.term import in_one_pass
 from mjstack.managers.view import EnvView
+from mjstack.sim.graph import where_any
 from mjstack.tasks import parts
 from mjstack.tasks.check import EpisodeCheck, Rule
 from mjstack.tasks.placed import HeldSuccess
@@ -138,7 +141,7 @@ class StackSuccess(HeldSuccess):
         """
         check = StackCheck(env.cfg)
         view = check.view(env)
-        super().__init__(env, view, [self._stands], check.t.window)
+        super().__init__(env, view, [check.placed, check.released], check.t.window)
         self._check = check
         ring = (check.t.window, len(view.objects))
         # Where the oldest step is, in every world.
@@ -148,14 +151,20 @@ class StackSuccess(HeldSuccess):
         self._far = view.zeros(*ring)  # squared distance to later steps
         self._turned = view.zeros(*ring)  # 1 - |cosine of half the angle| to them
 
-    def _stands(self, step: Step) -> Tensor:
-        """Take a step in place of the oldest one. `reset` may leave the ring alone: every slot is
-        written anew before the streak can reach the window.
-        """
+    def __call__(self, env: EnvView) -> Tensor:
+        """Process a step; shape ``(nworld,)``, bool."""
+        achieved = super().__call__(env)
         self._slot.add_(1).remainder_(self._steps)
-        stands = self._check.placed(step).all(1, keepdim=True) & self._check.released(step)
-        if not stands.is_cuda and not bool(stands.any()):
-            return stands  # no window that holds this step can pass: its slot is never judged
+        # No window that holds a step without a standing object can pass: its slot is never judged.
+        where_any(self._length > 0, partial(in_one_pass, partial(self._look, achieved)))
+        return achieved
+
+    def _look(self, achieved: Tensor) -> None:
+        """Take a step in place of the oldest one, and take back what was no rest, shape
+        ``(nworld,)``, bool. `reset` may leave the ring alone: every slot is written anew before the
+        streak can reach the window.
+        """
+        step = self._view.step()
         self._pose.index_copy_(1, self._slot, step.pose[:, None])
         self._energy.index_copy_(1, self._slot, step.speed.square()[:, None])
         for ring in (self._far, self._turned):
@@ -166,15 +175,11 @@ class StackSuccess(HeldSuccess):
         torch.maximum(self._far, apart, out=self._far)
         cosine = (self._pose[..., 3:] * step.quat[:, None]).sum(-1).abs()
         torch.maximum(self._turned, 1.0 - cosine, out=self._turned)
-        return stands
 
-    def __call__(self, env: EnvView) -> Tensor:
-        """Process a step; shape ``(nworld,)``, bool."""
-        achieved = super().__call__(env)
         if not achieved.is_cuda and not bool(achieved.any()):
-            return achieved
+            return
         t = self._check.t
         rotation = 1.0 - math.cos(0.5 * math.radians(t.rest_rotation_deg))
         achieved &= (self._energy.mean(1) <= t.rest_speed**2).all(1)
         achieved &= self._far.amax((1, 2)) <= t.rest_position**2
-        return achieved & (self._turned.amax((1, 2)) <= rotation)
+        achieved &= self._turned.amax((1, 2)) <= rotation
