@@ -5,7 +5,9 @@ uses them.
 import math
 import weakref
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,6 +20,7 @@ from environments import (
     NewRun,
     Patch,
     at_double_speed,
+    on_backend,
     on_cuda,
     one_second_episode,
 )
@@ -26,15 +29,16 @@ import mjstack
 from mjstack.config.schema import Backend
 from mjstack.envs import Env
 from mjstack.envs.buffers import (
+    MeasuringWorlds,
     Peaks,
     Workload,
     join_peaks,
     measured_sizes,
     play_random_actions,
-    play_workload,
     read_peaks,
     recommend_sizes,
 )
+from mjstack.episodes.rollout import Episode
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Progress, Stage
 from mjstack.errors import FaultError, Unreachable
@@ -140,28 +144,40 @@ def test_peaks_join() -> None:
 
 
 def tried(
-    monkeypatch: Patch, lost: Callable[[BatchSizes], int]
-) -> tuple[list[BatchSizes], Workload]:
-    """The sizes that a workload is tried in, and its last run; some of them lose physics."""
+    monkeypatch: Patch, *losses: Callable[[BatchSizes], int]
+) -> tuple[list[BatchSizes], list[Workload]]:
+    """The sizes of the worlds that some workloads are tried in, and the last run of each; they lose
+    physics.
+    """
     made: list[BatchSizes] = []
 
-    def make(sizes: BatchSizes) -> SimpleNamespace:
+    def make(*_: object, sizes: BatchSizes, **__: object) -> SimpleNamespace:
         made.append(sizes)
-        qpos = torch.zeros(4, 1)
-        return SimpleNamespace(sizes=sizes, qpos=qpos, description="", close=lambda: None)
+        facts = {"sizes": sizes, "fields": {}, "qpos": torch.zeros(4, 1), "description": ""}
+        return SimpleNamespace(**facts, reset=lambda: None, close=lambda: None)
 
-    def read(sim: SimpleNamespace) -> Peaks:
-        return peaks(rows=7, overflow=np.array([0, lost(sim.sizes), 0, 0]))
+    lost = [0]
 
+    def read(_: SimpleNamespace) -> Peaks:
+        return peaks(rows=7, overflow=np.array([0, lost[0], 0, 0]))
+
+    def workload(loss: Callable[[BatchSizes], int], sim: SimpleNamespace) -> np.ndarray:
+        lost[0] = loss(sim.sizes)
+        return np.zeros(4)
+
+    monkeypatch.setattr("mjstack.envs.buffers.make_simulation", make)
     monkeypatch.setattr("mjstack.envs.buffers.read_peaks", read)
-    return made, play_workload(load_config([]), make, lambda sim: np.zeros(4))
+    worlds = MeasuringWorlds(load_config([]), None, 4, Backend.mjwarp, "cpu")  # type: ignore[arg-type]
+    runs = [worlds.play(partial(workload, loss)) for loss in losses]  # type: ignore[arg-type]
+    worlds.close()
+    return made, runs
 
 
 @pytest.mark.full
 def test_room_to_measure_in_grows_where_it_is_too_little_but_not_for_ever(
     monkeypatch: Patch,
 ) -> None:
-    made, run = tried(
+    made, (run,) = tried(
         monkeypatch,
         lambda s: int(Overflow.NEFC) * (s.njmax < 2000) | int(Overflow.CCD) * (s.nconmax < 200),
     )
@@ -169,10 +185,82 @@ def test_room_to_measure_in_grows_where_it_is_too_little_but_not_for_ever(
     assert not run.peaks.overflow.any()
     assert run.sizes == made[-1]
     assert measured_sizes(load_config([]), run, "").njmax == 16
-    made, run = tried(monkeypatch, lambda _: int(Overflow.NEFC))
+    made, (run,) = tried(monkeypatch, lambda _: int(Overflow.NEFC))
     assert run.peaks.overflow.any()
     assert len(made) == 4
     assert run.sizes == made[-1]
+
+
+def test_workloads_share_worlds_and_the_room_that_one_of_them_needs(monkeypatch: Patch) -> None:
+    def calm(_: BatchSizes) -> int:
+        return 0
+
+    def rows(sizes: BatchSizes) -> int:
+        return int(Overflow.NEFC) * (sizes.njmax < 2000)
+
+    def contacts(sizes: BatchSizes) -> int:
+        return int(Overflow.NARROWPHASE) * (sizes.nconmax < 1000)
+
+    made, runs = tried(monkeypatch, calm, calm, calm)
+    assert len(made) == 1
+    # As much of each as a workload gets alone, although that is five growths.
+    made, runs = tried(monkeypatch, calm, rows, contacts, rows)
+    sizes = [(768, 128), (1536, 128), (3072, 128), (3072, 256), (3072, 512), (3072, 1024)]
+    assert [(s.njmax, s.nconmax) for s in made] == sizes
+    assert [run.sizes for run in runs] == [made[0], made[2], made[5], made[5]]
+    assert not any(run.peaks.overflow.any() for run in runs)
+    # Two that lose physics in any room do not grow it further than one does.
+    made, runs = tried(monkeypatch, *[lambda _: int(Overflow.NEFC)] * 2)
+    assert [s.njmax for s in made] == [768, 1536, 3072, 6144]
+    assert all(run.peaks.overflow.any() for run in runs)
+
+
+def test_a_workload_in_used_worlds_ends_as_in_new_ones(backend: str, new_run: NewRun) -> None:
+    """Nothing of the workload before acts on: fields, state, counters. Fields that it does not need
+    change nothing either.
+    """
+    where = on_backend(backend)
+    run = new_run(f"sim={where['backend']}", f"sim.device={where['device']}", "nworld=2")
+    stage = run.stage
+    randomized = run.cfg.gate.capacity.reset
+
+    def steps(sim: Simulation, reset: dict) -> None:
+        env = stage.start(sim, reset)
+        driver = stage.driver(env)
+        for _ in range(20):
+            env.step(driver.command())
+
+    def wild(sim: Simulation) -> np.ndarray:
+        steps(sim, randomized)
+        for name in ("body_mass", "geom_friction", "actuator_gainprm"):
+            values = torch.from_numpy(getattr(sim.model, name)).to(sim.fields[name])
+            assert not torch.equal(sim.fields[name][0], values)
+        sim.overflow.fill_(int(Overflow.CCD))
+        sim.qpos[1] = math.nan
+        sim.step(2)
+        return np.zeros(2)
+
+    def task(sim: Simulation) -> np.ndarray:
+        assert not torch.stack(sim.lasting_peaks()).any()
+        for name, field in sim.fields.items():
+            values = torch.from_numpy(getattr(sim.model, name)).to(field)
+            assert torch.equal(field, values.expand_as(field)), name
+        steps(sim, run.cfg.reset)
+        return np.zeros(2)
+
+    def last(*workloads: Callable[[Simulation], np.ndarray], resets: tuple = ()) -> Workload:
+        with closing(stage.measuring_worlds(*resets)) as worlds:
+            return [worlds.play(workload) for workload in workloads][-1]
+
+    expected = last(task)
+    for found in (last(task, resets=(randomized,)), last(wild, task, resets=(randomized,))):
+        assert not found.peaks.overflow.any()
+        if where["device"] != "cpu":  # sums have no fixed order
+            continue
+        assert found.final.tobytes() == expected.final.tobytes()
+        for name in ("contacts", "rows"):
+            assert getattr(found.peaks, name).tolist() == getattr(expected.peaks, name).tolist()
+        assert found.peaks.pools == expected.peaks.pools
 
 
 @pytest.mark.parametrize(
@@ -355,14 +443,14 @@ def test_defaults_too_small_for_environments_fail(new_run: NewRun) -> None:
 def test_native_tells_what_it_cannot_know_and_a_layout_out_of_reach_leaves_the_rest(
     new_run: NewRun, monkeypatch: Patch
 ) -> None:
-    play = Stage.play_task
+    play = Stage.play
 
-    def unreachable(stage: Stage, reset: dict) -> Workload:
+    def unreachable(stage: Stage, sim: Simulation, reset: dict) -> Episode:
         if reset is stage.cfg.gate.capacity.reset:
             raise Unreachable(0, "grasp_red", "red", (0.9, 0.0, 0.0), 0.3, 5e-4)
-        return play(stage, reset)
+        return play(stage, sim, reset)
 
-    monkeypatch.setattr(Stage, "play_task", unreachable)
+    monkeypatch.setattr(Stage, "play", unreachable)
     _, result, lines = measure(new_run, *NATIVE, "nworld=1", "gate.capacity.random_steps=5")
     assert result.status is Status.passed
     assert any("randomised starts: not measured: world 0" in text for text in result.details)
@@ -382,6 +470,31 @@ def workload(**changes: object) -> Workload:
         "description": "",
     }
     return Workload(**(facts | changes))
+
+
+def made_up(
+    monkeypatch: Patch, randomized: dict, play: Callable[[str, BatchSizes | None], Workload]
+) -> None:
+    """Have workloads made up from their names and the sizes that they are tried in, None for room
+    to spare, in the place of playing them.
+    """
+
+    class Worlds(MeasuringWorlds):
+        def __init__(self, *_: object, sizes: BatchSizes | None = None) -> None:
+            self.sizes = sizes
+
+        def play(self, play_name: Callable) -> Workload:
+            return play(play_name(None), self.sizes)
+
+        def close(self) -> None:
+            pass
+
+    def episode(stage: Stage, sim: None, reset: dict) -> SimpleNamespace:
+        return SimpleNamespace(failed="randomized" if reset is randomized else "task")
+
+    monkeypatch.setattr("mjstack.episodes.stage.MeasuringWorlds", Worlds)
+    monkeypatch.setattr(Stage, "play", episode)
+    monkeypatch.setattr(capacity_module, "play_random_actions", lambda *_, **__: "random_actions")
 
 
 MOVED = {"final": np.array([[0.0, 0.0, 0.0], [0.0, 1e-6, 0.0]])}
@@ -424,21 +537,14 @@ def test_each_workload_is_played_again_and_a_flip_fails_where_runs_repeat(
 
     starts = {"randomized": peaks(rows=200, nworld=2), "task": peaks(rows=100, nworld=2)}
 
-    def play_task(stage: Stage, reset: dict, sizes: BatchSizes | None = None) -> Workload:
-        name = "randomized" if reset is other else "task"
+    def play(name: str, sizes: BatchSizes | None) -> Workload:
         if sizes is None:
-            return workload(peaks=starts[name])
+            return workload(**({"peaks": starts[name]} if name in starts else {}))
         played.append((name, sizes))
-        return workload(sizes=sizes, failed=np.array([0, 4 if reset is other else 0]))
+        failed = np.array([0, 4 if name == "randomized" else 0])
+        return workload(sizes=sizes, failed=failed)
 
-    def play_random(run: Run, sizes: BatchSizes | None = None) -> Workload:
-        if sizes is None:
-            return workload()
-        played.append(("random_actions", sizes))
-        return workload(sizes=sizes)
-
-    monkeypatch.setattr(Stage, "play_task", play_task)
-    monkeypatch.setattr(capacity_module, "play_random", play_random)
+    made_up(monkeypatch, other, play)
     (result,) = run_capacity(run)
     assert {name: sizes.njmax for name, sizes in played} == {
         "randomized": 256,
@@ -463,13 +569,12 @@ def test_the_gate_recommends_nothing_from_motion_that_lost_physics(
     run = new_run("sim=mjwarp", "sim.device=cpu", "nworld=2", "batch=auto")
     run.stage.progress = Progress(said.append)
     lost = workload(peaks=peaks(nworld=2, overflow=np.array([0, int(Overflow.NEFC)])))
-    monkeypatch.setattr(Stage, "play_task", lambda *_: workload())
 
-    def play_random(run: Run, *sizes: BatchSizes) -> Workload:
-        assert not sizes, "tried sizes that are not known"
-        return lost
+    def play(name: str, sizes: BatchSizes | None) -> Workload:
+        assert name == "task" or sizes is None, "tried sizes that are not known"
+        return lost if name == "random_actions" else workload()
 
-    monkeypatch.setattr(capacity_module, "play_random", play_random)
+    made_up(monkeypatch, run.cfg.gate.capacity.reset, play)
     (result,) = run_capacity(run)
     assert result.status is Status.failed
     assert result.reason.startswith(
@@ -507,8 +612,7 @@ def test_environment_is_sized_by_a_probe() -> None:
     env = mjstack.make_env([*overrides], nworld=2, device="cpu")
     sizes = env.sim.sizes
     assert sizes.source == "batch=auto: 4 steps of random actions in 2 worlds, times 1.25"
-    env.reset(seed=0)
-    play_random_actions(env, 4)
+    play_random_actions(env.cfg, 4, env.sim)
     used = read_peaks(env.sim)
     assert not used.overflow.any()
     assert used.rows.max() <= sizes.njmax < resolve_env_sizes(env.cfg).njmax
@@ -548,7 +652,7 @@ def test_gates_get_no_sizes_from_a_task_that_lost_physics(
     new_run: NewRun, monkeypatch: Patch
 ) -> None:
     lost = workload(peaks=peaks(nworld=2, overflow=np.array([int(Overflow.NEFC), 0])))
-    monkeypatch.setattr(Stage, "play_task", lambda *_: lost)
+    made_up(monkeypatch, {}, lambda *_: lost)
     run = new_run("sim=mjwarp", "sim.device=cpu", "nworld=2", "batch=auto")
     message = "measured by the driven task in 2 worlds: NEFC overflow in 1 of 2 worlds"
     with pytest.raises(FaultError, match=message):
@@ -558,7 +662,7 @@ def test_gates_get_no_sizes_from_a_task_that_lost_physics(
 
 @pytest.mark.full
 def test_native_environment_measures_nothing(monkeypatch: Patch) -> None:
-    monkeypatch.setattr("mjstack.envs.buffers.play_workload", lambda *_: pytest.fail("measured"))
+    monkeypatch.setattr(MeasuringWorlds, "play", lambda *_: pytest.fail("measured"))
     mjstack.make_env(["batch=auto", "sim=native"], nworld=1).reset(seed=0)
 
 

@@ -190,6 +190,9 @@ def test_plan_does_not_depend_on_the_other_worlds(stage: Stage) -> None:
         assert alone.waypoint_error[0] == among.waypoint_error[world]
         for step in range(0, 600, 37):
             assert (alone.command(step)[0] == among.command(step)[world]).all()
+    assert planner.plan(xy) is among  # the last two batches are planned once
+    planner.plan(xy[:2])
+    assert planner.plan(xy) is not among
     assert len(np.unique(among.knots.numpy().round(4), axis=0)) == 38
 
 

@@ -113,7 +113,7 @@ def test_a_replay_runs_no_command_of_its_folder(key: str, stranger: Path) -> Non
 DOERS = {
     "mjstack.mdp.starts.starts_file.write_starts": {"path": "victim"},
     "mjstack.bench.env_step.measure_env_step": {"name": "victim"},
-    "mjstack.envs.buffers.play_random_actions": {"steps": 10**12},
+    "mjstack.episodes.rollout.rollout": {"driver": "victim"},
     "mjstack.mdp.starts.expert_states.ExpertStates": {"path": "victim"},
     "mjstack.adapters.rsl_rl_runner.Runner": {"train_cfg": {}},  # of earlier versions
     "mjstack.adapters.rsl_rl.RslRlVecEnv": {},

@@ -1,5 +1,6 @@
 """Planning before the episode: targets of the grasp point and joint trajectories of every world."""
 
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -99,7 +100,7 @@ class OpenLoopPlanner:
         self._grips = gripper_targets(self.ik.model, cfg.robot, widths)
         self._nodes = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, cfg.controller.knots))
         self._weights, self._numbers = self._step_weights()
-        self._last: tuple[ndarray, JointTrajectory] | None = None
+        self._plans: deque[tuple[ndarray, JointTrajectory]] = deque(maxlen=2)  # batches of the run
         self._xy = nominal_xy(cfg.scene)
         (first,), _ = self._solve_knots(self._xy[None], [0], self._solve_nominal)
         self.nominal = first[len(self._nodes) - 1 :: len(self._nodes)]
@@ -119,8 +120,9 @@ class OpenLoopPlanner:
             Unreachable: A target is out of reach; names the world (the first one), the phase and
                 the distance.
         """
-        if self._last is not None and np.array_equal(self._last[0], sources_xy):
-            return self._last[1]  # the gates of one run play the same batch
+        for sources, plan in self._plans:
+            if np.array_equal(sources, sources_xy):
+                return plan
         nworld = len(sources_xy)
         knots = np.tile(self._knots, (nworld, 1, 1))
         error = np.full(nworld, self._error)
@@ -132,7 +134,7 @@ class OpenLoopPlanner:
             knots[displaced], error[displaced] = plans
         trajectory = JointTrajectory(torch.from_numpy(knots), self._weights, self._numbers, error)
         if nworld > 1:
-            self._last = (sources_xy.copy(), trajectory)
+            self._plans.append((sources_xy.copy(), trajectory))
         return trajectory
 
     def path_error(self) -> float:

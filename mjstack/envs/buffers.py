@@ -5,7 +5,8 @@ actions to find them.
 import gc
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -13,7 +14,7 @@ import mujoco
 import numpy as np
 import torch
 
-from mjstack.config.schema import Backend, Config
+from mjstack.config.schema import Backend, Config, TermCfg
 from mjstack.envs.camera_schedule import without_images
 from mjstack.envs.env import Env
 from mjstack.envs.faults import NO_KEY, POOL, describe_loss
@@ -28,12 +29,14 @@ log = logging.getLogger(__name__)
 
 ROWS = int(Overflow.NEFC | Overflow.NJMAX_NNZ)
 SIZED = ROWS | POOL | int(Overflow.CCD)
-_GROWTHS = 3  # of the room to measure in, each by 2
+_GROWTH = 8  # of the room to measure in, at most, by 2 each time
 _STEP = 8  # sizes are multiples of this
 _POOLS = ("contacts", "pairs", "ccd_pairs")  # as the simulation counts them
 
 Advance = Callable[[str, int, int], None]
 """Reports progress: the work in progress, how much is done, and of how much."""
+Play = Callable[[Simulation], np.ndarray]
+"""Plays in some worlds, and returns the bits of the rules that each one broke."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,54 +146,74 @@ class Workload:
         return f"{loss}{room}. {fix}"
 
 
-def play_workload(
-    cfg: Config,
-    make: Callable[..., Simulation],
-    play: Callable[[Simulation], np.ndarray],
-    sizes: BatchSizes | None = None,
-) -> Workload:
-    """Play something in worlds of these sizes; without, with room to spare, and with twice the
-    room wherever even that was too little.
+class MeasuringWorlds:
+    """Worlds in which workloads are played one after the other, each as if the worlds were new."""
 
-    Peaks of a run that lost physics are those of another motion. Where the last run has lost some
-    too, its ``overflow`` tells: nothing may be sized from it.
-
-    Args:
-        cfg: The configuration.
-        make: Makes the worlds with some ``sizes``.
-        play: Plays in them, and returns the bits of the rules that each world broke.
-        sizes: Of the buffers.
-
-    Returns:
-        The last run.
-    """
-    room = sizes or resolve_measuring_sizes(cfg)
-    for growths_left in reversed(range(_GROWTHS + 1)):
-        sim = make(sizes=room)
-        try:
-            failed = play(sim)
-            run = Workload(
-                peaks=read_peaks(sim),
-                sizes=sim.sizes,
-                final=sim.qpos.cpu().numpy().copy(),
-                failed=failed,
-                description=sim.description,
-            )
-        finally:
-            sim.close()
-            del sim
-            gc.collect()  # an environment and its managers refer to each other, and hold the worlds
-        bits = int(np.bitwise_or.reduce(run.peaks.overflow)) & SIZED
-        if sizes or run.sizes is None or not (bits and growths_left):
-            break
-        # In this room convex pairs have as much as contacts, so they grow together.
-        room = replace(
-            room,
-            njmax=room.njmax * (2 if bits & ROWS else 1),
-            nconmax=room.nconmax * (2 if bits & ~ROWS else 1),
+    def __init__(
+        self,
+        cfg: Config,
+        model: mujoco.MjModel,
+        nworld: int,
+        backend: Backend,
+        device: str,
+        *resets: Mapping[str, TermCfg],
+        sizes: BatchSizes | None = None,
+    ) -> None:
+        """Take the worlds' ``sizes``. Without, there is room to spare, which may grow. They can
+        start as the configuration and ``resets`` say; other arguments as of `make_simulation`.
+        """
+        fields = required_fields(cfg.reset, *resets)
+        self._make = partial(
+            make_simulation, model, cfg, nworld, backend=backend, device=device, fields=fields
         )
-        log.info("%s overflow while measuring: again with %s", Overflow(bits), room.as_overrides())
-    return run
+        self._sim: Simulation | None = None
+        self._room = sizes or resolve_measuring_sizes(cfg)
+        growth = 1 if sizes else _GROWTH
+        self._most = (growth * self._room.njmax, growth * self._room.nconmax)
+
+    def play(self, play: Play) -> Workload:
+        """Play a workload, and again in worlds of twice the room wherever that was too little and
+        may grow.
+
+        Peaks of a run that lost physics are those of another motion. Where the last run, which is
+        returned, has lost some too, its ``overflow`` tells: nothing may be sized from it.
+        """
+        while True:
+            run = self._play_once(play)
+            bits = int(np.bitwise_or.reduce(run.peaks.overflow)) & SIZED
+            # In this room convex pairs have as much as contacts, so they grow together.
+            room = replace(
+                self._room,
+                njmax=min(self._room.njmax * (2 if bits & ROWS else 1), self._most[0]),
+                nconmax=min(self._room.nconmax * (2 if bits & ~ROWS else 1), self._most[1]),
+            )
+            if run.sizes is None or room == self._room:
+                return run
+            self.close()
+            self._room = room
+            log.info("%s overflow while measuring: again, %s", Overflow(bits), room.as_overrides())
+
+    def close(self) -> None:
+        """Give the worlds back, and all that was built on them."""
+        if self._sim is not None:
+            self._sim.close()
+        self._sim = None
+        gc.collect()  # an environment and its managers refer to each other, and hold the worlds
+
+    def _play_once(self, play: Play) -> Workload:
+        gc.collect()  # the environment of the workload before, its graphs and their memory
+        self._sim = sim = self._sim or self._make(sizes=self._room)
+        for name, field in sim.fields.items():
+            field.copy_(torch.from_numpy(getattr(sim.model, name)))
+        sim.reset()
+        failed = play(sim)
+        return Workload(
+            peaks=read_peaks(sim),
+            sizes=sim.sizes,
+            final=sim.qpos.cpu().numpy().copy(),
+            failed=failed,
+            description=sim.description,
+        )
 
 
 def measured_sizes(cfg: Config, run: Workload, source: str) -> BatchSizes:
@@ -208,11 +231,14 @@ def measured_sizes(cfg: Config, run: Workload, source: str) -> BatchSizes:
 
 
 def play_random_actions(
-    env: Env, steps: int, advance: Advance = lambda what, done, total: None
-) -> None:
-    """Step worlds that have started with actions drawn evenly from the action range; worlds that
-    end start anew.
+    cfg: Config, steps: int, sim: Simulation, advance: Advance = lambda what, done, total: None
+) -> np.ndarray:
+    """Step worlds with actions drawn evenly from the action range, for `MeasuringWorlds.play`.
+    Worlds that end start anew, and none of them breaks a rule.
     """
+    index = SceneIndex(sim.model, cfg.robot, cfg.scene)
+    env = Env(sim, index, without_images(cfg), check_faults=False)  # a lack of room is looked for
+    env.reset(seed=cfg.seed)
     actions = env.action_manager
     for step in range(steps):
         share = random_uniform(
@@ -220,16 +246,6 @@ def play_random_actions(
         )
         env.step(actions.low + (actions.high - actions.low) * share)
         advance("random actions", step + 1, steps)
-
-
-def random_actions(cfg: Config, steps: int, sim: Simulation, **options: Advance) -> np.ndarray:
-    """Random actions for `play_workload`, of which no world breaks a rule; options as of
-    `play_random_actions`.
-    """
-    index = SceneIndex(sim.model, cfg.robot, cfg.scene)
-    env = Env(sim, index, without_images(cfg), check_faults=False)  # a lack of room is looked for
-    env.reset(seed=cfg.seed)
-    play_random_actions(env, steps, **options)
     return np.zeros(sim.nworld, dtype=np.int64)
 
 
@@ -248,17 +264,9 @@ def probe_env_sizes(cfg: Config, model: mujoco.MjModel, nworld: int, device: str
     """
     c = cfg.gate.capacity
     worlds = min(nworld, c.probe_nworld if device.startswith("cuda") else c.cpu_nworld)
-    make = partial(
-        make_simulation,
-        model,
-        cfg,
-        worlds,
-        backend=Backend.mjwarp,
-        device=device,
-        fields=required_fields(cfg.reset),
-    )
-    with torch.no_grad():
-        probe = play_workload(cfg, make, partial(random_actions, cfg, c.probe_steps))
+    measuring = MeasuringWorlds(cfg, model, worlds, Backend.mjwarp, device)
+    with torch.no_grad(), closing(measuring):
+        probe = measuring.play(partial(play_random_actions, cfg, c.probe_steps))
     source = f"{c.probe_steps} steps of random actions in {worlds} worlds"
     sizes = measured_sizes(cfg, probe, source)
     log.info("%s", sizes)

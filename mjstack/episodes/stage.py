@@ -18,7 +18,7 @@ from mjstack.drivers.lerobot import LerobotDriver
 from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.drivers.policy import PolicyDriver
 from mjstack.envs import Env, build_env, driven_config
-from mjstack.envs.buffers import Advance, Workload, measured_sizes, play_workload
+from mjstack.envs.buffers import Advance, MeasuringWorlds, measured_sizes
 from mjstack.episodes.rollout import (
     CLOSED_LOOP,
     PHASELESS,
@@ -307,7 +307,8 @@ class Stage:
             return resolve_sizes(self.cfg)
         if "task" not in self.measured:
             source = f"the driven task in {self.measuring_nworld} worlds"
-            task = self.play_task(self.cfg.reset)
+            with closing(self.measuring_worlds()) as worlds:
+                task = worlds.play(lambda sim: self.play(sim, self.cfg.reset).failed)
             self.measured["task"] = measured_sizes(self.cfg, task, source)
             self.progress.print_line(str(self.measured["task"]))
         return apply_configured(self.cfg, self.measured["task"])
@@ -327,15 +328,10 @@ class Stage:
         on_cuda = self.backend[1].startswith("cuda")
         return self.cfg.nworld if on_cuda else min(self.cfg.nworld, most)
 
-    def measuring_simulation(self, sizes: BatchSizes) -> Simulation:
-        """Worlds that size the buffers."""
-        return self.simulation(self.measuring_nworld, *self.backend, sizes=sizes)
-
-    def play_task(self, reset: Reset, sizes: BatchSizes | None = None) -> Workload:
-        """Play the driven task once, at these buffer sizes; without, with room to spare."""
-        stage = self.with_config(replace(self.cfg, reset=reset))
-        make = stage.measuring_simulation
-        return play_workload(self.cfg, make, lambda sim: stage.play(sim, reset).failed, sizes)
+    def measuring_worlds(self, *resets: Reset, sizes: BatchSizes | None = None) -> MeasuringWorlds:
+        """Worlds that size the buffers; arguments as of `MeasuringWorlds`."""
+        nworld = self.measuring_nworld
+        return MeasuringWorlds(self.cfg, self.model, nworld, *self.backend, *resets, sizes=sizes)
 
     def native_env(self, cfg: Config, nworld: int = 1) -> closing[Env]:
         """An environment of the scene on native MuJoCo, to find out about its terms."""

@@ -3,7 +3,8 @@ they be?
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping
+from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial, reduce
 
@@ -12,10 +13,10 @@ import numpy as np
 from mjstack.config.schema import Backend
 from mjstack.envs.buffers import (
     Peaks,
+    Play,
     Workload,
     join_peaks,
-    play_workload,
-    random_actions,
+    play_random_actions,
     recommend_sizes,
 )
 from mjstack.episodes.run import Run, each_rank, needs_episode
@@ -47,24 +48,32 @@ def run_capacity(run: Run) -> list[GateResult]:
     try them.
 
     Peaks are over all steps and all worlds, in worlds with room to spare: one that has lost physics
-    moves differently.
+    moves differently. All workloads are played in the same worlds.
     """
     cfg = run.cfg
     t = cfg.gate.capacity
     nworld = run.stage.measuring_nworld
     result = GateResult(name="capacity", status=Status.passed, metrics={"worlds": nworld})
 
-    # Environments first: each start is planned once, for both of its runs, and the plan of the
-    # task's is kept for the gates that follow.
-    env = _measure(
-        run,
-        result,
-        resolve_env_sizes(cfg),
-        random_actions=partial(play_random, run),
-        randomized=partial(run.stage.play_task, t.reset),
-    )
-    play_task = partial(run.stage.play_task, cfg.reset)
-    task = _measure(run, result, resolve_sizes(cfg), task=play_task)
+    stage = run.stage
+    steps = t.random_steps or cfg.task.episode_steps
+    plays: dict[str, Play] = {
+        "random_actions": partial(play_random_actions, cfg, steps, advance=stage.progress.advance),
+        "randomized": lambda sim: stage.play(sim, t.reset).failed,
+        "task": lambda sim: stage.play(sim, cfg.reset).failed,
+    }
+    loads = {}
+    with closing(stage.measuring_worlds(t.reset)) as worlds:
+        for name, play in plays.items():
+            try:
+                loads[name] = worlds.play(play)
+            except Unreachable as error:
+                if name != "randomized":
+                    raise
+                # Starts of the user's own; the rest stands
+                result.details.append(f"randomised starts: not measured: {error}")
+    task = _recommend(run, result, resolve_sizes(cfg), {"task": loads.pop("task")}, plays)
+    env = _recommend(run, result, resolve_env_sizes(cfg), loads, plays)
 
     # Problems. Motion that lost physics sizes nothing that follows.
     groups = {"task": task, "env": env}
@@ -106,34 +115,16 @@ def run_capacity(run: Run) -> list[GateResult]:
     return [result]
 
 
-def play_random(run: Run, sizes: BatchSizes | None = None) -> Workload:
-    """Step the task's environment with random actions; worlds end and start anew as its managers
-    do it. Sizes as in `play_workload`.
-    """
-    cfg = run.cfg
-    steps = cfg.gate.capacity.random_steps or cfg.task.episode_steps
-    play = partial(random_actions, cfg, steps, advance=run.stage.progress.advance)
-    return play_workload(cfg, run.stage.measuring_simulation, play, sizes)
-
-
-def _measure(
+def _recommend(
     run: Run,
     result: GateResult,
     configured: BatchSizes,
-    **plays: Callable[..., Workload],
+    runs: dict[str, Workload],
+    plays: Mapping[str, Play],
 ) -> _Group:
-    """Play some workloads, recommend sizes for them, and try those on MJWarp."""
+    """Recommend sizes for some workloads, and try those on MJWarp."""
     cfg = run.cfg
     margin = cfg.gate.capacity.margin
-    runs = {}
-    for workload, play in plays.items():
-        try:
-            runs[workload] = play()
-        except Unreachable as error:
-            if workload != "randomized":
-                raise
-            # Starts of the user's own; the rest stands
-            result.details.append(f"randomised starts: not measured: {error}")
     peaks = reduce(join_peaks, (load.peaks for load in runs.values()))
     how = f"batch=auto: gate capacity, {run.stage.measuring_nworld} worlds, times {margin:g}"
     advice = recommend_sizes(peaks, margin, how if cfg.batch.auto else "gate capacity")
@@ -145,10 +136,12 @@ def _measure(
         lost="; ".join(load.loss for load in runs.values() if load.sizes and load.loss),
     )
     exact = not run.stage.backend[1].startswith("cuda")
-    for workload, load in reversed(runs.items()):
-        if load.sizes is not None and not group.lost:
-            again = plays[workload](advice)
-            group.problems += _compare(workload, load, again, result, exact=exact)
+    resets = [cfg.gate.capacity.reset] if "randomized" in runs else []
+    with closing(run.stage.measuring_worlds(*resets, sizes=advice)) as worlds:
+        for workload, load in runs.items():
+            if load.sizes is not None and not group.lost:
+                again = worlds.play(plays[workload])
+                group.problems += _compare(workload, load, again, result, exact=exact)
     return group
 
 

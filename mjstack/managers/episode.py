@@ -40,9 +40,10 @@ class ResetManager:
         return render_table(f"reset: {len(rows)} terms", ("term", "model fields"), rows)
 
 
-def required_fields(cfg: Mapping[str, TermCfg]) -> tuple[str, ...]:
+def required_fields(*resets: Mapping[str, TermCfg]) -> tuple[str, ...]:
     """Per-world model fields that some reset terms write, for the simulation's constructor."""
-    fields = [offered(term.func, "model_fields") or () for term in cfg.values()]
+    terms = chain.from_iterable(reset.values() for reset in resets)
+    fields = [offered(term.func, "model_fields") or () for term in terms]
     return tuple(dict.fromkeys(chain.from_iterable(fields)))
 
 
