@@ -2,7 +2,6 @@
 
 import sys
 import time
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -27,6 +26,7 @@ from mjstack.sim.native import NativeSimulation
 FEW = (
     "gates=[throughput]",
     "gate.throughput.repetitions=3",
+    "gate.throughput.precision=0",
     "gate.throughput.steps=3",
     "gate.throughput.env_steps=2",
     "gate.throughput.cpu_max_seconds=120",
@@ -118,6 +118,16 @@ def test_native_measurements(new_run: NewRun) -> None:
     assert not any("bare" in name for name in m)
 
 
+def episode_of(seconds: float) -> Episode:
+    """An episode of four worlds that took so long."""
+    spent = RolloutTiming(
+        steps=5, seconds=seconds, warm_up_seconds=0.0, capture_seconds=0.0, captured=False
+    )
+    result: Any = SimpleNamespace(failed=torch.zeros(4), values={})
+    arrays = dict.fromkeys(("start", "waypoint_error", "retries"), np.zeros(4))
+    return Episode(result=result, **arrays, timing=spent, description="some")
+
+
 @pytest.mark.parametrize(
     ("backend", "repetitions", "played"),
     [("mjwarp", 3, 2), ("mjwarp", 1, 1), ("native", 3, 2), ("native", 1, 0)],
@@ -131,18 +141,63 @@ def test_the_batch_gates_episode_is_the_first_repetition(
     sim, _ = worlds(monkeypatch, "cpu")
     sim.backend = backend
     sim.description = "some"
-    spent = RolloutTiming(
-        steps=5, seconds=1.0, warm_up_seconds=0.0, capture_seconds=0.0, captured=False
-    )
-    result: Any = SimpleNamespace(failed=torch.zeros(4), values={})
-    arrays = dict.fromkeys(("start", "waypoint_error", "retries"), np.zeros(4))
-    first = Episode(result=result, **arrays, timing=spent, description="some")
-    more = [replace(first, timing=replace(spent, seconds=2.0)) for _ in range(played)]
+    first = episode_of(1.0)
+    more = [episode_of(2.0) for _ in range(played)]
     monkeypatch.setattr(episode, "_play", lambda *_: more.pop())
     measured = episode.measure_episode(run.stage, sim, first)
     assert not more
     assert measured.samples["seconds"] == [1.0] + [2.0] * played
     assert measured.facts["of_the_batch_gate"] == 1
+
+
+@pytest.mark.parametrize(
+    ("figures", "precision", "narrow"),
+    [
+        ([[1.0]], 0.01, False),  # one has no range
+        ([[1.0, 1.0]], 0.0, False),  # 0: all repetitions are made
+        ([[1.0, 1.019]], 0.01, True),
+        ([[1.0, 1.021]], 0.01, False),
+        ([[1e-3, 1.019e-3]], 0.01, True),
+        ([[1.0, 1.5, 1.01]], 0.01, False),  # an outlier stays one
+        ([[1.0, 1.0], [1.0, 1.1]], 0.01, False),  # all figures
+    ],
+)
+def test_repetitions_end_where_the_range_is_narrow(
+    figures: list[list[float]], precision: float, narrow: bool
+) -> None:
+    cfg = load_config([f"gate.throughput.precision={precision}"])
+    assert timing.settled(cfg, *figures) is narrow
+
+
+def test_two_episodes_that_agree_are_enough(new_run: NewRun, monkeypatch: Patch) -> None:
+    sim, _ = worlds(monkeypatch, "cpu")
+    sim.backend = "mjwarp"
+    sim.description = "some"
+    first = episode_of(1.0)
+
+    def play(stage: Any, sim: Any, meter: Any, out: Measurement) -> Episode:
+        out.samples.setdefault("bare_ratio", []).append(0.25)
+        return episode_of(1.005)
+
+    monkeypatch.setattr(episode, "_play", play)
+    for before, precision, played, bare in (
+        (first, 0.01, 2, 1),
+        (None, 0.01, 2, 2),
+        (first, 0, 3, 2),
+    ):
+        choices = [f"gate.throughput.precision={precision}", "gate.throughput.cpu_max_seconds=100"]
+        run = new_run("sim=native", "nworld=4", *choices)
+        found = episode.measure_episode(run.stage, sim, before).facts
+        assert (found["repetitions"], found["bare_repetitions"]) == (played, bare)
+
+
+def test_native_mujoco_beside_cuda_takes_less_time(monkeypatch: Patch) -> None:
+    cfg = load_config([])
+    cpu, cuda = (worlds(monkeypatch, device)[0] for device in ("cpu", "cuda"))
+    for device, seconds in (("cuda:0", 2.0), ("cpu", 5.0)):
+        monkeypatch.setattr(timing, "resolve_backend", lambda _, device=device: (None, device))
+        assert timing.time_budget(cfg, cpu) == seconds
+        assert timing.time_budget(cfg, cuda) == 300.0
 
 
 @pytest.mark.full
@@ -351,7 +406,7 @@ def test_the_parts_play_one_trajectory(monkeypatch: Patch) -> None:
     """Physics alone ends where the whole step ended, except in worlds that were reset meanwhile, of
     which there are some.
     """
-    limits = {"env_steps": 4, "repetitions": 3, "cpu_max_seconds": 1000}
+    limits = {"env_steps": 4, "repetitions": 3, "precision": 0, "cpu_max_seconds": 1000}
     choices = [f"gate.throughput.{key}={value}" for key, value in limits.items()]
     cfg = load_config(["task=stack", "sim=native", "task.episode_steps=9", *choices])
     env = build_env(cfg, nworld=12)

@@ -15,7 +15,9 @@ from mjstack.bench.timing import (
     EnergyMeter,
     EnergyObserver,
     Measurement,
+    budget_key,
     lost_worlds,
+    settled,
     time_budget,
     timed,
 )
@@ -73,11 +75,12 @@ def measure_episode(
         played.append(_play(stage, sim, meter, out))
         estimate = time.perf_counter() - repetition_began
         stage.progress.advance("episode, repetitions", number + 1, rounds)
+        if settled(cfg, [episode.timing.seconds for episode in played]):
+            break
     if not played:
-        key = "max_seconds" if sim.device.type == "cuda" else "cpu_max_seconds"
         out.missing = (
             f"an episode would take about {estimate:.0f} s, and a measurement has {seconds:g} s"
-            f" (gate.throughput.{key})"
+            f" (gate.throughput.{budget_key(cfg, sim)})"
         )
         return out
 
@@ -95,6 +98,7 @@ def measure_episode(
     out.add_repetitions(sim, cfg, times, steps, used, *timings, captured=captured)
     out.headline = f"{statistics.median(times):.3g} s"
     if "bare_ratio" in out.samples:
+        out.facts["bare_repetitions"] = len(out.samples["bare_ratio"])
         out.headline += f" ({out.median('bare_ratio'):.3f} x bare steps)"
     elif mjwarp:
         out.notes["bare_ratio"] = "not measured: no time for an episode and as many bare steps"

@@ -9,6 +9,7 @@ from mjstack.bench.timing import (
     Measurement,
     describe_lost,
     lost_worlds,
+    settled,
     steps_that_fit,
     time_budget,
     timed,
@@ -81,6 +82,8 @@ def measure_physics(stage: Stage, sim: Simulation, carry: State | None = None) -
     for repetition in range(t.repetitions):
         times.append(physics.play(steps, meter))
         stage.progress.advance("physics, repetitions", repetition + 1, t.repetitions)
+        if settled(stage.cfg, times):
+            break
 
     # The result
     graph = sim.graph_of(physics.decimation)

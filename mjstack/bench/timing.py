@@ -2,7 +2,7 @@
 
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -12,7 +12,7 @@ from typing_extensions import override
 from mjstack.config.schema import Config
 from mjstack.episodes.rollout import Observer, RolloutTiming
 from mjstack.math import not_finite
-from mjstack.sim import LOST_PHYSICS, Simulation
+from mjstack.sim import LOST_PHYSICS, Simulation, resolve_backend
 from mjstack.sim.build import cuda_uuid, device_memory
 from mjstack.sim.graph import StepGraph
 
@@ -233,10 +233,28 @@ def describe_lost(lost: Tensor) -> str:
     return f"{count} worlds overflowed, diverged or were not stepped" if count else ""
 
 
+def settled(cfg: Config, *figures: Sequence[float]) -> bool:
+    """Whether no more repetitions are needed: there are two at least, and half the range of every
+    figure is within ``precision`` of its median.
+    """
+    precision = 2.0 * cfg.gate.throughput.precision
+    return all(
+        len(values) > 1 and max(values) - min(values) < precision * statistics.median(values)
+        for values in figures
+    )
+
+
+def budget_key(cfg: Config, sim: Simulation) -> str:
+    """The setting with the seconds that a measurement on these worlds may take."""
+    if sim.device.type == "cuda":
+        return "max_seconds"
+    beside_cuda = resolve_backend(cfg)[1].startswith("cuda")
+    return "baseline_max_seconds" if beside_cuda else "cpu_max_seconds"
+
+
 def time_budget(cfg: Config, sim: Simulation) -> float:
     """Seconds that a measurement on these worlds may take."""
-    t = cfg.gate.throughput
-    return t.max_seconds if sim.device.type == "cuda" else t.cpu_max_seconds
+    return getattr(cfg.gate.throughput, budget_key(cfg, sim))
 
 
 def steps_that_fit(most: int, budget: float, seconds_per_step: float) -> int:
