@@ -36,6 +36,12 @@ CUDA = [
 ]
 DEVICES = ["cpu", pytest.param("cuda:0", marks=CUDA)]
 TASKS = ("stack", "reach")
+# Of task=reach, episodes of half the length, in which the expert still succeeds
+SHORT_REACH = (
+    "controller.phases.hold.seconds=0.4",
+    "task.episode_steps=70",
+    "task.check.window=10",
+)
 # For tests whose path is one for both robots: the reBot's in test-rest alone
 REBOT_LATER = pytest.mark.parametrize(
     "robot", ["so101", pytest.param("rebot", marks=pytest.mark.full)]

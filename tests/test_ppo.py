@@ -9,7 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from environments import Patch, Refused, at_double_speed, configure, mask_of, on_cuda, on_new_sim
+from environments import (
+    SHORT_REACH,
+    Patch,
+    Refused,
+    at_double_speed,
+    configure,
+    mask_of,
+    on_cuda,
+    on_new_sim,
+)
 from policies import assert_drives, curve, interrupted, report, run_as_torchrun, same
 from rsl_rl.algorithms import PPO
 
@@ -27,7 +36,7 @@ TINY = (
     *("job.save_every=2", "job.hidden=[16]", "job.horizon=4", "job.epochs=2"),
     *("job.minibatches=2", "gate.success.rate=0.0", "web.episode=false"),
 )
-REACH = (*TINY, "task=reach", "termination.time_out.params.steps=30")
+REACH = (*TINY, "task=reach", "termination.time_out.params.steps=30", *SHORT_REACH)
 
 
 def test_a_training_leaves_policies_a_curve_and_a_judgement(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """job=train: small trainings on native MuJoCo, what they leave, and how they go on."""
 
 import resource
+import shutil
 import time
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from compositions import load_config
-from environments import Capture, Patch, at_double_speed, configure, on_new_sim
+from environments import SHORT_REACH, Capture, Patch, at_double_speed, configure, on_new_sim
 from policies import assert_drives, curve, interrupted, report, same, weights
 from safetensors.torch import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -32,7 +33,7 @@ TINY = (
     *("job.hidden=[32]", "job.batches=30", "job.batch_size=64", "job.save_every=10"),
     *("gate.success.rate=0.0", "web.episode=false"),
 )
-REACH = (*TINY, "task=reach")
+REACH = (*TINY, "task=reach", *SHORT_REACH)
 
 
 def test_a_training_leaves_policies_a_curve_and_a_judgement(
@@ -76,12 +77,17 @@ def test_a_training_leaves_policies_a_curve_and_a_judgement(
     assert_drives(out / "last", tmp_path / "gates", "task=reach", nworld=3)
 
 
-@pytest.mark.full
-def test_a_training_goes_on_where_it_was_interrupted(tmp_path: Path) -> None:
-    """Bit for bit as one that was not."""
-    whole = tmp_path / "whole"
-    assert run([*REACH, f"job.folder={whole}"]) == 0
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a training that was not interrupted."""
+    folder = tmp_path_factory.mktemp("whole") / "training"
+    assert run([*REACH, f"job.folder={folder}"]) == 0
+    return folder
 
+
+@pytest.mark.full
+def test_a_training_goes_on_where_it_was_interrupted(whole: Path, tmp_path: Path) -> None:
+    """Bit for bit as one that was not."""
     parts = tmp_path / "parts"
     interrupted([*REACH, f"job.folder={parts}"], CloneLearner, 7)
     assert (parts / "training.safetensors").exists()
@@ -209,9 +215,8 @@ def test_headings_are_those_of_a_quarter_turn() -> None:
 
 
 @pytest.mark.full
-def test_a_folder_belongs_to_one_training(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    assert run([*REACH, f"job.folder={out}"]) == 0
+def test_a_folder_belongs_to_one_training(whole: Path, tmp_path: Path) -> None:
+    out = Path(shutil.copytree(whole, tmp_path / "out"))
     with pytest.raises(MjstackError, match=r"another configuration: job\.chunk="):
         check_train(load_config([*REACH, f"job.folder={out}", "job.chunk=4"]))
     state, facts = read_state(out / STATE)
