@@ -11,9 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from environments import at_double_speed, one_second_episode, report_of
-from test_ranks import SCRIPT, SHORT, play, start_python
+from environments import SHORT_REACH, at_double_speed, one_second_episode, report_of
+from test_ranks import PLAIN, SCRIPT, play, start_python
 
+from mjstack.cli import run
 from mjstack.datasets import read_dataset
 from mjstack.policy import load_policy
 
@@ -26,7 +27,7 @@ def test_two_nodes(tmp_path: Path) -> None:
     """Two agents of torchrun, as on two machines with one disk: one report, and neither agent waits
     for the other after it, though the gate has failed.
     """
-    run = [*SHORT, "nworld=3", f"hydra.run.dir={tmp_path}/run"]
+    args = [*PLAIN, "nworld=3", f"hydra.run.dir={tmp_path}/run"]
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     nodes = []
@@ -34,7 +35,7 @@ def test_two_nodes(tmp_path: Path) -> None:
         (tmp_path / str(node)).mkdir()
         where = [f"--node-rank={node}", "--master-addr=127.0.0.1", f"--master-port={port}"]
         agent = ["-m", "torch.distributed.run", "--nnodes=2", "--nproc-per-node=1", *where]
-        nodes.append(start_python([*agent, str(SCRIPT), *run], tmp_path / str(node)))
+        nodes.append(start_python([*agent, str(SCRIPT), *args], tmp_path / str(node)))
     began = time.monotonic()
     texts = [node.communicate(timeout=500)[0] for node in nodes]
     assert time.monotonic() - began < 200.0, texts  # an agent waits 300 s for one that fails
@@ -66,10 +67,10 @@ def test_two_ranks_beside_one(tmp_path: Path) -> None:
     command = [sys.executable, *bench, f"--folder={tmp_path}/many", "--", *small]
     done = subprocess.run(command, capture_output=True, text=True, timeout=900, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    runs = [json.loads(line) for line in (tmp_path / "many/many.jsonl").read_text().splitlines()]
-    assert [(run["gpus"], run["episodes"], run["status"]) for run in runs] == [(2, 4, 0), (1, 2, 0)]
-    for run in runs:
-        assert min(run[name] for name in ("physics", "episode", "batch", "env.step")) > 0.0
+    rows = [json.loads(line) for line in (tmp_path / "many/many.jsonl").read_text().splitlines()]
+    assert [(row["gpus"], row["episodes"], row["status"]) for row in rows] == [(2, 4, 0), (1, 2, 0)]
+    for row in rows:
+        assert min(row[name] for name in ("physics", "episode", "batch", "env.step")) > 0.0
     table = (tmp_path / "many/many.md").read_text()
     for name in ("physics", "episode", "batch", "env.step"):
         assert f"| weak | 2 | {name} | 2 |" in table
@@ -80,8 +81,8 @@ def test_ranks_collect_images(tmp_path: Path) -> None:
     """Videos of both ranks: each frame is that of the world as one rank draws it."""
     args = ["job=collect", *CAMERA, "nworld=3", "job.keep_failures=true", "job.episodes=3"]
     args += one_second_episode()
-    for ranks in (1, 2):
-        play(ranks, [*args, f"job.folder={tmp_path}/{ranks}"], tmp_path)
+    assert run([*args, f"job.folder={tmp_path}/1"]) == 0
+    play(2, [*args, f"job.folder={tmp_path}/2"], tmp_path)
     alone, shared = (read_dataset(tmp_path / name / "dataset") for name in "12")
     for key in ("world", "length"):
         assert [row[key] for row in shared.episodes] == [row[key] for row in alone.episodes]
@@ -106,7 +107,7 @@ def test_ranks_learn_from_pixels(tmp_path: Path) -> None:
         "nworld=4",
         "web.episode=false",
     ]
-    args += ["controller.phases.hold.seconds=0.4", "task.episode_steps=70", "task.check.window=10"]
+    args += SHORT_REACH
     args += [f"job.vision.{key}" for key in vision] + [f"job.{key}" for key in sizes]
     args += ["job.save_every=2", "gate.success.rate=0.0", f"job.folder={tmp_path}/out"]
     text = play(2, args, tmp_path)

@@ -6,6 +6,7 @@ import contextlib
 import csv
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -36,6 +37,7 @@ from mjstack.errors import ArgumentError, ConfigError, MjstackError
 from mjstack.jobs import check_job, check_ranks, count_devices
 
 SHORT = ["sim=native", "gates=[batch]", *one_second_episode()]
+PLAIN = [*SHORT, "web.episode=false"]
 SCRIPT = Path(mjstack.__file__).parents[1] / "scripts" / "run.py"
 ON_CUDA = (Backend.mjwarp, "cuda:0")
 OF_CALL = {"seconds", "rank_first_world", "rank_place"}  # of a record
@@ -123,13 +125,11 @@ def test_ranks_play_what_one_plays(tmp_path: Path) -> None:
     """Five worlds, so that shares differ, with the feedback of the closed loop. Batch and success,
     whose starts are drawn; every gate has one result, and says where its worlds were.
     """
-    args = [*SHORT, "gates=[baseline,batch,success]", "nworld=5", "gate.batch.seeds=2"]
+    args = [*PLAIN, "gates=[baseline,batch,success]", "nworld=5", "gate.batch.seeds=2"]
     args.append("controller=closed_loop")
     assert run([*args, f"hydra.run.dir={tmp_path}/one"]) == 1  # the episodes are too short
     text = play(0, [*args, "devices=2", f"hydra.run.dir={tmp_path}/two"], tmp_path, 1)
     assert_same_episodes(tmp_path / "one", tmp_path / "two")
-    play(3, [*args, f"hydra.run.dir={tmp_path}/three"], tmp_path, 1)
-    assert_same_episodes(tmp_path / "one", tmp_path / "three")
     with np.load(tmp_path / "two/starts_seed0.npz") as starts:
         assert {len(array) for array in starts.values()} == {5}
 
@@ -145,19 +145,20 @@ def test_ranks_play_what_one_plays(tmp_path: Path) -> None:
     assert len(two["provenance"]["ranks"]) == 2
 
 
-def test_shares_played_apart_join_to_the_whole(finished: Path) -> None:
-    """Three worlds as two ranks share them, in one process: bit for bit what one rank played."""
+@pytest.mark.parametrize("size", [2, 3])
+def test_shares_played_apart_join_to_the_whole(finished: Path, size: int) -> None:
+    """Three worlds as ranks share them, in one process: bit for bit what one rank played."""
     cfg = load_config([*SHORT, "nworld=3"])
     stage = Stage(cfg)
     parts = []
-    for rank in (0, 1):
-        own = stage.with_config(stage.cfg, ranks=Ranks(rank, 2))
+    for rank in range(size):
+        own = stage.with_config(stage.cfg, ranks=Ranks(rank, size))
         for batch in play_batches(own, [BatchPlan(1, own.worlds)]):
             parts.append(record_of(own, batch, None))
     joined = EpisodeRecord.join(parts)
     whole = EpisodeRecord.read(finished, 1)
     assert whole is not None
-    assert list(joined.ranks) == [0, 1]
+    assert list(joined.ranks) == list(range(size))
     assert len(np.unique(joined.worlds["start_qpos"], axis=0)) == 3
     assert joined.worlds.keys() <= whole.worlds.keys()
     for name, values in joined.worlds.items():
@@ -172,18 +173,29 @@ def test_two_ranks_meet(tmp_path: Path) -> None:
     assert "rank 1 silent" in texts[1]
 
 
-@pytest.fixture
-def trap(tmp_path: Path) -> list[str]:
+@pytest.fixture(scope="module")
+def trap(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """Overrides of a run in which one rank, by default the second, breaks under seed 2."""
-    (tmp_path / "conf").mkdir()
-    (tmp_path / "trap.py").write_text(TRAP)
+    folder = tmp_path_factory.mktemp("trap")
+    (folder / "conf").mkdir()
+    (folder / "trap.py").write_text(TRAP)
     more = ["nworld=5", "gate.batch.seeds=4", "+reset.trap={func: trap.spring}"]
-    return [*SHORT, "--config-dir", str(tmp_path / "conf"), *more]
+    return [*PLAIN, "--config-dir", str(folder / "conf"), *more]
+
+
+@pytest.fixture(scope="module")
+def untrapped(trap: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of that run in one process, which nothing breaks."""
+    folder = tmp_path_factory.mktemp("untrapped")
+    assert run([*trap, f"hydra.run.dir={folder}/whole"]) == 1
+    return folder / "whole"
 
 
 @pytest.mark.full
 @pytest.mark.parametrize(("env", "why"), [({}, "the trap"), ({"KILL": "1"}, "was killed")])
-def test_a_rank_that_breaks(env: dict[str, str], why: str, trap: list[str], tmp_path: Path) -> None:
+def test_a_rank_that_breaks(
+    env: dict[str, str], why: str, trap: list[str], untrapped: Path, tmp_path: Path
+) -> None:
     """The run fails with the rank and the reason, within seconds; finished seeds are kept, and one
     process goes on with them.
     """
@@ -198,9 +210,8 @@ def test_a_rank_that_breaks(env: dict[str, str], why: str, trap: list[str], tmp_
     assert f"mjstack: {gate['reason'].split('.')[0]}" in text
     before = {path: path.stat().st_mtime_ns for path in folder.glob("*_seed*.npz")}
     assert {path.name for path in before} == {"worlds_seed0.npz", "worlds_seed1.npz"}
-    play(0, [*trap, f"resume={folder}"], tmp_path, 1)
-    play(0, [*trap, f"hydra.run.dir={tmp_path}/whole"], tmp_path, 1)
-    assert_same_episodes(tmp_path / "whole", folder)
+    assert run([*trap, f"resume={folder}"]) == 1
+    assert_same_episodes(untrapped, folder)
     assert {path: path.stat().st_mtime_ns for path in before} == before  # read back
     report = report_of(folder)
     (gate,) = report["gates"]
@@ -227,7 +238,7 @@ def test_a_killed_first_rank_is_named(script: bool, trap: list[str], tmp_path: P
     assert "mjstack: rank 2" not in text
     assert ("mjstack: rank 0 of 2 was killed (SIGKILL, process " in text) == (not script)
     assert report_of(folder)["status"] == "interrupted"
-    play(0, [*trap, f"resume={folder}"], tmp_path, 1)
+    assert run([*trap, f"resume={folder}"]) == 1
     assert report_of(folder)["gates"][0]["metrics"]["episodes"] == 20
 
 
@@ -252,7 +263,7 @@ def test_a_rank_killed_while_ranks_start_is_a_failure(
     rank: int, delay: float, tmp_path: Path
 ) -> None:
     """It is no interruption; the command that has started the ranks names it."""
-    process = start(0, [*SHORT, "devices=2", "nworld=4", f"hydra.run.dir={tmp_path}/run"], tmp_path)
+    process = start(0, [*PLAIN, "devices=2", "nworld=4", f"hydra.run.dir={tmp_path}/run"], tmp_path)
     killed = rank_process(process.pid, rank)
     time.sleep(delay)
     os.kill(killed, signal.SIGKILL)
@@ -265,7 +276,7 @@ def test_a_rank_killed_while_ranks_start_is_a_failure(
 @pytest.mark.full
 def test_ctrl_c_stops_all_ranks(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    args = [*SHORT, "nworld=4", "gate.batch.seeds=10000", f"hydra.run.dir={folder}", "devices=2"]
+    args = [*PLAIN, "nworld=4", "gate.batch.seeds=10000", f"hydra.run.dir={folder}", "devices=2"]
     process = start(0, args, tmp_path)
     until = time.monotonic() + 120.0
     while not (folder / "worlds_seed1.npz").exists() and time.monotonic() < until:
@@ -431,13 +442,13 @@ def test_a_port_in_use_is_one_line(tmp_path: Path) -> None:
 
 @pytest.mark.full
 def test_ranks_collect_one_dataset(tmp_path: Path) -> None:
-    """Two ranks begin it, three go on, and it has what one rank collects, in the same order."""
+    """One begins it, three go on, and it has what one rank collects, in the same order."""
     args = ["job=collect", "sim=native", "nworld=5", "job.keep_failures=true"]
     args += one_second_episode()
-    for count in (7, 12):
-        assert run([*args, f"job.folder={tmp_path}/one", f"job.episodes={count}"]) == 0
     several = [*args, f"job.folder={tmp_path}/several"]
-    play(2, [*several, "job.episodes=7"], tmp_path)
+    assert run([*several, "job.episodes=7"]) == 0
+    shutil.copytree(tmp_path / "several", tmp_path / "one")
+    assert run([*args, f"job.folder={tmp_path}/one", "job.episodes=12"]) == 0
     text = play(3, [*several, "job.episodes=12"], tmp_path)
     assert text.count("12 of 12 episodes there") == 1
     found, expected = (read_dataset(tmp_path / name / "dataset") for name in ("several", "one"))
@@ -466,7 +477,7 @@ def test_all_failing_worlds_are_replayed(finished: Path, tmp_path: Path) -> None
 
 @pytest.mark.full
 def test_ranks_replay_failing_worlds(finished: Path, tmp_path: Path) -> None:
-    args = ["job=replay", f"run={finished}", "world=failing", "sim=mjwarp", "sim.device=cpu"]
+    args = ["job=replay", f"run={finished}", "world=failing", "sim=native"]
     play(2, [*args, f"hydra.run.dir={tmp_path}/two"], tmp_path, 1)
     assert run([*args, f"hydra.run.dir={tmp_path}/one"]) == 1
     tables = [(tmp_path / name / "replayed_worlds.csv").read_text() for name in ("one", "two")]
