@@ -89,7 +89,9 @@ def test_shown_commands_compose() -> None:
         for group in groups:
             together = {key: word for shown in group for key, word in shown.items()}
             # Thresholds are a task's own, and starts from a file refuse seeds and regions.
-            alike = all(command.get(key) == group[0].get(key) for key in ("task", "reset"))
+            # An experiment has keys of its job.
+            apart = ("task", "reset", "experiment", "job")
+            alike = all(command.get(key) == group[0].get(key) for key in apart)
             if alike and all(
                 key in ("gates", "nworld") or together.get(key, word) == word
                 for key, word in command.items()
