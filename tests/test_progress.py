@@ -107,10 +107,15 @@ def fall(value: torch.Tensor) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(
-    ("task", "objects"),
-    [("stack", 1), *(pytest.param(task, 2, marks=pytest.mark.full) for task in ("box", "tower"))],
+    ("task", "objects", "robot"),
+    [
+        ("stack", 1, "so101"),
+        *(
+            pytest.param(*row, marks=pytest.mark.full)
+            for row in (("stack", 1, "rebot"), ("box", 2, "rebot"), ("tower", 2, "so101"))
+        ),
+    ],
 )
-@REBOT_LATER
 def test_the_stage_never_falls_along_an_accepted_episode(
     task: str, objects: int, robot: str
 ) -> None:

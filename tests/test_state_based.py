@@ -51,7 +51,6 @@ def test_episodes_are_accepted(get_stage: GetStage, robot: str, task: str, steps
         ("so101", "lift", 170),
         pytest.param("rebot", "lift", 170, marks=pytest.mark.full),
         pytest.param("so101", "tower", 520, marks=pytest.mark.full),
-        pytest.param("rebot", "tower", 520, marks=pytest.mark.full),
     ],
 )
 def test_tasks_of_ones_own_are_accepted(
