@@ -58,6 +58,9 @@ def earlier(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+NO_PAGE = "web.episode=false"
+
+
 def replay_into(out: Path, folder: Path, *args: str) -> tuple[int, dict]:
     status = run(["job=replay", f"run={folder}", f"hydra.run.dir={out}", *args])
     return status, json.loads((out / "report.json").read_text())
@@ -116,7 +119,7 @@ def test_an_accepted_world_of_another_seed(earlier: Path, tmp_path: Path) -> Non
     """Its saved configuration is the run's, with that seed."""
     record = record_of(earlier, 1)
     assert record.failed[3] == 0
-    status, report = replay_into(tmp_path / "out", earlier, f"world={SUCCEEDED}")
+    status, report = replay_into(tmp_path / "out", earlier, f"world={SUCCEEDED}", NO_PAGE)
     assert status == 0
     (gate,) = report["gates"]
     assert gate["status"] == "pass"
@@ -164,7 +167,7 @@ def test_another_verdict_is_said(earlier: Path, tmp_path: Path) -> None:
     record.failed[0] = RULES["CARRY"]
     record.qpos[0, 14] += 0.002  # somewhere in blue's position
     write_npz(folder / record_name("batch", record.seed), record.arrays())
-    status, report = replay_into(tmp_path / "out", folder, "world=0")
+    status, report = replay_into(tmp_path / "out", folder, "world=0", NO_PAGE)
     (gate,) = report["gates"]
     differs = "NOT as recorded (red not carried): its objects end 2 mm from where they did, "
     assert gate["reason"].startswith("succeeded, ")
@@ -176,7 +179,7 @@ def test_another_verdict_is_said(earlier: Path, tmp_path: Path) -> None:
     told["provenance"]["versions"]["mujoco"] = "3.9.9"  # which promises nothing
     told["provenance"]["model_sha256"] = "0" * 64
     (folder / "report.json").write_text(json.dumps(told))
-    status, report = replay_into(tmp_path / "other", folder, "world=0")
+    status, report = replay_into(tmp_path / "other", folder, "world=0", NO_PAGE)
     (gate,) = report["gates"]
     assert gate["reason"].endswith(f"{differs}and not all is as it was in that run")
     assert any("mujoco was 3.9.9 in that run" in line for line in gate["details"])
@@ -278,7 +281,7 @@ def test_a_run_from_a_file_replays_from_its_own_copy(
     assert (from_file / "starts_played.npz").read_bytes() == carry()
     # A file of that name where the replay is called
     (tmp_path / "carry.npz").write_bytes(carry(red_x=0.32))
-    _, report = replay_into(tmp_path / "out", from_file, f"world={gate}:1")
+    _, report = replay_into(tmp_path / "out", from_file, f"world={gate}:1", NO_PAGE)
     (found,) = report["gates"]
     assert found["reason"].endswith("as recorded, and it ends bit for bit where it did")
     with np.load(tmp_path / "out" / "trajectory.npz") as held:
@@ -315,7 +318,7 @@ def test_what_the_start_does_not_show_is_found_at_the_end(from_file: Path, tmp_p
     """Another mass."""
     folder = copy_of(from_file, tmp_path)
     (folder / "starts_played.npz").write_bytes(carry(red_mass=0.1))
-    status, report = replay_into(tmp_path / "out", folder, "world=batch:1")
+    status, report = replay_into(tmp_path / "out", folder, "world=batch:1", NO_PAGE)
     assert "; NOT as recorded (the same result): its objects end " in report["gates"][0]["reason"]
     assert status == 1
 
