@@ -15,7 +15,7 @@ import pytest
 import torch
 from compositions import load_config, refusal
 from dataset_checker import contents
-from environments import Patch, has_gl
+from environments import SHORT_REACH, Patch, has_gl
 
 from mjstack.cli import run
 from mjstack.datasets import DatasetSpec, DatasetWriter, EpisodeData, Feature, Video, read_dataset
@@ -215,7 +215,7 @@ def test_a_missing_video_is_one_line(tmp_path: Path) -> None:
 
 SMALL = "scene.cameras.front.size=[32,32] scene.cameras.wrist={size:[32,32],rate:10}"
 COMMAND = ["job=collect", "task=reach", "sim=native", "job.folder=demos", "cameras=[front,wrist]"]
-COMMAND += SMALL.split()
+COMMAND += [*SMALL.split(), *SHORT_REACH]
 
 
 @GL
@@ -258,7 +258,7 @@ def test_a_dataset_has_the_images_of_the_environment(
     assert run([*args, "nworld=3", "job.episodes=5"]) == 0
     stored = read_dataset(tmp_path / "demos/dataset")
     assert stored.info["fps"] == 30
-    assert [row["length"] for row in stored.episodes] == [90] * 5
+    assert [row["length"] for row in stored.episodes] == [42] * 5
     cfg = load_config([*args, "job.episodes=5"])
     env = build_env(replace(cfg, action=cfg.controller.action, termination={}), nworld=3)
     for row in stored.episodes:
