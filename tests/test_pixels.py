@@ -12,7 +12,7 @@ import pytest
 import torch
 from browser import messages
 from compositions import load_config, make_env
-from environments import Capture, has_gl, on_cuda
+from environments import SHORT_REACH, Capture, at_double_speed, has_gl, on_cuda
 from PIL import Image
 from policies import interrupted, report, same
 
@@ -35,8 +35,7 @@ CAMERAS = [
     "scene.cameras.front.size=[16,24]",
     "scene.cameras.wrist.size=[16,16]",
 ]
-SHORT = ["controller.phases.hold.seconds=0.4", "task.episode_steps=70", "task.check.window=10"]
-SMALL = ["task=reach", "sim=mjwarp", "sim.device=cpu", "nworld=4", *CAMERAS, *SHORT]
+SMALL = ["task=reach", "sim=mjwarp", "sim.device=cpu", "nworld=4", *CAMERAS, *SHORT_REACH]
 TRAIN = ["job=train", "experiment=pixels", *SMALL, "web.episode=false", "gate.success.rate=0.0"]
 TINY = [
     *TRAIN,
@@ -139,7 +138,13 @@ def test_a_video_has_what_the_policy_saw_in_a_corner(trained: Path, tmp_path: Pa
 
 @pytest.mark.full
 def test_other_cameras_are_refused(trained: Path, capsys: Capture) -> None:
-    base = [*SMALL[:4], *SHORT, "controller=policy", f"policy={trained}/last", "gates=[batch]"]
+    base = [
+        *SMALL[:4],
+        *SHORT_REACH,
+        "controller=policy",
+        f"policy={trained}/last",
+        "gates=[batch]",
+    ]
     for cameras, says in (
         (["cameras=[]"], "with scene.cameras.front.size=[16, 24], and here it is missing"),
         ([], "was trained with scene.cameras.front.size=[16, 24], and here it is ["),
@@ -325,7 +330,7 @@ def test_a_training_goes_on_where_it_was_interrupted(trained: Path, tmp_path: Pa
 def test_stack_learns_from_pixels_and_goes_on_bit_for_bit(tmp_path: Path) -> None:
     """Looks differ between episodes. Any rate will do."""
     sizes = [each for each in TINY if not each.startswith(("task", "controller"))]
-    command = [*sizes, "looks=randomized", "job.length=0.2", "web.episode=false"]
+    command = [*sizes, "looks=randomized", "job.length=0.2", *at_double_speed()]
     interrupted([*command, f"job.folder={tmp_path}/parts"], CloneLearner, 8)
     for name in ("parts", "whole"):
         assert run([*command, f"job.folder={tmp_path}/{name}"]) == 0
