@@ -55,6 +55,7 @@ def measure(what: str, worlds: int, gpus: int, args: argparse.Namespace) -> Run:
             command += [f"job.folder={folder}", f"job.save_every={max(1, args.iterations // 5)}"]
         elif what in ("weak", "strong"):
             command += ["gates=[batch,throughput]", "gate.throughput.native_baseline=false"]
+            command += ["gate.throughput.precision=0"]  # ranks measure at the same time, as long
             command += [f"hydra.run.dir={folder}"]
         with (Path(place) / "output.log").open("wb") as output:
             child = Child(command, output, folder=Path(place))
