@@ -110,6 +110,7 @@ class Env:
         self.given_places: dict[str, Tensor] = {}
         self.success = torch.zeros(sim.nworld, dtype=torch.bool, device=sim.device)
         self._all_worlds = torch.ones_like(self.success)
+        self._no_worlds = torch.zeros_like(self.success)
         self._version = 0
         self._started = False
         self._closed = False
@@ -292,21 +293,25 @@ class Env:
         self.episode_step += 1 if ended is None else ~ended
 
         def look() -> tuple[Tensor, Tensor | None]:
-            lost = lost_state(self)
-            # None where the host can see that there are none
-            broken = lost if lost.is_cuda or bool(lost.any()) else None
+            lost = achieved = self._no_worlds
             ends = self.termination_manager
             rewards = self.reward_manager
 
             def succeed() -> None:
-                if self._success is None:
-                    return
-                achieved = self._success(self)
-                if ended is not None:  # their success stays
-                    achieved = torch.where(ended, self.success, achieved)
-                self.success.copy_(achieved if broken is None else achieved & ~broken)
+                nonlocal achieved
+                if self._success is not None:
+                    achieved = self._success(self)
 
-            self._branches(succeed, ends.begin, rewards.begin)
+            def lose() -> None:
+                nonlocal lost
+                lost = lost_state(self)
+
+            self._branches(succeed, lose, ends.begin, rewards.begin)
+            # None where the host can see that there are none
+            broken = lost if lost.is_cuda or bool(lost.any()) else None
+            if ended is not None:  # their success stays
+                achieved = torch.where(ended, self.success, achieved)
+            self.success.copy_(achieved if broken is None else achieved & ~broken)
             works: list[Callable[[], object]] = [partial(ends.compute, ended)]
             works.append(partial(rewards.compute, broken, ended))
             # A held step is seen by what remembers it alone.

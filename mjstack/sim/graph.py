@@ -26,6 +26,7 @@ _ALIGNMENT = 512  # bytes
 log = logging.getLogger(__name__)
 
 _nesting = 0  # of graphs that are warming up or being captured
+_branching = 0  # of branches that are being captured
 # The rest of a broken capture is kept: torch counts its memory as in use until the process ends.
 _abandoned: list[tuple[torch.cuda.CUDAGraph, torch.cuda.MemPool]] = []
 _capture_streams: dict[str, torch.cuda.Stream] = {}
@@ -270,6 +271,8 @@ def side_by_side(device: torch.device, *works: Callable[[], object]) -> None:
     while len(free) < len(works) - 1:
         free.append(torch.cuda.Stream(device))
     used = [free.pop() for _ in works[1:]]  # a branch may fork again, and takes others then
+    global _branching
+    _branching += 1
     try:
         for stream in used:
             stream.wait_stream(main)
@@ -280,12 +283,14 @@ def side_by_side(device: torch.device, *works: Callable[[], object]) -> None:
         for stream in used:
             main.wait_stream(stream)
     finally:
+        _branching -= 1
         free.extend(used)
 
 
 def where_any(mask: Tensor, work: Callable[[], None]) -> None:
     """Do work that changes the masked worlds alone, where there are some. A CUDA graph that is
-    captured looks in each replay. An eager step on CUDA does not look: that would stop the device.
+    captured looks in each replay, except in a branch, which cannot be interrupted. An eager step on
+    CUDA does not look: that would stop the device.
 
     Args:
         mask: Shape ``(nworld,)``, bool.
@@ -293,7 +298,7 @@ def where_any(mask: Tensor, work: Callable[[], None]) -> None:
     """
     if not mask.is_cuda and not bool(mask.any()):
         return
-    if not mask.is_cuda or not torch.cuda.is_current_stream_capturing():
+    if not mask.is_cuda or _branching or not torch.cuda.is_current_stream_capturing():
         work()
         return
     from mjstack.sim.warp_setup import torch_stream_scope, wp
