@@ -27,6 +27,7 @@ from compositions import make_env
 from environments import one_second_episode
 from test_train import REACH, weights
 
+from mjstack.cli import run
 from mjstack.interrupt import EXIT_CODE
 from mjstack.policy.checkpoint import read_state
 from mjstack.train.trainer import STATE
@@ -34,17 +35,21 @@ from mjstack.train.trainer import STATE
 NO_WORK = "mjstack: interrupted before anything ran\n"
 WORK = "interrupted; the finished gates are in the report\n"
 PROPER = {"before it ran", "while it ran", "after its last step", "ended by itself"}
+COMMANDS = {
+    "gates": ["gates=[baseline,batch]", "gate.batch.seeds=3"],
+    "collect": ["job=collect", "job.folder=demos", "job.episodes=5", "job.keep_failures=true"],
+}
 SECONDS = 2.0  # of processor time, in which an interrupted command ends
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("kind", ["gates", "collect"])
-def test_a_command_that_is_interrupted(kind: str) -> None:
-    done = subprocess.run(
-        [sys.executable, __file__, kind, "10"], capture_output=True, text=True, timeout=600
-    )
+def test_a_command_that_is_interrupted() -> None:
+    """Six times of each kind, once in every sixth of it."""
+    command = [sys.executable, __file__, "all", "6"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stdout[-5000:] + done.stderr[-3000:]
-    assert "10 runs" in done.stdout
+    for kind in COMMANDS:
+        assert f"{kind}: 6 runs" in done.stdout
 
 
 @pytest.mark.full
@@ -56,27 +61,28 @@ def test_a_script_that_is_interrupted() -> None:
 @pytest.mark.full
 def test_a_training_that_is_killed_goes_on_where_it_saved(tmp_path: Path) -> None:
     """SIGKILL after the first save: the same command ends bit for bit as a whole one."""
+    # With more batches than can follow before the kill
+    train = [*REACH, "job.batches=400", "job.save_every=50"]
+    state = tmp_path / "killed" / STATE
+    process = subprocess.Popen(
+        [sys.executable, "-m", "mjstack", *train, f"job.folder={state.parent}"],
+        env=os.environ | {"OMP_NUM_THREADS": "1"},  # other work may share the machine
+        stdout=subprocess.DEVNULL,
+    )
+    until = time.monotonic() + 300.0
+    while not state.exists():
+        assert process.poll() is None
+        assert time.monotonic() < until
+        time.sleep(0.005)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL
+    assert 0 < read_state(state)[1]["done"] < 400
     ends = []
     for name in ("killed", "whole"):
         folder = tmp_path / name
-        # With more batches than can follow before the kill
-        train = [*REACH, "job.batches=400", "job.save_every=50", f"job.folder={folder}"]
-        command = [sys.executable, "-m", "mjstack", *train]
-        alone = os.environ | {"OMP_NUM_THREADS": "1"}  # other work may share the machine
-        if name == "killed":
-            process = subprocess.Popen(command, env=alone, stdout=subprocess.DEVNULL)
-            until = time.monotonic() + 300.0
-            while not (folder / STATE).exists():
-                assert process.poll() is None
-                assert time.monotonic() < until
-                time.sleep(0.005)
-            process.kill()
-            assert process.wait() == -signal.SIGKILL
-            done = read_state(folder / STATE)[1]["done"]
-            assert 0 < done < 400
-        subprocess.run(command, env=alone, stdout=subprocess.DEVNULL, check=True, timeout=300)
-        state, facts = read_state(folder / STATE)
-        ends.append(state | weights(folder / "last") | weights(folder / "best"))
+        assert run([*train, f"job.folder={folder}"]) == 0
+        tensors, facts = read_state(folder / STATE)
+        ends.append(tensors | weights(folder / "last") | weights(folder / "best"))
         assert facts["done"] == 400
     killed, whole = ends
     assert killed.keys() == whole.keys()
@@ -119,22 +125,29 @@ def interrupt_steps(count: int) -> Counter[str]:
 
 
 def main(kind: str, count: str) -> int:
-    """Interrupt commands of a kind at random moments, and print how each ended."""
+    """Interrupt commands of a kind, or of all, and print how each ended."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # it may be ignored where tests run
+    fuzz._preload(chosen=())
+    warnings.simplefilter("ignore")  # of a machine that cannot draw
+    return max([interrupt_kind(name, int(count)) for name in COMMANDS if kind in (name, "all")])
+
+
+def interrupt_kind(kind: str, count: int) -> int:
+    """Interrupt a command at a random moment of each of as many equal parts of it; 1 if it ends
+    too late or in no proper way.
+    """
     moments = random.Random(kind)
     ended: Counter[str] = Counter()
     slowest = 0.0
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # it may be ignored where tests run
     with tempfile.TemporaryDirectory() as fixture:
-        fuzz._preload()
-        warnings.simplefilter("ignore")  # of a machine that cannot draw
         whole = min(interrupt_command(kind, Path(fixture), None)[1] for _ in range(2))
-        for _ in range(int(count)):
-            delay = moments.uniform(0.0, 0.95 * whole)
+        for number in range(count):
+            delay = moments.uniform(number, number + 1) / count * 0.95 * whole
             how, seconds = interrupt_command(kind, Path(fixture), delay)
             print(f"after {delay:.2f} s: {how}, {seconds:.2f} s later", flush=True)
             slowest = max(slowest, seconds)
             ended[how] += 1
-    print(f"{count} runs of {whole:.1f} s: {dict(ended)}, slowest {slowest:.2f} s")
+    print(f"{kind}: {count} runs of {whole:.1f} s: {dict(ended)}, slowest {slowest:.2f} s")
     return int(slowest > SECONDS or not ended.keys() <= PROPER)
 
 
@@ -142,11 +155,7 @@ def interrupt_command(kind: str, fixture: Path, delay: float | None) -> tuple[st
     """How a command ended that was interrupted after some seconds of processor time, or was not,
     and the processor time from then on.
     """
-    commands = {
-        "gates": ["gates=[baseline,batch]", "gate.batch.seeds=3"],
-        "collect": ["job=collect", "job.folder=demos", "job.episodes=5", "job.keep_failures=true"],
-    }
-    args = [*commands[kind], "nworld=2", "sim=native", *one_second_episode()]
+    args = [*COMMANDS[kind], "nworld=2", "sim=native", *one_second_episode()]
     child = fuzz._fork(0, lambda case, folder: args, fixture, True)
     before = 0.0
     if delay is not None:
