@@ -112,7 +112,10 @@ def fall(value: torch.Tensor) -> torch.Tensor:
         ("stack", 1, "so101"),
         *(
             pytest.param(*row, marks=pytest.mark.full)
-            for row in (("stack", 1, "rebot"), ("box", 2, "rebot"), ("tower", 2, "so101"))
+            for row in (
+                *(("stack", 1, "rebot"), ("box", 2, "rebot")),
+                *(("box", 2, "so101"), ("tower", 2, "so101")),
+            )
         ),
     ],
 )
