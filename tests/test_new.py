@@ -29,14 +29,15 @@ def test_a_task_passes_as_it_is_written(here: Path, capsys: Capture) -> None:
 
 
 @pytest.mark.full
-def test_it_passes_all_gates_with_the_other_robot(here: Path) -> None:
-    """And its own test passes, which plays both."""
-    assert run(["new", "task", "fresh_rebot"]) == 0
-    folder = here / "fresh_rebot"
-    overrides = ["task=fresh_rebot", "robot=rebot", "nworld=4", "gate.capacity.cpu_nworld=2"]
+@pytest.mark.parametrize("arm", ["so101", "rebot"])
+def test_it_passes_the_gates_with_both_robots(arm: str, here: Path) -> None:
+    assert run(["new", "task", f"fresh_{arm}"]) == 0
+    folder = here / f"fresh_{arm}"
+    overrides = [f"task=fresh_{arm}", f"robot={arm}", "nworld=4", "gate.capacity.cpu_nworld=2"]
     result = mjstack.verify([*overrides, GATES], config_dir=folder / "conf")
     assert result.status == "pass", result.messages
-    runpy.run_path(str(folder / "test_fresh_rebot.py"))["test_the_gates_pass"]()
+    if arm == "rebot":
+        runpy.run_path(str(folder / f"test_fresh_{arm}.py"))["test_the_gates_pass"]()
 
 
 def test_a_robot_is_read_from_its_file(here: Path) -> None:
