@@ -9,7 +9,7 @@ from environments import configure, on_cuda
 from mjstack.config.schema import Backend
 from mjstack.scene import SceneIndex, build_model
 from mjstack.sim import make_simulation
-from mjstack.sim.fused.step import StepPlan, can_rearrange
+from mjstack.sim.fused.step import StepPlan, why_stock
 from mjstack.sim.mjwarp import MjwarpSimulation
 from mjstack.sim.mujoco_warp import mjw
 from mjstack.sim.sizes import resolve_env_sizes
@@ -152,5 +152,5 @@ def test_what_it_leaves_out_is_stepped_by_mjwarp(change) -> None:
     change(spec)
     changed = spec.compile()
     with wp.ScopedDevice("cpu"):
-        assert can_rearrange(plain, mjw.put_model(plain))
-        assert not can_rearrange(changed, mjw.put_model(changed))
+        assert not why_stock(plain, mjw.put_model(plain))
+        assert why_stock(changed, mjw.put_model(changed))

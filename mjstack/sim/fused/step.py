@@ -44,8 +44,8 @@ class StepPlan:
 
 def plan_step(model: mujoco.MjModel, m: mjw.Model, d: mjw.Data) -> StepPlan:
     """The fastest step that does all that the model needs."""
-    if not can_rearrange(model, m):
-        return StepPlan(reason="the model has features that only mujoco_warp.step knows")
+    if reason := why_stock(model, m):
+        return StepPlan(reason=reason)
     if reason := constraints.why_not(m, d):
         return StepPlan("arranged", reason=reason)
     slower = {"contact rows": constraints.why_not_rows(m), "smooth dynamics": smooth.why_not(m)}
@@ -53,29 +53,31 @@ def plan_step(model: mujoco.MjModel, m: mjw.Model, d: mjw.Data) -> StepPlan:
     return StepPlan("fused", smooth=not slower["smooth dynamics"], reason="; ".join(reasons))
 
 
-def can_rearrange(model: mujoco.MjModel, m: mjw.Model) -> bool:
-    """Whether `rearranged_step` does all that `mujoco_warp.step` does for this model.
+def why_stock(model: mujoco.MjModel, m: mjw.Model) -> str:
+    """What of this model `rearranged_step` does not do as `mujoco_warp.step` does; "" if nothing.
 
-    It leaves out cameras and lights, which nothing in the physics reads, tendons, flexes, sleeping,
-    energy and callbacks, and it knows one integrator. Equalities between bodies read velocities of
-    the step before, adhesion reads contacts among the smooth forces, and sensors of acceleration or
-    of a camera need stages of their own.
+    It leaves out cameras and lights, which nothing in the physics reads. Equalities between bodies
+    read velocities of the step before, adhesion reads contacts among the smooth forces, and sensors
+    of acceleration or of a camera need stages of their own.
     """
-    return (
-        m.opt.run_collision_detection
-        and not m.nacttrnbody
-        and not m.flg_adhesion
-        and mujoco.mjtObj.mjOBJ_CAMERA not in (*model.sensor_objtype, *model.sensor_reftype)
-        and model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        and model.ntendon == model.nflex == 0
-        and model.nhistory == 0
-        and not model.opt.enableflags
-        & (mujoco.mjtEnableBit.mjENBL_SLEEP | mujoco.mjtEnableBit.mjENBL_ENERGY)
-        and (model.eq_type == mujoco.mjtEq.mjEQ_JOINT).all()
-        and not m.sensor_rne_postconstraint
-        and not m.opt.run_rne_postconstraint
-        and not any((m.callback.control, m.callback.contactfilter))
-    )
+    sensed = (*model.sensor_objtype, *model.sensor_reftype)
+    enabled = mujoco.mjtEnableBit.mjENBL_SLEEP | mujoco.mjtEnableBit.mjENBL_ENERGY
+    integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    features = {
+        "an integrator other than implicitfast": model.opt.integrator != integrator,
+        "tendons": model.ntendon,
+        "flexes": model.nflex,
+        "equalities between bodies": (model.eq_type != mujoco.mjtEq.mjEQ_JOINT).any(),
+        "sensors of acceleration": m.sensor_rne_postconstraint or m.opt.run_rne_postconstraint,
+        "sensors of a camera": mujoco.mjtObj.mjOBJ_CAMERA in sensed,
+        "adhesion": m.flg_adhesion or m.nacttrnbody,
+        "delays": model.nhistory,
+        "sleeping or energy": model.opt.enableflags & enabled,
+        "no collision detection": not m.opt.run_collision_detection,
+        "callbacks": m.callback.control or m.callback.contactfilter,
+    }
+    named = [name for name, has in features.items() if has]
+    return f"mjstack's does not know {', '.join(named)}" if named else ""
 
 
 def rearranged_forward(
