@@ -8,14 +8,14 @@ set -u
 out=${1:?a folder}
 shift
 sizes() { echo "scene.cameras.front.size=[$1,$1] scene.cameras.wrist.size=[$1,$1]"; }
-pixels="experiment=pixels nworld=2048 job.rounds=16" # 13 minutes on an H100
+pixels="experiment=pixels nworld=2048 job.rounds=12 job.vision.pool=900000" # 10 minutes on an H100
 ppo="trainer=ppo nworld=4096 job.iterations=null gate.success.rate=0.0001"
 declare -A lanes=(
   [ppo_lift]="--config-dir ${LIFT:-lift/conf} task=lift $ppo job.minutes=10"
   [hz10]="nworld=2048 job.chunk=5 job.execute=5 job.beta_decay=1 gate.success.seeds=2"
   [delay]="nworld=2048 trainer=clone timing.command_delay=5 gate.success.seeds=2"
   [pixels_rebot]="$pixels $(sizes 96) robot=rebot"
-  [pixels_looks]="$pixels $(sizes 96) looks=randomized"
+  [pixels_looks]="$pixels $(sizes 96) looks=randomized job.rounds=16"
   [pixels_wrist]="$pixels cameras=wrist scene.cameras.wrist.size=[96,96]"
   [pixels_front]="$pixels cameras=front scene.cameras.front.size=[96,96]"
 )
