@@ -1,7 +1,9 @@
 """Managers: on any object of an environment's shape, their tables, and what overrides change."""
 
+import functools
 import itertools
 import sys
+from contextlib import closing
 from types import FrameType
 from typing import Any
 
@@ -11,7 +13,7 @@ from environments import actions, configure, mask_of, new_sim, on_shared_sim, re
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from mjstack import make_env
-from mjstack.config.schema import Config
+from mjstack.config.schema import Config, TermCfg
 from mjstack.managers import (
     ActionManager,
     ObservationManager,
@@ -20,8 +22,10 @@ from mjstack.managers import (
     TerminationManager,
 )
 from mjstack.managers.term import Term, in_one_pass, shared
+from mjstack.mdp import reward as reward_terms
 from mjstack.scene import SceneIndex
 from mjstack.scene.index import Columns
+from mjstack.tasks.progress import Progress
 
 
 class Bench:
@@ -242,3 +246,45 @@ def test_terms_with_parameters_are_built_once() -> None:
     assert clock(env).tolist() == [False, True, True]
     assert limit(env).tolist() == [False] * 3
     limit.reset(mask_of(env, 1))  # no memory, nothing to forget
+
+
+def test_a_term_marked_so_ignores_success() -> None:
+    lift = "{func: mjstack.mdp.reward.lift, params: {object: red, height: 0.04}, weight: 1.0}"
+    reach = "{func: mjstack.mdp.reward.reach, params: {object: red, scale: 0.2}, weight: 1.0}"
+    rewards = (f"+reward.lift={lift}", f"+reward.reach={reach}")
+    with closing(make_env(["task=stack", "sim=native", *rewards], nworld=4)) as env:
+        env.reset(seed=0)
+        for action in actions(env, 3):
+            env.step(action)
+        managers = (env.reward_manager, env.termination_manager)
+        marked = [t for m in managers for t in m._terms.values() if t.ignores_success]
+        assert {term.label.partition(".")[2] for term in marked} == {
+            *("progress", "lift", "reach", "action_rate", "joint_vel"),
+            *("time_out", "object_off_table", "joint_limit", "non_finite", "overflow"),
+        }
+        for term in marked:
+            values = []
+            for success in (False, True):
+                env.success.fill_(success)
+                values.append(term(env).clone())
+            assert torch.equal(*values), term.label
+
+
+class PaysOnce(Progress):
+    """Progress as long as the task is not achieved."""
+
+    def __call__(self, env: Any) -> torch.Tensor:
+        return super().__call__(env) * ~env.success
+
+
+@functools.wraps(reward_terms.lift)
+def bonus(env: Any, **params: Any) -> torch.Tensor:
+    """Lifting, and the success of the same step."""
+    return reward_terms.lift(env, **params) + env.success.float()
+
+
+def test_what_is_made_of_a_marked_term_is_not_marked() -> None:
+    with closing(make_env(["task=stack", "sim=native"], nworld=2)) as env:
+        for name, params in (("PaysOnce", {}), ("bonus", {"object": "red", "height": 0.04})):
+            cfg = TermCfg(func=f"{__name__}.{name}", params=params)
+            assert not Term("reward.mine", cfg, env).ignores_success

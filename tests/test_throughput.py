@@ -191,15 +191,6 @@ def test_two_episodes_that_agree_are_enough(new_run: NewRun, monkeypatch: Patch)
         assert (found["repetitions"], found["bare_repetitions"]) == (played, bare)
 
 
-def test_native_mujoco_beside_cuda_takes_less_time(monkeypatch: Patch) -> None:
-    cfg = load_config([])
-    cpu, cuda = (worlds(monkeypatch, device)[0] for device in ("cpu", "cuda"))
-    for device, seconds in (("cuda:0", 2.0), ("cpu", 5.0)):
-        monkeypatch.setattr(timing, "resolve_backend", lambda _, device=device: (None, device))
-        assert timing.time_budget(cfg, cpu) == seconds
-        assert timing.time_budget(cfg, cuda) == 300.0
-
-
 @pytest.mark.full
 def test_mjwarp_alternates_with_bare_steps_and_tells_warm_up_and_capture_apart(
     new_run: NewRun,

@@ -15,7 +15,6 @@ from mjstack.bench.timing import (
     EnergyMeter,
     EnergyObserver,
     Measurement,
-    budget_key,
     lost_worlds,
     settled,
     time_budget,
@@ -78,9 +77,10 @@ def measure_episode(
         if settled(cfg, [episode.timing.seconds for episode in played]):
             break
     if not played:
+        key = "max_seconds" if sim.device.type == "cuda" else "cpu_max_seconds"
         out.missing = (
             f"an episode would take about {estimate:.0f} s, and a measurement has {seconds:g} s"
-            f" (gate.throughput.{budget_key(cfg, sim)})"
+            f" (gate.throughput.{key})"
         )
         return out
 
@@ -99,7 +99,8 @@ def measure_episode(
     out.headline = f"{statistics.median(times):.3g} s"
     if "bare_ratio" in out.samples:
         out.facts["bare_repetitions"] = len(out.samples["bare_ratio"])
-        out.headline += f" ({out.median('bare_ratio'):.3f} x bare steps)"
+        once = ", once" if out.facts["bare_repetitions"] == 1 else ""
+        out.headline += f" ({out.median('bare_ratio'):.3f} x bare steps{once})"
     elif mjwarp:
         out.notes["bare_ratio"] = "not measured: no time for an episode and as many bare steps"
     if failed:

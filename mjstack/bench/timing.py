@@ -12,7 +12,7 @@ from typing_extensions import override
 from mjstack.config.schema import Config
 from mjstack.episodes.rollout import Observer, RolloutTiming
 from mjstack.math import not_finite
-from mjstack.sim import LOST_PHYSICS, Simulation, resolve_backend
+from mjstack.sim import LOST_PHYSICS, Simulation
 from mjstack.sim.build import cuda_uuid, device_memory
 from mjstack.sim.graph import StepGraph
 
@@ -244,17 +244,10 @@ def settled(cfg: Config, *figures: Sequence[float]) -> bool:
     )
 
 
-def budget_key(cfg: Config, sim: Simulation) -> str:
-    """The setting with the seconds that a measurement on these worlds may take."""
-    if sim.device.type == "cuda":
-        return "max_seconds"
-    beside_cuda = resolve_backend(cfg)[1].startswith("cuda")
-    return "baseline_max_seconds" if beside_cuda else "cpu_max_seconds"
-
-
 def time_budget(cfg: Config, sim: Simulation) -> float:
     """Seconds that a measurement on these worlds may take."""
-    return getattr(cfg.gate.throughput, budget_key(cfg, sim))
+    t = cfg.gate.throughput
+    return t.max_seconds if sim.device.type == "cuda" else t.cpu_max_seconds
 
 
 def steps_that_fit(most: int, budget: float, seconds_per_step: float) -> int:

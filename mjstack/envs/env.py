@@ -312,11 +312,14 @@ class Env:
             if ended is not None:  # their success stays
                 achieved = torch.where(ended, self.success, achieved)
             self.success.copy_(achieved if broken is None else achieved & ~broken)
-            works: list[Callable[[], object]] = [partial(ends.compute, ended)]
-            works.append(partial(rewards.compute, broken, ended))
+
+            def reward() -> None:
+                ends.compute(ended)
+                rewards.compute(void=broken, ended=ended)
+
             # A held step is seen by what remembers it alone.
-            if last or self.observation_manager.remembers:
-                works.append(self.observation_manager.compute)
+            observes = last or self.observation_manager.remembers
+            works = (reward, self.observation_manager.compute) if observes else (reward,)
             self._branches(*works)
             return lost, broken
 

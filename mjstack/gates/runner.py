@@ -113,7 +113,11 @@ def _in_each_rank(run: Run, gate: Gate) -> list[GateResult]:
     """
     stage = run.stage
     ranks = stage.ranks
-    share = replace(run.cfg, nworld=len(stage.worlds))
+    gate_cfg = run.cfg.gate
+    # Ranks that made different numbers of repetitions would not be timed at the same time
+    throughput = replace(gate_cfg.throughput, precision=0.0)
+    gates = replace(gate_cfg, throughput=throughput)
+    share = replace(run.cfg, nworld=len(stage.worlds), gate=gates)
     alone = replace(run, stage=stage.with_config(share, ranks=Ranks(), measured=stage.measured))
     results_of = ranks.in_all(lambda: gate(alone))
     note = f"each of {ranks.size} ranks its own worlds; figures are rank 0's"

@@ -161,7 +161,7 @@ class Term:
         params: Its parameters.
         model_fields: Per-world model fields that it writes.
         has_memory: Whether it keeps something from step to step.
-        ignores_success: Whether it does not read ``env.success``.
+        ignores_success: Whether it is marked as such.
     """
 
     def __init__(
@@ -193,7 +193,7 @@ class Term:
         is_class = inspect.isclass(func)
         check_params(label, func, self.params, 1 if is_class or not masked else 2)
         self.model_fields: Sequence[str] = getattr(func, "model_fields", ())
-        self.ignores_success: bool = getattr(func, "ignores_success", False)
+        self.ignores_success = getattr(func, "ignores_success", None) is func
         self.call: Any = partial(func, **self.params)
         if is_class:
             with blamed(label):

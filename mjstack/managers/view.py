@@ -64,8 +64,7 @@ def offers(kind: str = "", /, **attributes: Any) -> Callable[[Any], Any]:
     where it ends such worlds; of a reset term ``reads_file``, where its parameter ``path`` names a
     file of starts, ``places_objects``, where its parameter ``xy`` is a region, ``joint_noise``,
     where its parameter ``arm`` moves the arm's joints; ``starts_midway``, where worlds start in the
-    middle of an episode; ``ignores_success`` of a reward or termination that does not read
-    ``env.success``, so that CUDA may compute both at once.
+    middle of an episode.
 
     Example:
         >>> @offers("observation term", unit="m")
@@ -80,6 +79,15 @@ def offers(kind: str = "", /, **attributes: Any) -> Callable[[Any], Any]:
         return term
 
     return mark
+
+
+def ignores_success(term: Any) -> Any:
+    """Mark a reward or termination term that reads neither ``env.success`` nor what a success term
+    or another manager writes: CUDA may compute it beside success. A subclass, or a function that
+    wraps it, is not marked.
+    """
+    term.ignores_success = term
+    return term
 
 
 def uses_fields(*names: str) -> Callable[[Any], Any]:

@@ -5,13 +5,13 @@ import math
 from torch import Tensor
 
 from mjstack.config.fields import Count, NotNegative
-from mjstack.managers.view import EnvView, offers
+from mjstack.managers.view import EnvView, ignores_success, offers
 from mjstack.mdp.geometry import lost_state, robot
 from mjstack.mdp.observation import joint_pos, positions
 from mjstack.sim import LOST_PHYSICS
 
 
-@offers(ignores_success=True)
+@ignores_success
 def time_out(env: EnvView, *, steps: Count) -> Tensor:
     """After this many steps."""
     return env.episode_step >= steps
@@ -22,7 +22,7 @@ def success(env: EnvView) -> Tensor:
     return env.success
 
 
-@offers(ignores_success=True)
+@ignores_success
 class ObjectOffTable:
     """When an object's centre is beside the table or below its top."""
 
@@ -40,7 +40,7 @@ class ObjectOffTable:
         return ((offset < self._low) | (offset > self._high)).flatten(1).any(1)
 
 
-@offers(ignores_success=True)
+@ignores_success
 class JointLimit:
     """When a joint of the robot is outside its range by more than a part of it: MuJoCo's limits are
     soft.
@@ -64,13 +64,15 @@ class JointLimit:
         return ((q < self._low) | (q > self._high)).any(1)
 
 
-@offers(ends_on="non_finite", ignores_success=True)
+@ignores_success
+@offers(ends_on="non_finite")
 def non_finite(env: EnvView) -> Tensor:
     """When a position or velocity is NaN or infinite: such a world cannot go on."""
     return lost_state(env)
 
 
-@offers(ends_on="overflow", ignores_success=True)
+@ignores_success
+@offers(ends_on="overflow")
 def overflow(env: EnvView) -> Tensor:
     """When a buffer of the world was too small, so that physics was lost."""
     return (env.sim.overflow & LOST_PHYSICS) != 0

@@ -288,13 +288,13 @@ def side_by_side(device: torch.device, *works: Callable[[], object]) -> None:
 
 
 def where_any(mask: Tensor, work: Callable[[], None]) -> None:
-    """Do work that changes the masked worlds alone, where there are some. A CUDA graph that is
+    """Do work that matters to the masked worlds alone, where there are some. A CUDA graph that is
     captured looks in each replay, except in a branch, which cannot be interrupted. An eager step on
     CUDA does not look: that would stop the device.
 
     Args:
         mask: Shape ``(nworld,)``, bool.
-        work: Changes nothing if the mask is empty.
+        work: Changes nothing that counts if the mask is empty.
     """
     if not mask.is_cuda and not bool(mask.any()):
         return

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from mjstack.config.fields import Fraction, Positive
 from mjstack.errors import ConfigError
-from mjstack.managers.view import EnvView, offers
+from mjstack.managers.view import EnvView, ignores_success
 from mjstack.math import norm
 from mjstack.mdp.observation import grasp_point_pos
 from mjstack.tasks.check import make_check
@@ -14,7 +14,7 @@ STAGES = ("reach", "lift", "carry", "place", "release")
 BELOW = 0.005  # m below its goal that an object over it may be: contacts are soft
 
 
-@offers(ignores_success=True)
+@ignores_success
 class Progress:
     """Progress of a task whose check has `EpisodeCheck.goals`, from 0 to 1.
 

@@ -205,7 +205,8 @@ class ThroughputCfg(GateFuncCfg):
     repetitions: int = spec(ge=1)
     """Repetitions of each measurement, at most."""
     precision: float = spec(0.01, ge=0.0)
-    """Repetitions end, from two on, as soon as half their range is less, relative to the median."""
+    """physics, episode: repetitions end, from two on, as soon as half their range is less,
+    relative to the median."""
     episodes: int = spec(ge=1)
     """episode: repetitions at most."""
     steps: int = spec(unit="steps", ge=1)
@@ -218,8 +219,6 @@ class ThroughputCfg(GateFuncCfg):
     """Time budget of each measurement on CUDA."""
     cpu_max_seconds: float = spec(unit="s", gt=0.0)
     """Time budget of each measurement on a CPU."""
-    baseline_max_seconds: float = spec(2.0, unit="s", gt=0.0)
-    """The same of native MuJoCo on CUDA machines."""
     from_phase: str = spec()
     """Phase at whose start physics begins; it holds the joint target from there. Empty: the one
     after the first grasp, or without grasps after the last phase with a closed gripper."""
