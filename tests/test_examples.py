@@ -63,7 +63,7 @@ def play_gates(example: str, robot: str, folder: Path, *overrides: str) -> dict[
     ("example", "robot", "gates"),
     [
         pytest.param("tower", "so101", "batch", marks=pytest.mark.full),
-        pytest.param("tower", "rebot", "baseline,batch", marks=pytest.mark.full),
+        pytest.param("tower", "rebot", "baseline,parity,batch", marks=pytest.mark.full),
         ("push", "so101", "baseline,batch"),
         pytest.param("push", "rebot", "baseline,parity,batch", marks=pytest.mark.full),
         ("scara", "scara", "baseline,batch,success"),
