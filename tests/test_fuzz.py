@@ -2,7 +2,7 @@
 
 The check of each passes, or ends in one line and exit status 2. Then nothing is written. Nothing
 in the home folder changes, and no process is left. A tenth of the command lines that pass, and
-six of the folders, are run to the end.
+twelve of the folders, are run to the end.
 
 The cases run in forked children of a process of their own, whose modules are loaded already:
 ``python tests/test_fuzz.py commands 17 200-220`` runs these cases and prints what they say.
@@ -42,7 +42,7 @@ from mjstack.config.load import compose
 from mjstack.config.session import hydra_session
 
 COUNTS = {"commands": 60, "folders": 60}  # `make fuzz` tries 1,000 and 500
-REAL = 6  # folders that commands in a process of their own are given
+REAL = 12  # folders that commands in a process of their own are given
 CASES = {"commands": command_lines, "folders": damaged_folders}
 UNTOUCHED = ("policy", "run")  # what is only read
 PASSED = 77  # exit status of a child whose check has passed

@@ -190,8 +190,8 @@ def test_an_interrupted_sweep_leaves_a_summary(begin: Callable[..., int]) -> Non
     assert begin("-m", "seed=1,2,3", work=work) == 130
     rows = csv.DictReader(Path(SWEEP, "summary.csv").read_text().splitlines())
     assert [row["status"] for row in rows] == ["pass", "interrupted", "not run"]
-    assert begin("-m", "seed=3") == 0  # a folder of the hour is new
-    assert Path(f"{SWEEP}-2", "0", "report.json").exists()
+    assert begin("-m", "seed=1,2,3") == 0  # a folder of the hour is new
+    assert Path(f"{SWEEP}-2", "2", "report.json").exists()
 
 
 @pytest.mark.full

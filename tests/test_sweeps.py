@@ -207,17 +207,17 @@ def test_a_gpu_for_each_job(stub: Path, monkeypatch: Patch) -> None:
 @pytest.mark.full
 def test_a_sweep_in_two_terminals(tmp_path: Path) -> None:
     """Each job runs once, and both commands report all of them."""
-    args = [*PLAIN, "-m", "hydra/launcher=gpus", "seed=1,2", "nworld=2"]
+    args = [*PLAIN, "-m", "hydra/launcher=gpus", "seed=1,2,3", "nworld=2"]
     args += [f"hydra.sweep.dir={tmp_path}/sweep"]
     commands = [start(0, args, tmp_path) for _ in range(2)]
     texts = [command.communicate(timeout=400)[0] for command in commands]
     assert [command.returncode for command in commands] == [1, 1], (
         texts
     )  # the episodes are too short
-    for number in range(2):
+    for number in range(3):
         assert sum(text.count(f"job {number} on ") for text in texts) == 1
         assert report_of(tmp_path / "sweep" / str(number))["status"] == "fail"
-        assert all("sweep of 2 jobs" in text for text in texts)
+        assert all("sweep of 3 jobs" in text for text in texts)
 
 
 def test_a_report_is_read_back(tmp_path: Path) -> None:
