@@ -58,6 +58,12 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true")
     args = parser.parse_args()
     os.environ.pop("PYTHONPATH", None)  # which may name the checkout
+    for name in [] if args.quick else args.python:
+        python = name.partition(":")[0]
+        try:
+            subprocess.run([python, "-V"], check=True, capture_output=True)
+        except (OSError, subprocess.CalledProcessError):
+            parser.error(f"{python} does not run here. Install it, or name others with --python")
     version = check_versions()
     with tempfile.TemporaryDirectory(prefix="dist") as name:
         work = Path(name)

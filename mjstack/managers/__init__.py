@@ -11,7 +11,14 @@ from mjstack.managers.episode import (
     required_fields,
 )
 from mjstack.managers.observation import ObservationManager
-from mjstack.managers.view import EnvView, episode_draw, offers, random_uniform, uses_fields
+from mjstack.managers.view import (
+    EnvView,
+    episode_draw,
+    ignores_success,
+    offers,
+    random_uniform,
+    uses_fields,
+)
 
 __all__ = [
     "ActionManager",
@@ -22,6 +29,7 @@ __all__ = [
     "RewardManager",
     "TerminationManager",
     "episode_draw",
+    "ignores_success",
     "offers",
     "random_uniform",
     "required_fields",
