@@ -17,7 +17,7 @@ from mjstack.errors import ArgumentError
 from mjstack.managers.action import ActionManager
 from mjstack.managers.episode import ResetManager, RewardManager, TerminationManager
 from mjstack.managers.observation import ObservationManager
-from mjstack.managers.term import Term, current_term, first_value, in_one_pass
+from mjstack.managers.term import Term, branches, current_term, first_value, in_one_pass
 from mjstack.mdp.geometry import lost_state
 from mjstack.rng import check_seed
 from mjstack.scene import SceneIndex
@@ -37,10 +37,8 @@ class Env:
     4. observations are computed: for the worlds that end here, this is the terminal observation;
     5. finished episodes go into the statistics;
     6. the worlds that ended are reset, and observed again;
-    7. the cameras of ``scene.cameras`` are drawn, once for all worlds.
-
-    A camera that is slower than the control rate is drawn in the first step of a world's episode
-    and then in every so many of its steps. Images of other steps are the last ones drawn.
+    7. the cameras of ``scene.cameras`` are drawn, once for all worlds. One that is slower than the
+       control rate is drawn in the first step of a world's episode and then in every so many.
 
     With ``timing.policy_decimation`` 1 to 4 are repeated so many times with the same action, each
     time for a control step. Rewards are summed. A world whose episode ends before the last of them
@@ -53,9 +51,8 @@ class Env:
     term's Python number, call `recapture`.
 
     Values that derive from contacts (``sensordata``, ``contact_count``) are those of the last
-    physics step before, and zero in a world that has just been reset.
-
-    It has the attributes of `EnvView`, and these.
+    physics step before, and zero in a world that has just been reset. Attributes are those of
+    `EnvView`, and these.
 
     Attributes:
         action_manager: Actions; ``action_dim`` is the policy's output.
@@ -293,20 +290,11 @@ class Env:
         self.episode_step += 1 if ended is None else ~ended
 
         def look() -> tuple[Tensor, Tensor | None]:
-            lost = achieved = self._no_worlds
             ends = self.termination_manager
             rewards = self.reward_manager
-
-            def succeed() -> None:
-                nonlocal achieved
-                if self._success is not None:
-                    achieved = self._success(self)
-
-            def lose() -> None:
-                nonlocal lost
-                lost = lost_state(self)
-
-            self._branches(succeed, lose, ends.begin, rewards.begin)
+            succeed = partial(self._success, self) if self._success else lambda: self._no_worlds
+            begun = (ends.begin, rewards.begin)
+            achieved, lost, *_ = branches(self.device, succeed, partial(lost_state, self), *begun)
             # None where the host can see that there are none
             broken = lost if lost.is_cuda or bool(lost.any()) else None
             if ended is not None:  # their success stays
@@ -320,7 +308,7 @@ class Env:
             # A held step is seen by what remembers it alone.
             observes = last or self.observation_manager.remembers
             works = (reward, self.observation_manager.compute) if observes else (reward,)
-            self._branches(*works)
+            branches(self.device, *works)
             return lost, broken
 
         lost, broken = in_one_pass(look)
@@ -331,14 +319,6 @@ class Env:
         if last:
             self._reset_ended(done, broken)
         return None if last else done
-
-    def _branches(self, *works: Callable[[], object]) -> None:
-        """Independent works of one pass. Values that terms share are known to all works that begin
-        later, except on CUDA, where these are branches of a graph.
-        """
-        if self.device.type == "cuda":
-            works = tuple(partial(in_one_pass, work) for work in works)
-        side_by_side(self.device, *works)
 
     def _reset_ended(self, done: Tensor, broken: Tensor | None) -> None:
         """The terminal observation, the statistics, the reset of the worlds that are ``done``, and

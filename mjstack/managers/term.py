@@ -20,6 +20,7 @@ from mjstack.config.schema import TermCfg
 from mjstack.errors import ConfigError, MjstackError, ParameterError, TermError, first_line, suggest
 from mjstack.managers.view import EnvView
 from mjstack.math import describe_tensor
+from mjstack.sim.graph import side_by_side
 
 Result = TypeVar("Result")
 
@@ -130,6 +131,19 @@ def in_one_pass(work: Callable[[], Result]) -> Result:
     context = copy_context()
     context.run(_pass_values.set, dict(_pass_values.get() or {}))
     return context.run(work)
+
+
+def branches(device: torch.device, *works: Callable[[], Any]) -> list[Any]:
+    """Results of independent works of one pass. Later ones know the values that earlier ones have
+    computed, except on CUDA, where they are branches of a graph.
+    """
+    results: dict[int, Any] = {}
+
+    def keep(number: int, work: Callable[[], Any]) -> None:
+        results[number] = in_one_pass(work) if device.type == "cuda" else work()
+
+    side_by_side(device, *(partial(keep, *pair) for pair in enumerate(works)))
+    return [results[number] for number in range(len(works))]
 
 
 def known_values() -> dict[Any, Any]:
