@@ -216,7 +216,7 @@ def _sweep(hydra: Any, overrides: list[str]) -> int:
     jobs = expand(master, overrides)
     check_jobs(master, jobs, _check)
     begin_job()
-    from mjstack.jobs.sweep_folder import list_jobs
+    from mjstack.jobs.sweep import list_jobs
     from mjstack.jobs.sweep_table import sweep_config
 
     sweep = sweep_config(master)
@@ -247,7 +247,7 @@ def run_job(cfg: DictConfig) -> Report:
     """Run a job in the folder that Hydra made. A launcher may call it in another process, where
     nothing has been checked yet.
     """
-    from mjstack.jobs.sweep_folder import SweepJob  # they load torch
+    from mjstack.jobs.sweep import SweepJob  # they load torch
     from mjstack.jobs.sweep_table import update_summary
 
     logging.raiseExceptions = False  # a full disk would print a traceback for each line of run.log

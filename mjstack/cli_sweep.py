@@ -63,8 +63,7 @@ def claim_sweep(master: DictConfig, jobs: Sequence[list[str]]) -> Iterator[Path]
     """A sweep's folder, with the list of its jobs: a new one by the hour, or one in which the same
     command goes on, with a queue also beside others.
     """
-    from mjstack.jobs.sweep import Queueing
-    from mjstack.jobs.sweep_folder import SWEEP, add_jobs, number_jobs
+    from mjstack.jobs.sweep import SWEEP, Queueing, add_jobs, number_jobs
 
     folder = hydra_path(master, "sweep.dir")
     queued = _launcher(master).endswith(".GpuLauncher")

@@ -21,7 +21,7 @@ from mjstack.cli import run
 from mjstack.config.schema import Backend, SweepCfg
 from mjstack.errors import MjstackError
 from mjstack.jobs import check_job, sweep, sweep_table
-from mjstack.jobs.sweep_folder import LOG, SweepJob, add_jobs
+from mjstack.jobs.sweep import LOG, SweepJob, add_jobs
 from mjstack.jobs.sweep_table import sweep_rows, write_summary
 from mjstack.report.record import GateResult, Report, Status
 from mjstack.report.sweep_picture import Plot, Row, crossover, save_sweep

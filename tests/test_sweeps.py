@@ -14,8 +14,7 @@ from test_run_folder import contents
 
 from mjstack import process
 from mjstack.errors import ConfigError, FolderError
-from mjstack.jobs.sweep import Queueing, run_jobs
-from mjstack.jobs.sweep_folder import LOG, SWEEP, SweepJob, add_jobs, lock_file
+from mjstack.jobs.sweep import LOG, SWEEP, Queueing, SweepJob, add_jobs, lock_file, run_jobs
 from mjstack.report.record import GateResult, Report, Status
 from mjstack.report.write import read_report, write_report
 

@@ -29,8 +29,7 @@ class GpuLauncher(Launcher):
         """See `Launcher`."""
         # Hydra looks at every plugin, and these load torch.
         from mjstack.cli_sweep import hydra_path
-        from mjstack.jobs.sweep import Queueing, run_jobs
-        from mjstack.jobs.sweep_folder import number_jobs
+        from mjstack.jobs.sweep import Queueing, number_jobs, run_jobs
         from mjstack.jobs.sweep_table import update_summary
 
         folder = hydra_path(self._config, "sweep.dir")

@@ -12,7 +12,7 @@ from mjstack.config.explain import parse
 from mjstack.config.schema import SweepCfg
 from mjstack.errors import is_out_of_memory
 from mjstack.files import to_csv, write_atomic
-from mjstack.jobs.sweep_folder import LOG, list_jobs
+from mjstack.jobs.sweep import LOG, list_jobs
 from mjstack.report.markdown import to_markdown
 from mjstack.report.record import Report, Status
 from mjstack.report.sections import Part, Section
