@@ -347,11 +347,11 @@ def lead_out(name: str) -> Callable[[Path], None]:
 
 
 def test_a_term_without_numbers(tmp_path: Path) -> None:
-    """Nothing that can move is a box, for example."""
+    """The scene has no places, for example."""
     cfg = configure()
-    func = "mjstack.mdp.observation.headings"
-    cfg.observation["policy"].terms["headings"] = ObservationTermCfg(func, params={"objects": []})
-    assert load_policy(write_policy(tmp_path / "mine", cfg)).widths["headings"] == 0
+    func = "mjstack.mdp.observation.goals"
+    cfg.observation["policy"].terms["goals"] = ObservationTermCfg(func)
+    assert load_policy(write_policy(tmp_path / "mine", cfg)).widths["goals"] == 0
 
 
 def sparse(folder: Path) -> None:

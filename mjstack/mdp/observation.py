@@ -78,24 +78,16 @@ def object_pose(env: EnvView, *, object: str) -> Tensor:
 
 
 @_in_metres
-def positions(env: EnvView, *, objects: list[str] | None = None) -> Tensor:
-    """Where objects are [m], world frame, shape ``(nworld, 3 * objects)``.
-
-    Args:
-        env: The environment.
-        objects: The objects; all of the scene that can move if None.
-    """
-    names = env.cfg.scene.free if objects is None else objects
-    parts = [pose_w(env, name)[:, :3] for name in names]
+def positions(env: EnvView) -> Tensor:
+    """Where the objects that can move are [m], world frame, shape ``(nworld, 3 * objects)``."""
+    parts = [pose_w(env, name)[:, :3] for name in env.cfg.scene.free]
     return torch.cat([env.sim.qpos[:, :0], *parts], dim=1)
 
 
 @_in_metres
-def offsets(env: EnvView, *, objects: list[str] | None = None) -> Tensor:
-    """From the grasp point to objects [m], shape ``(nworld, 3 * objects)``; arguments as of
-    `positions`.
-    """
-    at = positions(env, objects=objects)
+def offsets(env: EnvView) -> Tensor:
+    """From the grasp point to the objects that can move [m], shape ``(nworld, 3 * objects)``."""
+    at = positions(env)
     return at - grasp_point_pos(env).repeat(1, at.shape[1] // 3)
 
 
@@ -107,19 +99,14 @@ def goals(env: EnvView) -> Tensor:
 
 
 @offers("observation term", unit="1")
-def headings(env: EnvView, *, objects: list[str] | None = None) -> Tensor:
-    """How boxes are turned about z: cosine and sine of four times the yaw of each, which are the
-    same after a quarter turn, shape ``(nworld, 2 * objects)``.
-
-    Args:
-        env: The environment.
-        objects: The boxes; all boxes of the scene that can move if None.
+def headings(env: EnvView) -> Tensor:
+    """How the boxes that can move are turned about z: cosine and sine of four times the yaw of
+    each, which are the same after a quarter turn, shape ``(nworld, 2 * boxes)``.
     """
-    if objects is None:
-        objects = [name for name, thing in env.cfg.scene.free.items() if thing.shape == "box"]
-    if not objects:
+    boxes = [name for name, thing in env.cfg.scene.free.items() if thing.shape == "box"]
+    if not boxes:
         return env.sim.qpos[:, :0]
-    w, x, y, z = torch.stack([pose_w(env, name)[:, 3:] for name in objects], dim=1).unbind(2)
+    w, x, y, z = torch.stack([pose_w(env, name)[:, 3:] for name in boxes], dim=1).unbind(2)
     cos = 1.0 - 2.0 * (y * y + z * z)
     sin = 2.0 * (w * z + x * y)
     # Of the yaw, then of twice, then of four times. A box that stands on edge has no yaw.
