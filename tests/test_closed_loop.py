@@ -11,9 +11,8 @@ from compositions import load_config, make_env
 from environments import GetStage, at_double_speed, on_cuda
 
 from mjstack.drivers.closed_loop import ClosedLoopDriver, make_expert
-from mjstack.drivers.feedback import FeedbackDriver, measure_planar
+from mjstack.drivers.feedback import FeedbackDriver, _keeps, _places, measure_planar
 from mjstack.drivers.state_based import StateBasedDriver
-from mjstack.drivers.tilt import _keeps, _places
 from mjstack.envs import Env, driven_config
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ArgumentError

@@ -91,7 +91,10 @@ PATHS: dict[str, dict[str, str] | None] = {
         "": "_put",
     },
     "drivers/policy.py": {"PolicyDriver": "command _query"},
-    "drivers/feedback.py": {"FeedbackDriver": "_observe _aim _last_seen _measure _keep_finite"},
+    "drivers/feedback.py": {
+        "CarryTilt": "desired_approach release_approach",
+        "FeedbackDriver": "_observe _aim _last_seen _measure _keep_finite",
+    },
     "drivers/state_based.py": {
         "StateBasedDriver": (
             "command _decide _find_delivered _lead_point _tilted _turn_left _point _grasp_offsets"
@@ -99,7 +102,6 @@ PATHS: dict[str, dict[str, str] | None] = {
     },
     "train/rounds.py": {"MixedDriver": "command"},
     "policy/network.py": {"PolicyNetwork": "normalized forward"},
-    "drivers/tilt.py": {"CarryTilt": "desired_approach release_approach"},
     "episodes/failures.py": {"FailureMonitor": "update", "": "_of"},
     "kinematics/batched_ik.py": {"BatchedIk": "solve forward _launch _copy_in"},
     "scene/index.py": {"Columns": "read write write_masked"},
