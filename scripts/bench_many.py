@@ -21,7 +21,7 @@ sys.path.insert(0, str(ROOT))
 
 from mjstack.files import to_csv, write_atomic  # noqa: E402
 from mjstack.process import Child, stop_all  # noqa: E402
-from mjstack.report.markdown import to_markdown  # noqa: E402
+from mjstack.report.formats import to_markdown  # noqa: E402
 from mjstack.report.picture import figure  # noqa: E402
 from mjstack.report.sections import Part, Section  # noqa: E402
 from mjstack.report.table import Console, Table  # noqa: E402

@@ -13,7 +13,7 @@ from mjstack.config.schema import SweepCfg
 from mjstack.errors import is_out_of_memory
 from mjstack.files import to_csv, write_atomic
 from mjstack.jobs.sweep import LOG, list_jobs
-from mjstack.report.markdown import to_markdown
+from mjstack.report.formats import to_markdown
 from mjstack.report.record import Report, Status
 from mjstack.report.sections import Part, Section
 from mjstack.report.sweep_picture import Plot, Row, save_sweep
