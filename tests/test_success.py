@@ -31,11 +31,19 @@ from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.failures import FailureMonitor, Sign
 from mjstack.episodes.record import FAILING
-from mjstack.episodes.regions import describe_region, find_regions, radial_yaw_deg, regions_table
 from mjstack.episodes.rollout import Hook, reset_worlds, rollout
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Progress, Stage
-from mjstack.gates.success import Goal, find_doubts, run_success, success_config
+from mjstack.gates.success import (
+    Goal,
+    describe_region,
+    find_doubts,
+    find_regions,
+    radial_yaw_deg,
+    regions_table,
+    run_success,
+    success_config,
+)
 from mjstack.jobs.gates import check_machine
 from mjstack.math import wilson_interval
 from mjstack.report.record import GateResult, Status

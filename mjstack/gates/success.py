@@ -1,30 +1,42 @@
 """Gate *success*: how often the expert or a policy does the task from random starts, and where it
-fails.
+fails: by rule, by sign, and by where the objects started.
 """
 
+import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from typing_extensions import override
 
 from mjstack.config.check import places_objects, reads_starts_file, with_region
-from mjstack.config.schema import Config
+from mjstack.config.schema import Config, SuccessGateCfg
 from mjstack.distributed import Ranks
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
-from mjstack.episodes.record import starts_name
-from mjstack.episodes.regions import find_regions, regions_table, save_regions
+from mjstack.episodes.record import REGIONS, starts_name
 from mjstack.episodes.rollout import CLOSED_LOOP, FEEDBACK, POLICY, Observer
 from mjstack.episodes.run import Run, needs_episode, spread
 from mjstack.episodes.seeds import play_seeds
-from mjstack.files import write_npz
-from mjstack.math import wilson_interval
+from mjstack.episodes.tally import rate_cells
+from mjstack.files import to_csv, write_atomic, write_npz
+from mjstack.math import rate_interval, wilson_interval
 from mjstack.mdp.starts.starts_file import start_arrays
 from mjstack.report.record import GateResult
+from mjstack.report.table import Table
 from mjstack.report.text import format_percent
 from mjstack.report.write import safely_write
+
+Region = dict[str, Any]
+"""Episodes whose object started in one cell, by column of the file: the ``object``; the bounds that
+the cell has, of x and y of its centre [m] and of its direction [deg], as of `radial_yaw_deg`; how
+many ``episodes``, and how many ``succeeded``, their ``rate`` and its 95 % interval."""
+
+_BOUNDS = (*("x_min_m", "x_max_m", "y_min_m", "y_max_m"), "yaw_min_deg", "yaw_max_deg")
+_EDGE = 1e-9  # cells: a place this close below a cell's edge is on it
 
 
 def success_config(cfg: Config) -> Config:
@@ -83,8 +95,10 @@ def run_success(run: Run) -> list[GateResult]:
     if all(region["succeeded"] == region["episodes"] for region in regions):
         there = "had a failure" if regions else "(gate.success.cell_episodes): more seeds have more"
         tally.details.append(f"no region of at least {t.cell_episodes} episodes {there}")
-    if run.folder is not None and (problem := save_regions(run.folder, regions)):
-        tally.details.append(problem)
+    if run.folder is not None:
+        table = to_csv(regions, ("object", *_BOUNDS))
+        if problem := safely_write(run.folder / REGIONS, write_atomic, table):
+            tally.details.append(problem)
     result = tally.result(
         parts,
         passed=tally.successes / tally.episodes >= t.rate,
@@ -167,3 +181,78 @@ def _describe_start(cfg: Config) -> str:
     regions = [term.params["xy"] for term in cfg.reset.values() if places_objects(term)]
     where = "".join(f", objects within {x:g} x {y:g} m of their places" for x, y in regions)
     return f"gate.success.reset ({', '.join(cfg.reset)}{where})"
+
+
+def radial_yaw_deg(places: np.ndarray) -> np.ndarray:
+    """Angle of an object relative to the direction in which the base, at the origin, sees it [deg],
+    from 0 to 90.
+
+    Args:
+        places: x and y [m] and rotation about z [rad], shape ``(..., 3)``.
+    """
+    relative = np.degrees(places[..., 2] - np.arctan2(places[..., 1], places[..., 0]))
+    return np.mod(relative, 90.0) % 90.0  # twice: just below 0 rounds to 90
+
+
+def find_regions(
+    cfg: SuccessGateCfg, places: np.ndarray, succeeded: np.ndarray, objects: Sequence[str]
+) -> list[Region]:
+    """Cells of each object's position, of its direction, and of both, that have enough episodes;
+    the lowest rate first. In x and y they begin at multiples of their width; the last one in
+    direction ends at 90.
+
+    Args:
+        cfg: The configuration of the gate, with their widths and the least number of episodes.
+        places: x and y [m] and rotation about z [rad] of each object at the start, shape ``(n,
+            objects, 3)``.
+        succeeded: Whether each episode was, shape ``(n,)``, bool.
+        objects: Names of the objects.
+    """
+    out: list[Region] = []
+    widths = np.array([cfg.cell, cfg.cell, cfg.yaw_cell_deg])
+    ends = np.array([math.inf, math.inf, 90.0])
+    for number, name in enumerate(objects):
+        yaw = radial_yaw_deg(places[:, number])
+        keys = np.floor(np.column_stack((places[:, number, :2], yaw)) / widths + _EDGE)
+        keys[keys[:, 2] * cfg.yaw_cell_deg >= 90.0, 2] = 0.0  # on the edge of 90, which is 0
+        for axes in ([0, 1], [2], [0, 1, 2]):
+            cells, which = np.unique(keys[:, axes], axis=0, return_inverse=True)
+            for row, key in enumerate(cells):
+                outcomes = succeeded[which.ravel() == row]
+                n = len(outcomes)
+                if n < cfg.cell_episodes:
+                    continue
+                k = int(outcomes.sum())
+                edges = (key * widths[axes], np.minimum((key + 1.0) * widths[axes], ends[axes]))
+                names = [_BOUNDS[2 * axis + end] for axis in axes for end in (0, 1)]
+                bounds = zip(names, np.column_stack(edges).round(9).ravel().tolist(), strict=True)
+                region = {"object": name, **dict(bounds), "episodes": n, "succeeded": k}
+                out.append(region | rate_interval("rate", k, n))
+    return sorted(out, key=lambda region: (region["rate"], region["rate_high95"]))
+
+
+def describe_region(region: Region) -> str:
+    """The cell in words."""
+    texts = {
+        "x_min_m": "x {x_min_m:.3f} to {x_max_m:.3f} m, y {y_min_m:.3f} to {y_max_m:.3f} m",
+        "yaw_min_deg": "turned {yaw_min_deg:g} to {yaw_max_deg:g} deg",
+    }
+    parts = [text.format(**region) for name, text in texts.items() if name in region]
+    return f"{region['object']}: {', '.join(parts)}"
+
+
+def regions_table(cfg: SuccessGateCfg, regions: list[Region]) -> list[Table]:
+    """The regions with the lowest rates; no table where none has a failure."""
+    failing = [r for r in regions if r["succeeded"] < r["episodes"]]
+    if not failing:
+        return []
+    rows = []
+    for region in failing[: cfg.worst_regions]:
+        n, k = region["episodes"], region["succeeded"]
+        rows.append([describe_region(region), str(n), str(k), *rate_cells(k, n)])
+    title = (
+        f"Worst regions of at least {cfg.cell_episodes} episodes ({len(rows)} of {len(failing)}"
+        " with a failure)"
+    )
+    header = ["where the object started", "episodes", "succeeded", "rate", "95 % interval"]
+    return [Table(title=title, header=header, rows=rows)]
