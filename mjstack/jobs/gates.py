@@ -106,7 +106,7 @@ def check_task(stage: Stage) -> None:
     judged = success_config(cfg).controller.name
     if judged == CLOSED_LOOP and (name == CLOSED_LOOP or "success" in cfg.gates):
         # Loads Warp, which a native open-loop run does not need.
-        from mjstack.kinematics.chain import build_chain
+        from mjstack.kinematics.batched_ik import build_chain
 
         build_chain(stage.model, cfg.robot)
 
