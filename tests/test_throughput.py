@@ -11,7 +11,7 @@ import torch
 from compositions import load_config
 from environments import MakeSim, NewRun, Patch, at_double_speed, on_cuda
 
-from mjstack.bench import env_step, episode, physics, timing
+from mjstack.bench import env_step, episode, timing
 from mjstack.bench.env_step import measure_env_step
 from mjstack.bench.timing import EnergyMeter, Measurement, steps_that_fit, timed
 from mjstack.envs import Env, build_env
@@ -358,7 +358,7 @@ def test_no_time_for_an_episode_is_said(new_run: NewRun) -> None:
 def test_start_states_repeat_without_the_batch_gate(new_run: NewRun) -> None:
     run = new_run("sim=native", "nworld=5", *SHORT, "gate.throughput.start_worlds=2")
     sim = run.stage.batch_simulation(5)
-    state = physics.carry_start(run.stage, sim, None)
+    state = episode.carry_start(run.stage, sim, None)
     assert state.qpos.shape[0] == 5
     assert np.array_equal(state.qpos[[0, 1, 0]], state.qpos[2:])
     assert not np.array_equal(state.qpos[0], state.qpos[1])
@@ -368,7 +368,7 @@ def test_start_states_repeat_without_the_batch_gate(new_run: NewRun) -> None:
     assert state.qpos[:, gripper].max() < run.cfg.robot.gripper_open[0] - 0.1  # closed on the cube
     kept = State(state.qpos.copy(), state.qvel, state.ctrl)
     run.artifacts.carry_start = kept
-    assert physics.carry_start(run.stage, sim, kept) is kept
+    assert episode.carry_start(run.stage, sim, kept) is kept
 
 
 @pytest.mark.full
@@ -376,7 +376,7 @@ def test_worlds_with_an_empty_grasp_are_counted(new_run: NewRun) -> None:
     """Red beside the jaws in two of five worlds, then in three of them."""
     run = new_run("sim=native", "nworld=5", *SHORT, f"{ONLY}[physics]")
     sim = run.stage.batch_simulation(5)
-    state = physics.carry_start(run.stage, sim, None)
+    state = episode.carry_start(run.stage, sim, None)
     red = run.stage.index.object_qpos[0]
     state.qpos[[1, 4], red + 1] -= 0.1
     run.artifacts.carry_start = state

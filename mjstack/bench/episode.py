@@ -1,4 +1,6 @@
-"""The whole episode with its check; on MJWarp beside bare steps of the same commands."""
+"""Physics steps with the object in hand, and the whole judged episode; on MJWarp beside bare
+steps of the same commands.
+"""
 
 import math
 import statistics
@@ -15,21 +17,132 @@ from mjstack.bench.timing import (
     EnergyMeter,
     EnergyObserver,
     Measurement,
+    describe_lost,
     lost_worlds,
     settled,
+    steps_that_fit,
     time_budget,
     timed,
 )
+from mjstack.config.schema import Backend
 from mjstack.drivers.driver import OpenLoopDriver
 from mjstack.drivers.open_loop import JointTrajectory
 from mjstack.episodes.recorder import COMMANDS, Recorder
-from mjstack.episodes.rollout import FEEDBACK, Episode
+from mjstack.episodes.rollout import FEEDBACK, Episode, State, restore, rollout, snapshot
 from mjstack.episodes.stage import Stage
 from mjstack.errors import name_worlds
+from mjstack.mdp.geometry import objects_in_hand
 from mjstack.sim import Simulation
 
 if TYPE_CHECKING:
     from mjstack.sim.mjwarp import MjwarpSimulation
+
+
+class HeldPhysics:
+    """Physics under a held joint target, timed again and again from one state.
+
+    Attributes:
+        lost: Worlds that overflowed, diverged or were not stepped in some repetition, shape
+            ``(nworld,)``, bool.
+    """
+
+    def __init__(self, sim: Simulation, state: State, decimation: int) -> None:
+        """Put the worlds into the state in which every repetition starts."""
+        self.sim = sim
+        self.state = state
+        self.decimation = decimation
+        restore(sim, state)
+        self.lost = lost_worlds(sim)
+
+    def warm_up(self) -> float:
+        """Compile and capture the step; return the seconds that one takes then."""
+        return [timed(self.sim, lambda: self._play(1)) for _ in range(WARM_UP)][-1]
+
+    def play(self, steps: int, meter: EnergyMeter = NO_METER) -> float:
+        """Seconds that some control steps take from the state."""
+        restore(self.sim, self.state)
+        seconds = timed(self.sim, lambda: self._play(steps), meter)
+        self.lost |= lost_worlds(self.sim, steps * self.decimation)
+        return seconds
+
+    def _play(self, steps: int) -> None:
+        for _ in range(steps):
+            self.sim.step(self.decimation)
+
+
+def measure_physics(stage: Stage, sim: Simulation, carry: State | None = None) -> Measurement:
+    """Measure physics steps under a held joint target, the object in hand.
+
+    A grasp may be empty at the start, about to be retried. The number of full ones is reported, and
+    there is no figure if they are less than half. The figure includes the rest of a simulation's
+    step: counting contacts, latching overflow. Fewer steps are made where the time budget [s] is
+    short.
+    """
+    t = stage.cfg.gate.throughput
+    out = Measurement(name="physics")
+    physics = HeldPhysics(sim, carry_start(stage, sim, carry), stage.cfg.timing.decimation)
+    carried = stage.phase(t.from_phase).carried
+    full = sim.nworld
+    if carried >= 0:  # both jaws press on the phase's object
+        full = int(objects_in_hand(stage.index, sim)[:, carried].sum())
+        out.facts["worlds_with_object_in_hand"] = full
+        if 2 * full < sim.nworld:
+            where = f"as {t.from_phase} begins (gate.throughput.from_phase)"
+            out.problem = f"only {full} of {sim.nworld} worlds have the object in hand {where}"
+            return out
+
+    # The repetitions
+    seconds = t.repetitions * physics.warm_up()
+    steps = steps_that_fit(t.steps, time_budget(stage.cfg, sim), seconds)
+    meter = EnergyMeter(str(sim.device))
+    times = []
+    for repetition in range(t.repetitions):
+        times.append(physics.play(steps, meter))
+        stage.progress.advance("physics, repetitions", repetition + 1, t.repetitions)
+        if settled(stage.cfg, times):
+            break
+
+    # The result
+    graph = sim.graph_of(physics.decimation)
+    captured = graph is not None and graph.captured
+    out.add_repetitions(sim, stage.cfg, times, steps, meter, graph, captured=captured, whole=False)
+    out.facts |= {
+        "peak_contacts_per_world": int(sim.peak_contacts.max()),
+        "peak_constraint_rows_per_world": int(sim.peak_constraints.max()),
+    }
+    out.problem = describe_lost(physics.lost) or out.problem
+    out.headline = (
+        f"{out.median('world_steps_per_s'):,.0f} world-steps/s,"
+        f" {out.median('ms_per_batched_step'):.3g} ms per step of {sim.nworld} worlds"
+    )
+    if full < sim.nworld:
+        out.headline += f" ({sim.nworld - full} of them with an empty grasp)"
+    return out
+
+
+def carry_start(stage: Stage, sim: Simulation, state: State | None) -> State:
+    """States at the start of the measured phase.
+
+    Those of gate *batch*, ``state``, or those of some native worlds over and over.
+    """
+    if state is not None and state.qpos.shape[0] == sim.nworld:
+        return state
+    count = min(sim.nworld, stage.cfg.gate.throughput.start_worlds)
+    native = stage.simulation(count, Backend.native, "cpu")
+    state = play_to_phase(stage, native)
+    native.close()
+    rows = np.arange(sim.nworld) % count
+    return State(state.qpos[rows], state.qvel[rows], state.ctrl[rows])
+
+
+def play_to_phase(stage: Stage, sim: Simulation) -> State:
+    """The state of every world as the measured phase begins, played from the configured starts."""
+    phase = stage.cfg.gate.throughput.from_phase
+    env = stage.start(sim, stage.cfg.reset)
+    steps = stage.phase(phase).start
+    label = f"steps to {phase}"
+    rollout(env, stage.driver(env), steps=steps, advance=stage.progress.advance, label=label)
+    return snapshot(sim)
 
 
 def measure_episode(

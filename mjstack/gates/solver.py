@@ -9,7 +9,7 @@ from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from mjstack.bench.physics import HeldPhysics, play_to_phase
+from mjstack.bench.episode import HeldPhysics, play_to_phase
 from mjstack.bench.timing import describe_lost, steps_that_fit
 from mjstack.config.complete import typed
 from mjstack.config.fields import spec

@@ -7,8 +7,7 @@ from contextlib import closing
 from functools import partial
 
 from mjstack.bench.env_step import measure_env_step
-from mjstack.bench.episode import measure_episode
-from mjstack.bench.physics import measure_physics
+from mjstack.bench.episode import measure_episode, measure_physics
 from mjstack.bench.timing import Measurement
 from mjstack.config.schema import Backend
 from mjstack.envs import build_env, decided_every_step, without_images
