@@ -29,7 +29,7 @@ from mjstack.errors import MjstackError
 from mjstack.policy import load_policy
 from mjstack.scene.index import ALL
 from mjstack.tasks.check import make_check
-from mjstack.train.ppo_learner import PpoLearner
+from mjstack.train.ppo import PpoLearner
 
 TINY = (
     *("job=train", "trainer=ppo", "sim=native", "nworld=4", "job.iterations=4"),
