@@ -14,9 +14,8 @@ import mujoco
 from mjstack.config.schema import Backend, Config, TermCfg
 from mjstack.distributed import Ranks, current_ranks
 from mjstack.drivers.driver import Driver, OpenLoopDriver
-from mjstack.drivers.lerobot import LerobotDriver
 from mjstack.drivers.open_loop import OpenLoopPlanner
-from mjstack.drivers.policy import PolicyDriver
+from mjstack.drivers.policy import LerobotDriver, PolicyDriver
 from mjstack.envs import Env, build_env, driven_config
 from mjstack.envs.buffers import Advance, MeasuringWorlds, measured_sizes
 from mjstack.episodes.rollout import (
