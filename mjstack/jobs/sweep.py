@@ -69,27 +69,23 @@ def add_jobs(folder: Path, jobs: Sequence[SweepJob]) -> None:
         FolderError: The list has another job of one of these numbers, or a job's folder has other
             files than those of its run.
     """
-    listed = {job.number: _entry(job) for job in list_jobs(folder)}
-    before = dict(listed)
+    before = {job.number: job for job in list_jobs(folder)}
+    listed = dict(before)
     for job in jobs:
-        entry = _entry(job)
-        if listed.setdefault(job.number, entry) != entry:
-            overrides = " ".join(listed[job.number][1])
+        earlier = listed.setdefault(job.number, job).overrides
+        if earlier != job.overrides:
             raise FolderError(
-                f"{folder} has another sweep, whose job {job.number} is {overrides}, expected the"
-                f" same jobs, which are in {SWEEP}. Set hydra.sweep.dir to another folder"
+                f"{folder} has another sweep, whose job {job.number} is {' '.join(earlier)},"
+                f" expected the same jobs, which are in {SWEEP}. Set hydra.sweep.dir to another"
+                " folder"
             )
         refuse_links([job.folder], "Remove it, or set hydra.sweep.dir to another folder")
         if job.number not in before or job.report() is None:
             check_unused(job.folder, key="hydra.sweep.dir")
-    if listed != before or not (folder / SWEEP).exists():
+    if len(listed) > len(before) or not (folder / SWEEP).exists():
         folder.mkdir(parents=True, exist_ok=True)
-        write_atomic(folder / SWEEP, json.dumps(listed, indent=1) + "\n")
-
-
-def _entry(job: SweepJob) -> tuple[str, list[str]]:
-    """A job's folder and overrides in the list of a sweep's folder."""
-    return job.folder.name, list(job.overrides)
+        entries = {number: (job.folder.name, job.overrides) for number, job in listed.items()}
+        write_atomic(folder / SWEEP, json.dumps(entries, indent=1) + "\n")
 
 
 def list_jobs(folder: Path) -> list[SweepJob]:
