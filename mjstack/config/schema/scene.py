@@ -79,8 +79,6 @@ class ShapeCfg:
     @property
     def half_height(self) -> float:
         """Height of the centre above what it stands on [m]."""
-        if self.upright:
-            return self.half[2]
         up = [abs(part) for part in self.axes[2]]
         if self.shape == "box":
             return sum(map(mul, up, self.size))
