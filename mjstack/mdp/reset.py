@@ -126,7 +126,6 @@ class RandomizeObjects:
         yaw: NotNegative = math.pi,
         gap: NotNegative = GAP,
         candidates: Count = 16,
-        pose: Pose = "start",
     ) -> None:
         """Check that the region has room.
 
@@ -136,7 +135,6 @@ class RandomizeObjects:
             yaw: Half-width of the rotation about z [rad].
             gap: Free room around an object, for fingers [m].
             candidates: Draws per object and world; four times as many where objects may meet.
-            pose: Where the arm is then, ``home`` or ``start``.
 
         Raises:
             ParameterError: The region leaves no free place, or the arm does not reach all of it.
@@ -154,7 +152,7 @@ class RandomizeObjects:
             env,
             region=region,
             gap=gap,
-            pose=getattr(robot(env), pose).tolist(),
+            pose=robot(env).start.tolist(),
             noise=sum(term.params.get("arm", 0.0) for term in noisy),
         )
         self._placement.require_room(region, candidates + self._more)
