@@ -20,8 +20,10 @@ PATHS: dict[str, dict[str, str] | None] = {
     },
     "envs/command_delay.py": {"CommandDelay": "late reset"},
     "envs/faults.py": {"FaultLatch": "record"},
-    "envs/statistics.py": {"EpisodeStatistics": "update"},
-    "envs/outputs.py": {"Outputs": "write_final restore_observations returned"},
+    "envs/outputs.py": {
+        "Outputs": "write_final restore_observations returned",
+        "EpisodeStatistics": "update",
+    },
     "managers/action.py": {"ActionManager": "process apply reset"},
     "managers/observation.py": {
         "_Part": "value",

@@ -10,8 +10,7 @@ from mjstack.config.schema import Config
 from mjstack.envs.camera_schedule import CameraSchedule
 from mjstack.envs.command_delay import CommandDelay
 from mjstack.envs.faults import FaultLatch
-from mjstack.envs.outputs import Outputs, ResetResult, StepResult
-from mjstack.envs.statistics import EpisodeStatistics
+from mjstack.envs.outputs import EpisodeStatistics, Outputs, ResetResult, StepResult
 from mjstack.envs.threads import few_threads
 from mjstack.errors import ArgumentError
 from mjstack.managers.action import ActionManager

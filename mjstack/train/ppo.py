@@ -20,7 +20,7 @@ from mjstack.config.functions import resolve_func
 from mjstack.config.schema import Config, PpoJobCfg, TermCfg
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env, build_env
-from mjstack.envs.statistics import join_statistics
+from mjstack.envs.outputs import join_statistics
 from mjstack.episodes.batches import BatchPlan, play_batches
 from mjstack.episodes.recorder import Channels, Read
 from mjstack.episodes.rollout import Observer
