@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mjstack.config.schema import Config
 from mjstack.drivers.driver import Driver, require_actions
 from mjstack.errors import ArgumentError
 from mjstack.kinematics.batched_ik import BatchedIk
@@ -57,39 +56,28 @@ class CarryTilt:
     """
 
     def __init__(
-        self,
-        model: mujoco.MjModel,
-        cfg: Config,
-        phases: Sequence[Phase],
-        ik: BatchedIk,
-        nominal: Tensor,
+        self, env: EnvView, phases: Sequence[Phase], ik: BatchedIk, nominal: Tensor
     ) -> None:
-        """Allocate for the worlds of the solver.
-
-        Args:
-            model: The compiled scene.
-            cfg: The configuration; ``controller.approach_gain`` must be positive.
-            phases: The phases.
-            ik: The driver's solver.
-            nominal: Commands at the end of each phase of the nominal plan, shape ``(phases, nu)``,
-                float32.
+        """Allocate for the worlds of a driver with these phases, solver and nominal commands, shape
+        ``(phases, nu)``, float32.
 
         Raises:
             ConfigError: The arm's first joint does not turn about the vertical.
         """
         self._ik = ik
         self._nominal = nominal
-        c = cfg.controller
-        device = ik.device
+        model = env.sim.model
+        c = env.cfg.controller
+        device = env.device
         self._there_ik = BatchedIk(
             model,
-            cfg.robot,
-            ik.nworld,
+            env.cfg.robot,
+            env.nworld,
             device,
             iterations=c.step_iterations,
             approach_gain=c.approach_gain,
         )
-        self._sign = turn_sign(model, cfg.robot)
+        self._sign = turn_sign(model, env.cfg.robot)
         self._keeps = torch.tensor(_keeps(phases), device=device)
         self._grasps = torch.tensor([phase.grasped >= 0 for phase in phases], device=device)
         self.place = torch.tensor(_places(phases), device=device)
@@ -225,7 +213,7 @@ class FeedbackDriver(Driver):
         grasped = {phase.grasps for phase in c.phases.values()} - {None}
         self._tilt: CarryTilt | None = None
         if c.approach_gain > 0.0 and grasped:
-            self._tilt = CarryTilt(env.sim.model, cfg, self._plan, self._ik, self._nominal)
+            self._tilt = CarryTilt(env, self._plan, self._ik, self._nominal)
         # Jaws turn to a face, and to the narrower side of what is oblong in any case.
         objects = cfg.scene.objects
         self._long = [name for name, thing in objects.items() if thing.oblong and name in grasped]
