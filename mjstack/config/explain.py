@@ -22,6 +22,7 @@ from mjstack.config.fields import accepted, find_field
 from mjstack.config.schema import JOB_SCHEMAS, Config, GateCfg
 from mjstack.errors import MjstackError, UnknownName, first_line, suggest
 
+COMMANDS = ("demo", "doctor", "list", "new")  # first words of a command line
 LISTS = ("cameras", "experiment")  # groups of which several may be chosen
 TERM_GROUPS = ("action", "observation", "reset", "termination", "reward")
 
@@ -58,6 +59,9 @@ def parse(override: str) -> Override:
     try:
         return OverridesParser.create().parse_override(override)
     except HydraException as error:
+        if override.isidentifier():
+            problem = f"override {override!r} cannot be read: expected key=value, or a command"
+            raise MjstackError(f"{problem}. {suggest(override, COMMANDS)}") from error
         raise MjstackError(
             f"override {override!r} cannot be read: expected key=value without spaces around the"
             " sign, such as nworld=64. A value with a bracket, a quote, a letter beyond ASCII or"
