@@ -217,6 +217,7 @@ BAD = [
     ),
     (["=3"], "=3: "),
     (["nworld"], "override 'nworld' cannot be read: expected key=value"),
+    (["lst"], "expected key=value, or a command. Did you mean 'list'?"),
     (
         ["~reward.progres"],
         "~reward.progres: there is none to leave out. Did you mean 'reward.progress'?",
