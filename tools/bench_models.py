@@ -10,6 +10,7 @@ MJWarp's. ``apart`` is the largest difference of a position after one control of
 """
 
 import argparse
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -94,10 +95,10 @@ def measure(path: Path, cfg: Config, args: argparse.Namespace) -> list[str]:
     times: dict[str, list[float]] = {name: [] for name in works}
     ends = {}
 
-    def play(step: object, chosen: list[torch.Tensor]) -> None:
+    def play(step: Callable[[], None], chosen: list[torch.Tensor]) -> None:
         for ctrl in chosen:
             sim.ctrl[:] = ctrl
-            step()  # type: ignore[operator]
+            step()
 
     for repetition in range(args.repetitions + 1):  # the first one captures
         for name, step in works.items():
@@ -126,7 +127,7 @@ def measure(path: Path, cfg: Config, args: argparse.Namespace) -> list[str]:
 
 
 def main() -> None:
-    """Measure the models of the command line, and print a row for each as it is there."""
+    """Measure the models of the command line, and print a row for each."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

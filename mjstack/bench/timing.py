@@ -233,15 +233,12 @@ def describe_lost(lost: Tensor) -> str:
     return f"{count} worlds overflowed, diverged or were not stepped" if count else ""
 
 
-def settled(cfg: Config, *figures: Sequence[float]) -> bool:
-    """Whether no more repetitions are needed: there are two at least, and half the range of every
-    figure is within ``precision`` of its median.
+def settled(cfg: Config, times: Sequence[float]) -> bool:
+    """Whether no more repetitions are needed: there are two at least, and half the range of their
+    times is less than ``precision``, relative to the median.
     """
-    precision = 2.0 * cfg.gate.throughput.precision
-    return all(
-        len(values) > 1 and max(values) - min(values) < precision * statistics.median(values)
-        for values in figures
-    )
+    range_allowed = 2.0 * cfg.gate.throughput.precision * statistics.median(times)
+    return len(times) > 1 and max(times) - min(times) < range_allowed
 
 
 def time_budget(cfg: Config, sim: Simulation) -> float:

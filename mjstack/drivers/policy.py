@@ -160,8 +160,8 @@ class LerobotWords:
         self.units = LerobotUnits(env.index.n_arm, env.index.ctrl_range, units)
 
     def observe(self) -> dict[str, np.ndarray]:
-        """What there is to see, by LeRobot's names. What is not finite is 0: the check fails its
-        world.
+        """The observations, by LeRobot's names. A number that is not finite becomes 0: the check
+        fails its world.
         """
         positions = self._joints.read(self._env.sim.qpos)
         seen = {STATE: self.units.from_si(positions.cpu().numpy())}

@@ -67,7 +67,7 @@ class _ValueManager:
         self._early = {name: term(self._env) for name, term in early.items()}
 
     def _term_values(self) -> list[Tensor]:
-        """What every term says, in order; those that `begin` has computed are taken from it."""
+        """The value of every term, in order. `begin` has computed some of them."""
         early, self._early = self._early, {}
         return [
             early[name] if name in early else term(self._env) for name, term in self._terms.items()

@@ -54,7 +54,7 @@ def plan_step(model: mujoco.MjModel, m: mjw.Model, d: mjw.Data) -> StepPlan:
 
 
 def why_stock(model: mujoco.MjModel, m: mjw.Model) -> str:
-    """What of this model `rearranged_step` does not do as `mujoco_warp.step` does; "" if nothing.
+    """The features of a model that `rearranged_step` does not know, in a sentence; "" if none.
 
     It leaves out cameras and lights, which nothing in the physics reads. Equalities between bodies
     read velocities of the step before, adhesion reads contacts among the smooth forces, and sensors
