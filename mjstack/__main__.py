@@ -1,5 +1,6 @@
 """The command: ``mjstack``, ``python -m mjstack`` and ``python scripts/run.py``."""
 
+import gc
 import os
 import sys
 
@@ -14,7 +15,9 @@ def main() -> None:
     with handle_interrupts():
         from mjstack.cli import run  # takes seconds
 
-        raise SystemExit(run(sys.argv[1:]))
+        status = run(sys.argv[1:])
+        gc.freeze()  # Python ends sooner by a second or two where it looks for no cycles
+        raise SystemExit(status)
 
 
 if __name__ == "__main__":
