@@ -1,9 +1,9 @@
 """Put a trained policy into the package, with a card of what it was seen to do.
 
 ``python tools/ship_policy.py outputs/mine so101_stack`` takes the folder of a ``job=train``. Its
-last policy, with weights in float16, is judged by gate *success* on native MuJoCo: from random
-starts that neither training nor its own judgement has used, and from ``reset=jitter``. Only a
-policy that passes is kept.
+last policy, or its best one, with weights in float16, is judged by gate *success* on native MuJoCo:
+from random starts that neither training nor its own judgement has used, and from ``reset=jitter``.
+Only a policy that passes is kept.
 """
 
 import argparse
@@ -41,11 +41,12 @@ def main() -> None:
     parser.add_argument("--seeds", type=common.count, default=4, help="of --nworld starts each")
     parser.add_argument("--nworld", type=common.count, default=256, help="worlds of a seed")
     parser.add_argument("--rate", type=float, default=0.99, help="share without which none is kept")
+    parser.add_argument("--which", choices=("last", "best"), default="last", help="of its policies")
     parser.add_argument("--to", type=Path, default=SHIPPED, help="where the policy's folder goes")
     args = parser.parse_args()
     folder = args.to / args.name
     try:
-        policy = load_policy(args.training / "last")
+        policy = load_policy(args.training / args.which)
         for name, value in policy.network.named_parameters():
             value.data = value.data.half()
             if not bool(value.isfinite().all()):
@@ -57,7 +58,7 @@ def main() -> None:
                 reset: judge(Path(trial) / args.name, reset, args.seeds, args.nworld, args.rate)
                 for reset in ("randomized", "jitter")
             }
-        card = write_card(args.training, args.name, policy, judged)
+        card = write_card(args.training, args.which, args.name, policy, judged)
     except MjstackError as error:
         parser.exit(error.exit_code, f"{parser.prog}: {error}\n")
     print(card)
@@ -75,7 +76,9 @@ def judge(folder: Path, reset: str, seeds: int, nworld: int, rate: float) -> Gat
     return mjstack.verify([*overrides, *starts]).gates["success"]
 
 
-def write_card(training: Path, name: str, policy: Policy, judged: dict[str, GateResult]) -> str:
+def write_card(
+    training: Path, which: str, name: str, policy: Policy, judged: dict[str, GateResult]
+) -> str:
     """The card in Markdown; its third line is what ``mjstack list policies`` prints."""
     made = json.loads((training / "report.json").read_text())["provenance"]
     here = collect_provenance()
@@ -101,7 +104,7 @@ def write_card(training: Path, name: str, policy: Policy, judged: dict[str, Gate
         "broken rules": ", ".join(f"{texts[k]} in {v}" for k, v in broken.items()) or "none",
         "jittered starts": f"{rate_text(judged['jitter'])}; {starts_text(judged['jitter'])}",
         "training": f"`{shlex.join(['mjstack', *words, 'job.folder=outputs/mine'])}`, seed"
-        f" {policy.config['seed']}",
+        f" {policy.config['seed']}, its {which} policy",
         "trained": f"commit {made['git_commit'][:7]}, {made['date'][:10]}, {made['device']}, torch"
         f" {made['versions']['torch']}",
         "judged": f"commit {here['git_commit'][:7]}, {here['date'][:10]}, MuJoCo"
