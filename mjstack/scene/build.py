@@ -16,6 +16,8 @@ from mjstack.robots import read_mjcf, robot_spec
 
 TABLE = "table"
 WORLD = "world"  # MuJoCo's name of the body that never moves
+CAPSULE_TURN = np.array([math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0])
+"""MuJoCo's capsule stands along z; an object's lies along x."""
 _TOUCH = 1e-5  # m: objects closer together by less only touch
 _NETFORCE = 3  # the contact sensor's reduction to one force and torque, in the world frame
 
@@ -149,8 +151,8 @@ def _add_object(spec: mujoco.MjSpec, name: str, thing: ObjectCfg, top: float) ->
         size = [*piece.size, 0.0, 0.0][:3]
         geom = _add_geom(body, name + suffix, piece.shape, size=size, pos=piece.pos, **surface)
         geom.quat = piece.turned
-        if piece.shape == "capsule":  # MuJoCo's stands along z; this one lies along x
-            mujoco.mju_mulQuat(geom.quat, piece.turned, [math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0])
+        if piece.shape == "capsule":
+            mujoco.mju_mulQuat(geom.quat, piece.turned, CAPSULE_TURN)
     if thing.file is not None:
         key = f"scene.objects.{name}.file"
         child = read_mjcf(thing.file, f"Correct the file ({key})")

@@ -12,12 +12,17 @@ from torch import Tensor
 
 from mjstack.config.schema import RobotCfg, SceneCfg
 from mjstack.errors import ConfigError, UnknownName
-from mjstack.math import quat_z_row
-from mjstack.scene.build import WORLD, force_sensor
+from mjstack.math import lowest_point, quat_mul, quat_to_matrix
+from mjstack.scene.build import CAPSULE_TURN, WORLD, force_sensor
 
 Rows = Tensor | slice
 """Worlds: their numbers, shape ``(n,)``, or all of them."""
 ALL = slice(None)
+_SHAPES = {
+    int(mujoco.mjtGeom.mjGEOM_SPHERE): "sphere",
+    int(mujoco.mjtGeom.mjGEOM_CAPSULE): "capsule",
+    int(mujoco.mjtGeom.mjGEOM_CYLINDER): "cylinder",
+}
 
 
 class Columns:
@@ -300,9 +305,8 @@ def lowest_height(
 ) -> Tensor:
     """Height of the lowest point of the colliding geoms of some bodies [m], shape ``(nworld,)``.
 
-    Each geom is a box, a ball around it, and a disc across its z axis, some of them of size 0:
-    together they are a box, sphere, capsule or cylinder. Of other shapes, such as meshes, the
-    bounding box counts, which reaches lower, never higher.
+    Of shapes that objects do not have, such as meshes, the bounding box counts, which reaches
+    lower, never higher.
 
     Args:
         model: The compiled scene.
@@ -310,37 +314,20 @@ def lowest_height(
         xpos: Positions of all bodies [m], shape ``(nworld, nbody, 3)``.
         xquat: Their orientations, shape ``(nworld, nbody, 4)``.
     """
-    # The geoms, each in its body
     owners = [model.body(name).id for name in bodies]
     collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    geoms = np.flatnonzero(collides & np.isin(model.geom_bodyid, owners))
-    g = mujoco.mjtGeom
-    kind = model.geom_type[geoms]
-    radius = model.geom_size[geoms, 0]
-    middle, half = model.geom_aabb[geoms].reshape(-1, 2, 3).swapaxes(0, 1)
-    # Of round shapes the box is only what lies between the balls or discs: half a length in z.
-    ball = np.isin(kind, (g.mjGEOM_SPHERE, g.mjGEOM_CAPSULE))
-    disc = kind == g.mjGEOM_CYLINDER
-    half = half.copy()
-    half[ball | disc] = 0.0
-    long = disc | (kind == g.mjGEOM_CAPSULE)
-    half[long, 2] = model.geom_size[geoms[long], 1]
-    axes = np.zeros((len(geoms), 3, 3))
-    for matrix, quat in zip(axes, model.geom_quat[geoms], strict=True):
-        mujoco.mju_quat2Mat(matrix.reshape(9), quat)
-    center = model.geom_pos[geoms] + (axes @ middle[..., None])[..., 0]
-
-    def constant(values: np.ndarray) -> Tensor:
-        return torch.tensor(values, dtype=torch.float32, device=xpos.device)
-
-    # How far down they reach in each world
-    body = torch.tensor(model.geom_bodyid[geoms], dtype=torch.int64, device=xpos.device)
-    up = quat_z_row(xquat.index_select(1, body).float())  # world z in each geom's body
-    along = (up[..., None] * constant(axes)).sum(-2)  # and in each geom
-    at = xpos[..., 2].index_select(1, body).float() + (up * constant(center)).sum(-1)
-    reach = (
-        (along.abs() * constant(half)).sum(-1)
-        + constant(radius * ball)
-        + constant(radius * disc) * torch.linalg.vector_norm(along[..., :2], dim=-1)
-    )
-    return (at - reach).amin(1)
+    lowest = []
+    for geom in np.flatnonzero(collides & np.isin(model.geom_bodyid, owners)):
+        shape = _SHAPES.get(model.geom_type[geom], "box")
+        middle, half = model.geom_aabb[geom].reshape(2, 3)
+        size = half if shape == "box" else model.geom_size[geom]
+        center, quat = np.empty(3), np.empty(4)  # in its body
+        turn = CAPSULE_TURN if shape == "capsule" else np.array([1.0, 0.0, 0.0, 0.0])
+        frame = (model.geom_pos[geom], model.geom_quat[geom])
+        mujoco.mju_mulPose(center, quat, *frame, middle, turn)
+        turned = xquat[:, model.geom_bodyid[geom]].float()
+        offset = (quat_to_matrix(turned) * turned.new_tensor(center)).sum(-1)
+        pos = xpos[:, model.geom_bodyid[geom]].float() + offset
+        turned = quat_mul(turned, turned.new_tensor(quat).expand_as(turned))
+        lowest.append(lowest_point(pos, turned, shape, size.tolist()))
+    return torch.stack(lowest, dim=1).amin(1)
