@@ -9,7 +9,7 @@ from typing import Any
 
 from mjstack.config.fields import check_fields
 from mjstack.config.functions import offered
-from mjstack.config.schema import OUTPUTS, SHAPES, CameraCfg, Config, SceneCfg, TermCfg
+from mjstack.config.schema import OUTPUTS, SHAPES, Config, SceneCfg, TermCfg
 from mjstack.errors import ConfigError, UnknownName
 
 PARITY_FIELDS = ("qpos", "qvel", "xpos", "xquat", "site_xpos", "qfrc_actuator", "contact_count")
@@ -176,27 +176,23 @@ def _cameras(cfg: Config) -> Checks:
         wrong = not re.fullmatch(r"[a-z][a-z0-9_]*", name)
         yield "scene.cameras", wrong, "names of small letters, digits and _"
         key = f"scene.cameras.{name}"
+        pose = camera.pose
         expected = f"a pose, because robot.wrist_camera of {cfg.robot.name} is null"
-        yield f"{key}.pose", camera.pose is None, expected
-        yield from _pose(key, camera)
+        yield f"{key}.pose", pose is None, expected
+        assert pose is not None
+        x, y, z = (b - a for a, b in zip(pose.pos, pose.target, strict=True))
+        length = math.hypot(x, y, z)
+        yield f"{key}.pose.target", length < 1e-6, "a point away from pos"
+        a, b, c = pose.up
+        side = math.hypot(y * c - z * b, z * a - x * c, x * b - y * a)
+        wrong = side < 1e-3 * length * math.hypot(a, b, c) or not any(pose.up)
+        yield f"{key}.pose.up", wrong, "a direction across that from pos to target"
         wrong = len(set(camera.outputs)) != len(camera.outputs) or not camera.outputs
         yield f"{key}.outputs", wrong, f"some of {', '.join(OUTPUTS)}, each once"
         steps = cfg.task.control_hz / (camera.rate or cfg.task.control_hz)
         wrong = steps < 1.0 - 1e-9 or not math.isclose(steps, round(steps), rel_tol=1e-9)
         expected = f"{cfg.task.control_hz:g} Hz over an integer, as that is the control rate"
         yield f"{key}.rate", wrong, expected
-
-
-def _pose(key: str, camera: CameraCfg) -> Checks:
-    pose = camera.pose
-    assert pose is not None
-    x, y, z = (b - a for a, b in zip(pose.pos, pose.target, strict=True))
-    length = math.hypot(x, y, z)
-    yield f"{key}.pose.target", length < 1e-6, "a point away from pos"
-    a, b, c = pose.up
-    side = math.hypot(y * c - z * b, z * a - x * c, x * b - y * a)
-    wrong = side < 1e-3 * length * math.hypot(a, b, c) or not any(pose.up)
-    yield f"{key}.pose.up", wrong, "a direction across that from pos to target"
 
 
 def _phases(cfg: Config) -> Checks:

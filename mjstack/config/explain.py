@@ -92,7 +92,12 @@ def explain(error: Exception, overrides: Sequence[str] = ()) -> MjstackError:
     overrides; it begins with the file that does not fit, if it is one.
     """
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
-        problem = _unknown_choice(error.missing_cfg_file, error.options)
+        group, _, name = error.missing_cfg_file.rpartition("/")
+        # Of a list of choices Hydra names none.
+        choices = error.options or session.list_choices().get(group, [])
+        problem: MjstackError = UnknownName(f"{group}={name}:", name, choices)
+        if not session.config_folders() and not group.startswith("hydra/"):
+            problem = MjstackError(f"{problem} A choice of your own needs --config-dir DIR.")
     else:
         problem = _explain(error, overrides)
     inside = re.match(r"In '([^']+)': ", str(error))
@@ -104,17 +109,6 @@ def explain(error: Exception, overrides: Sequence[str] = ()) -> MjstackError:
     name = f"{inside[1]}.yaml"
     paths = [folder / name for folder in session.config_folders() if (folder / name).is_file()]
     return MjstackError(f"{paths[0] if paths else name}: {problem}")
-
-
-def _unknown_choice(path: str, options: Sequence[str] | None) -> MjstackError:
-    group, _, name = path.rpartition("/")
-    # Of a list of choices Hydra names none.
-    unknown = UnknownName(
-        f"{group}={name}:", name, options or session.list_choices().get(group, [])
-    )
-    if session.config_folders() or group.startswith("hydra/"):
-        return unknown
-    return MjstackError(f"{unknown} A choice of your own needs --config-dir DIR.")
 
 
 def _explain(error: Exception, overrides: Sequence[str]) -> MjstackError:

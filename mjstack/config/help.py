@@ -174,7 +174,12 @@ def help_text(cfg: Config, width: int) -> str:
     for name in groups:
         keys.pop(name, None)
     text = _TEXT.format(groups=_table(groups), keys=_table(keys))
-    return "\n".join(line for row in text.splitlines() for line in _wrapped(row, width) or [""])
+    lines = []
+    for row in text.splitlines():  # the second column of a table is wrapped
+        column = re.match(r"  \S.*?  +", row)
+        indent = " " * len(column[0] if column else "")
+        lines += textwrap.wrap(row, width, subsequent_indent=indent) or [""]
+    return "\n".join(lines)
 
 
 def _yaml(value: object) -> str:
@@ -188,12 +193,6 @@ def _table(rows: Mapping[str, str]) -> str:
     """Two columns, a line for each row."""
     indent = max(map(len, rows)) + 4
     return "\n".join(f"  {name}".ljust(indent) + words for name, words in rows.items())
-
-
-def _wrapped(row: str, width: int) -> list[str]:
-    """A row as lines; the second column of a table is wrapped."""
-    column = re.match(r"  \S.*?  +", row)
-    return textwrap.wrap(row, width, subsequent_indent=" " * len(column[0] if column else ""))
 
 
 def list_text(kinds: Sequence[str]) -> str:
