@@ -265,16 +265,15 @@ class Judge(Observer):
         self.result = self._check.result()
 
 
+@dataclass(eq=False)
 class Hook(Observer):
-    """Calls a function after every step, on the host."""
+    """Calls a function with the step's number and the simulation after every step, on the host."""
 
-    def __init__(self, function: Callable[[int, Simulation], None]) -> None:
-        """``function`` gets the step's number and the simulation."""
-        self._function = function
+    function: Callable[[int, Simulation], None]
 
     @override
     def after_step(self, step: int) -> None:
-        self._function(step, self.env.sim)
+        self.function(step, self.env.sim)
 
 
 def lacks_episode(cfg: Config) -> str:

@@ -4,7 +4,7 @@ fails: by rule, by sign, and by where the objects started.
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -151,27 +151,25 @@ class Goal(Observer):
         self.lost += sum(self._ranks.gather(int((self._reached & ~self.env.success).sum())))
 
 
+@dataclass(eq=False)
 class _StartsWriter(Observer):
     """Writes how worlds start into a file of the run, unless they start from that very file."""
 
-    def __init__(self, run: Run, seed: int, unwritten: list[str]) -> None:
-        """``unwritten`` gets the problem if the file cannot be written."""
-        folder = run.folder
-        self._path = None if folder is None else folder / starts_name(seed)
-        self._ranks = run.stage.ranks
-        self._unwritten = unwritten
+    run: Run
+    seed: int
+    unwritten: list[str]  # gets the problem if the file cannot be written
 
     @override
     def start(self, env: Env, driver: Driver) -> None:
-        path = self._path
+        path = self.run.folder and self.run.folder / starts_name(self.seed)
         starts = env.cfg.starts
-        parts = self._ranks.gather(start_arrays(env))
+        parts = self.run.stage.ranks.gather(start_arrays(env))
         if path is None or (starts is not None and path.resolve() == Path(starts).resolve()):
             return
         # Where the disk is full, the episodes are played all the same
         arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
         if problem := safely_write(path, write_npz, arrays):
-            self._unwritten.append(problem)
+            self.unwritten.append(problem)
 
 
 def _describe_start(cfg: Config) -> str:
