@@ -194,8 +194,7 @@ class FeedbackDriver(Driver):
         targets = [phase.target for phase in self._aimed if phase.target]
         self._target = self._tensor([*t.offset, t.z] for t in targets)
         self._source = self._tensor(t.source for t in targets)
-        self._toward = self._tensor(max(t.toward, 0) for t in targets)
-        self._turns = self._tensor(float(t.toward >= 0) for t in targets)
+        self._toward = self._tensor(t.toward for t in targets)
         grips = gripper_targets(env.sim.model, cfg.robot, [phase.width for phase in self._plan])
         self._grip = self._tensor(grips.tolist())
 
@@ -247,7 +246,7 @@ class FeedbackDriver(Driver):
         offset = table[:, :2]
         if any(spec.toward is not None for spec in self._cfg.controller.phases.values()):
             away = self._last_seen(self._toward, phase)[:, :2] - seen
-            offset = _turn_about_z(offset, atan2(away[:, 1], away[:, 0]) * self._turns[phase])
+            offset = _turn_about_z(offset, atan2(away[:, 1], away[:, 0]))
         return torch.cat((offset + seen, table[:, 2:]), dim=1)
 
     def _last_seen(self, sources: Tensor, phase: Tensor) -> Tensor:

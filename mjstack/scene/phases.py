@@ -13,7 +13,8 @@ class Target:
 
     Attributes:
         source: Number of its anchor among `source_names`.
-        toward: Number of the source towards which the offset's x axis points; -1 for world x.
+        toward: Number of the source towards which the offset's x axis points; the anchor itself for
+            world x.
         offset: Along that axis and to its left [m].
         z: Height [m].
         above: The same over the anchor's centre, or over the table where a place is the anchor [m].
@@ -95,10 +96,10 @@ def build_phases(cfg: Config) -> list[Phase]:
             x, y, rise = spec.offset
             grip = scene.grasp_offset if spec.in_hand else 0.0
             above = spec.h_scale * cfg.robot.approach_height + rise + grip
-            toward = -1 if spec.toward is None else sources.index(spec.toward)
             z = scene.table_top + up + above
-            over = up + above - centre
-            target = Target(sources.index(spec.anchor), toward, (x, y), z, over)
+            source = sources.index(spec.anchor)
+            toward = sources.index(spec.toward or spec.anchor)
+            target = Target(source, toward, (x, y), z, up + above - centre)
         stop = start + round(spec.seconds / cfg.timing.step_dt)
         grasped = -1 if spec.grasps is None else sources.index(spec.grasps)
         carried = sources.index(load) if in_hand and spec.grasps is None else -1
@@ -120,8 +121,6 @@ def target_xy(target: Target, sources: np.ndarray) -> np.ndarray:
     """
     at = sources[..., target.source, :]
     along, left = target.offset
-    if target.toward < 0:
-        return at + target.offset
     away = sources[..., target.toward, :] - at
     angle = np.arctan2(away[..., 1], away[..., 0])
     cos = np.cos(angle)
