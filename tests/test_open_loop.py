@@ -115,7 +115,9 @@ def test_commands_are_within_limits_and_do_not_jump(
     model = stage.model
     robot = stage.cfg.robot
     names = [*robot.arm_joints, *robot.gripper_joints]
-    commands = np.stack([trajectory.command(step).numpy() for step in range(trajectory.steps)])
+    commands = np.stack(
+        [trajectory.command(step).numpy() for step in range(len(trajectory.weights))]
+    )
     assert commands.shape == (600, 3, len(names))
     assert np.abs(np.diff(commands, axis=0)).max() < 0.08
     for column, name in enumerate(names):

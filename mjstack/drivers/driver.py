@@ -72,7 +72,7 @@ class OpenLoopDriver(Driver):
     def __init__(self, trajectory: JointTrajectory, phases: list[Phase]) -> None:
         """Take the trajectory, which must be on the device, and its phases, if it has any."""
         device = trajectory.knots.device
-        super().__init__(len(trajectory.knots), trajectory.steps, device, phases)
+        super().__init__(len(trajectory.knots), len(trajectory.weights), device, phases)
         self.error = torch.as_tensor(trajectory.waypoint_error, device=device)
         self._trajectory = trajectory
         numbers = [k for k, phase in enumerate(phases) for _ in range(phase.start, phase.stop)]

@@ -47,11 +47,6 @@ class JointTrajectory:
     numbers: Tensor
     waypoint_error: ndarray
 
-    @property
-    def steps(self) -> int:
-        """Length of the episode."""
-        return len(self.weights)
-
     def to(self, device: torch.device, dtype: torch.dtype) -> "JointTrajectory":
         """The same trajectory on a device."""
         return replace(
@@ -176,17 +171,8 @@ class OpenLoopPlanner:
         self, xy: ndarray, worlds: Sequence[int], solve: _Solve, seed: ndarray | None = None
     ) -> tuple[ndarray, ndarray]:
         """Commands at the knots, shape ``(nworld, n, nu)``, and the largest distance from a target
-        at any [m], shape ``(nworld,)``.
-
-        Args:
-            xy: Position of each object and place at the start [m], shape ``(nworld, sources, 2)``.
-            worlds: Numbers of the worlds, for the error.
-            solve: Inverse kinematics of these worlds.
-            seed: Commands at which the solutions of every world start, shape ``(n, nu)``. Without
-                it each one starts at the one before, the first one at home.
-
-        Raises:
-            Unreachable: A target is out of reach.
+        at any [m], shape ``(nworld,)``; arguments as of `plan`. Solutions start at the ``seed``,
+        shape ``(n, nu)``, or without one each at that before, the first at home.
         """
         n = len(self._nodes)
         ends = self._targets(xy)
