@@ -18,7 +18,7 @@ from mjstack.managers.view import EnvView
 from mjstack.math import atan2
 from mjstack.mdp.geometry import gripper_opening, objects_in_hand, place_xy, pose_w, robot
 from mjstack.scene.index import gripper_targets, turn_sign
-from mjstack.scene.phases import Phase, build_phases, source_names
+from mjstack.scene.phases import Phase, Target, build_phases, source_names
 
 _BEYOND = 10.0  # what a roll beyond the joint's range costs, per rad
 _BACK = 3.0  # rad: what a roll counts that leads back over the nominal one
@@ -188,10 +188,10 @@ class FeedbackDriver(Driver):
         self._nominal = torch.as_tensor(nominal, dtype=torch.float32, device=device)
 
         # Targets of the phases, a row per phase: without its own, a phase has the one before
-        self._aimed: list[Phase] = []
+        self._aimed: list[tuple[Phase, Target]] = []
         for phase in self._plan:
-            self._aimed.append(phase if phase.target else self._aimed[-1])
-        targets = [phase.target for phase in self._aimed if phase.target]
+            self._aimed.append((phase, phase.target) if phase.target else self._aimed[-1])
+        targets = [target for _, target in self._aimed]
         self._target = self._tensor([*t.offset, t.z] for t in targets)
         self._source = self._tensor(t.source for t in targets)
         self._toward = self._tensor(t.toward for t in targets)

@@ -111,10 +111,3 @@ def _find_release(phases: Sequence[Phase], place: int) -> tuple[int, int]:
 def _refusal(cfg: Config, why: str) -> ConfigError:
     expected = f"another controller, because the phases of task {cfg.task.name} {why}"
     return ConfigError("controller", cfg.controller.name, expected, _FIX)
-
-
-def follows_anchor(phase: Phase, things: Sequence[str]) -> bool:
-    """Whether a phase's height follows its anchor: an object, but not the carried one."""
-    spec = phase.spec
-    follows = phase.target is not None and spec.level != "table" and spec.anchor in things
-    return follows and things.index(str(spec.anchor)) != phase.carried

@@ -11,7 +11,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from mjstack.drivers.feedback import STAY, FeedbackDriver, State, servo_lag
-from mjstack.drivers.roles import Role, find_roles, follows_anchor
+from mjstack.drivers.roles import Role, find_roles
 from mjstack.managers.view import EnvView
 from mjstack.math import atan2, norm, quat_to_matrix
 from mjstack.mdp.geometry import pose_w, robot
@@ -131,9 +131,14 @@ class StateBasedDriver(FeedbackDriver):
         self._reach = size + beside * self._pushes
         self._has_faces = tensor(thing.has_faces for thing in cfg.scene.objects.values())
 
-        # Heights of targets: over an anchor that may stand anywhere, or over the table
-        self._above = tensor(phase.target.above if phase.target else 0.0 for phase in self._aimed)
-        self._follows = tensor(follows_anchor(phase, things) for phase in self._aimed)
+        # Heights of targets: over an object that may stand anywhere and is not carried, or over the
+        # table
+        objects = {*range(len(things))}
+        self._above = tensor(target.above for _, target in self._aimed)
+        self._follows = tensor(
+            phase.spec.level != "table" and target.source in objects - {phase.carried}
+            for phase, target in self._aimed
+        )
         self._off_center = tensor(_OFF_CENTER)
 
         # The robot
