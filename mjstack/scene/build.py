@@ -208,13 +208,8 @@ def _add_box(spec: mujoco.MjSpec, box: BoxCfg, top: float) -> None:
     up = 0.5 * box.height
     color = [0.50, 0.55, 0.52, 1]
     add = partial(_add_geom, spec.worldbody, shape="box", friction=box.friction, rgba=color)
-    half_floor = 0.5 * box.floor
-    add(
-        "box_floor",
-        pos=[x, y, top + half_floor],
-        size=[*box.half, half_floor],
-        solref=box.floor_solref,
-    )
+    floor = [*box.half, 0.5 * box.floor]
+    add("box_floor", pos=[x, y, top + floor[2]], size=floor, solref=box.floor_solref)
     for name, i, j in (("near", -1, 0), ("far", 1, 0), ("right", 0, -1), ("left", 0, 1)):
         pos = [x + i * half_x + i * thick, y + j * half_y + j * thick, top + up]
         # The walls across x close the corners.
