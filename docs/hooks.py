@@ -66,7 +66,7 @@ def reference_markdown() -> str:
     """Every key of the default configuration and of the jobs as Markdown tables, by group."""
     cfg = load_config()
     words = field_docs(Config)
-    groups = {group.name: group for group in list_groups()}
+    groups = list_groups()
     sections: dict[str, list[Key]] = {}
     for key in list_keys(cfg, named=False):
         sections.setdefault(key.name.partition(".")[0] if "." in key.name else "", []).append(key)
@@ -76,7 +76,7 @@ def reference_markdown() -> str:
         sections["job"] += [k for k in own if k.name not in ("job.name", "job.func")]
     text = []
     for section, keys in sections.items():
-        choices = f" Choices: {', '.join(groups[section].choices)}." if section in groups else ""
+        choices = f" Choices: {', '.join(groups[section][0])}." if section in groups else ""
         text += [f"## {section or 'Top level'}", "", words.get(section, "") + choices, ""]
         text += ["| key | default | accepts | meaning |", "| --- | --- | --- | --- |"]
         for k in keys:

@@ -77,16 +77,6 @@ Exit status: 0 passed, 1 a gate failed, 2 bad configuration or input, 130 interr
 """
 
 
-class Group(NamedTuple):
-    """A configuration group: its name, its choices with the default first, and what it selects. Of
-    ``gate``, all choices are in use at once.
-    """
-
-    name: str
-    choices: Sequence[str]
-    words: str
-
-
 class Key(NamedTuple):
     """A dotted configuration key, its value, its type with range and unit, and its meaning."""
 
@@ -96,16 +86,18 @@ class Key(NamedTuple):
     words: str
 
 
-def list_groups() -> list[Group]:
-    """The groups of the whole search path, mjstack's in the order of composition first."""
+def list_groups() -> dict[str, tuple[list[str], str]]:
+    """The groups of the whole search path, mjstack's in the order of composition first: the choices
+    of each, the default first, and what it selects. Of ``gate``, all choices are in use at once.
+    """
     choices = list_choices()
     text = (CONFIG_FOLDER / "config.yaml").read_text(encoding="utf-8")
     groups = dict.fromkeys(choices, ("", "added by the search path"))
     known = {name: (default, words) for name, default, words in _GROUP.findall(text)}
-    return [
-        Group(name, sorted(choices[name], key=default.__ne__), words)
+    return {
+        name: (sorted(choices[name], key=default.__ne__), words)
         for name, (default, words) in (known | groups | known).items()
-    ]
+    }
 
 
 def list_keys(value: object, name: str = "", *, named: bool = True) -> Iterator[Key]:
@@ -169,7 +161,9 @@ def _declared_keys(key: str, node: dict[str, Any], attribute: str) -> Iterator[K
 
 def help_text(cfg: Config, width: int) -> str:
     """The whole text with a configuration's values, in lines of at most ``width``."""
-    groups = {group.name: f"{group.words}: {', '.join(group.choices)}" for group in list_groups()}
+    groups = {
+        name: f"{words}: {', '.join(names)}" for name, (names, words) in list_groups().items()
+    }
     keys = {key.name: f"{key.words} ({key.value})" for key in list_keys(cfg) if "." not in key.name}
     for name in groups:
         keys.pop(name, None)
