@@ -8,7 +8,7 @@ import json
 import re
 import sysconfig
 import traceback
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -90,6 +90,13 @@ class UnknownName(MjstackError):
 
     def __init__(self, what: str, name: str, available: Iterable[str]) -> None:
         super().__init__(f"{what} '{name}' does not exist. {suggest(name, available)}")
+
+
+def require_names(what: str, names: Iterable[str | None], available: Collection[str]) -> None:
+    """Raise an `UnknownName` for the first name, None aside, that is not available."""
+    for name in names:
+        if name is not None and name not in available:
+            raise UnknownName(what, name, available)
 
 
 class DeviceError(MjstackError):

@@ -7,7 +7,7 @@ import torch
 from numpy import ndarray
 
 from mjstack.envs import Env
-from mjstack.errors import ArgumentError, ConfigError, MissingExtra, UnknownName
+from mjstack.errors import ArgumentError, ConfigError, MissingExtra, require_names
 
 try:
     import gymnasium
@@ -58,8 +58,7 @@ class GymnasiumVectorEnv(VectorEnv):
             name: spaces.Box(-np.inf, np.inf, (dim,), np.float32)
             for name, dim in env.observation_manager.group_dims.items()
         }
-        if group is not None and group not in boxes:
-            raise UnknownName("observation group", group, boxes)
+        require_names("observation group", [group], boxes)
         boxes |= {name: _image_box(image) for name, image in env.images.items()}
         cameras = env.cameras.cameras if env.cameras is not None else {}
         lacking = [name for name, camera in cameras.items() if not camera.terminal]
@@ -93,8 +92,7 @@ class GymnasiumVectorEnv(VectorEnv):
         """
         rest = dict(options or {})
         mask = rest.pop("reset_mask", None)
-        for name in rest:
-            raise UnknownName("reset option", name, ("reset_mask",))
+        require_names("reset option", rest, ("reset_mask",))
         if mask is not None:
             mask = torch.as_tensor(mask, device=self.inner.device)
         obs, _ = self.inner.reset(seed=seed, mask=mask)
@@ -178,8 +176,7 @@ class GymnasiumEnv(gymnasium.Env):
         Raises:
             MjstackError: The seed or an option cannot be used.
         """
-        for name in options or ():
-            raise UnknownName("reset option", name, ())
+        require_names("reset option", options or (), ())
         first = self._first
         if seed is not None or first is None:
             first, _ = self._worlds.reset(seed=seed)

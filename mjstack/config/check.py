@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 from mjstack.config.fields import check_fields
 from mjstack.config.functions import offered
 from mjstack.config.schema import OUTPUTS, SHAPES, Config, SceneCfg, TermCfg
-from mjstack.errors import ConfigError, UnknownName
+from mjstack.errors import ConfigError, require_names
 
 PARITY_FIELDS = ("qpos", "qvel", "xpos", "xquat", "site_xpos", "qfrc_actuator", "contact_count")
 _DEVICE = re.compile(r"auto|cpu|cuda:\d+")
@@ -65,17 +65,11 @@ def _value(cfg: Config, key: str) -> Any:
     return list(value) if isinstance(value, dict) else value
 
 
-def _require(what: str, names: Iterable[str | None], known: Mapping | Sequence) -> None:
-    for name in names:
-        if name is not None and name not in known:
-            raise UnknownName(what, name, known)
-
-
 def _run(cfg: Config) -> Checks:
     """Gates, device and step, and keys that only one job or one group reads."""
     known = cfg.gate.functions()
     yield "gates", not cfg.gates, f"at least one of {', '.join(known)}"
-    _require("gate", (*cfg.gates, *cfg.gate.added), known)  # a misspelt one has no function
+    require_names("gate", (*cfg.gates, *cfg.gate.added), known)  # a misspelt one has no function
     yield "sim.device", not _DEVICE.fullmatch(cfg.sim.device), "auto, cpu or cuda:N, such as cuda:0"
     step_dt = 1.0 / cfg.task.control_hz
     if not math.isclose(cfg.timing.step_dt, step_dt, rel_tol=1e-9):
@@ -117,8 +111,8 @@ def _robot(cfg: Config) -> Checks:
         wrong = path.is_absolute() or ".." in path.parts
         yield f"robot.{key}", wrong, "a name that does not lead out of a folder"
     names = (*robot.ik_joints, *robot.locked)
-    _require("robot.ik_joints, robot.locked: arm joint", names, robot.arm_joints)
-    _require("robot.roll_joint: arm joint", [robot.roll_joint], robot.arm_joints)
+    require_names("robot.ik_joints, robot.locked: arm joint", names, robot.arm_joints)
+    require_names("robot.roll_joint: arm joint", [robot.roll_joint], robot.arm_joints)
     wrong = cfg.controller.yaw_alignment > 0.0 and robot.roll_joint is None
     yield "controller.yaw_alignment", wrong, "0, because robot.roll_joint is null"
 
@@ -211,10 +205,10 @@ def _phases(cfg: Config) -> Checks:
         key = f"controller.phases.{name}"
         wrong = number == 0 and phase.anchor is None
         yield f"{key}.anchor", wrong, "an object or a place, as the phase is the first"
-        _require(f"{key}.grasps: object that moves", [phase.grasps], cfg.scene.free)
-        _require(f"{key}.retry: phase", [phase.retry], phases)
+        require_names(f"{key}.grasps: object that moves", [phase.grasps], cfg.scene.free)
+        require_names(f"{key}.retry: phase", [phase.retry], phases)
         for role, source in (("anchor", phase.anchor), ("toward", phase.toward)):
-            _require(f"{key}.{role}: object or place", [source], known)
+            require_names(f"{key}.{role}: object or place", [source], known)
             wrong = closed_loop and not phase.observe and source not in observed
             expected = f"true here or before, as closed_loop does not know yet where {source} is"
             yield f"{key}.observe", wrong, expected
@@ -238,9 +232,9 @@ def _gates(cfg: Config) -> Checks:
     """Names in the gates' parameters, and seeds and region that fit random starts."""
     gate = cfg.gate
     phases = cfg.controller.phases
-    _require("gate.parity.states: phase", gate.parity.states.values(), phases)
+    require_names("gate.parity.states: phase", gate.parity.states.values(), phases)
     if phases:
-        _require("gate.throughput.from_phase: phase", [gate.throughput.from_phase], phases)
+        require_names("gate.throughput.from_phase: phase", [gate.throughput.from_phase], phases)
     for name in ("step1", "step50"):
         wrong = set(getattr(gate.parity, name)) != set(PARITY_FIELDS)
         yield f"gate.parity.{name}", wrong, f"a number for each of {', '.join(PARITY_FIELDS)}"

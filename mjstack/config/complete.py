@@ -13,7 +13,7 @@ from omegaconf.errors import OmegaConfBaseException
 from mjstack.config import schema
 from mjstack.config.fields import accepted, check_fields
 from mjstack.config.session import config_folders
-from mjstack.errors import ConfigError, TermError, UnknownName
+from mjstack.errors import ConfigError, TermError, require_names
 
 # Terms are untyped in the schema: OmegaConf would not let a command line add one to a typed dict.
 _TERMS = {
@@ -79,9 +79,7 @@ def typed(key: str, node: Any, kind: type) -> Any:
     items = {field.name: field for field in fields(kind)}
     if not isinstance(node, dict):
         raise ConfigError(key, node, f"a mapping with some of {', '.join(items)}")
-    for name in node:
-        if name not in items:
-            raise UnknownName(f"{key}: key", str(name), items)
+    require_names(f"{key}: key", map(str, node), items)
     if (content := (kind, repr(node))) in _values:
         return copy.deepcopy(_values[content])
     try:

@@ -18,7 +18,7 @@ from mjstack.config.fingerprint import shipped_policies
 from mjstack.config.functions import find_object, offered
 from mjstack.config.schema import Config
 from mjstack.config.session import CONFIG_FOLDER, config_folders, list_choices
-from mjstack.errors import UnknownName
+from mjstack.errors import UnknownName, require_names
 
 _GROUP = re.compile(r"^  - (\w+): (\[.*\]|\S+) # (.+)$", re.MULTILINE)  # name, default, words
 _LISTED = ("tasks", "robots", "terms", "conditions", "gates", "trainers", "policies")
@@ -196,8 +196,7 @@ def list_text(kinds: Sequence[str]) -> str:
     Raises:
         UnknownName: There is no such kind.
     """
-    for kind in set(kinds) - set(_LISTED):
-        raise UnknownName("list", kind, _LISTED)
+    require_names("list", kinds, _LISTED)
     lines = []
     for kind in kinds or _LISTED:
         named: Iterable[tuple[str, str]] = shipped_policies().items()

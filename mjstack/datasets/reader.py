@@ -15,7 +15,7 @@ from mjstack.config.fingerprint import differences
 from mjstack.datasets import lerobot
 from mjstack.datasets.spec import DatasetSpec, Video
 from mjstack.datasets.video import decode
-from mjstack.errors import FolderError, UnknownName
+from mjstack.errors import FolderError, require_names
 from mjstack.files import reading
 
 _USED = ("codebase_version", "fps", "features", "total_episodes", "total_frames")
@@ -54,8 +54,7 @@ class StoredDataset:
             FolderError: A file is missing or damaged.
         """
         videos = _videos(self.info)
-        if name not in videos:
-            raise UnknownName("video", name, videos)
+        require_names("video", [name], videos)
         row = self.episodes[episode]
         place = {key: row[f"videos/{name}/{key}"] for key in ("chunk_index", "file_index")}
         path = self.folder / lerobot.VIDEO.format(video_key=name, **place)
@@ -79,8 +78,7 @@ class StoredDataset:
         """
         videos = _videos(self.info)
         features = self.info["features"]
-        if name not in features or name in videos:
-            raise UnknownName("feature", name, features.keys() - videos.keys())
+        require_names("feature", [name], features.keys() - videos.keys())
         dtype = features[name]["dtype"]
         parts = [np.empty((0, *features[name]["shape"]), dtype)]
         for path in data_files(self.folder, self.info):

@@ -5,7 +5,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from mjstack.errors import UnknownName
+from mjstack.errors import require_names
 from mjstack.managers.term import shared
 from mjstack.managers.view import EnvView, episode_draw
 from mjstack.math import lowest_point, norm, not_finite
@@ -71,8 +71,7 @@ def place_xy(env: EnvView, name: str) -> Tensor:
         UnknownName: The scene has no such place.
     """
     places = env.cfg.scene.places
-    if name not in places:
-        raise UnknownName("place", name, places)
+    require_names("place", [name], places)
     if name in env.given_places:
         return env.given_places[name].index_select(0, env.world)
     place = places[name]
@@ -102,7 +101,6 @@ def objects_in_hand(index: SceneIndex, sim: Simulation) -> Tensor:
 
 def jaw_forces(index: SceneIndex, sim: Simulation, name: str) -> Tensor:
     """Contact force of each jaw on an object [N], at the last physics step, ``(nworld, 2)``."""
-    if name not in index.jaw_force:
-        raise UnknownName("object", name, index.jaw_force)
+    require_names("object", [name], index.jaw_force)
     parts = [sim.sensordata[:, a : a + 3] for a in index.jaw_force[name]]
     return norm(torch.stack(parts, dim=1))

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from mjstack.config.schema import ModelCfg, RobotCfg, ServoCfg
-from mjstack.errors import ConfigError, MjstackError, UnknownName, first_line
+from mjstack.errors import ConfigError, MjstackError, UnknownName, first_line, require_names
 
 BUILTIN = Path(__file__).parent
 _MENAGERIE_FIX = "Set MENAGERIE_ROOT to a checkout of MuJoCo Menagerie, or use model=builtin."
@@ -38,15 +38,13 @@ def robot_spec(robot: RobotCfg, model: ModelCfg) -> mujoco.MjSpec:
     spec = read_mjcf(path, _MENAGERIE_FIX if menagerie else "Correct the file (robot.file).")
     if menagerie and robot.replace_collision:
         _replace_collision(spec, robot)
-    for name in robot.jaw_bodies:
-        _require("robot.jaw_bodies: body", name, spec.bodies)
-    if robot.approach_body:
-        _require("robot.approach_body: body", robot.approach_body, spec.bodies)
+    _require("robot.jaw_bodies: body", robot.jaw_bodies, spec.bodies)
+    _require("robot.approach_body: body", [robot.approach_body or None], spec.bodies)
     _add_grasp_sites(spec, robot)
     _split_tendon_servos(spec, robot.gripper_joints)
     for key in ("arm_joints", "gripper_joints"):
         for name in getattr(robot, key):
-            _require(f"robot.{key}: joint", name, spec.joints)
+            _require(f"robot.{key}: joint", [name], spec.joints)
             _prepare_joint(spec, name)
     fresh = mujoco.MjSpec().default.geom
     # The file's own defaults would count for the scene's geoms too
@@ -133,14 +131,13 @@ def _add_grasp_sites(spec: mujoco.MjSpec, robot: RobotCfg) -> None:
         if spec.site(site) is not None:
             continue
         if site not in robot.grasp_parts:
-            _require("grasp site", site, spec.sites)
+            _require("grasp site", [site], spec.sites)
         parts = robot.grasp_parts[site]
         if spec.body(parts[0]) is not None:
             pos = robot.grasp_pos.get(site, [0.0, 0.0, 0.0])
             spec.body(parts[0]).add_site(name=site, pos=pos, group=4)
             continue
-        for name in parts:
-            _require("geom", name, spec.geoms)
+        _require("geom", parts, spec.geoms)
         geoms = [spec.geom(name) for name in parts]
         geoms[0].parent.add_site(name=site, pos=np.mean([g.pos for g in geoms], axis=0), group=4)
 
@@ -205,7 +202,5 @@ def _set_servo(spec: mujoco.MjSpec, name: str, servo: ServoCfg) -> None:
         joint.damping[0] = servo.viscous_friction  # what follows is for higher powers of velocity
 
 
-def _require(kind: str, name: str, available: Iterable) -> None:
-    names = [item.name for item in available if item.name]
-    if name not in names:
-        raise UnknownName(kind, name, names)
+def _require(kind: str, names: Iterable[str | None], available: Iterable) -> None:
+    require_names(kind, names, [item.name for item in available if item.name])

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from mjstack.config.schema import RobotCfg, SceneCfg
-from mjstack.errors import ConfigError, UnknownName
+from mjstack.errors import ConfigError, require_names
 from mjstack.math import lowest_point, quat_mul, quat_to_matrix
 from mjstack.scene.build import CAPSULE_TURN, WORLD, force_sensor
 
@@ -202,8 +202,7 @@ class SceneIndex:
         """Columns of qpos (7 numbers) and of qvel (6) of an object that moves; any other name is
         an error that lists those.
         """
-        if name not in self._columns:
-            raise UnknownName("object", name, self._columns)
+        require_names("object", [name], self._columns)
         return self._columns[name]
 
 

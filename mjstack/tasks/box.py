@@ -10,7 +10,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from mjstack.config.fields import spec
-from mjstack.errors import ConfigError, UnknownName
+from mjstack.errors import ConfigError, require_names
 from mjstack.managers.view import EnvView
 from mjstack.mdp.geometry import place_xy
 from mjstack.scene.index import lowest_height
@@ -168,9 +168,8 @@ class BoxCheck(EpisodeCheck):
         if len(t.places) != len(t.objects):
             raise ConfigError("task.check.places", t.places, "a place for each object")
         self.slots = dict(zip(t.objects, t.places, strict=True))
+        require_names("task.check.places: place", t.places, scene.places)
         for name, slot in self.slots.items():
-            if slot not in scene.places:
-                raise UnknownName("task.check.places: place", slot, scene.places)
             if name not in scene.objects:
                 continue  # the base class reports it
             xy = scene.places[slot].xy

@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from mjstack.errors import UnknownName
+from mjstack.errors import require_names
 from mjstack.managers.view import EnvView, offers
 from mjstack.mdp.geometry import pose_w
 from mjstack.tasks.box import BoxCheck
@@ -25,8 +25,7 @@ class ToSlot:
             MjstackError: There is no such object, or no box.
         """
         check = BoxCheck(env.cfg)
-        if object not in check.slots:
-            raise UnknownName("object", object, check.slots)
+        require_names("object", [object], check.slots)
         self._object = object
         self._check = check
 

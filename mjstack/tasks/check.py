@@ -36,7 +36,7 @@ from mjstack.config.complete import typed
 from mjstack.config.fields import field_range
 from mjstack.config.functions import resolve_func
 from mjstack.config.schema import Config
-from mjstack.errors import ConfigError, TermError, UnknownName
+from mjstack.errors import ConfigError, TermError, require_names
 from mjstack.managers.view import EnvView
 from mjstack.math import not_finite
 from mjstack.mdp.geometry import LOADED
@@ -217,12 +217,10 @@ class EpisodeCheck(ABC):
             raise ConfigError("task.check.window", self.settle_steps, expected)
         self.objects = list(cfg.scene.objects)
         self._rules = self.build()
-        for name in self.objects:
-            if name not in cfg.scene.objects:
-                raise UnknownName("task.check: object", name, cfg.scene.objects)
-        for name in chain(*chain(*(rule.phases for rule in self._rules))):
-            if phases and name not in phases:
-                raise UnknownName("task.check: phase", name, phases)
+        require_names("task.check: object", self.objects, cfg.scene.objects)
+        if phases:
+            named = chain(*chain(*(rule.phases for rule in self._rules)))
+            require_names("task.check: phase", named, phases)
         self.rules = Rules(dict(chain(*(rule.texts.items() for rule in self._rules))))
 
     @abstractmethod

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mjstack.errors import UnknownName
+from mjstack.errors import require_names
 from mjstack.managers.term import known_values
 from mjstack.managers.view import EnvView
 from mjstack.math import lowest_point, norm, quat_to_matrix
@@ -119,8 +119,7 @@ class TaskView:
 
     def number(self, name: str) -> int:
         """Number of an object among those of the task; any other name is an error with those."""
-        if name not in self.objects:
-            raise UnknownName("object of the check", name, self.objects)
+        require_names("object of the check", [name], self.objects)
         return self.objects.index(name)
 
     def during(self, phases: PhaseNames) -> slice:

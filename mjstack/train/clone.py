@@ -10,7 +10,7 @@ from pathlib import Path
 from mjstack.config.schema import CloneJobCfg
 from mjstack.episodes.rollout import STATE_BASED
 from mjstack.episodes.stage import Stage
-from mjstack.errors import ConfigError, MjstackError, UnknownName
+from mjstack.errors import ConfigError, MjstackError, require_names
 from mjstack.math import rate_interval
 from mjstack.policy.checkpoint import Facts
 from mjstack.train.clone_learner import CloneLearner
@@ -55,9 +55,8 @@ def _check_rounds(stage: Stage, job: CloneJobCfg) -> None:
 def _check_vision(stage: Stage, job: CloneJobCfg) -> None:
     """Refuse images that a policy cannot see, or that do not fit into memory."""
     cameras = stage.cfg.scene.cameras
+    require_names("job.vision.cameras: camera", job.vision.cameras, cameras)
     for name in job.vision.cameras:
-        if name not in cameras:
-            raise UnknownName("job.vision.cameras: camera", name, cameras)
         if "rgb" not in cameras[name].outputs:
             expected = "rgb among them, which a policy sees"
             raise ConfigError(f"scene.cameras.{name}.outputs", cameras[name].outputs, expected)

@@ -11,7 +11,7 @@ from torch import Tensor
 from mjstack.config.check import starts_midway, with_region
 from mjstack.config.schema import CloneJobCfg, Config, ObservationGroupCfg, PpoJobCfg, TermCfg
 from mjstack.episodes.stage import Stage
-from mjstack.errors import ConfigError, FolderError, MjstackError, UnknownName, renamed_keys
+from mjstack.errors import ConfigError, FolderError, MjstackError, renamed_keys, require_names
 from mjstack.policy.checkpoint import Facts, read_state
 
 # In the folder of a training: two policies, and what it needs to go on.
@@ -72,12 +72,10 @@ def observed_group(job: CloneJobCfg | PpoJobCfg) -> ObservationGroupCfg:
     Raises:
         UnknownName: There is no such group, or no such term as the job names.
     """
-    if job.group not in job.observation:
-        raise UnknownName("job.group: observation group", job.group, job.observation)
+    require_names("job.group: observation group", [job.group], job.observation)
     group = job.observation[job.group]
-    for name in job.leave_out:
-        if name not in group.terms and not name.endswith("?"):
-            raise UnknownName(f"job.leave_out: term of {job.group}", name, group.terms)
+    needed = [name for name in job.leave_out if not name.endswith("?")]
+    require_names(f"job.leave_out: term of {job.group}", needed, group.terms)
     left_out = {name.removesuffix("?") for name in job.leave_out}
     terms = {name: term for name, term in group.terms.items() if name not in left_out}
     return replace(group, noise=job.observation_noise, terms=terms)
