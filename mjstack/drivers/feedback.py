@@ -66,18 +66,9 @@ class CarryTilt:
         """
         self._ik = ik
         self._nominal = nominal
-        model = env.sim.model
-        c = env.cfg.controller
         device = env.device
-        self._there_ik = BatchedIk(
-            model,
-            env.cfg.robot,
-            env.nworld,
-            device,
-            iterations=c.step_iterations,
-            approach_gain=c.approach_gain,
-        )
-        self._sign = turn_sign(model, env.cfg.robot)
+        self._there_ik = _solver(env)
+        self._sign = turn_sign(env.sim.model, env.cfg.robot)
         self._keeps = torch.tensor(_keeps(phases), device=device)
         self._grasps = torch.tensor([phase.grasped >= 0 for phase in phases], device=device)
         self.place = torch.tensor(_places(phases), device=device)
@@ -199,15 +190,7 @@ class FeedbackDriver(Driver):
         self._grip = self._tensor(grips.tolist())
 
         # Inverse kinematics
-        self._ik = BatchedIk(
-            env.sim.model,
-            cfg.robot,
-            env.nworld,
-            device,
-            iterations=c.step_iterations,
-            posture_gain=c.posture_gain,
-            approach_gain=c.approach_gain,
-        )
+        self._ik = _solver(env, c.posture_gain)
         # Where nothing is carried, the gripper points down as far as it can.
         grasped = {phase.grasps for phase in c.phases.values()} - {None}
         self._tilt: CarryTilt | None = None
@@ -294,6 +277,20 @@ class FeedbackDriver(Driver):
             closing.append(self._ik.forward(command)[1][0].double().cpu())
         (x0, y0, _), (x1, y1, _) = closing
         return column, math.copysign(1.0, float(x0 * y1 - y0 * x1))
+
+
+def _solver(env: EnvView, posture_gain: float = 0.0) -> BatchedIk:
+    """Inverse kinematics of an environment's worlds, as its controller has it."""
+    c = env.cfg.controller
+    return BatchedIk(
+        env.sim.model,
+        env.cfg.robot,
+        env.nworld,
+        env.device,
+        iterations=c.step_iterations,
+        posture_gain=posture_gain,
+        approach_gain=c.approach_gain,
+    )
 
 
 def measure_planar(env: EnvView, name: str) -> Tensor:

@@ -49,12 +49,8 @@ class JointTrajectory:
 
     def to(self, device: torch.device, dtype: torch.dtype) -> "JointTrajectory":
         """The same trajectory on a device."""
-        return replace(
-            self,
-            knots=self.knots.to(device, dtype),
-            weights=self.weights.to(device, dtype),
-            numbers=self.numbers.to(device),
-        )
+        knots, weights = (part.to(device, dtype) for part in (self.knots, self.weights))
+        return replace(self, knots=knots, weights=weights, numbers=self.numbers.to(device))
 
     def command(self, step: int | Tensor) -> Tensor:
         """Commands of one step.
