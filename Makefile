@@ -48,7 +48,7 @@ test-lerobot:
 
 # build/site/index.html opens from the disk. The build fetches nothing.
 docs: $(READY_DOCS)
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 # Wheel and sdist in dist/, tried in empty environments of three Pythons: half an hour, and some 7 GB for a while.
 dist: $(READY_DEV)
