@@ -18,6 +18,7 @@ if TYPE_CHECKING:  # the reference is made where MkDocs is not, too
     from mkdocs.config.defaults import MkDocsConfig
     from mkdocs.structure.files import Files
     from mkdocs.structure.nav import Navigation
+    from mkdocs.structure.pages import Page
 
 MARKER = "<!-- reference -->"
 
@@ -56,8 +57,13 @@ def on_files(files: Files, config: MkDocsConfig, **_: Any) -> Files:
     return files
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Put the reference in place of its marker, and have pictures of examples beside the pages."""
+def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
+    """Put the reference in place of its marker, and have pictures of examples beside the pages.
+
+    The search shows pages of the past last.
+    """
+    if page.file.src_uri.startswith("history/"):
+        page.meta["search"] = {"boost": 0.1}
     markdown = re.sub(r"\.\./examples/\w+/(\w+\.png)", r"\1", markdown)
     return markdown.replace(MARKER, reference_markdown()) if MARKER in markdown else markdown
 

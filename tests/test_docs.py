@@ -34,6 +34,15 @@ def test_lines_keep_their_numbers() -> None:
     assert lines == {4: "x = 1", 17: "z = x"}
 
 
+@pytest.mark.parametrize(
+    "words", ["domain randomization", "LeRobot", "ONNX", "contact buffers", "Slurm"]
+)
+def test_the_search_has_pages_for_words_of_the_field(words: str) -> None:
+    """The site's search finds words as they stand, not other spellings."""
+    texts = [" ".join(page.read_text(encoding="utf-8").split()) for page in PAGES[1:]]
+    assert any(words.lower() in text.lower() for text in texts)
+
+
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: Patch) -> Iterator[Path]:
     """An empty working folder; modules that a page imports from it are forgotten afterwards."""
