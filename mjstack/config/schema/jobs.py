@@ -97,7 +97,8 @@ class VisionCfg:
     cameras: list[str] = spec([])
     """Cameras of the scene that it sees; empty: none."""
     channels: list[int] = spec([32, 64, 128, 128], ge=1, le=4096)
-    """Channels of the convolutions for each camera; each halves height and width."""
+    """Channels of the convolutions for each camera. The first one leaves a quarter of height and
+    width, the others a half."""
     features: int = spec(256, ge=1, le=65536)
     """Numbers that the other layers get from each image."""
     shift: int = spec(2, unit="pixels", ge=0, le=1000)
