@@ -1,6 +1,7 @@
 """The README: its Python runs, its links lead somewhere, and it stays short."""
 
 import re
+import sys
 from pathlib import Path
 
 from doc_blocks import ROOT, python_blocks, write_files
@@ -16,6 +17,7 @@ def test_python_blocks_run(capsys: Capture, tmp_path: Path, monkeypatch: Patch) 
     names: dict[str, object] = {}
     for block in python_blocks(README.read_text()):  # later ones use names of earlier ones
         exec(block, names)
+    sys.modules.pop("mine", None)  # a page has another module of this name
     assert "'policy': (64, 24)" in capsys.readouterr().out
 
 
