@@ -23,8 +23,7 @@ from mjstack.config.load import load_config
 from mjstack.jobs.demo import show_demo
 from mjstack.policy import load_policy, save_policy
 
-RATES = {"rebot_stack": 0.98, "so101_stack": 0.96}  # of 64: at most one failure, and two
-NAMES = list(RATES)
+NAMES = ["rebot_stack", "so101_stack"]
 SOME_OF_THEM = ["nworld=2", "gate.success.rate=0.0", "task.episode_seconds=1.0"]
 
 
@@ -88,8 +87,8 @@ def test_a_card_says_what_the_policy_is(name: str) -> None:
         assert f"{word} " in card
     successes, episodes = map(int, re.search(r"(\d+) of (\d+) episodes", card).groups())  # type: ignore[union-attr]
     assert episodes >= 1024
-    assert ("do not reach" in card) == (successes < 0.99 * episodes)
-    assert successes >= 0.98 * episodes  # SO-101's, of two cores, is below the task's 99 %
+    assert successes >= 0.99 * episodes
+    assert "these random starts reach" in card
 
 
 @pytest.mark.full
@@ -98,7 +97,7 @@ def test_a_shipped_policy_succeeds(name: str) -> None:
     """From 64 starts that no card has."""
     policy = ["controller=policy", f"policy={name}", "sim=native", "gates=[success]"]
     found = mjstack.verify(
-        [*policy, "nworld=64", "seed=3000000", f"gate.success.rate={RATES[name]}"]
+        [*policy, "nworld=64", "seed=3000000", "gate.success.rate=0.98"]  # at most one failure
     )
     assert found.status == "pass", found.messages
     assert found.gates["success"].metrics["distinct_starts"] == 64
@@ -130,7 +129,7 @@ def test_the_tool_writes_folder_and_card(folder: Path, monkeypatch: Patch, capsy
     (after,) = written.glob("*.safetensors")
     assert after.read_bytes() == before.read_bytes()
     card = (written / "card.md").read_text()
-    assert "`mjstack job=train 'job.hidden=[8]' job.folder=outputs/mine`, seed 0" in card
+    assert "`mjstack job=train 'job.hidden=[8]' job.folder=outputs/mine`, seed 1, its last" in card
     assert "commit 0123456, 2026-11-27" in card
     assert card in capsys.readouterr().out
 

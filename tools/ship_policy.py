@@ -90,13 +90,15 @@ def write_card(
     gate = judged["randomized"]
     counts = gate.metrics
     broken = {rule: counts[f"failed.{rule}"] for rule in texts if f"failed.{rule}" in counts}
+    targets = "a joint target"
+    if policy.network.chunk > 1:
+        targets = f"{policy.network.chunk} joint targets, of which {policy.execute} are played,"
     size = sum(value.numel() for value in policy.network.parameters())
     rows = {
         "task": f"{cfg.task.name}: {cfg.task.instruction}",
         "robot": f"{cfg.robot.title}, mjstack's built-in model",
         "sees": ", ".join(policy.observation.terms),
-        "gives": f"{policy.network.chunk} joint targets for each of {', '.join(policy.joints)}, of"
-        f" which the first {policy.execute} are played",
+        "gives": f"{targets} for each of {', '.join(policy.joints)}",
         "an episode fails by": "; ".join(texts.values()),
         "random starts": f"{rate_text(gate)}; {starts_text(gate)}",
         "the task's threshold": f"{cfg.gate.success.rate:.0%}, which these random starts "
