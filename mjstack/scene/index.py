@@ -251,13 +251,11 @@ def gripper_targets(
         mujoco.mj_kinematics(model, data)
         apart[k] = np.linalg.norm(np.subtract(*data.site_xpos[sites]))
     closer = apart[200] - robot.closed_width
-
-    def around(width: float | None) -> list[float]:
-        if width is None or width == robot.closed_width:
-            return robot.gripper_open if width is None else robot.gripper_closed
-        return [float(np.interp(closer + width, apart, column)) for column in targets.T]
-
-    return np.array([around(width) for width in widths])
+    wide = np.array(widths, dtype=float)  # None is NaN
+    rows = np.stack([np.interp(closer + wide, apart, column) for column in targets.T], axis=1)
+    rows[np.isnan(wide)] = opened
+    rows[wide == robot.closed_width] = closed
+    return rows
 
 
 def locked_home(robot: RobotCfg) -> np.ndarray:

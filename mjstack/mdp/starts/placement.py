@@ -240,7 +240,6 @@ def _arm_boxes(cfg: Config, data: mujoco.MjData, geoms: ndarray, noise: float) -
 
 def world_boxes(data: mujoco.MjData, geoms: Sequence[int] | ndarray) -> tuple[ndarray, ndarray]:
     """Centres and half sizes, ``(n, 3)``, of the world-aligned boxes that hold some geoms."""
-    geoms = np.asarray(geoms, dtype=int)
     model = data.model
     rotation = data.geom_xmat[geoms].reshape(-1, 3, 3)
     centers = data.geom_xpos[geoms] + np.einsum("nij,nj->ni", rotation, model.geom_aabb[geoms, :3])
