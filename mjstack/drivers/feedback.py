@@ -66,12 +66,11 @@ class CarryTilt:
         """
         self._ik = ik
         self._nominal = nominal
-        device = env.device
         self._there_ik = _solver(env)
         self._sign = turn_sign(env.sim.model, env.cfg.robot)
-        self._keeps = torch.tensor(_keeps(phases), device=device)
-        self._grasps = torch.tensor([phase.grasped >= 0 for phase in phases], device=device)
-        self.place = torch.tensor(_places(phases), device=device)
+        self._keeps = torch.tensor(_keeps(phases), device=env.device)
+        self._grasps = torch.tensor([phase.grasped >= 0 for phase in phases], device=env.device)
+        self.place = torch.tensor(_places(phases), device=env.device)
         self._there = nominal.new_zeros((ik.nworld, nominal.shape[1]))
         self._last_axis = nominal.new_zeros((ik.nworld, 3))
         self._last_turn = nominal.new_zeros(ik.nworld)

@@ -131,8 +131,7 @@ class StateBasedDriver(FeedbackDriver):
         self._reach = size + beside * self._pushes
         self._has_faces = tensor(thing.has_faces for thing in cfg.scene.objects.values())
 
-        # Heights of targets: over an object that may stand anywhere and is not carried, or over the
-        # table
+        # Heights of targets: over an object that is not carried, wherever it is, or over the table
         objects = {*range(len(things))}
         self._above = tensor(target.above for _, target in self._aimed)
         self._follows = tensor(

@@ -320,8 +320,7 @@ def lowest_height(
         size = half if shape == "box" else model.geom_size[geom]
         center, quat = np.empty(3), np.empty(4)  # in its body
         turn = CAPSULE_TURN if shape == "capsule" else np.array([1.0, 0.0, 0.0, 0.0])
-        frame = (model.geom_pos[geom], model.geom_quat[geom])
-        mujoco.mju_mulPose(center, quat, *frame, middle, turn)
+        mujoco.mju_mulPose(center, quat, model.geom_pos[geom], model.geom_quat[geom], middle, turn)
         turned = xquat[:, model.geom_bodyid[geom]].float()
         offset = (quat_to_matrix(turned) * turned.new_tensor(center)).sum(-1)
         pos = xpos[:, model.geom_bodyid[geom]].float() + offset

@@ -96,9 +96,9 @@ def build_phases(cfg: Config) -> list[Phase]:
             x, y, rise = spec.offset
             grip = scene.grasp_offset if spec.in_hand else 0.0
             above = spec.h_scale * cfg.robot.approach_height + rise + grip
-            z = scene.table_top + up + above
             source = sources.index(spec.anchor)
             toward = sources.index(spec.toward or spec.anchor)
+            z = scene.table_top + up + above
             target = Target(source, toward, (x, y), z, up + above - centre)
         stop = start + round(spec.seconds / cfg.timing.step_dt)
         grasped = -1 if spec.grasps is None else sources.index(spec.grasps)
