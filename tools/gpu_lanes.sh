@@ -8,6 +8,12 @@ set -u
 out=${1:?a folder}
 shift
 sizes() { echo "scene.cameras.front.size=[$1,$1] scene.cameras.wrist.size=[$1,$1]"; }
+held() { # two thirds of each range of looks=randomized: the rest stays unseen
+  echo "reset.light.params.pos=0.2667 reset.light.params.brightness=[0.7333,1.1333] reset.light.params.tint=0.0667"
+  echo "reset.object_colors.params.spread=0.0533 reset.table_color.params.spread=0.1333"
+  echo "reset.background.params.spread=0.1333 reset.camera_poses.params.pos=0.00667"
+  echo "reset.camera_poses.params.angle=0.02 reset.camera_fovy.params.scale=[0.9667,1.0333]"
+}
 pixels="experiment=pixels nworld=2048 job.rounds=12 job.vision.pool=900000" # 10 minutes on an H100
 ppo="trainer=ppo nworld=4096 job.iterations=null gate.success.rate=0.0001"
 declare -A lanes=(
@@ -16,6 +22,7 @@ declare -A lanes=(
   [delay]="nworld=2048 trainer=clone timing.command_delay=5 gate.success.seeds=2"
   [pixels_rebot]="$pixels $(sizes 96) robot=rebot"
   [pixels_looks]="$pixels $(sizes 96) looks=randomized job.rounds=16"
+  [pixels_held]="$pixels $(sizes 96) looks=randomized $(held)"
   [pixels_wrist]="$pixels cameras=wrist scene.cameras.wrist.size=[96,96]"
   [pixels_front]="$pixels cameras=front scene.cameras.front.size=[96,96]"
 )
@@ -24,7 +31,7 @@ for seed in 0 1 2; do
   lanes[pixels_$seed]="$pixels $(sizes 96) seed=$seed"
 done
 for size in 64 128 160; do
-  lanes[pixels_$size]="$pixels $(sizes $size) job.vision.channels=[32,64,128]"
+  lanes[pixels_$size]="$pixels $(sizes $size) job.vision.pool=320000"
 done
 for name; do
   [[ -n ${lanes[$name]:-} ]] || { echo "no lane $name: there are ${!lanes[*]}" >&2; exit 2; }
