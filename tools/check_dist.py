@@ -4,7 +4,8 @@ Each Python of ``--python`` gets an empty environment outside of the checkout, w
 installed by pip alone; ``python3.11:constraints.txt`` with versions of that file, else the newest.
 There run the gates, ``mjstack demo``, an example in its own folder and the tests that need no
 checkout. Then the same with the sdist in the wheel's place. ``--log`` writes the tables as a page.
-``--quick`` builds the wheel alone, and tries it among the packages of this environment.
+``--quick`` builds the wheel alone, and tries its gates and ``mjstack demo`` in an empty environment
+of this Python, with versions of constraints.txt.
 """
 
 import argparse
@@ -193,17 +194,15 @@ def use(python: str, source: Path, folder: Path) -> list[Row]:
 
 
 def try_quickly(work: Path) -> None:
-    """The wheel's own files among the packages of this environment."""
-    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
-    call([*pip, "wheel", "--no-deps", "--wheel-dir", str(work), str(ROOT)])
+    """The wheel alone, in an empty environment of this Python and versions of constraints.txt."""
+    pip = ["-m", "pip", "--disable-pip-version-check", "--quiet"]
+    call([sys.executable, *pip, "wheel", "--no-deps", "--wheel-dir", str(work), str(ROOT)])
     (wheel,) = work.glob("*.whl")
     print(check_content(wheel, check_versions()))
-    call([*pip, "install", "--no-deps", "--target", str(work / "site"), str(wheel)])
-    os.environ["PYTHONPATH"] = str(work / "site")
-    code = "import mjstack, sys; sys.exit(not mjstack.__file__.startswith(sys.argv[1]))"
-    call([sys.executable, "-c", code, str(work / "site")], work)
+    python = make_environment(sys.executable, work / "own")
+    call([python, *pip, "install", "--constraint", str(ROOT / "constraints.txt"), str(wheel)])
     for words in (GATES, DEMO):
-        call([sys.executable, "-m", "mjstack", *words], work)
+        call([python, "-m", "mjstack", *words], work)
 
 
 def make_environment(python: str, folder: Path) -> str:
