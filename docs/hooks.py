@@ -63,7 +63,7 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
     The search shows pages of the past last.
     """
     if page.file.src_uri.startswith("history/"):
-        page.meta["search"] = {"boost": 0.1}
+        page.meta.setdefault("search", {})["boost"] = 0.1
     markdown = re.sub(r"\.\./examples/\w+/(\w+\.png)", r"\1", markdown)
     return markdown.replace(MARKER, reference_markdown()) if MARKER in markdown else markdown
 

@@ -1,4 +1,5 @@
-// From the disk browsers start no workers: the search then runs in a hidden frame, with a worker's functions.
+// From the disk browsers start no workers: the search then runs in a hidden frame, with a worker's
+// functions. Tried in Chromium alone.
 if (location.protocol === "file:")
   window.Worker = class extends EventTarget {
     constructor(url) {

@@ -16,7 +16,7 @@ def main() -> None:
         from mjstack.cli import run  # takes seconds
 
         status = run(sys.argv[1:])
-        gc.freeze()  # Python ends sooner by a second or two where it looks for no cycles
+        gc.freeze()  # files are closed, and looking for cycles takes seconds
         raise SystemExit(status)
 
 

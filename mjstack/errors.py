@@ -181,7 +181,7 @@ def describe_error(
         return " ".join(str(error).splitlines())  # a value in it may have several
     first = first_line(error)
     if is_out_of_memory(f"{type(error).__name__}: {error}"):
-        smaller = "Run fewer worlds, or lower batch.nconmax, batch.njmax or job.vision.pool"
+        smaller = "Run fewer worlds, or lower batch.nconmax, batch.njmax or, for images, job.vision.pool"
         return f"out of memory ({first}). {smaller}"
     frames = [
         f"{Path(frame.filename).name}:{frame.lineno}; "

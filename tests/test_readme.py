@@ -15,9 +15,11 @@ def test_python_blocks_run(capsys: Capture, tmp_path: Path, monkeypatch: Patch) 
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     names: dict[str, object] = {}
-    for block in python_blocks(README.read_text()):  # later ones use names of earlier ones
-        exec(block, names)
-    sys.modules.pop("mine", None)  # a page has another module of this name
+    try:
+        for block in python_blocks(README.read_text()):  # later ones use names of earlier ones
+            exec(block, names)
+    finally:
+        sys.modules.pop("mine", None)  # a page has another module of this name
     assert "'policy': (64, 24)" in capsys.readouterr().out
 
 

@@ -21,7 +21,7 @@ declare -A lanes=(
   [hz10]="nworld=2048 job.chunk=5 job.execute=5 job.beta_decay=1 gate.success.seeds=2"
   [delay]="nworld=2048 trainer=clone timing.command_delay=5 gate.success.seeds=2"
   [pixels_rebot]="$pixels $(sizes 96) robot=rebot"
-  [pixels_looks]="$pixels $(sizes 96) looks=randomized job.rounds=16"
+  [pixels_looks]="$pixels $(sizes 96) looks=randomized job.rounds=15"
   [pixels_held]="$pixels $(sizes 96) looks=randomized $(held)"
   [pixels_wrist]="$pixels cameras=wrist scene.cameras.wrist.size=[96,96]"
   [pixels_front]="$pixels cameras=front scene.cameras.front.size=[96,96]"
@@ -30,9 +30,9 @@ for seed in 0 1 2; do
   lanes[ppo_stack_$seed]="$ppo reset=expert_states job.minutes=20 seed=$seed"
   lanes[pixels_$seed]="$pixels $(sizes 96) seed=$seed"
 done
-for size in 64 128 160; do
-  lanes[pixels_$size]="$pixels $(sizes $size) job.vision.pool=320000"
-done
+lanes[pixels_64]="$pixels $(sizes 64)"
+lanes[pixels_128]="$pixels $(sizes 128) job.vision.pool=500000"
+lanes[pixels_160]="$pixels $(sizes 160) job.vision.pool=320000"
 for name; do
   [[ -n ${lanes[$name]:-} ]] || { echo "no lane $name: there are ${!lanes[*]}" >&2; exit 2; }
 done

@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # How a policy that sees images does in looks that it has not seen: none, those of looks=randomized, the same ranges
-# wider by half, and each look alone in its wider range. Arguments after the first two go to every run.
+# wider by half (brightness: nearly twice as wide), and each look alone in its wider range. Arguments after the first
+# two go to every run.
 #
 #     tools/judge_looks.sh outputs/lanes/pixels_looks/best outputs/looks 'scene.cameras.front.size=[96,96]' 'scene.cameras.wrist.size=[96,96]'
 set -u

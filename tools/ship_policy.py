@@ -92,7 +92,7 @@ def write_card(
     broken = {rule: counts[f"failed.{rule}"] for rule in texts if f"failed.{rule}" in counts}
     targets = "a joint target"
     if policy.network.chunk > 1:
-        targets = f"{policy.network.chunk} joint targets, of which {policy.execute} are played,"
+        targets = f"{policy.network.chunk} joint targets, the first {policy.execute} to be played,"
     size = sum(value.numel() for value in policy.network.parameters())
     rows = {
         "task": f"{cfg.task.name}: {cfg.task.instruction}",

@@ -23,3 +23,10 @@ def available_memory() -> int:
 def free_memory(device: torch.device) -> int:
     """Memory of a device that is free, in bytes; of the CPU `available_memory`."""
     return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else available_memory()
+
+
+def give_back_memory(device: torch.device) -> None:
+    """Free what torch keeps on a CUDA device: pieces into which a large block may not fit."""
+    if device.type == "cuda":
+        with torch.cuda.device(device):
+            torch.cuda.empty_cache()

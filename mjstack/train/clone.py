@@ -7,12 +7,15 @@ from collections import Counter
 from contextlib import closing
 from pathlib import Path
 
+import torch
+
 from mjstack.config.schema import CloneJobCfg
 from mjstack.episodes.rollout import STATE_BASED
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, MjstackError, require_names
 from mjstack.math import rate_interval
 from mjstack.policy.checkpoint import Facts
+from mjstack.sim.memory import give_back_memory
 from mjstack.train.clone_learner import CloneLearner
 from mjstack.train.clone_network import vision_of
 from mjstack.train.dataset import check_dataset, read_demonstrations
@@ -109,6 +112,7 @@ def train_clone(stage: Stage, folder: Path) -> Trained:
         for number in range(1, job.rounds + 1):
             learner.process(Demonstrations.join(parts))
             learner.learn(number)
+            give_back_memory(torch.device(stage.backend[1]))  # a round's images are large blocks
             part = make_round(stage, folder, learner.policy, number, pool)
             parts.append(part)
             figures = _judge(stage, f"round {number}: the policy alone", part)

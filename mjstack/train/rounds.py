@@ -171,7 +171,6 @@ def _play_round(
     cfg = stage.cfg
     job: CloneJobCfg = cfg.job
     began = time.perf_counter()
-    torch.cuda.empty_cache()  # what training left over is not in one piece, which images need
     nworld = min(cfg.nworld, job.episodes)
     worlds = stage.ranks.share(nworld)
     beta = job.beta * job.beta_decay ** (number - 1) if policy else 1.0

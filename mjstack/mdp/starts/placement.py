@@ -238,7 +238,7 @@ def _arm_boxes(cfg: Config, data: mujoco.MjData, geoms: ndarray, noise: float) -
     return centers, halves, np.tile([0.0, 1.0, 0.0], (len(geoms), 1))
 
 
-def world_boxes(data: mujoco.MjData, geoms: Sequence[int] | ndarray) -> tuple[ndarray, ndarray]:
+def world_boxes(data: mujoco.MjData, geoms: list[int] | ndarray) -> tuple[ndarray, ndarray]:
     """Centres and half sizes, ``(n, 3)``, of the world-aligned boxes that hold some geoms."""
     model = data.model
     rotation = data.geom_xmat[geoms].reshape(-1, 3, 3)
