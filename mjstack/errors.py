@@ -181,8 +181,8 @@ def describe_error(
         return " ".join(str(error).splitlines())  # a value in it may have several
     first = first_line(error)
     if is_out_of_memory(f"{type(error).__name__}: {error}"):
-        smaller = "Run fewer worlds, or lower batch.nconmax, batch.njmax or, for images, job.vision.pool"
-        return f"out of memory ({first}). {smaller}"
+        smaller = "Run fewer worlds, or lower batch.nconmax, batch.njmax"
+        return f"out of memory ({first}). {smaller} or, with images, job.vision.pool"
     frames = [
         f"{Path(frame.filename).name}:{frame.lineno}; "
         for frame in traceback.extract_tb(error.__traceback__)
