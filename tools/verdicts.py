@@ -172,6 +172,8 @@ def main() -> None:
     local = checkout / ".venv/bin/python"
     python = (args.python or (local if local.exists() else Path(sys.executable))).absolute()
     names = [name for name in RUNS if name.startswith(args.only)]
+    if not names:
+        parser.error(f"--only {args.only}: no run's name begins so; there are {', '.join(RUNS)}")
     for name in names:
         play(name, checkout, python, folder / name)
     runs = {name: summarise(folder / name) for name in names}
