@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -27,7 +28,7 @@ from environments import (
 from mjstack.config.schema import Backend
 from mjstack.errors import MjstackError
 from mjstack.scene import build_model
-from mjstack.sim import Simulation, SolverLimit, make_simulation
+from mjstack.sim import Simulation, SolverLimit, compiling, make_simulation
 
 N = 3
 VIEWS = (*STATE, *POSES, "qfrc_actuator", "sensordata")
@@ -492,3 +493,53 @@ sim.forward()
     assert "compiling MJWarp's kernels" in done.stderr
     compiled = re.findall(r"Module (\S+) .*\(compiled\)", after)
     assert compiled == ["mjstack.sim.usage"], after  # the rest of a simulation's step
+
+
+@pytest.mark.full
+def test_the_stock_step_is_compiled_by_a_process_apart(tmp_path: Path) -> None:
+    script = """
+from mjstack.config.load import load_config
+from mjstack.scene import build_model
+from mjstack.sim import make_simulation
+from mjstack.sim.compiling import compile_apart
+from mjstack.sim.mujoco_warp import wp
+
+cfg = load_config(["sim=mjwarp", "sim.device=cpu"])
+model = build_model(cfg)
+assert compile_apart(model, cfg, "cpu").wait() == 0
+sim = make_simulation(model, cfg, 2)
+wp.config.log_level = wp.LOG_INFO
+print("APART", flush=True)
+sim.bare_step()()
+"""
+    (tmp_path / "script.py").write_text(script)
+    env = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "cache")}
+    command = [sys.executable, str(tmp_path / "script.py")]
+    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=300, check=True)
+    _, apart, after = done.stdout.partition("APART")
+    assert apart
+    assert "(compiled)" not in after
+
+
+def test_a_compiling_process_starts_once_and_ends_with_its_context(monkeypatch: Patch) -> None:
+    started = []
+
+    def start(model: Any, cfg: Any, device: str) -> subprocess.Popen[bytes]:
+        started.append((model, cfg, device))
+        return subprocess.Popen(["sleep", "600"])
+
+    monkeypatch.setattr(compiling, "compile_apart", start)
+    compiling._compile_planned("cuda:0")  # nobody compares
+    with compiling.stock_step_beside(lambda: ("model", "cfg")):  # type: ignore[arg-type,return-value]
+        assert not started
+        for _ in range(2):
+            compiling._compile_planned("cuda:0")
+        (process,) = compiling._running
+        assert process.poll() is None
+    assert started == [("model", "cfg", "cuda:0")]
+    assert process.poll() is not None
+    compiling.wait_for_stock_step()
+    with compiling.stock_step_beside(lambda: ("model", "cfg")):  # type: ignore[arg-type,return-value]
+        pass
+    compiling._compile_planned("cuda:0")
+    assert len(started) == 1

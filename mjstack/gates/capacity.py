@@ -139,10 +139,17 @@ def _recommend(
     resets = [cfg.gate.capacity.reset] if "randomized" in runs else []
     with closing(run.stage.measuring_worlds(*resets, sizes=advice)) as worlds:
         for workload, load in runs.items():
-            if load.sizes is not None and not group.lost:
+            # One that needs less of everything than another would try nothing
+            if _needs(load.peaks) & _needs(peaks) and load.sizes is not None and not group.lost:
                 again = worlds.play(plays[workload])
                 group.problems += _compare(workload, load, again, result, exact=exact)
     return group
+
+
+def _needs(peaks: Peaks) -> set[tuple[str, float]]:
+    """What buffers must hold, by the kind of entry; nothing of which nothing is needed."""
+    needs = {"rows": peaks.rows.max(), "pool": peaks.share, "convex": peaks.convex_share or 0.0}
+    return {(kind, float(need)) for kind, need in needs.items() if need}
 
 
 def _compare(

@@ -3,6 +3,7 @@
 import logging
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -55,8 +56,14 @@ def run_gates(run: Run, folder: Path) -> None:
     elif stage.ranks.writes:  # of several ranks, the first makes the copies
         cfg = archive_starts(cfg, folder)
     run = replace(run, stage=stage.with_config(cfg, measured=stage.measured))
-    for name, gate in find_gates(run.cfg).items():
-        run_guarded(run, name, gate)
+    gates = find_gates(run.cfg)
+    with ExitStack() as beside:
+        if "throughput" in gates and stage.ranks.size == 1 and stage.backend[1] != "cpu":
+            from mjstack.sim.compiling import stock_step_beside  # loads Warp
+
+            beside.enter_context(stock_step_beside(lambda: (run.stage.model, run.cfg)))
+        for name, gate in gates.items():
+            run_guarded(run, name, gate)
 
 
 def run_guarded(run: Run, name: str, gate: Gate, spread: str = "") -> None:

@@ -1,17 +1,25 @@
-"""Kernels of a physics step, compiled at the same time instead of one after the other."""
+"""Kernels of a physics step, compiled at the same time instead of one after the other; those of
+`mujoco_warp.step` beside other work.
+"""
 
 import logging
-from collections.abc import Callable
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 
 import mujoco
 
+from mjstack.config.schema import Config
 from mjstack.process import available_cores
 from mjstack.sim.fused import constraints, smooth
 from mjstack.sim.fused.step import StepPlan
 from mjstack.sim.mujoco_warp import mjw, wp
-from mjstack.sim.sizes import BatchSizes
+from mjstack.sim.sizes import BatchSizes, resolve_sizes
 
 log = logging.getLogger(__name__)
 
@@ -21,6 +29,8 @@ Stage = Callable[[mjw.Model, mjw.Data], object]
 SHARED = ("forward", "passive", "sensor", "smooth", "solver", "support", "constraint")
 _SILENT = 3.0  # s: from the cache it takes less
 _done: set[tuple] = set()
+_planned: list[Callable[[str], subprocess.Popen[bytes]]] = []  # compilers, by the device
+_running: list[subprocess.Popen[bytes]] = []
 
 
 def compile_step(
@@ -51,6 +61,8 @@ def compile_step(
         futures += [pool.submit(stage) for stage in later]
         if wait(futures, timeout=_SILENT).not_done:
             log.info("compiling MJWarp's kernels; later runs on this machine load them")
+            if device.is_cuda:
+                _compile_planned(str(device))
     wp.synchronize_device(device)
 
 
@@ -70,3 +82,55 @@ def _stages(m: mjw.Model, plan: StepPlan) -> list[Stage]:
 
 def _reset(m: mjw.Model, d: mjw.Data) -> None:
     mjw.reset_data(m, d, reset=wp.zeros(1, dtype=bool))
+
+
+@contextmanager
+def stock_step_beside(stage: Callable[[], tuple[mujoco.MjModel, Config]]) -> Iterator[None]:
+    """Compile what `mujoco_warp.step` launches in a process of its own, as soon as a CUDA kernel
+    of this process turns out not to be in the cache: a graph cannot be captured while a thread
+    loads a module. The process ends with the context.
+
+    Args:
+        stage: Gives the scene and the configuration, asked when that process starts.
+    """
+    _planned.append(lambda device: compile_apart(*stage(), device))
+    try:
+        yield
+    finally:
+        _planned.clear()
+        for process in _running:
+            process.kill()
+        wait_for_stock_step()
+        _running.clear()
+
+
+def _compile_planned(device: str) -> None:
+    while _planned:
+        _running.append(_planned.pop()(device))
+
+
+def wait_for_stock_step() -> None:
+    """Return when no process is compiling any more: it would disturb what is timed."""
+    for process in _running:
+        process.wait()
+
+
+def compile_apart(model: mujoco.MjModel, cfg: Config, device: str) -> subprocess.Popen[bytes]:
+    """Start the process of `stock_step_beside`. Where it fails, kernels compile when they are
+    needed.
+    """
+    cfg = replace(cfg, sim=replace(cfg.sim, step="stock"))
+    worlds = pickle.dumps((model, cfg, 1, resolve_sizes(cfg), device, ()))
+    silent = subprocess.DEVNULL
+    command = [sys.executable, "-m", __name__]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=silent, stderr=silent)
+    assert process.stdin is not None
+    with process.stdin as stdin:
+        stdin.write(worlds)
+    return process
+
+
+if __name__ == "__main__":
+    from mjstack.sim.mjwarp import MjwarpSimulation
+
+    MjwarpSimulation(*pickle.load(sys.stdin.buffer)).close()
