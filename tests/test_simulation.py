@@ -463,7 +463,9 @@ def test_twice_the_same_run(backend: str, make_sim: MakeSim, get_stage: GetStage
 
 @pytest.mark.full
 def test_kernels_are_compiled_ahead(tmp_path: Path) -> None:
-    """With an empty cache, all that a step, its forward and resets launch is compiled before."""
+    """With an empty cache, a process apart compiles all that a bare step launches. All that our
+    step, its forward and resets launch is loaded before.
+    """
     script = """
 import logging
 from mjstack.config.load import load_config
@@ -481,44 +483,24 @@ def compile_step(*args):
 
 mjwarp.compile_step = compile_step
 cfg = load_config(["sim=mjwarp", "sim.device=cpu"])
-sim = make_simulation(build_model(cfg), cfg, 2)
+model = build_model(cfg)
+assert compiling.compile_apart(model, cfg, "cpu").wait() == 0
+sim = make_simulation(model, cfg, 2)
 sim.step(2, kinematics=True)
 sim.forward()
-"""
-    (tmp_path / "script.py").write_text(script)
-    env = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "cache")}
-    command = [sys.executable, str(tmp_path / "script.py")]
-    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=300, check=True)
-    *_, after = done.stdout.partition("AHEAD")
-    assert "compiling MJWarp's kernels" in done.stderr
-    compiled = re.findall(r"Module (\S+) .*\(compiled\)", after)
-    assert compiled == ["mjstack.sim.usage"], after  # the rest of a simulation's step
-
-
-@pytest.mark.full
-def test_the_stock_step_is_compiled_by_a_process_apart(tmp_path: Path) -> None:
-    script = """
-from mjstack.config.load import load_config
-from mjstack.scene import build_model
-from mjstack.sim import make_simulation
-from mjstack.sim.compiling import compile_apart
-from mjstack.sim.mujoco_warp import wp
-
-cfg = load_config(["sim=mjwarp", "sim.device=cpu"])
-model = build_model(cfg)
-assert compile_apart(model, cfg, "cpu").wait() == 0
-sim = make_simulation(model, cfg, 2)
-wp.config.log_level = wp.LOG_INFO
-print("APART", flush=True)
+print("BARE", flush=True)
 sim.bare_step()()
 """
     (tmp_path / "script.py").write_text(script)
     env = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "cache")}
     command = [sys.executable, str(tmp_path / "script.py")]
     done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=300, check=True)
-    _, apart, after = done.stdout.partition("APART")
-    assert apart
-    assert "(compiled)" not in after
+    assert "compiling MJWarp's kernels" in done.stderr
+    ours, bare = done.stdout.partition("AHEAD")[2].split("BARE", 1)
+    loaded = re.findall(r"Module (\S+) .*\((?:compiled|cached)\)", ours)
+    assert loaded == ["mjstack.sim.usage"], ours  # the rest of a simulation's step
+    assert "(cached)" in bare
+    assert "(compiled)" not in bare
 
 
 def test_a_compiling_process_starts_once_and_ends_with_its_context(monkeypatch: Patch) -> None:
