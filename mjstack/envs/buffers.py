@@ -30,7 +30,8 @@ log = logging.getLogger(__name__)
 ROWS = int(Overflow.NEFC | Overflow.NJMAX_NNZ)
 SIZED = ROWS | POOL | int(Overflow.CCD)
 _GROWTH = 8  # of the room to measure in, at most, by 2 each time
-_STEP = 8  # sizes are multiples of this
+_STEP = 8  # sizes are multiples of this, and large ones of more: each njmax has a solver kernel of
+_COARSE, _MANY = 64, 256  # its own to compile, and on CUDA random actions differ from run to run
 _POOLS = ("contacts", "pairs", "ccd_pairs")  # as the simulation counts them
 
 Advance = Callable[[str, int, int], None]
@@ -95,14 +96,15 @@ def join_peaks(a: Peaks, b: Peaks) -> Peaks:
 
 
 def recommend_sizes(peaks: Peaks, margin: float, source: str) -> BatchSizes:
-    """Sizes with a margin over the peaks, in multiples of 8.
+    """Sizes with a margin over the peaks, in multiples of 8, from 256 on of 64.
 
     Pools are shared: what all worlds had at once, divided by their number, is what each needs.
     Where convex pairs are not counted, their room stays as much as there is for contacts.
     """
 
     def size(peak: float) -> int:
-        return max(_STEP, _STEP * math.ceil(margin * peak / _STEP))
+        step = _STEP if margin * peak <= _MANY else _COARSE
+        return max(step, step * math.ceil(margin * peak / step))
 
     nconmax = size(peaks.share)
     convex = peaks.convex_share
