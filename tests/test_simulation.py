@@ -522,6 +522,7 @@ def test_a_compiling_process_starts_once_and_ends_with_its_context(monkeypatch: 
     assert process.poll() is not None
     compiling.wait_for_stock_step()
     with compiling.stock_step_beside(lambda: ("model", "cfg")):  # type: ignore[arg-type,return-value]
-        pass
+        compiling.wait_for_stock_step()  # from here on something is timed
+        compiling._compile_planned("cuda:0")
     compiling._compile_planned("cuda:0")
     assert len(started) == 1

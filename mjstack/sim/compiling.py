@@ -6,6 +6,7 @@ import logging
 import pickle
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
@@ -97,7 +98,6 @@ def stock_step_beside(stage: Callable[[], tuple[mujoco.MjModel, Config]]) -> Ite
     try:
         yield
     finally:
-        _planned.clear()
         for process in _running:
             process.kill()
         wait_for_stock_step()
@@ -110,7 +110,8 @@ def _compile_planned(device: str) -> None:
 
 
 def wait_for_stock_step() -> None:
-    """Return when no process is compiling any more: it would disturb what is timed."""
+    """Return when no process is compiling any more, and start none: what follows is timed."""
+    _planned.clear()
     for process in _running:
         process.wait()
 
@@ -120,14 +121,12 @@ def compile_apart(model: mujoco.MjModel, cfg: Config, device: str) -> subprocess
     needed.
     """
     cfg = replace(cfg, sim=replace(cfg.sim, step="stock"))
-    worlds = pickle.dumps((model, cfg, 1, resolve_sizes(cfg), device, ()))
     silent = subprocess.DEVNULL
-    command = [sys.executable, "-m", __name__]
-    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=silent, stderr=silent)
-    assert process.stdin is not None
-    with process.stdin as stdin:
-        stdin.write(worlds)
-    return process
+    with tempfile.TemporaryFile() as worlds:
+        pickle.dump((model, cfg, 1, resolve_sizes(cfg), device, ()), worlds)
+        worlds.seek(0)
+        command = [sys.executable, "-m", __name__]
+        return subprocess.Popen(command, stdin=worlds, stdout=silent, stderr=silent)
 
 
 if __name__ == "__main__":
