@@ -65,11 +65,13 @@ class Shapes:
         count = len(qpos)
         places = np.empty((count, len(self.bodies), 3))
         turns = np.empty((count, len(self.bodies), 4))
+        data = self._data
+        state, xpos, xquat = data.qpos, data.xpos, data.xquat  # each access makes a new array
         for world, row in enumerate(qpos):
-            self._data.qpos[:] = row
-            mujoco.mj_kinematics(self.model, self._data)
-            places[world] = self._data.xpos[self.bodies]
-            turns[world] = self._data.xquat[self.bodies]
+            state[:] = row
+            mujoco.mj_kinematics(self.model, data)
+            xpos.take(self.bodies, 0, places[world])
+            xquat.take(self.bodies, 0, turns[world])
         return places, turns
 
     @cached_property
