@@ -12,11 +12,13 @@ def main() -> None:
     for name in ("stdin", "stdout", "stderr"):
         if getattr(sys, name) is None:  # closed; a file opened later would take its place
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), "r+"))
+    gc.disable()  # until a job begins: loading makes a million objects, which stay
     with handle_interrupts():
         from mjstack.cli import run  # takes seconds
 
         status = run(sys.argv[1:])
         gc.freeze()  # files are closed, and looking for cycles takes seconds
+        gc.enable()
         raise SystemExit(status)
 
 

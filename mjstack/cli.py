@@ -6,6 +6,7 @@ makes the run folder before calling it. So every job is composed, checked and bu
 Hydra runs what was composed.
 """
 
+import gc
 import logging
 import os
 import re
@@ -176,6 +177,9 @@ def _run_checked(hydra: Any, cfg: DictConfig, checked: "CheckedJob", overrides: 
     chosen = any(override.lstrip("+").startswith("hydra.run.dir=") for override in overrides)
     resumed = None if chosen else checked.folder
     folder = resumed or hydra_path(cfg, "run.dir")
+    if not gc.isenabled():  # by `main`
+        gc.freeze()
+        gc.enable()
     begin_job()
     if not ranks.writes:
         global _assisting
@@ -205,6 +209,7 @@ def _sweep(hydra: Any, overrides: list[str]) -> int:
             "hydra.sweeper: expected Hydra's own. Give the values on the command line, as in"
             " -m nworld=1,2."
         )
+    gc.enable()  # every job is built to be checked
     overrides = [*overrides, "hydra.mode=MULTIRUN"]
     master = compose(overrides, RunMode.MULTIRUN)
     subdir = OmegaConf.to_container(master.hydra)["sweep"]["subdir"]  # type: ignore[index,call-overload]

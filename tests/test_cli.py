@@ -189,6 +189,39 @@ def test_any_error_of_the_run_is_a_line(
     assert the_report(folder)["status"] == "fail"
 
 
+@pytest.mark.full
+def test_the_collector_passes_over_what_was_loaded(folder: Path) -> None:
+    """It waits while modules load. Once a job has begun it works, also after MuJoCo Warp."""
+    program = """
+import gc, sys
+from mjstack import cli, jobs
+from mjstack.__main__ import main
+
+def note(work):
+    def noted(*args):
+        print("collector", int(gc.isenabled()), gc.get_freeze_count(), flush=True)
+        return work(*args)
+    return noted
+
+def stop():
+    raise RuntimeError("far enough")
+
+cli.compose = note(cli.compose)
+load = note(jobs.CheckedJob._load)
+jobs.CheckedJob._load = lambda *args: (load(*args), note(stop)())
+sys.argv = ["mjstack", "gates=[parity]", "web.episode=false"]
+main()
+"""
+    done = in_a_process(folder, "-c", program)
+    assert done.returncode == 1
+    assert "far enough" in done.stderr
+    lines = re.findall(r"^collector (\d) (\d+)$", done.stdout, re.MULTILINE)
+    (loading, _), (begun, modules), (after, more) = lines
+    assert (loading, begun, after) == ("0", "1", "1")
+    assert int(modules) > 100_000
+    assert int(more) > int(modules) + 50_000
+
+
 def test_bad_input_in_a_process_of_its_own(folder: Path) -> None:
     done = in_a_process(folder, SCRIPT, "robot=so100")
     assert (done.returncode, done.stdout) == (2, "")

@@ -80,8 +80,8 @@ def run_guarded(run: Run, name: str, gate: Gate, spread: str = "") -> None:
         Exception: It failed in a rank whose part the others need, or a rank has gone: the run is
             over.
     """
-    run.begin(name)
     began = time.perf_counter()
+    run.begin(name)  # which may load what the gate plays on
     ranks = run.stage.ranks
     spread = spread or getattr(gate, "spread", "")
     over: BaseException | None = None

@@ -2,10 +2,12 @@
 
 import gc
 import hashlib
+import importlib
 import logging
 import os
 import re
 import socket
+import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -160,6 +162,7 @@ class CheckedJob:
 
         def begin(name: str) -> None:
             bar.start(name)
+            self._load(name)
             if live is not None:
                 live.begin(name)
 
@@ -180,6 +183,21 @@ class CheckedJob:
         write_formats(report, page)
         draw_episode(self.stage, folder, run.artifacts.pictured, run.draw)
         page.note = save_page(self.stage, folder, page)
+
+    def _load(self, name: str) -> None:
+        """Load MuJoCo Warp for the part of the work that first plays on it. The collector, which
+        gates call often, need not look at its kernels.
+        """
+        plays = self.stage.backend[0] is Backend.mjwarp and name != "baseline"
+        if "mujoco_warp" in sys.modules or not (plays or name in ("parity", "capacity")):
+            return
+        gc.collect()
+        gc.disable()
+        try:
+            importlib.import_module("mjstack.sim.mjwarp")
+            gc.freeze()
+        finally:
+            gc.enable()
 
     def _end(self, error: BaseException, report: Report, console: Console) -> None:
         """Say why the work has ended early."""
