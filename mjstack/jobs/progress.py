@@ -66,11 +66,13 @@ class ProgressBar:
             self._unit = unit
             self._show(f"{self._gate}: {unit}", total)
         self._progress.update(self._task.id, completed=done)
-        speed = self._task.speed or 0.0
+        now = time.monotonic()
+        if self._progress.disable and now - self._spoke <= 15.0:
+            return
+        speed = self._task.speed or 0.0  # a sum over all reports
         rate = f"{speed:.1f}/s" if speed > 0.0 else ""
         self._progress.update(self._task.id, rate=rate)
-        now = time.monotonic()
-        if self._progress.disable and speed > 0.0 and now - self._spoke > 15.0:
+        if self._progress.disable and speed > 0.0:
             self._spoke = now
             left = (total - done) / speed
             self.print_line(f"{self._gate}: {unit} {done}/{total}, {rate}, {left:.0f} s left")
