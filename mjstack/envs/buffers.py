@@ -31,7 +31,7 @@ ROWS = int(Overflow.NEFC | Overflow.NJMAX_NNZ)
 SIZED = ROWS | POOL | int(Overflow.CCD)
 _GROWTH = 8  # of the room to measure in, at most, by 2 each time
 _STEP = 8  # sizes are multiples of this, and large ones of more: each njmax has a solver kernel of
-_COARSE, _MANY = 64, 256  # its own to compile, and on CUDA random actions differ from run to run
+_COARSE, _LARGE = 64, 256  # its own to compile, and on CUDA random actions differ from run to run
 _POOLS = ("contacts", "pairs", "ccd_pairs")  # as the simulation counts them
 
 Advance = Callable[[str, int, int], None]
@@ -103,7 +103,7 @@ def recommend_sizes(peaks: Peaks, margin: float, source: str) -> BatchSizes:
     """
 
     def size(peak: float) -> int:
-        step = _STEP if margin * peak <= _MANY else _COARSE
+        step = _STEP if margin * peak <= _LARGE else _COARSE
         return max(step, step * math.ceil(margin * peak / step))
 
     nconmax = size(peaks.share)
