@@ -12,7 +12,7 @@ from torch import Tensor
 
 # The third row of a rotation matrix is 2xz - 2wy, 2yz + 2wx, 1 - 2xx - 2yy: columns of w, x, y, z
 # in the products of both terms; and their signs times 2, and what is added.
-_Z_ROW_COLUMNS = torch.tensor([[1, 2, 1, 2, 1, 2], [3, 3, 1, 0, 0, 2]])
+_Z_ROW_COLUMNS = torch.tensor([1, 2, 1, 2, 1, 2, 3, 3, 1, 0, 0, 2])
 _Z_ROW_NUMBERS = torch.tensor([2.0, 2.0, -2.0, -2.0, 2.0, -2.0, 0.0, 0.0, 1.0])
 
 
@@ -75,8 +75,9 @@ def quat_angle(a: Tensor, b: Tensor) -> Tensor:
 
 def quat_z_row(quat: Tensor) -> Tensor:
     """Third row of the rotation matrix: world z of the body's axes, shape ``(..., 3)``."""
-    left, right, signs, added = _z_row_constants(quat.device, quat.dtype)
-    terms = quat.index_select(-1, left) * quat.index_select(-1, right) * signs
+    columns, signs, added = _z_row_constants(quat.device, quat.dtype)
+    factors = quat.index_select(-1, columns)
+    terms = factors[..., :6] * factors[..., 6:] * signs
     return terms[..., :3] + terms[..., 3:] + added
 
 
@@ -85,7 +86,7 @@ def _z_row_constants(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, 
     """The constants of `quat_z_row`, copied once: a captured step may not copy from the host."""
     with torch.inference_mode(False):
         numbers = _Z_ROW_NUMBERS.to(device, dtype)
-        return (*_Z_ROW_COLUMNS.to(device), *numbers.split((6, 3)))
+        return (_Z_ROW_COLUMNS.to(device), *numbers.split((6, 3)))
 
 
 def quat_to_matrix(quat: Tensor) -> Tensor:

@@ -262,7 +262,8 @@ class Step:
     @step_value
     def narrowest(self) -> Tensor:
         """Opening of the least open gripper joint as measured, 0 to 1, shape ``(nworld, 1)``."""
-        return gripper_opening(self.view.env).float().amin(1, keepdim=True)
+        opening = gripper_opening(self.view.env).float()
+        return opening if opening.shape[1] == 1 else opening.amin(1, keepdim=True)
 
     @step_value
     def supported(self) -> Tensor:
