@@ -1,5 +1,7 @@
 """Reward in stages for tasks in which objects are carried to their goals."""
 
+from math import inf
+
 import torch
 from torch import Tensor
 
@@ -9,6 +11,7 @@ from mjstack.managers.view import EnvView, ignores_success
 from mjstack.math import norm
 from mjstack.mdp.observation import grasp_point_pos
 from mjstack.tasks.check import make_check
+from mjstack.tasks.view import Step
 
 STAGES = ("reach", "lift", "carry", "place", "release")
 BELOW = 0.005  # m below its goal that an object over it may be: contacts are soft
@@ -65,43 +68,39 @@ class Progress:
             expected = "a check with goals, which this reward follows"
             raise ConfigError("task.check.func", type(self._check).__name__, expected)
         self._columns = self._view.columns(names)
-        self._within = within
-        self._height = height
-        self._near = near
-        # Ranges of the stages: those measured by a distance first (reach, carry, place), then lift
-        # and release. An open_fraction of 0 takes any opening.
+        # Of away, across, above, low and opening, see `_measure`: the range over which each counts
+        # (an open_fraction of 0 takes any opening), the number of the stage that it measures, and
+        # from where to where it unlocks stages.
         constant = self._view.constant
         self._ranges = constant(scale, scale, scale, height, max(open_fraction, 1e-6))
+        self._nearest = constant(1.0)
         self._number = constant(0.0, 2.0, 3.0, 1.0, 4.0)
+        self._least = constant(-inf, -inf, -BELOW, height, -inf)
+        self._most = constant(within, near, inf, inf, inf)
+        # Conditions of each of these stages: those of the five numbers, in hand, placed
+        conditions = [[4, 4, 4], [5, 0, 3], [1, 2, 2], [5, 0, 0], [6, 6, 6]]
+        self._conditions = torch.tensor(conditions, device=env.device).flatten()
 
     def __call__(self, env: EnvView) -> Tensor:
         """The reward, shape ``(nworld,)``."""
         step = self._view.step()
         read = self._columns.read
-        pos = read(step.pos)
-        goals = list(self._check.goals(step).values())
-        goal = torch.stack(goals, dim=1) if len(goals) > 1 else goals[0][:, None]
-        low = read(step.height)
         in_hand = read(step.in_hand)
         placed = read(self._check.placed(step))
+        measured = self._measure(step)
 
         # Which stages each object has got to
-        offset = pos - goal
-        above = offset[..., 2]
-        away = norm(pos - grasp_point_pos(env).float()[:, None])
-        across = norm(offset[..., :2])
-        grasped = in_hand & (away <= self._within)
-        lifted = grasped & (low >= self._height)
-        over = (across <= self._near) & (above >= -BELOW)
-        reached = torch.stack((torch.ones_like(lifted), lifted, over, grasped, placed), dim=-1)
+        within = measured.clamp(self._least, self._most) == measured
+        facts = torch.cat((within, in_hand[..., None], placed[..., None]), dim=-1)
+        reached = facts.index_select(-1, self._conditions).unflatten(-1, (5, 3)).all(-1)
 
         # How far it has got in each: the last one that it has got to is worth most
-        opening = step.narrowest.expand_as(low)
-        done = torch.stack((away, across, above.abs(), low, opening), dim=-1) / self._ranges
-        near = 1.0 - torch.tanh(done[..., :3])
-        worth = torch.cat((near, done[..., 3:].clamp(0.0, 1.0)), dim=-1) + self._number
-        value = (worth * reached).amax(-1) / len(STAGES)
-        if len(goals) == 1:
+        worth = measured / self._ranges
+        nearness = worth[..., :3]
+        torch.sub(self._nearest, nearness.abs_().tanh_(), out=nearness)
+        worth[..., 3:].clamp_(0.0, 1.0)
+        value = worth.add_(self._number).mul_(reached).amax(-1) / len(STAGES)
+        if value.shape[1] == 1:
             return value[:, 0]
 
         # One object after the other
@@ -109,3 +108,16 @@ class Progress:
         value[:, :-1].masked_fill_(finished, 1.0)
         value[:, 1:].mul_(finished.cumprod(1))
         return value.mean(1)
+
+    def _measure(self, step: Step) -> Tensor:
+        """Of each object: its distance from the grasp point, and from its goal horizontally and
+        upwards, the height of its lowest point [m], and the gripper's opening, shape ``(nworld,
+        objects, 5)``.
+        """
+        pos = self._columns.read(step.pos)
+        goals = list(self._check.goals(step).values())
+        offset = pos - (torch.stack(goals, dim=1) if len(goals) > 1 else goals[0][:, None])
+        away = norm(pos - grasp_point_pos(step.view.env).float()[:, None])
+        low = self._columns.read(step.height)
+        across = norm(offset[..., :2])
+        return torch.stack((away, across, offset[..., 2], low, step.narrowest.expand_as(low)), -1)
