@@ -16,7 +16,7 @@ from mjstack.errors import MjstackError
 from mjstack.managers.view import EnvView
 from mjstack.rng import uniform
 from mjstack.sim.draws import draw_uniform
-from mjstack.sim.graph import StepGraph
+from mjstack.sim.graph import StepGraph, side_by_side
 
 BACKENDS = ["mjwarp", pytest.param("mjwarp-cuda", marks=CUDA)]
 
@@ -208,3 +208,29 @@ def test_what_a_step_returns_is_the_callers_own() -> None:
     again = env.step(zero + 1.0)
     assert all(torch.equal(kept[name], obs[name]) for name in obs)
     assert not again[2].any()
+
+
+@on_cuda
+def test_a_branch_within_a_branch_keeps_its_memory() -> None:
+    """A branch reads late what its inner branch has made; meanwhile another one forks too."""
+    device = torch.device("cuda:0")
+    out = torch.zeros((2, 1 << 20), device=device)
+    busy = torch.zeros(1 << 26, device=device)
+
+    def branch(number: int) -> None:
+        made = []
+        inner = partial(torch.full_like, out[0], number + 1.0)
+        side_by_side(device, lambda: None, lambda: made.append(inner()))
+        if number == 1:
+            for _ in range(50):
+                busy.add_(1.0)
+        out[number].copy_(made.pop())
+
+    def work() -> None:
+        side_by_side(device, partial(branch, 0), partial(branch, 1))
+
+    graph = StepGraph(work, device, "require", name="branches")
+    for _ in range(3):
+        out.zero_()
+        graph()
+        assert [row.unique().tolist() for row in out] == [[1.0], [2.0]]

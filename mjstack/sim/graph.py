@@ -31,6 +31,7 @@ _branching = 0  # of branches that are being captured
 _abandoned: list[tuple[torch.cuda.CUDAGraph, torch.cuda.MemPool]] = []
 _capture_streams: dict[str, torch.cuda.Stream] = {}
 _side_streams: dict[str, list[torch.cuda.Stream]] = {}
+_joined_streams: list[torch.cuda.Stream] = []  # of branches within branches
 
 
 @contextmanager
@@ -284,7 +285,10 @@ def side_by_side(device: torch.device, *works: Callable[[], object]) -> None:
             main.wait_stream(stream)
     finally:
         _branching -= 1
-        free.extend(used)
+        _joined_streams.extend(used)
+        if not _branching:  # before that, another branch may reuse memory that is still read here
+            free.extend(_joined_streams)
+            _joined_streams.clear()
 
 
 def where_any(mask: Tensor, work: Callable[[], None]) -> None:
@@ -293,7 +297,7 @@ def where_any(mask: Tensor, work: Callable[[], None]) -> None:
     CUDA does not look: that would stop the device.
 
     Args:
-        mask: Shape ``(nworld,)``, bool.
+        mask: Shape ``(nworld,)``, bool or integers.
         work: Changes nothing that counts if the mask is empty.
     """
     if not mask.is_cuda and not bool(mask.any()):

@@ -3,11 +3,13 @@ object is where it belongs.
 """
 
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from mjstack.config.fields import Count, Fraction
+from mjstack.managers.term import branches
 from mjstack.managers.view import EnvView
 from mjstack.tasks.check import make_check
 from mjstack.tasks.parts import Condition, released
@@ -35,10 +37,15 @@ class HeldSuccess:
 
     def __call__(self, env: EnvView) -> Tensor:
         """Process a step; shape ``(nworld,)``, bool."""
-        step = self._view.step()
-        holds = torch.cat([condition(step) for condition in self._conditions], dim=1)
+        works = [partial(self._holds, condition) for condition in self._conditions]
+        holds = torch.cat(branches(env.device, *works), dim=1)
         self._length.add_(1).mul_(holds.all(1))
         return self._length >= self._steps
+
+    def _holds(self, condition: Condition) -> Tensor:
+        return condition(
+            self._view.step()
+        )  # a step of its own, because a branch may share no value
 
     def reset(self, mask: Tensor) -> None:
         """Forget the masked worlds."""

@@ -7,11 +7,11 @@ from torch import Tensor
 
 from mjstack.config.fields import Fraction, Positive
 from mjstack.errors import ConfigError
+from mjstack.managers.term import branches
 from mjstack.managers.view import EnvView, ignores_success
 from mjstack.math import norm
 from mjstack.mdp.observation import grasp_point_pos
 from mjstack.tasks.check import make_check
-from mjstack.tasks.view import Step
 
 STAGES = ("reach", "lift", "carry", "place", "release")
 BELOW = 0.005  # m below its goal that an object over it may be: contacts are soft
@@ -83,11 +83,7 @@ class Progress:
 
     def __call__(self, env: EnvView) -> Tensor:
         """The reward, shape ``(nworld,)``."""
-        step = self._view.step()
-        read = self._columns.read
-        in_hand = read(step.in_hand)
-        placed = read(self._check.placed(step))
-        measured = self._measure(step)
+        (measured, in_hand), placed = branches(env.device, self._measure, self._placed)
 
         # Which stages each object has got to
         within = measured.clamp(self._least, self._most) == measured
@@ -109,15 +105,21 @@ class Progress:
         value[:, 1:].mul_(finished.cumprod(1))
         return value.mean(1)
 
-    def _measure(self, step: Step) -> Tensor:
+    def _placed(self) -> Tensor:
+        return self._columns.read(self._check.placed(self._view.step()))
+
+    def _measure(self) -> tuple[Tensor, Tensor]:
         """Of each object: its distance from the grasp point, and from its goal horizontally and
         upwards, the height of its lowest point [m], and the gripper's opening, shape ``(nworld,
-        objects, 5)``.
+        objects, 5)``; and whether it is in the hand.
         """
+        step = self._view.step()
         pos = self._columns.read(step.pos)
         goals = list(self._check.goals(step).values())
         offset = pos - (torch.stack(goals, dim=1) if len(goals) > 1 else goals[0][:, None])
         away = norm(pos - grasp_point_pos(step.view.env).float()[:, None])
         low = self._columns.read(step.height)
         across = norm(offset[..., :2])
-        return torch.stack((away, across, offset[..., 2], low, step.narrowest.expand_as(low)), -1)
+        opening = step.narrowest.expand_as(low)
+        measured = torch.stack((away, across, offset[..., 2], low, opening), dim=-1)
+        return measured, self._columns.read(step.in_hand)

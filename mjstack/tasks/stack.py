@@ -10,7 +10,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from mjstack.config.fields import spec
-from mjstack.managers.term import in_one_pass
+from mjstack.managers.term import branches
 from mjstack.managers.view import EnvView
 from mjstack.sim.graph import where_any
 from mjstack.tasks import parts
@@ -142,44 +142,41 @@ class StackSuccess(HeldSuccess):
         check = StackCheck(env.cfg)
         view = check.view(env)
         super().__init__(env, view, [check.placed, check.released], check.t.window)
-        self._check = check
         ring = (check.t.window, len(view.objects))
         # Where the oldest step is, in every world.
         self._slot = torch.zeros(1, dtype=torch.int64, device=env.device)
         self._pose = view.zeros(*ring, 7)
         self._energy = view.zeros(*ring)  # squared speed
-        self._far = view.zeros(*ring)  # squared distance to later steps
-        self._turned = view.zeros(*ring)  # 1 - |cosine of half the angle| to them
+        # Squared distance to later steps, and 1 - |cosine of half the angle| to them
+        self._apart = view.zeros(*ring, 2)
+        t = check.t
+        rotation = 1.0 - math.cos(0.5 * math.radians(t.rest_rotation_deg))
+        speeds = [t.rest_speed**2] * len(view.objects)
+        self._limits = view.constant(*speeds, t.rest_position**2, rotation)
 
     def __call__(self, env: EnvView) -> Tensor:
         """Process a step; shape ``(nworld,)``, bool."""
-        achieved = super().__call__(env)
-        self._slot.add_(1).remainder_(self._steps)
-        # No window that holds a step without a standing object can pass: its slot is never judged.
-        where_any(self._length > 0, partial(in_one_pass, partial(self._look, achieved)))
+        achieved, _ = branches(env.device, partial(super().__call__, env), self._look)
+        if achieved.is_cuda or bool(achieved.any()):
+            largest = torch.cat((self._energy.mean(1), self._apart.amax((1, 2))), dim=1)
+            achieved &= (largest <= self._limits).all(1)
         return achieved
 
-    def _look(self, achieved: Tensor) -> None:
-        """Take a step in place of the oldest one, and take back what was no rest, shape
-        ``(nworld,)``, bool. `reset` may leave the ring alone: every slot is written anew before the
-        streak can reach the window.
+    def _look(self) -> None:
+        """Take a step in place of the oldest one. `reset` may leave the ring alone: every slot is
+        written anew before the streak can reach the window.
         """
+        self._slot.add_(1).remainder_(self._steps)
+        # No window that holds a step without a standing object can pass: its slot is never judged.
+        where_any(self._length, self._replace_oldest)
+
+    def _replace_oldest(self) -> None:
         step = self._view.step()
         self._pose.index_copy_(1, self._slot, step.pose[:, None])
         self._energy.index_copy_(1, self._slot, step.speed.square()[:, None])
-        for ring in (self._far, self._turned):
-            ring.index_fill_(1, self._slot, 0.0)
-
+        self._apart.index_fill_(1, self._slot, 0.0)
         # The newest step against the others
-        apart = (self._pose[..., :3] - step.pos[:, None]).square().sum(-1)
-        torch.maximum(self._far, apart, out=self._far)
+        distance = (self._pose[..., :3] - step.pos[:, None]).square().sum(-1)
         cosine = (self._pose[..., 3:] * step.quat[:, None]).sum(-1).abs()
-        torch.maximum(self._turned, 1.0 - cosine, out=self._turned)
-
-        if not achieved.is_cuda and not bool(achieved.any()):
-            return
-        t = self._check.t
-        rotation = 1.0 - math.cos(0.5 * math.radians(t.rest_rotation_deg))
-        achieved &= (self._energy.mean(1) <= t.rest_speed**2).all(1)
-        achieved &= self._far.amax((1, 2)) <= t.rest_position**2
-        achieved &= self._turned.amax((1, 2)) <= rotation
+        apart = torch.stack((distance, 1.0 - cosine), dim=-1)
+        torch.maximum(self._apart, apart, out=self._apart)
