@@ -291,9 +291,19 @@ class Env:
         def look() -> tuple[Tensor, Tensor | None]:
             ends = self.termination_manager
             rewards = self.reward_manager
+            observations = self.observation_manager
+            # A held step is seen by what remembers it alone.
+            observe = (observations.compute,) if last or observations.remembers else ()
+            early = observe if observations.ignores_success else ()
+
+            def begin_ends() -> Tensor:
+                lost = lost_state(self)
+                ends.begin()
+                return lost
+
             succeed = partial(self._success, self) if self._success else lambda: self._no_worlds
-            begun = (ends.begin, rewards.begin)
-            achieved, lost, *_ = branches(self.device, succeed, partial(lost_state, self), *begun)
+            begun = [partial(rewards.begin, name) for name in rewards.early]
+            achieved, lost, *_ = branches(self.device, succeed, begin_ends, *begun, *early)
             # None where the host can see that there are none
             broken = lost if lost.is_cuda or bool(lost.any()) else None
             if ended is not None:  # their success stays
@@ -304,20 +314,16 @@ class Env:
                 ends.compute(ended)
                 rewards.compute(void=broken, ended=ended)
 
-            # A held step is seen by what remembers it alone.
-            observes = last or self.observation_manager.remembers
-            works = (reward, self.observation_manager.compute) if observes else (reward,)
-            branches(self.device, *works)
+            branches(self.device, reward, *(() if early else observe))
             return lost, broken
 
         lost, broken = in_one_pass(look)
         current_term.label = ""
         self.faults.look(lost, broken)
-        ends = self.termination_manager
-        done = ends.terminated | ends.truncated
+        done = self.termination_manager.done
         if last:
             self._reset_ended(done, broken)
-        return None if last else done
+        return None if last else done.clone()
 
     def _reset_ended(self, done: Tensor, broken: Tensor | None) -> None:
         """The terminal observation, the statistics, the reset of the worlds that are ``done``, and

@@ -48,7 +48,9 @@ def required_fields(*resets: Mapping[str, TermCfg]) -> tuple[str, ...]:
 
 
 class _ValueManager:
-    """Terms that give every world a value at every step, by name."""
+    """Terms that give every world a value at every step, by name; ``early`` are those that do not
+    read the task's success.
+    """
 
     def __init__(
         self, kind: str, env: EnvView, cfg: Mapping[str, TermCfg], dtype: torch.dtype
@@ -58,13 +60,14 @@ class _ValueManager:
         for term in self._terms.values():
             first_value(term, env, boolean=dtype is torch.bool)
         self.names = list(self._terms)
+        self.early = [name for name, term in self._terms.items() if term.ignores_success]
         self._early: dict[str, Tensor] = {}
         self.values = torch.zeros((env.nworld, len(cfg)), dtype=dtype, device=env.device)
 
-    def begin(self) -> None:
-        """Compute the terms that do not read the task's success, which may be computed beside."""
-        early = {name: term for name, term in self._terms.items() if term.ignores_success}
-        self._early = {name: term(self._env) for name, term in early.items()}
+    def begin(self, *names: str) -> None:
+        """Compute terms of `early`, by default all, beside the task's success or each other."""
+        for name in names or self.early:
+            self._early[name] = self._terms[name](self._env)
 
     def _term_values(self) -> list[Tensor]:
         """The value of every term, in order. `begin` has computed some of them."""
@@ -143,6 +146,7 @@ class TerminationManager(_ValueManager):
 
     Attributes:
         names: The terms.
+        done: Ended by any term, shape ``(nworld,)``, bool.
         terminated: Ended by a term that is no time-out, shape ``(nworld,)``, bool.
         truncated: Ended by a time-out alone, shape ``(nworld,)``, bool.
         values: What each term said last, shape ``(nworld, nterm)``, bool.
@@ -156,13 +160,14 @@ class TerminationManager(_ValueManager):
         """
         super().__init__("termination", env, cfg, torch.bool)
         self._cfg = dict(cfg)
-        self.terminated = self.values.any(1)
-        self.truncated = self.values.any(1)
-        ends = [not term.time_out for term in cfg.values()]
-        self._ends = torch.tensor(ends, dtype=torch.bool, device=env.device)
+        self._ended = self.values.new_zeros((2, env.nworld))
+        self.terminated, self.done = self._ended
+        self.truncated = self.done.clone()
+        counts = [[[not term.time_out for term in cfg.values()]], [[True for _ in cfg]]]
+        self._counts = torch.tensor(counts, dtype=torch.bool, device=env.device)
 
     def compute(self, ended: Tensor | None = None) -> None:
-        """Write `terminated`, `truncated` and `values`.
+        """Write `done`, `terminated`, `truncated` and `values`.
 
         Args:
             ended: Worlds whose episode ended in an earlier control step of the same decision, shape
@@ -175,11 +180,10 @@ class TerminationManager(_ValueManager):
             earlier = self.values.unbind(1)
             values = [torch.where(ended, *pair) for pair in zip(earlier, values, strict=True)]
         torch.stack(values, dim=1, out=self.values)
-        torch.any(self.values & self._ends, dim=1, out=self.terminated)
+        torch.any(self.values & self._counts, dim=2, out=self._ended)
         # Where both hold, the state itself ended the episode: there is nothing left to bootstrap
         # from.
-        torch.any(self.values, dim=1, out=self.truncated)
-        self.truncated ^= self.terminated
+        torch.bitwise_xor(self.done, self.terminated, out=self.truncated)
 
     def __str__(self) -> str:
         rows = [

@@ -82,8 +82,8 @@ def offers(kind: str = "", /, **attributes: Any) -> Callable[[Any], Any]:
 
 
 def ignores_success(term: Any) -> Any:
-    """Mark a reward or termination term that reads neither ``env.success`` nor what a success term
-    or another manager writes: CUDA may compute it beside success. A subclass, or a function that
+    """Mark a reward, termination or observation term that reads neither ``env.success`` nor what
+    another term or manager writes: CUDA may compute it beside them. A subclass, or a function that
     wraps it, is not marked.
     """
     term.ignores_success = term

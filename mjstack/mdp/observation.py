@@ -1,14 +1,23 @@
 """Observation terms: functions of the environment that return ``(nworld,)`` or ``(nworld, d)``."""
 
+from collections.abc import Callable, Sequence
+from typing import Any
+
 import torch
 from torch import Tensor
 
 from mjstack.managers.term import shared
-from mjstack.managers.view import EnvView, offers
+from mjstack.managers.view import EnvView, ignores_success, offers
 from mjstack.mdp.geometry import jaw_forces, place_xy, pose_w, robot
 
-_in_metres = offers("observation term", unit="m")
-_by_joint = offers("observation term", unit="joint")
+
+def _in(unit: str | Sequence[str]) -> Callable[[Any], Any]:
+    """Mark an observation of the state alone with its unit."""
+    return lambda term: ignores_success(offers("observation term", unit=unit)(term))
+
+
+_in_metres = _in("m")
+_by_joint = _in("joint")
 
 
 @_by_joint
@@ -23,7 +32,7 @@ def joint_pos_relative(env: EnvView) -> Tensor:
     return joint_pos(env) - robot(env).home
 
 
-@offers("observation term", unit="joint/s")
+@_in("joint/s")
 def joint_vel(env: EnvView) -> Tensor:
     """Joint velocities [rad/s, m/s], shape ``(nworld, n)``."""
     return env.sim.part("qvel", robot(env).qvel)
@@ -71,7 +80,7 @@ def object_to_place(env: EnvView, *, object: str, place: str) -> Tensor:
     return torch.cat((place_xy(env, place) - at[:, :2], height - at[:, 2:]), dim=1)
 
 
-@offers("observation term", unit=("m",) * 3 + ("1",) * 4)
+@_in(("m",) * 3 + ("1",) * 4)
 def object_pose(env: EnvView, *, object: str) -> Tensor:
     """Position [m] and quaternion (wxyz), world frame, shape ``(nworld, 7)``."""
     return pose_w(env, object)
@@ -98,7 +107,7 @@ def goals(env: EnvView) -> Tensor:
     return torch.cat([env.sim.qpos[:, :0], *places], dim=1)
 
 
-@offers("observation term", unit="1")
+@_in("1")
 def headings(env: EnvView) -> Tensor:
     """How the boxes that can move are turned about z: cosine and sine of four times the yaw of
     each, which are the same after a quarter turn, shape ``(nworld, 2 * boxes)``.
@@ -117,7 +126,7 @@ def headings(env: EnvView) -> Tensor:
     return torch.stack((cos, sin), dim=2).flatten(1)
 
 
-@offers("observation term", unit=("m/s",) * 3 + ("rad/s",) * 3)
+@_in(("m/s",) * 3 + ("rad/s",) * 3)
 def object_velocity(env: EnvView, *, object: str) -> Tensor:
     """Linear [m/s, world frame] and angular [rad/s, body frame] velocity, shape ``(nworld, 6)``."""
     if object in env.index.fixed:
@@ -125,7 +134,7 @@ def object_velocity(env: EnvView, *, object: str) -> Tensor:
     return env.sim.part("qvel", env.index.object_columns(object)[1])
 
 
-@offers("observation term", unit="N")
+@_in("N")
 def jaw_force(env: EnvView, *, object: str) -> Tensor:
     """Size of each jaw's contact force on an object [N], shape ``(nworld, 2)``."""
     return jaw_forces(env.index, env.sim, object)
