@@ -150,8 +150,8 @@ def not_finite(*parts: Tensor) -> Tensor:
     if not parts[0].is_cuda and all_finite(*parts):
         return torch.zeros(len(parts[0]), dtype=torch.bool, device=parts[0].device)
     # 0 times what is not finite is NaN, which a sum keeps: fewer kernels than a test of each.
-    first, *more = ((part * 0.0).sum(1) for part in parts)
-    return sum(more, first) != 0.0
+    numbers = torch.cat(parts, dim=1) if len(parts) > 1 else parts[0]
+    return (numbers * 0.0).sum(1) != 0.0
 
 
 def all_finite(*parts: Tensor) -> bool:

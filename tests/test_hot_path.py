@@ -19,12 +19,12 @@ PATHS: dict[str, dict[str, str] | None] = {
         "Env": "advance _step_physics _evaluate _reset_ended _start_worlds _reset_managers"
     },
     "envs/command_delay.py": {"CommandDelay": "late reset"},
-    "envs/faults.py": {"FaultLatch": "record"},
+    "envs/faults.py": {"FaultLatch": "record record_reward"},
     "envs/outputs.py": {
         "Outputs": "write_final restore_observations returned",
         "EpisodeStatistics": "update",
     },
-    "managers/action.py": {"ActionManager": "process apply reset"},
+    "managers/action.py": {"ActionManager": "process apply not_finite reset"},
     "managers/observation.py": {
         "_Part": "value",
         "_Group": "add_noise append restart",
@@ -48,7 +48,7 @@ PATHS: dict[str, dict[str, str] | None] = {
     "mdp/action.py": {
         "JointPosition Gripper": "write_commands",
         "EndEffectorDelta": "write_commands _tilted",
-        "_Commands": "_write_bounded",
+        "_Commands": "_write _write_bounded",
     },
     "mdp/reset.py": {
         "": "home _write_objects",

@@ -314,7 +314,17 @@ class Env:
                 ends.compute(ended)
                 rewards.compute(void=broken, ended=ended)
 
-            branches(self.device, reward, *(() if early else observe))
+            def keep() -> None:
+                for compute in () if early else observe:
+                    compute()
+                if not last:
+                    return
+                works = [partial(self._outputs.write_final, broken)]
+                if lost.is_cuda:  # elsewhere the host looks
+                    works.append(partial(self.faults.record, lost))
+                side_by_side(self.device, *works)
+
+            branches(self.device, reward, keep)
             return lost, broken
 
         lost, broken = in_one_pass(look)
@@ -326,31 +336,27 @@ class Env:
         return None if last else done.clone()
 
     def _reset_ended(self, done: Tensor, broken: Tensor | None) -> None:
-        """The terminal observation, the statistics, the reset of the worlds that are ``done``, and
-        the observation to go on with. ``broken`` are worlds whose state is not finite, None if
+        """The terminal images, the statistics, the reset of the worlds that are ``done``, and the
+        observation to go on with. ``broken`` are worlds whose state is not finite, None if
         there are none; both of shape ``(nworld,)``, bool.
         """
         # On CUDA the host cannot look, because that would stop the device: the graph does.
         ending = self.termination_manager.values.shape[1] > 0 and (done.is_cuda or bool(done.any()))
 
-        def keep() -> None:
-            self._outputs.write_final(broken)
-            self._draws.draw_ended(done)
-
         def count() -> None:
             if ending:
                 self.statistics.update(done)
 
-        def record() -> None:
-            if done.is_cuda and broken is not None:
-                self.faults.record(broken)
+        def latch() -> None:
+            if done.is_cuda:
+                self.faults.record_reward()
 
         def restart() -> None:
             self._start_worlds(done)
             self._reset_managers(done)
             in_one_pass(partial(self.observation_manager.refresh, done))
 
-        side_by_side(self.device, keep, count, record)
+        side_by_side(self.device, count, latch, partial(self._draws.draw_ended, done))
         if ending:
             where_any(done, restart)
         elif broken is not None:

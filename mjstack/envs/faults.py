@@ -64,6 +64,7 @@ class FaultLatch:
         fine = broken is None and not self._any and all_finite(*numbers)
         if not fine or bool(env.sim.overflow.any()):
             self.record(lost)
+            self.record_reward()
             self.raise_first()
 
     def after_step(self) -> None:
@@ -73,21 +74,25 @@ class FaultLatch:
             self.raise_first()
 
     def record(self, broken: Tensor) -> None:
-        """Add the faults of a step, before a reset can erase them, with the worlds whose state is
-        not finite, shape ``(nworld,)``, bool.
+        """Add the faults of a step except for its reward's, before a reset can erase them, with the
+        worlds whose state is not finite, shape ``(nworld,)``, bool.
         """
         if not self._check:
             return
         env = self._env
         self._any = True
         self._overflow |= env.sim.overflow & self._lost
-        bad_action = env.action_manager.not_finite
-        reward = env.reward_manager.reward
         groups = env.observation_manager.groups.values()
         seen = not_finite(*groups) if groups else self._none
         state = self._none if self._state_ends else broken
-        self._faults |= torch.stack((bad_action, state, reward * 0.0 != 0.0, seen & ~broken), dim=1)
-        bad_action.zero_()
+        # Seen in a world that is broken anyway says nothing: True is more than False
+        faults = (env.action_manager.not_finite(), state, self._none, seen > broken)
+        self._faults |= torch.stack(faults, dim=1)
+
+    def record_reward(self) -> None:
+        """Add the fault of a step's reward."""
+        if self._check:
+            self._faults[:, 2] |= self._env.reward_manager.reward * 0.0 != 0.0
 
     def clear(self) -> None:
         """Clear every fault."""

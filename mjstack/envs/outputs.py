@@ -69,16 +69,15 @@ class EpisodeStatistics:
             *(f"termination/{name}" for name in env.cfg.termination),
         ]
         # float64 counts exactly far beyond the 16.7 million at which float32 stops.
-        self._sums = torch.zeros(1 + len(self._names), dtype=torch.float64, device=env.device)
+        self._sums = torch.zeros(len(self._names), dtype=torch.float64, device=env.device)
 
     def update(self, done: Tensor) -> None:
         """Add the episodes that end in this step, shape ``(nworld,)``, bool."""
         env = self._env
-        rewards = env.reward_manager.episode_sums
         # A step count is exact in float32 up to 16.7 million; the sums are float64.
-        ends = (done.float(), env.episode_step.float(), env.success.float(), rewards.sum(1))
-        parts = (torch.stack(ends, dim=1), rewards, env.termination_manager.values.float())
-        row = torch.cat(parts, dim=1)
+        ends = [part.float()[:, None] for part in (done, env.episode_step, env.success)]
+        ways = env.termination_manager.values.float()
+        row = torch.cat((*ends, env.reward_manager.episode_sums, ways), dim=1)
         self._sums += torch.where(done[:, None], row, 0.0).sum(0, dtype=torch.float64)
 
     def read(self) -> dict[str, float]:
@@ -89,8 +88,10 @@ class EpisodeStatistics:
             ``episodes``; and if there were any ``steps``, ``success``, ``return``,
             ``reward/<term>`` (sums per episode) and ``termination/<term>`` (fraction of episodes).
         """
-        episodes, *sums = self._sums.tolist()
+        episodes, steps, success, *sums = self._sums.tolist()
         self._sums.zero_()
+        total = sum(sums[: len(self._env.cfg.reward)])
+        sums = [steps, success, total, *sums]
         means = zip(self._names, sums, strict=True) if episodes else ()
         return {"episodes": episodes} | {name: total / episodes for name, total in means}
 

@@ -49,8 +49,6 @@ class ActionManager:
         previous_action: The one before. Both are zero after a reset.
         low: Smallest meaningful action, shape ``(action_dim,)``.
         high: Largest, shape ``(action_dim,)``.
-        not_finite: Worlds whose action was not finite since this was last cleared, shape
-            ``(nworld,)``, bool.
     """
 
     def __init__(self, env: EnvView, cfg: Mapping[str, TermCfg]) -> None:
@@ -81,13 +79,12 @@ class ActionManager:
         self._parts = self.action.split(dims, dim=1) if terms else ()
         self.low = torch.cat([term.low for term in terms]) if terms else self.action[0]
         self.high = torch.cat([term.high for term in terms]) if terms else self.action[0]
-        self.not_finite = torch.zeros(env.nworld, dtype=torch.bool, device=env.device)
 
     def process(self, action: Tensor) -> None:
         """Check an action and keep it for `apply`.
 
         A value that is not finite is an error at once on the CPU. On CUDA, where looking would stop
-        the device, it counts as 0 and its world is marked in ``not_finite``.
+        the device, it counts as 0; see `not_finite`.
 
         Args:
             action: Shape ``(nworld, action_dim)``, float32 or float64.
@@ -115,10 +112,15 @@ class ActionManager:
             self.action.copy_(self._processed)
         else:
             torch.nan_to_num(self._processed, 0.0, 0.0, 0.0, out=self.action)
-            self.not_finite |= (self.action != self._processed).any(1)
         for (name, term), part in zip(self.terms.items(), self._parts, strict=True):
             current_term.label = f"action.{name}"
             term.write_commands(part)
+
+    def not_finite(self) -> Tensor:
+        """Worlds whose action, as it was applied last, was not finite, shape ``(nworld,)``, bool;
+        before their reset.
+        """
+        return (self.action != self._processed).any(1)
 
     def check(self, action: Tensor) -> None:
         """Raise an `ArgumentError` for an action of wrong type, shape, dtype or device."""

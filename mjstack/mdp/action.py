@@ -22,6 +22,8 @@ class _Commands(ActionTerm):
     def _set_up(self, env: EnvView, chosen: list[int] | slice, dim: int) -> None:
         self._ctrl = env.sim.ctrl
         self._columns = Columns(env.index.ctrl[chosen], env.device)
+        side_by_side = isinstance(self._columns.at, slice)
+        self._out = self._columns.read(self._ctrl) if side_by_side else None
         self._low, self._high = robot(env).ctrl_range[chosen].unbind(1)
         self.actuators = self._columns.indices
         self.dim = dim
@@ -30,7 +32,12 @@ class _Commands(ActionTerm):
 
     def _write_bounded(self, command: Tensor) -> None:
         """Write commands, kept within the actuators' ranges."""
-        self._columns.write(self._ctrl, torch.clamp(command, self._low, self._high))
+        self._write(torch.clamp(command, self._low, self._high, out=self._out))
+
+    def _write(self, command: Tensor) -> None:
+        """Write commands, unless they are computed in their place."""
+        if self._out is None:
+            self._columns.write(self._ctrl, command)
 
 
 class JointPosition(_Commands):
@@ -114,7 +121,8 @@ class Gripper(_Commands):
         if self._step:
             last = (self._columns.read(self._ctrl) - self._closed) / self._half_travel - 1.0
             action = (last + 2.0 * self._step * action).clamp(-1.0, 1.0)
-        self._columns.write(self._ctrl, self._closed + (action + 1.0) * self._half_travel)
+        opening = (action + 1.0) * self._half_travel
+        self._write(torch.add(self._closed, opening, out=self._out))
 
 
 class EndEffectorDelta(_Commands):
