@@ -76,7 +76,10 @@ PATHS: dict[str, dict[str, str] | None] = {
         "AtLeast": "holds unlocked",
     },
     "tasks/placed.py": {"HeldSuccess": "__call__ _holds reset"},
-    "tasks/stack.py": {"StackCheck": "placed goals", "StackSuccess": "_look _replace_oldest __call__"},
+    "tasks/stack.py": {
+        "StackCheck": "placed goals",
+        "StackSuccess": "_look _replace_oldest __call__",
+    },
     "tasks/box.py": {
         "BoxCheck": "airborne resting outside over placed goals at_slot",
         "_CarriedOver _Release _Settled _Order": "update",

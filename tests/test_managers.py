@@ -262,12 +262,33 @@ def test_a_term_marked_so_ignores_success() -> None:
             *("progress", "lift", "reach", "action_rate", "joint_vel"),
             *("time_out", "object_off_table", "joint_limit", "non_finite", "overflow"),
         }
-        for term in marked:
+        assert env.observation_manager.ignores_success
+        for term in [*marked, *(part.term for part in env.observation_manager._parts)]:
             values = []
             for success in (False, True):
                 env.success.fill_(success)
                 values.append(term(env).clone())
             assert torch.equal(*values), term.label
+
+
+def every_other_step(env: Any) -> torch.Tensor:
+    return env.episode_step % 2 == 0
+
+
+def succeeded(env: Any) -> torch.Tensor:
+    return env.success.float()
+
+
+def test_an_observation_may_read_the_success_of_its_step() -> None:
+    success = f"task.success={{func: {__name__}.every_other_step}}"
+    term = f"+observation.policy.terms.succeeded={{func: {__name__}.succeeded}}"
+    with closing(make_env(["task=stack", "sim=native", success, term], nworld=4)) as env:
+        assert not env.observation_manager.ignores_success
+        env.reset(seed=0)
+        for number, action in enumerate(actions(env, 4)):
+            _, _, terminated, _, extras = env.step(action)
+            assert extras["success"].tolist() == terminated.tolist() == [number % 2 == 1] * 4
+            assert extras["final_obs"]["policy"][:, -1].tolist() == extras["success"].tolist()
 
 
 class PaysOnce(Progress):

@@ -308,11 +308,16 @@ class Env:
             broken = lost if lost.is_cuda or bool(lost.any()) else None
             if ended is not None:  # their success stays
                 achieved = torch.where(ended, self.success, achieved)
-            self.success.copy_(achieved if broken is None else achieved & ~broken)
+            if broken is None:
+                self.success.copy_(achieved)
+            else:  # achieved and not broken
+                torch.gt(achieved, broken, out=self.success)
 
             def reward() -> None:
                 ends.compute(ended)
                 rewards.compute(void=broken, ended=ended)
+                if lost.is_cuda:  # elsewhere the host looks
+                    self.faults.record_reward()
 
             def keep() -> None:
                 for compute in () if early else observe:
@@ -320,7 +325,7 @@ class Env:
                 if not last:
                     return
                 works = [partial(self._outputs.write_final, broken)]
-                if lost.is_cuda:  # elsewhere the host looks
+                if lost.is_cuda:
                     works.append(partial(self.faults.record, lost))
                 side_by_side(self.device, *works)
 
@@ -343,20 +348,13 @@ class Env:
         # On CUDA the host cannot look, because that would stop the device: the graph does.
         ending = self.termination_manager.values.shape[1] > 0 and (done.is_cuda or bool(done.any()))
 
-        def count() -> None:
-            if ending:
-                self.statistics.update(done)
-
-        def latch() -> None:
-            if done.is_cuda:
-                self.faults.record_reward()
-
         def restart() -> None:
+            self.statistics.update(done)
             self._start_worlds(done)
             self._reset_managers(done)
             in_one_pass(partial(self.observation_manager.refresh, done))
 
-        side_by_side(self.device, count, latch, partial(self._draws.draw_ended, done))
+        self._draws.draw_ended(done)
         if ending:
             where_any(done, restart)
         elif broken is not None:

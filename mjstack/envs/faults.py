@@ -45,6 +45,7 @@ class FaultLatch:
         self._any = False  # latched since `clear`, on the CPU
         n = env.nworld
         self._faults = torch.zeros((n, len(_FIXES)), dtype=torch.bool, device=env.device)
+        self._reward = torch.zeros(n, device=env.device)  # NaN if one was not finite
         self._overflow = torch.zeros(n, dtype=torch.int32, device=env.device)
         self._none = torch.zeros(n, dtype=torch.bool, device=env.device)
         ends_on = {offered(term.func, "ends_on") for term in env.cfg.termination.values()}
@@ -90,14 +91,15 @@ class FaultLatch:
         self._faults |= torch.stack(faults, dim=1)
 
     def record_reward(self) -> None:
-        """Add the fault of a step's reward."""
-        if self._check:
-            self._faults[:, 2] |= self._env.reward_manager.reward * 0.0 != 0.0
+        """Add the fault of a step's reward; may be beside `record`."""
+        if self._check:  # 0 times what is not finite is NaN
+            self._reward.add_(self._env.reward_manager.reward, alpha=0.0)
 
     def clear(self) -> None:
         """Clear every fault."""
         self._any = False
         self._faults.zero_()
+        self._reward.zero_()
         self._overflow.zero_()
 
     def raise_first(self) -> None:
@@ -106,6 +108,7 @@ class FaultLatch:
         Raises:
             FaultError: Something went wrong; names the worlds and what to do.
         """
+        self._faults[:, 2] = self._reward != 0.0
         if not bool(self._faults.any() | (self._overflow != 0).any()):
             return
         env = self._env
