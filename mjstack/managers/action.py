@@ -71,9 +71,8 @@ class ActionManager:
         terms = self.terms.values()
         dims = [term.dim for term in terms]
         self.action_dim = sum(dims)
-        shape = (env.nworld, self.action_dim)
-        self.action = torch.zeros(shape, dtype=env.sim.qpos.dtype, device=env.device)
-        self.previous_action = self.action.clone()
+        self._last_two = env.sim.qpos.new_zeros((2, env.nworld, self.action_dim))
+        self.action, self.previous_action = self._last_two
         self._processed = self.action.clone()
         self._whole = not self.action.is_cuda  # as far as it is known
         self._parts = self.action.split(dims, dim=1) if terms else ()
@@ -136,7 +135,7 @@ class ActionManager:
 
     def reset(self, mask: Tensor) -> None:
         """Zero the actions of the masked worlds."""
-        zero_rows(mask, self.action, self.previous_action)
+        zero_rows(mask, self._last_two)
 
     def __str__(self) -> str:
         terms = self.terms.items()

@@ -145,7 +145,7 @@ def rows_of(mask: Tensor) -> Rows:
 
 
 def zero_rows(mask: Tensor, *buffers: Tensor) -> None:
-    """Write 0 into the masked worlds of buffers, each of shape ``(nworld, n)``."""
+    """Write 0 into the masked worlds of buffers, each of shape ``(..., nworld, n)``."""
     for buffer in buffers:
         buffer.masked_fill_(mask[:, None], 0.0)
 

@@ -87,12 +87,17 @@ class JointPosition(_Commands):
         if mode == "absolute":
             self.unit = "rad, m"
             self.low, self.high = self._low, self._high
+        elif mode == "relative":  # the command of an action beyond 1 is that of 1
+            low, high = self._low, self._high
+            self._low = torch.clamp(self._pose - scale, low, high)
+            self._high = torch.clamp(self._pose + scale, low, high)
 
     def write_commands(self, action: Tensor) -> None:
         """Write the commands of its joints."""
-        if self._mode != "absolute":
-            base = self._pose if self._mode == "relative" else self._columns.read(self._ctrl)
-            action = base + self._scale * action.clamp(-1.0, 1.0)
+        if self._mode == "relative":
+            action = self._pose + self._scale * action
+        elif self._mode == "delta":
+            action = self._columns.read(self._ctrl) + self._scale * action.clamp(-1.0, 1.0)
         self._write_bounded(action)
 
 
