@@ -157,8 +157,9 @@ class Env:
             ArgumentError: The seed or the mask cannot be used.
         """
         if self._closed:
-            expected = "an open environment"
-            raise ArgumentError("env", "reset() after close()", expected, "Make a new one")
+            raise ArgumentError(
+                "env", "reset() after close()", "an open environment", "Make a new one"
+            )
         if mask is not None:
             self.sim.check_mask(mask)
             if not self._started:
@@ -269,9 +270,8 @@ class Env:
     def __str__(self) -> str:
         managers = [self.action_manager, self.observation_manager, self.reset_manager]
         managers += [self.termination_manager, self.reward_manager]
-        worlds = f"{self.nworld} worlds, {self.sim.description}"
-        title = f"{self.cfg.task.name} with {self.cfg.robot.title}: {worlds}"
-        return "\n".join(map(str, [title, *managers]))
+        title = f"{self.cfg.task.name} with {self.cfg.robot.title}: {self.nworld} worlds, "
+        return "\n".join(map(str, [title + self.sim.description, *managers]))
 
     def _step_physics(self) -> None:
         current_term.label = ""
@@ -308,10 +308,7 @@ class Env:
             broken = lost if lost.is_cuda or bool(lost.any()) else None
             if ended is not None:  # their success stays
                 achieved = torch.where(ended, self.success, achieved)
-            if broken is None:
-                self.success.copy_(achieved)
-            else:  # achieved and not broken
-                torch.gt(achieved, broken, out=self.success)
+            torch.gt(achieved, lost, out=self.success)  # achieved and not lost
 
             def reward() -> None:
                 ends.compute(ended)
@@ -322,12 +319,9 @@ class Env:
             def keep() -> None:
                 for compute in () if early else observe:
                     compute()
-                if not last:
-                    return
-                works = [partial(self._outputs.write_final, broken)]
-                if lost.is_cuda:
-                    works.append(partial(self.faults.record, lost))
-                side_by_side(self.device, *works)
+                if last:
+                    record = [partial(self.faults.record, lost)] if lost.is_cuda else []
+                    side_by_side(self.device, partial(self._outputs.write_final, broken), *record)
 
             branches(self.device, reward, keep)
             return lost, broken
@@ -341,9 +335,8 @@ class Env:
         return None if last else done.clone()
 
     def _reset_ended(self, done: Tensor, broken: Tensor | None) -> None:
-        """The terminal images, the statistics, the reset of the worlds that are ``done``, and the
-        observation to go on with. ``broken`` are worlds whose state is not finite, None if
-        there are none; both of shape ``(nworld,)``, bool.
+        """Terminal images, statistics, the reset of the worlds that are ``done``, and what is
+        observed then. Of ``broken`` worlds the state is not finite; None if there are none.
         """
         # On CUDA the host cannot look, because that would stop the device: the graph does.
         ending = self.termination_manager.values.shape[1] > 0 and (done.is_cuda or bool(done.any()))
@@ -361,9 +354,7 @@ class Env:
             self._outputs.restore_observations()
 
     def _start_worlds(self, mask: Tensor) -> None:
-        """Start states of the masked worlds' next episode; a function of seed, world and episode
-        alone.
-        """
+        """Start the masked worlds' next episode, from seed, world and episode alone."""
         self.episode += mask
         self.episode_step.masked_fill_(mask, 0)
         self.reset_manager.reset(mask)

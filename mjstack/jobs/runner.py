@@ -189,14 +189,11 @@ class CheckedJob:
         gates call often, need not look at its kernels.
         """
         plays = self.stage.backend[0] is Backend.mjwarp and name != "baseline"
-        if "mujoco_warp" in sys.modules or not (plays or name in ("parity", "capacity")):
-            return
-        gc.collect()
-        gc.disable()
-        try:
+        if "mujoco_warp" not in sys.modules and (plays or name == "parity"):
+            gc.collect()
+            gc.disable()
             importlib.import_module("mjstack.sim.mjwarp")
             gc.freeze()
-        finally:
             gc.enable()
 
     def _end(self, error: BaseException, report: Report, console: Console) -> None:
