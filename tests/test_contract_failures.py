@@ -5,6 +5,7 @@ and no other world is.
 import math
 import re
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import pytest
@@ -14,6 +15,7 @@ from environments import GetStage, MakeSim, NewRun, Patch, at_double_speed
 
 from mjstack import interrupt
 from mjstack.config import Config
+from mjstack.config.schema import Backend
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes import batches as gate_module
@@ -21,13 +23,14 @@ from mjstack.episodes.rollout import Episode, Hook, play_episode
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
 from mjstack.episodes.tally import EpisodeTally
-from mjstack.errors import ConfigError
+from mjstack.errors import ConfigError, MjstackError
 from mjstack.gates.batch import run_batch
 from mjstack.gates.runner import run_guarded
 from mjstack.gates.throughput import run_throughput
 from mjstack.jobs import gates
 from mjstack.report.record import GateResult, Status
-from mjstack.sim import Overflow, Simulation
+from mjstack.sim import BatchSizes, Overflow, Simulation
+from mjstack.sim.usage import data_bytes
 from mjstack.tasks.check import make_check
 
 
@@ -196,6 +199,36 @@ def test_worlds_that_do_not_fit_are_refused(new_run: NewRun, monkeypatch: Patch)
     gates._check_memory(new_run("sim=native", f"nworld={most}").stage)
     with pytest.raises(ConfigError, match=f"at most {most}, because"):
         gates._check_memory(new_run("sim=native", f"nworld={int(most) + 1}").stage)
+
+
+def test_worlds_that_a_gpu_cannot_hold_are_refused_with_how_many_it_can(
+    get_stage: GetStage, monkeypatch: Patch
+) -> None:
+    """The GPU is made up."""
+    from mjstack.sim import build, mjwarp
+
+    def raises(error: Exception) -> Callable[..., None]:
+        def make(*_: Any) -> None:
+            raise error
+
+        return make
+
+    stage = get_stage("so101")
+    monkeypatch.setattr(build, "resolve_backend", lambda *_: (Backend.mjwarp, "cuda:0"))
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _: (2**30, 2**33))
+    sizes = BatchSizes(nconmax=40, njmax=184)
+    make = partial(build.make_simulation, stage.model, stage.cfg, sizes=sizes)
+    lost = RuntimeError("Failed to allocate 99 bytes on device 'cuda:0'")
+    monkeypatch.setattr(mjwarp, "MjwarpSimulation", raises(lost))
+    with pytest.raises(MjstackError, match=r"1\.0 are free, expected at most [\d,]+\.") as caught:
+        make(200_000)
+    says = str(caught.value)
+    assert says.startswith("out of memory: 200,000 worlds with batch.nconmax=40 batch.njmax=184")
+    most = int(re.search(r"at most ([\d,]+)", says)[1].replace(",", ""))  # type: ignore[index]
+    assert 0.5 * 2**30 < data_bytes(stage.model, most, sizes) < 2**30
+    monkeypatch.setattr(mjwarp, "MjwarpSimulation", raises(ValueError("another reason")))
+    with pytest.raises(ValueError, match="another reason"):
+        make(200_000)
 
 
 def test_an_interrupt_fails_no_gate(so101_cfg: Config, monkeypatch: Patch) -> None:

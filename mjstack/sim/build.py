@@ -12,7 +12,13 @@ import torch
 from torch import Tensor
 
 from mjstack.config.schema import Backend, Config
-from mjstack.errors import ArgumentError, ConfigError, DeviceError
+from mjstack.errors import (
+    ArgumentError,
+    ConfigError,
+    DeviceError,
+    MjstackError,
+    is_out_of_memory,
+)
 from mjstack.sim.native import NativeSimulation
 from mjstack.sim.simulation import Simulation
 from mjstack.sim.sizes import BatchSizes, resolve_sizes
@@ -79,14 +85,29 @@ def make_simulation(
 
     Raises:
         UnknownName: A field does not exist, or cannot differ.
-        MjstackError: The backend, or ``sim.step``, does not implement a feature of the model.
+        MjstackError: The backend, or ``sim.step``, does not implement a feature of the model. Or
+            the worlds do not fit on the GPU.
     """
     backend, device = resolve_backend(cfg, backend, device)
     if backend is Backend.native:
         return NativeSimulation(model, nworld, fields=fields)
     from mjstack.sim.mjwarp import MjwarpSimulation  # loads Warp, which native runs do not need
+    from mjstack.sim.usage import data_bytes
 
-    return MjwarpSimulation(model, cfg, nworld, sizes or resolve_sizes(cfg), device, fields)
+    sizes = sizes or resolve_sizes(cfg)
+    free = 0 if device == "cpu" else torch.cuda.mem_get_info(device)[0]
+    try:
+        return MjwarpSimulation(model, cfg, nworld, sizes, device, fields)
+    except Exception as error:
+        if not free or not is_out_of_memory(f"{type(error).__name__}: {error}"):
+            raise
+        needed = data_bytes(model, nworld, sizes)
+        fit = int(0.8 * nworld * free / needed)  # the rest is for what steps borrow
+        raise MjstackError(
+            f"out of memory: {nworld:,} worlds with {sizes.as_overrides()} need"
+            f" {needed / 2**30:.1f} GiB, {free / 2**30:.1f} are free, expected at most {fit:,}",
+            "Run fewer worlds, or lower the sizes",
+        ) from error
 
 
 class StateRenderer:
