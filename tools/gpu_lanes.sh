@@ -22,7 +22,7 @@ declare -A lanes=(
   [delay]="nworld=2048 trainer=clone timing.command_delay=5 gate.success.seeds=2"
   [pixels_rebot]="$pixels $(sizes 96) robot=rebot"
   [pixels_looks]="$pixels $(sizes 96) looks=randomized job.rounds=15"
-  [pixels_held]="$pixels $(sizes 96) looks=randomized $(held)"
+  [pixels_held]="$pixels $(sizes 96) looks=randomized $(held) job.rounds=15"
   [pixels_wrist]="$pixels cameras=wrist scene.cameras.wrist.size=[96,96]"
   [pixels_front]="$pixels cameras=front scene.cameras.front.size=[96,96]"
 )
