@@ -144,6 +144,7 @@ def _run_one(hydra: Any, overrides: list[str]) -> int:
 
         if (count := count_devices(checked.stage.cfg)) > 1:
             _check_spreads(checked)
+            gc.enable()
             return launch([*overrides, *search_path_args()], count)
         return _run_checked(hydra, cfg, checked, overrides)
     from mjstack.distributed import joined
@@ -177,9 +178,7 @@ def _run_checked(hydra: Any, cfg: DictConfig, checked: "CheckedJob", overrides: 
     chosen = any(override.lstrip("+").startswith("hydra.run.dir=") for override in overrides)
     resumed = None if chosen else checked.folder
     folder = resumed or hydra_path(cfg, "run.dir")
-    if not gc.isenabled():  # by `main`
-        gc.freeze()
-        gc.enable()
+    gc.enable()  # again: all is loaded
     begin_job()
     if not ranks.writes:
         global _assisting

@@ -18,7 +18,6 @@ _GRACE = 30.0  # s, in which an interrupted process must have ended
 _START = (
     "import ctypes, sys; sys.platform == 'linux' and ctypes.CDLL(None).prctl(1, 9);"
     f" sys.path.insert(0, {str(Path(__file__).parents[1])!r});"
-    " from mjstack.__main__ import main; main()"
 )
 
 
@@ -33,9 +32,11 @@ def available_cores() -> int:
     return max(1, (cores or 1) // int(os.environ.get("LOCAL_WORLD_SIZE", 1)))
 
 
-def own_command(args: Sequence[str]) -> list[str]:
-    """The command that runs this mjstack with some arguments, in a process of its own."""
-    return [sys.executable, "-P", "-c", _START, *args]
+def own_command(args: Sequence[str], module: str = "mjstack.__main__") -> list[str]:
+    """The command that runs this mjstack, or ``main`` of another module of it, with some arguments,
+    in a process of its own.
+    """
+    return [sys.executable, "-P", "-c", f"{_START} from {module} import main; main()", *args]
 
 
 class Child(subprocess.Popen[bytes]):

@@ -201,6 +201,17 @@ def test_worlds_that_do_not_fit_are_refused(new_run: NewRun, monkeypatch: Patch)
         gates._check_memory(new_run("sim=native", f"nworld={int(most) + 1}").stage)
 
 
+def test_a_part_that_cannot_be_loaded_fails_its_gate(so101_cfg: Config) -> None:
+    def begin(name: str) -> None:
+        raise ImportError("no warp here")
+
+    results: list[GateResult] = []
+    run_guarded(Run(Stage(so101_cfg), begin=begin, record=results.append), "batch", lambda _: [])
+    (result,) = results
+    assert (result.name, result.status) == ("batch", Status.failed)
+    assert "no warp here" in result.reason
+
+
 def test_worlds_that_a_gpu_cannot_hold_are_refused_with_how_many_it_can(
     get_stage: GetStage, monkeypatch: Patch
 ) -> None:
@@ -226,6 +237,8 @@ def test_worlds_that_a_gpu_cannot_hold_are_refused_with_how_many_it_can(
     assert says.startswith("out of memory: 200,000 worlds with batch.nconmax=40 batch.njmax=184")
     most = int(re.search(r"at most ([\d,]+)", says)[1].replace(",", ""))  # type: ignore[index]
     assert 0.5 * 2**30 < data_bytes(stage.model, most, sizes) < 2**30
+    with pytest.raises(RuntimeError, match="Failed to allocate 99 bytes"):
+        make(2)  # these would fit: something else has the memory
     monkeypatch.setattr(mjwarp, "MjwarpSimulation", raises(ValueError("another reason")))
     with pytest.raises(ValueError, match="another reason"):
         make(200_000)

@@ -25,6 +25,7 @@ from environments import (
     start_moving,
 )
 
+from mjstack import interrupt
 from mjstack.config.schema import Backend
 from mjstack.errors import MjstackError
 from mjstack.scene import build_model
@@ -520,9 +521,33 @@ def test_a_compiling_process_starts_once_and_ends_with_its_context(monkeypatch: 
         assert process.poll() is None
     assert started == [("model", "cfg", "cuda:0")]
     assert process.poll() is not None
-    compiling.wait_for_stock_step()
     with compiling.stock_step_beside(lambda: ("model", "cfg")):  # type: ignore[arg-type,return-value]
         compiling.wait_for_stock_step()  # from here on something is timed
         compiling._compile_planned("cuda:0")
     compiling._compile_planned("cuda:0")
     assert len(started) == 1
+
+
+def test_a_compiling_process_that_fails_or_hangs_holds_nothing_up(monkeypatch: Patch) -> None:
+    def sleep(*_: Any) -> subprocess.Popen[bytes]:
+        return subprocess.Popen(["sleep", "600"])
+
+    unpicklable = (lambda: None, load_config([]))
+    with compiling.stock_step_beside(lambda: unpicklable):  # type: ignore[arg-type,return-value]
+        compiling._compile_planned("cuda:0")
+        assert not compiling._running
+    monkeypatch.setattr(compiling, "compile_apart", sleep)
+    monkeypatch.setattr(compiling, "_LONGEST", 0.2)
+    with compiling.stock_step_beside(lambda: ("model", "cfg")):  # type: ignore[arg-type,return-value]
+        compiling._compile_planned("cuda:0")
+        (process,) = compiling._running
+        compiling.wait_for_stock_step()
+        assert process.poll() is not None
+    monkeypatch.setattr(compiling, "_LONGEST", 600.0)
+    monkeypatch.setattr(interrupt, "_asked", True)  # as the command's handler does
+    with compiling.stock_step_beside(lambda: ("model", "cfg")):  # type: ignore[arg-type,return-value]
+        compiling._compile_planned("cuda:0")
+        (process,) = compiling._running
+        with pytest.raises(KeyboardInterrupt):
+            compiling.wait_for_stock_step()
+    assert process.poll() is not None

@@ -17,7 +17,7 @@ from mjstack.sim.build import cuda_uuid, device_memory
 from mjstack.sim.graph import StepGraph
 
 WARM_UP = 3  # calls: eager, captured, replayed
-_EAGER = 2  # steps: the warm-up, and the one that is captured
+EAGER = 2  # steps: the warm-up, and the one that is captured
 SHORTEST = 0.5  # s, of a stretch of work on average: the counter moves some ten times a second
 
 
@@ -91,7 +91,7 @@ class EnergyObserver(Observer):
 
     @override
     def after_step(self, step: int) -> None:
-        if step == _EAGER - 1:
+        if step == EAGER - 1:
             self.env.sim.synchronize()
             reading = time.perf_counter()
             self._meter.start()

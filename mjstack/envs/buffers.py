@@ -30,8 +30,10 @@ log = logging.getLogger(__name__)
 ROWS = int(Overflow.NEFC | Overflow.NJMAX_NNZ)
 SIZED = ROWS | POOL | int(Overflow.CCD)
 _GROWTH = 8  # of the room to measure in, at most, by 2 each time
-_STEP = 8  # sizes are multiples of this, and large ones of more: each njmax has a solver kernel of
-_COARSE, _LARGE = 64, 256  # its own to compile, and on CUDA random actions differ from run to run
+_STEP = 8  # sizes are multiples of this
+# Above _LARGE they are multiples of _COARSE: each njmax has a solver kernel of its own to compile,
+# and on CUDA random actions differ from run to run.
+_LARGE, _COARSE = 256, 64
 _POOLS = ("contacts", "pairs", "ccd_pairs")  # as the simulation counts them
 
 Advance = Callable[[str, int, int], None]

@@ -139,8 +139,11 @@ def _recommend(
     resets = [cfg.gate.capacity.reset] if "randomized" in runs else []
     with closing(run.stage.measuring_worlds(*resets, sizes=advice)) as worlds:
         for workload, load in runs.items():
-            # One that needs less of everything than another would try nothing
-            if _needs(load.peaks) & _needs(peaks) and load.sizes is not None and not group.lost:
+            if load.sizes is None or group.lost:
+                continue
+            if not _needs(load.peaks) & _needs(peaks):  # it would try nothing
+                result.notes[f"rerun.{workload}"] = "another workload needs more of everything"
+            else:
                 again = worlds.play(plays[workload])
                 group.problems += _compare(workload, load, again, result, exact=exact)
     return group

@@ -35,9 +35,6 @@ def run_throughput(run: Run) -> list[GateResult]:
         reason = f"no CUDA device was used: sim={backend} sim.device={device}"
         cuda = skip(name=CUDA, reason=reason)
         return [_measure(run, "throughput", backend, device), cuda]
-    from mjstack.sim.compiling import wait_for_stock_step  # loads Warp
-
-    wait_for_stock_step()
     if run.cfg.gate.throughput.native_baseline:
         native = _measure(run, "throughput", Backend.native, "cpu")
     else:

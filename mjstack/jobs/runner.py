@@ -185,16 +185,18 @@ class CheckedJob:
         page.note = save_page(self.stage, folder, page)
 
     def _load(self, name: str) -> None:
-        """Load MuJoCo Warp for the part of the work that first plays on it. The collector, which
-        gates call often, need not look at its kernels.
+        """Load MuJoCo Warp for the part that first plays on it. The collector, which gates call
+        often, passes over its kernels.
         """
         plays = self.stage.backend[0] is Backend.mjwarp and name != "baseline"
         if "mujoco_warp" not in sys.modules and (plays or name == "parity"):
             gc.collect()
             gc.disable()
-            importlib.import_module("mjstack.sim.mjwarp")
-            gc.freeze()
-            gc.enable()
+            try:
+                importlib.import_module("mjstack.sim.mjwarp")
+                gc.freeze()
+            finally:
+                gc.enable()
 
     def _end(self, error: BaseException, report: Report, console: Console) -> None:
         """Say why the work has ended early."""

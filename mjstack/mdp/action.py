@@ -22,8 +22,8 @@ class _Commands(ActionTerm):
     def _set_up(self, env: EnvView, chosen: list[int] | slice, dim: int) -> None:
         self._ctrl = env.sim.ctrl
         self._columns = Columns(env.index.ctrl[chosen], env.device)
-        side_by_side = isinstance(self._columns.at, slice)
-        self._out = self._columns.read(self._ctrl) if side_by_side else None
+        adjacent = isinstance(self._columns.at, slice)
+        self._out = self._columns.read(self._ctrl) if adjacent else None
         self._low, self._high = robot(env).ctrl_range[chosen].unbind(1)
         self.actuators = self._columns.indices
         self.dim = dim

@@ -103,10 +103,12 @@ def make_simulation(
             raise
         needed = data_bytes(model, nworld, sizes)
         fit = int(0.8 * nworld * free / needed)  # the rest is for what steps borrow
+        if not 0 < fit < nworld:
+            raise
         raise MjstackError(
             f"out of memory: {nworld:,} worlds with {sizes.as_overrides()} need"
             f" {needed / 2**30:.1f} GiB, {free / 2**30:.1f} are free, expected at most {fit:,}",
-            "Run fewer worlds, or lower the sizes",
+            "Run fewer worlds, or ones with smaller buffers",
         ) from error
 
 

@@ -7,6 +7,7 @@ import pickle
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
@@ -15,8 +16,10 @@ from functools import partial
 
 import mujoco
 
-from mjstack.config.schema import Config
-from mjstack.process import available_cores
+from mjstack.config.schema import Config, GateCfg
+from mjstack.errors import first_line
+from mjstack.interrupt import check_interrupt
+from mjstack.process import POLL, available_cores, own_command
 from mjstack.sim.fused import constraints, smooth
 from mjstack.sim.fused.step import StepPlan
 from mjstack.sim.mujoco_warp import mjw, wp
@@ -29,6 +32,7 @@ Stage = Callable[[mjw.Model, mjw.Data], object]
 # Modules of which several stages of `mujoco_warp.step` launch kernels, the slowest first
 SHARED = ("forward", "passive", "sensor", "smooth", "solver", "support", "constraint")
 _SILENT = 3.0  # s: from the cache it takes less
+_LONGEST = 120.0  # s, to wait for a process: on an H100 with 16 cores it takes half a minute
 _done: set[tuple] = set()
 _planned: list[Callable[[str], subprocess.Popen[bytes]]] = []  # compilers, by the device
 _running: list[subprocess.Popen[bytes]] = []
@@ -98,38 +102,51 @@ def stock_step_beside(stage: Callable[[], tuple[mujoco.MjModel, Config]]) -> Ite
     try:
         yield
     finally:
-        for process in _running:
-            process.kill()
-        wait_for_stock_step()
-        _running.clear()
+        _end_processes()
 
 
 def _compile_planned(device: str) -> None:
     while _planned:
-        _running.append(_planned.pop()(device))
+        try:
+            _running.append(_planned.pop()(device))
+        except Exception as error:  # the kernels compile when they are needed
+            log.info("mujoco_warp.step is not compiled apart: %s", first_line(error))
 
 
 def wait_for_stock_step() -> None:
-    """Return when no process is compiling any more, and start none: what follows is timed."""
+    """Return when no process is compiling any more, and start none: what follows is timed. One that
+    takes too long is ended.
+    """
     _planned.clear()
-    for process in _running:
+    last = time.monotonic() + _LONGEST
+    while any(process.poll() is None for process in _running) and time.monotonic() < last:
+        check_interrupt()
+        time.sleep(POLL)
+    _end_processes()
+
+
+def _end_processes() -> None:
+    _planned.clear()
+    while _running:
+        process = _running.pop()
+        process.kill()
         process.wait()
 
 
 def compile_apart(model: mujoco.MjModel, cfg: Config, device: str) -> subprocess.Popen[bytes]:
-    """Start the process of `stock_step_beside`. Where it fails, kernels compile when they are
-    needed.
-    """
-    cfg = replace(cfg, sim=replace(cfg.sim, step="stock"))
+    """Start the process of `stock_step_beside`, which ends with this one."""
+    # Gates of the search path may have classes that the process does not find
+    cfg = replace(cfg, sim=replace(cfg.sim, step="stock"), gate=GateCfg())
     silent = subprocess.DEVNULL
     with tempfile.TemporaryFile() as worlds:
         pickle.dump((model, cfg, 1, resolve_sizes(cfg), device, ()), worlds)
         worlds.seek(0)
-        command = [sys.executable, "-m", __name__]
+        command = own_command([], "mjstack.sim.compiling")
         return subprocess.Popen(command, stdin=worlds, stdout=silent, stderr=silent)
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """The process that `compile_apart` starts."""
     from mjstack.sim.mjwarp import MjwarpSimulation
 
     MjwarpSimulation(*pickle.load(sys.stdin.buffer)).close()

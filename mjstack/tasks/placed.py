@@ -43,9 +43,8 @@ class HeldSuccess:
         return self._length >= self._steps
 
     def _holds(self, condition: Condition) -> Tensor:
-        return condition(
-            self._view.step()
-        )  # a step of its own, because a branch may share no value
+        # A step for each condition, because a branch may share no value
+        return condition(self._view.step())
 
     def reset(self, mask: Tensor) -> None:
         """Forget the masked worlds."""
