@@ -9,6 +9,7 @@ from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -571,6 +572,27 @@ def test_workloads_that_need_the_most_are_played_again_and_a_flip_fails_where_ru
     else:
         assert result.status is Status.passed
         assert f"{flip}: on CUDA sums have no fixed order" in result.details
+
+
+@pytest.mark.parametrize(
+    ("device", "choice", "steps"),
+    [("cpu", (), 600), ("cuda:0", (), 200), ("cuda:0", ("gate.capacity.random_steps=700",), 700)],
+)
+def test_few_worlds_act_at_random_for_an_episode(
+    device: str, choice: tuple[str, ...], steps: int, new_run: NewRun, monkeypatch: Patch
+) -> None:
+    run = new_run("sim=mjwarp", "sim.device=cpu", "nworld=2", *choice)
+    run.stage.backend = (Backend.mjwarp, device)  # the runs are made up: no device is used
+    made_up(monkeypatch, run.cfg.gate.capacity.reset, lambda *_: workload())
+    played = []
+
+    def act(cfg: Any, count: int, sim: None, **_: object) -> str:
+        played.append(count)
+        return "random_actions"
+
+    monkeypatch.setattr(capacity_module, "play_random_actions", act)
+    run_capacity(run)
+    assert set(played) == {steps}
 
 
 @pytest.mark.full

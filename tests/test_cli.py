@@ -214,7 +214,7 @@ main()
 """
     done = in_a_process(folder, "-c", program)
     assert done.returncode == 1
-    assert "far enough" in done.stderr
+    assert "far enough" in done.stdout
     lines = re.findall(r"^collector (\d) (\d+)$", done.stdout, re.MULTILINE)
     (loading, _), (begun, modules), (after, more) = lines
     assert (loading, begun, after) == ("0", "1", "1")

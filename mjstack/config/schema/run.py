@@ -175,7 +175,7 @@ class CapacityCfg(GateFuncCfg):
     margin: float = spec(ge=1.0)
     """Recommended sizes over the peaks."""
     random_steps: int | None = spec(None, unit="steps", ge=1)
-    """Steps of random actions; null: one whole episode."""
+    """Steps of random actions; null: one whole episode, on CUDA 200 steps at most."""
     probe_nworld: int = spec(unit="worlds", ge=1)
     """Most worlds that size an environment with ``batch=auto`` on CUDA; on a CPU, cpu_nworld."""
     probe_steps: int = spec(unit="steps", ge=1)
