@@ -33,9 +33,7 @@ def available_cores() -> int:
 
 
 def own_command(args: Sequence[str], module: str = "mjstack.__main__") -> list[str]:
-    """The command that runs this mjstack, or ``main`` of another module of it, with some arguments,
-    in a process of its own.
-    """
+    """The command that starts this mjstack, or ``main`` of one of its modules, in a process."""
     return [sys.executable, "-P", "-c", f"{_START} from {module} import main; main()", *args]
 
 

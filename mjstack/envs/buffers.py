@@ -31,8 +31,8 @@ ROWS = int(Overflow.NEFC | Overflow.NJMAX_NNZ)
 SIZED = ROWS | POOL | int(Overflow.CCD)
 _GROWTH = 8  # of the room to measure in, at most, by 2 each time
 _STEP = 8  # sizes are multiples of this
-# Above _LARGE they are multiples of _COARSE: each njmax has a solver kernel of its own to compile,
-# and on CUDA random actions differ from run to run.
+# Sizes above _LARGE are multiples of _COARSE. Every njmax needs another solver kernel, which takes
+# seconds to compile, and on CUDA random actions differ from run to run.
 _LARGE, _COARSE = 256, 64
 _POOLS = ("contacts", "pairs", "ccd_pairs")  # as the simulation counts them
 

@@ -154,7 +154,7 @@ def _recommend(
 
 
 def _needs(peaks: Peaks) -> set[tuple[str, float]]:
-    """What buffers must hold, by the kind of entry; nothing of which nothing is needed."""
+    """What the buffers must hold, by kind, without the kinds that are not used."""
     needs = {"rows": peaks.rows.max(), "pool": peaks.share, "convex": peaks.convex_share or 0.0}
     return {(kind, float(need)) for kind, need in needs.items() if need}
 

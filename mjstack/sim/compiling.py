@@ -91,9 +91,9 @@ def _reset(m: mjw.Model, d: mjw.Data) -> None:
 
 @contextmanager
 def stock_step_beside(stage: Callable[[], tuple[mujoco.MjModel, Config]]) -> Iterator[None]:
-    """Compile what `mujoco_warp.step` launches in a process of its own, as soon as a CUDA kernel
-    of this process turns out not to be in the cache: a graph cannot be captured while a thread
-    loads a module. The process ends with the context.
+    """Compile what `mujoco_warp.step` launches in another process. It starts when a CUDA kernel of
+    this process is not in the cache, and ends with the context. A thread would not do: a graph
+    cannot be captured while a thread loads a module.
 
     Args:
         stage: Gives the scene and the configuration, asked when that process starts.

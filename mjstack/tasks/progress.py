@@ -77,8 +77,10 @@ class Progress:
         self._number = constant(0.0, 2.0, 3.0, 1.0, 4.0)
         self._least = constant(-inf, -inf, -BELOW, height, -inf)
         self._most = constant(within, near, inf, inf, inf)
-        # Conditions of each of these stages: those of the five numbers, in hand, placed
-        conditions = [[4, 4, 4], [5, 0, 3], [1, 2, 2], [5, 0, 0], [6, 6, 6]]
+        # Conditions of each of these stages. Any opening will do, so the first has none.
+        away, across, above, low, opening, in_hand, placed = range(7)
+        conditions = [[opening] * 3, [in_hand, away, low], [across, above, above]]
+        conditions += [[in_hand, away, away], [placed] * 3]
         self._conditions = torch.tensor(conditions, device=env.device).flatten()
 
     def __call__(self, env: EnvView) -> Tensor:
