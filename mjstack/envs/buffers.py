@@ -38,8 +38,8 @@ _POOLS = ("contacts", "pairs", "ccd_pairs")  # as the simulation counts them
 
 Advance = Callable[[str, int, int], None]
 """Reports progress: the work in progress, how much is done, and of how much."""
-Play = Callable[[Simulation], np.ndarray]
-"""Plays in some worlds, and returns the bits of the rules that each one broke."""
+Play = Callable[[Simulation], object]
+"""Plays in some worlds."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,16 +125,11 @@ class Workload:
     Attributes:
         peaks: The most it used.
         sizes: The room it had, or None on native MuJoCo, which has no fixed buffers.
-        final: State at the end, shape ``(nworld, nq)``.
-        failed: Bits of the rules that each world broke, shape ``(nworld,)``; zero for random
-            actions, which nothing judges.
         description: Backend and hardware.
     """
 
     peaks: Peaks
     sizes: BatchSizes | None
-    final: np.ndarray
-    failed: np.ndarray
     description: str
 
     @property
@@ -161,19 +156,17 @@ class MeasuringWorlds:
         backend: Backend,
         device: str,
         *resets: Mapping[str, TermCfg],
-        sizes: BatchSizes | None = None,
     ) -> None:
-        """Take the worlds' ``sizes``. Without, there is room to spare, which may grow. They can
-        start as the configuration and ``resets`` say; other arguments as of `make_simulation`.
+        """Make worlds with room to spare, which may grow. They can start as the configuration and
+        ``resets`` say; other arguments as of `make_simulation`.
         """
         fields = required_fields(cfg.reset, *resets)
         self._make = partial(
             make_simulation, model, cfg, nworld, backend=backend, device=device, fields=fields
         )
         self._sim: Simulation | None = None
-        self._room = sizes or resolve_measuring_sizes(cfg)
-        growth = 1 if sizes else _GROWTH
-        self._most = (growth * self._room.njmax, growth * self._room.nconmax)
+        self._room = resolve_measuring_sizes(cfg)
+        self._most = (_GROWTH * self._room.njmax, _GROWTH * self._room.nconmax)
 
     def play(self, play: Play) -> Workload:
         """Play a workload, and again in worlds of twice the room wherever that was too little and
@@ -210,14 +203,8 @@ class MeasuringWorlds:
         for name, field in sim.fields.items():
             field.copy_(torch.from_numpy(getattr(sim.model, name)))
         sim.reset()
-        failed = play(sim)
-        return Workload(
-            peaks=read_peaks(sim),
-            sizes=sim.sizes,
-            final=sim.qpos.cpu().numpy().copy(),
-            failed=failed,
-            description=sim.description,
-        )
+        play(sim)
+        return Workload(peaks=read_peaks(sim), sizes=sim.sizes, description=sim.description)
 
 
 def measured_sizes(cfg: Config, run: Workload, source: str) -> BatchSizes:
@@ -236,9 +223,9 @@ def measured_sizes(cfg: Config, run: Workload, source: str) -> BatchSizes:
 
 def play_random_actions(
     cfg: Config, steps: int, sim: Simulation, advance: Advance = lambda what, done, total: None
-) -> np.ndarray:
+) -> None:
     """Step worlds with actions drawn evenly from the action range, for `MeasuringWorlds.play`.
-    Worlds that end start anew, and none of them breaks a rule.
+    Worlds that end start anew.
     """
     index = SceneIndex(sim.model, cfg.robot, cfg.scene)
     env = Env(sim, index, without_images(cfg), check_faults=False)  # a lack of room is looked for
@@ -250,7 +237,6 @@ def play_random_actions(
         )
         env.step(actions.low + (actions.high - actions.low) * share)
         advance("random actions", step + 1, steps)
-    return np.zeros(sim.nworld, dtype=np.int64)
 
 
 def probe_env_sizes(cfg: Config, model: mujoco.MjModel, nworld: int, device: str) -> BatchSizes:

@@ -307,7 +307,7 @@ class Stage:
         if "task" not in self.measured:
             source = f"the driven task in {self.measuring_nworld} worlds"
             with closing(self.measuring_worlds()) as worlds:
-                task = worlds.play(lambda sim: self.play(sim, self.cfg.reset).failed)
+                task = worlds.play(lambda sim: self.play(sim, self.cfg.reset))
             self.measured["task"] = measured_sizes(self.cfg, task, source)
             self.progress.print_line(str(self.measured["task"]))
         return apply_configured(self.cfg, self.measured["task"])
@@ -327,10 +327,9 @@ class Stage:
         on_cuda = self.backend[1].startswith("cuda")
         return self.cfg.nworld if on_cuda else min(self.cfg.nworld, most)
 
-    def measuring_worlds(self, *resets: Reset, sizes: BatchSizes | None = None) -> MeasuringWorlds:
-        """Worlds that size the buffers; arguments as of `MeasuringWorlds`."""
-        nworld = self.measuring_nworld
-        return MeasuringWorlds(self.cfg, self.model, nworld, *self.backend, *resets, sizes=sizes)
+    def measuring_worlds(self, *resets: Reset) -> MeasuringWorlds:
+        """Worlds that size the buffers, which can start as ``resets`` say, too."""
+        return MeasuringWorlds(self.cfg, self.model, self.measuring_nworld, *self.backend, *resets)
 
     def native_env(self, cfg: Config, nworld: int = 1) -> closing[Env]:
         """An environment of the scene on native MuJoCo, to find out about its terms."""

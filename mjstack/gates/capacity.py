@@ -3,9 +3,9 @@ they be?
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial, reduce
 
 import numpy as np
@@ -41,17 +41,16 @@ class _Group:
     sizes: BatchSizes  # in force
     advice: BatchSizes  # recommended
     lost: str  # physics that was lost with room to spare; nothing may be sized from it then
-    problems: list[str] = field(default_factory=list)  # at the recommended sizes
 
 
 @each_rank
 @needs_episode
 def run_capacity(run: Run) -> list[GateResult]:
-    """Find the buffer sizes that the driven task, randomised starts and random actions need, and
-    try them.
+    """Find the buffer sizes that the driven task, randomised starts and random actions need.
 
     Peaks are over all steps and all worlds, in worlds with room to spare: one that has lost physics
-    moves differently. All workloads are played in the same worlds.
+    moves differently. All workloads are played in the same worlds, once: room for a peak holds it
+    exactly, and what follows plays in the sizes in force.
     """
     cfg = run.cfg
     t = cfg.gate.capacity
@@ -63,8 +62,8 @@ def run_capacity(run: Run) -> list[GateResult]:
     steps = t.random_steps or min(most, cfg.task.episode_steps)
     plays: dict[str, Play] = {
         "random_actions": partial(play_random_actions, cfg, steps, advance=stage.progress.advance),
-        "randomized": lambda sim: stage.play(sim, t.reset).failed,
-        "task": lambda sim: stage.play(sim, cfg.reset).failed,
+        "randomized": lambda sim: stage.play(sim, t.reset),
+        "task": lambda sim: stage.play(sim, cfg.reset),
     }
     loads = {}
     with closing(stage.measuring_worlds(t.reset)) as worlds:
@@ -76,8 +75,8 @@ def run_capacity(run: Run) -> list[GateResult]:
                     raise
                 # Starts of the user's own; the rest stands
                 result.details.append(f"randomised starts: not measured: {error}")
-    task = _recommend(run, result, resolve_sizes(cfg), {"task": loads.pop("task")}, plays)
-    env = _recommend(run, result, resolve_env_sizes(cfg), loads, plays)
+    task = _recommend(run, resolve_sizes(cfg), {"task": loads.pop("task")})
+    env = _recommend(run, resolve_env_sizes(cfg), loads)
 
     # Problems. Motion that lost physics sizes nothing that follows.
     groups = {"task": task, "env": env}
@@ -88,7 +87,6 @@ def run_capacity(run: Run) -> list[GateResult]:
         # do for both.
         remarks = result.details if key in configured_sizes(cfg.batch) else problems
         remarks.append(f"environments: {text}")
-    problems += env.problems + task.problems
     if nworld < cfg.nworld:
         result.details.append(
             f"from {nworld} worlds: more of them meet rarer peaks, above all under random actions"
@@ -112,93 +110,23 @@ def run_capacity(run: Run) -> list[GateResult]:
         mjwarp = run.stage.backend[0] is Backend.mjwarp
         size = image_bytes(run.stage.model, cameras, cfg.nworld, mjwarp=mjwarp)
         result.metrics["memory.images_mb"] = size / 1e6
-    if task.runs["task"].sizes is None:
-        result.notes["rerun"] = "sizes were not tried: native MuJoCo has no fixed buffers"
-    elif task.lost or env.lost:
-        result.notes["rerun"] = "sizes were not tried where peaks are not known"
     return [result]
 
 
-def _recommend(
-    run: Run,
-    result: GateResult,
-    configured: BatchSizes,
-    runs: dict[str, Workload],
-    plays: Mapping[str, Play],
-) -> _Group:
-    """Recommend sizes for some workloads, and try those on MJWarp."""
+def _recommend(run: Run, configured: BatchSizes, runs: dict[str, Workload]) -> _Group:
+    """Recommend sizes for some workloads."""
     cfg = run.cfg
     margin = cfg.gate.capacity.margin
     peaks = reduce(join_peaks, (load.peaks for load in runs.values()))
     how = f"batch=auto: gate capacity, {run.stage.measuring_nworld} worlds, times {margin:g}"
     advice = recommend_sizes(peaks, margin, how if cfg.batch.auto else "gate capacity")
-    group = _Group(
+    return _Group(
         runs=runs,
         peaks=peaks,
         sizes=apply_configured(cfg, advice) if cfg.batch.auto else configured,
         advice=advice,
         lost="; ".join(load.loss for load in runs.values() if load.sizes and load.loss),
     )
-    exact = not run.stage.backend[1].startswith("cuda")
-    resets = [cfg.gate.capacity.reset] if "randomized" in runs else []
-    with closing(run.stage.measuring_worlds(*resets, sizes=advice)) as worlds:
-        for workload, load in runs.items():
-            if load.sizes is None or group.lost:
-                continue
-            if not _needs(load.peaks) & _needs(peaks):  # it would try nothing
-                result.notes[f"rerun.{workload}"] = "another workload needs more of everything"
-            else:
-                again = worlds.play(plays[workload])
-                group.problems += _compare(workload, load, again, result, exact=exact)
-    return group
-
-
-def _needs(peaks: Peaks) -> set[tuple[str, float]]:
-    """What the buffers must hold, by kind, without the kinds that are not used."""
-    needs = {"rows": peaks.rows.max(), "pool": peaks.share, "convex": peaks.convex_share or 0.0}
-    return {(kind, float(need)) for kind, need in needs.items() if need}
-
-
-def _compare(
-    name: str, first: Workload, again: Workload, result: GateResult, *, exact: bool
-) -> list[str]:
-    """Hold a run at exactly the recommended sizes against the first one.
-
-    Nothing may be lost. Where runs repeat bit for bit, the outcome is to be the same too; where
-    they do not, a world near a threshold may fall on its other side, which is reported. Returns the
-    problem, if any.
-    """
-    assert again.sizes is not None, "native MuJoCo has no sizes to try"
-    sizes = again.sizes.as_overrides()
-    count = len(first.failed)
-    lost = np.flatnonzero(again.peaks.overflow).tolist()
-    flipped = np.flatnonzero((first.failed == 0) != (again.failed == 0)).tolist()
-    same = (first.final == again.final) | (np.isnan(first.final) & np.isnan(again.final))
-    moved = np.flatnonzero(~same.all(1)).tolist()
-
-    # Figures
-    metrics: dict[str, float] = {
-        "overflow_worlds": len(lost),
-        "peak_constraint_rows_per_world": int(again.peaks.rows.max()),
-    }
-    if name != "random_actions":  # nothing judges these
-        metrics |= {"succeeded": int((again.failed == 0).sum()), "flipped_worlds": len(flipped)}
-    if exact:
-        metrics["same_final_state"] = not moved
-    result.metrics |= {f"rerun.{name}.{key}": value for key, value in metrics.items()}
-    result.notes[f"rerun.{name}.sizes"] = sizes
-
-    # The first problem
-    problems = {"overflow": lost, "another result": flipped}
-    if exact:
-        problems["another final state"] = moved
-    for problem, worlds in problems.items():
-        if worlds:
-            text = f"{name} at {sizes}: {problem} in {name_worlds(worlds, count)}"
-            if worlds is not flipped or exact:
-                return [text]
-            result.details.append(f"{text}: on CUDA sums have no fixed order")
-    return []
 
 
 def _report(run: Run, name: str, group: _Group, result: GateResult) -> None:
