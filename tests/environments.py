@@ -286,12 +286,17 @@ def play(env: Env, moves: list[torch.Tensor], before: Callable[[int], None] | No
     return trace
 
 
-def assert_same_run(a: torch.Tensor, b: torch.Tensor, backend: str) -> None:
+# N. Native MuJoCo's forces of a jaw, 5 to 100 N, move by up to 3e-3 where qpos and qvel are rounded
+# to float32 once, and every substep rounds.
+FORCE = 2e-2
+
+
+def assert_same_run(a: torch.Tensor, b: torch.Tensor, backend: str, atol: float = 1e-3) -> None:
     """Bit for bit on the CPU backends. CUDA sums in no fixed order: there two runs agree to
     rounding (docs/design.md).
     """
     if backend.endswith("cuda"):
-        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-3)
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=atol)
     else:
         assert torch.equal(a, b)
 
@@ -308,7 +313,8 @@ def assert_rows(
     assert a.keys() == b.keys()
     for name, x in a.items():
         try:
-            assert_same_run(x[rows], b[name][other], backend)
+            atol = FORCE if name == "sensordata" else 1e-3
+            assert_same_run(x[rows], b[name][other], backend, atol)
         except AssertionError as error:
             raise AssertionError(f"{where} {name}: {x[rows]} is not {b[name][other]}") from error
 
