@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,6 +15,7 @@ from mjstack.config.schema import Config
 from mjstack.errors import Unreachable
 from mjstack.interrupt import check_interrupt
 from mjstack.kinematics.mink_ik import GraspIk
+from mjstack.process import available_cores
 from mjstack.scene.index import gripper_targets
 from mjstack.scene.phases import build_phases, nominal_xy, target_xy
 
@@ -21,6 +23,7 @@ from mjstack.scene.phases import build_phases, nominal_xy, target_xy
 _ITERATIONS = 40
 # Its spare joints end where mink's posture task leaves them: near home.
 _POSTURE_GAIN = 0.3
+_WORLDS = 128  # of a thread
 
 # Joint positions to start from, shape (nworld, nu), and targets [m], shape (nworld, 3), to the
 # solutions and the distances that are left [m], shape (nworld,).
@@ -100,7 +103,8 @@ class OpenLoopPlanner:
         (self._knots,), (self._error,) = plan
 
     def plan(self, sources_xy: ndarray, names: Sequence[int] | None = None) -> JointTrajectory:
-        """Plan one trajectory per world, which does not depend on the other worlds.
+        """Plan one trajectory per world, which does not depend on the other worlds. Cores share the
+        worlds out.
 
         Args:
             sources_xy: Position of each object and place at the start [m], shape ``(nworld,
@@ -120,9 +124,17 @@ class OpenLoopPlanner:
         displaced = np.flatnonzero((sources_xy != self._xy).any(axis=(1, 2)))
         if displaced.size:
             worlds = displaced if names is None else np.array(names)[displaced]
-            solve = self._batched_solve(len(displaced))
-            plans = self._solve_knots(sources_xy[displaced], worlds.tolist(), solve, self._knots)
-            knots[displaced], error[displaced] = plans
+
+            def solve_part(part: ndarray) -> tuple[ndarray, ndarray]:
+                solve = self._batched_solve(len(part))
+                xy = sources_xy[displaced[part]]
+                return self._solve_knots(xy, worlds[part].tolist(), solve, self._knots)
+
+            # A launch on the CPU has one thread
+            parts = min(available_cores(), -(-displaced.size // _WORLDS))
+            with ThreadPoolExecutor(parts) as pool:
+                plans = pool.map(solve_part, np.array_split(np.arange(displaced.size), parts))
+                knots[displaced], error[displaced] = map(np.concatenate, zip(*plans, strict=True))
         trajectory = JointTrajectory(torch.from_numpy(knots), self._weights, self._numbers, error)
         if nworld > 1:
             self._plans.append((sources_xy.copy(), trajectory))
