@@ -7,7 +7,6 @@ import logging
 import os
 import re
 import socket
-import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -186,17 +185,17 @@ class CheckedJob:
 
     def _load(self, name: str) -> None:
         """Load MuJoCo Warp for the part that first plays on it. The collector, which gates call
-        often, passes over its kernels.
+        often, passes over what there is as a part begins: kernels are a million objects.
         """
         plays = self.stage.backend[0] is Backend.mjwarp and name != "baseline"
-        if "mujoco_warp" not in sys.modules and (plays or name == "parity"):
-            gc.collect()
-            gc.disable()
-            try:
+        gc.collect()
+        gc.disable()
+        try:
+            if plays or name == "parity":
                 importlib.import_module("mjstack.sim.mjwarp")
-                gc.freeze()
-            finally:
-                gc.enable()
+            gc.freeze()
+        finally:
+            gc.enable()
 
     def _end(self, error: BaseException, report: Report, console: Console) -> None:
         """Say why the work has ended early."""
