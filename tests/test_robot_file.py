@@ -11,17 +11,14 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-import torch
 from compositions import refusal
 from environments import Patch
 from ik_arm import Arm
 
 from mjstack import load_config
-from mjstack.bench.episode import play_bare
 from mjstack.config.fingerprint import config_content
-from mjstack.config.schema import Backend, Config
+from mjstack.config.schema import Config
 from mjstack.drivers.open_loop import OpenLoopPlanner
-from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, MjstackError, UnknownName
 from mjstack.kinematics.reach import PointReach
 from mjstack.robots import robot_spec
@@ -200,23 +197,3 @@ def test_mink_plans_an_arm_with_a_slide() -> None:
         miss = np.linalg.norm(arm.grasp_point(command[None])[0] - point)
         assert miss == pytest.approx(distance, abs=1e-9)
         assert abs(command[arm.names.index("roll")]) < 1e-12
-
-
-@pytest.mark.full
-def test_bare_steps_command_the_robots_own_actuators(tmp_path: Path) -> None:
-    """The file has them in another order, and one more that is not the robot's."""
-    block = MJCF.partition("<actuator>")[2].partition("</actuator>")[0].strip()
-    lines = ['<motor name="fan" site="left_grasp"/>', *reversed(block.splitlines())]
-    stage = Stage(changed(tmp_path, block, "\n".join(lines)))
-    sim = stage.simulation(1, Backend.native, "cpu")
-    command = torch.arange(1.0, 7.0, dtype=sim.ctrl.dtype)
-    sim.bare_step = lambda: sim.synchronize  # type: ignore[attr-defined]
-    sim.latch = sim.synchronize  # type: ignore[attr-defined]
-    play_bare(stage, sim, command[None, None])  # type: ignore[arg-type]
-    sim.close()
-    names = [stage.model.actuator(i).name for i in range(stage.model.nu)]
-    joints = stage.cfg.robot.joints
-    assert dict(zip(names, sim.ctrl[0].tolist(), strict=True)) == {
-        "fan": 0.0,
-        **dict(zip(joints, command.tolist(), strict=True)),
-    }

@@ -14,13 +14,15 @@ from environments import MakeSim, NewRun, Patch, at_double_speed, on_cuda
 from mjstack.bench import env_step, episode, timing
 from mjstack.bench.env_step import measure_env_step
 from mjstack.bench.timing import EnergyMeter, Measurement, steps_that_fit, timed
-from mjstack.envs import Env, build_env
+from mjstack.envs import build_env
 from mjstack.episodes.rollout import Episode, RolloutTiming, State
+from mjstack.episodes.stage import Stage
 from mjstack.gates import throughput
 from mjstack.gates.throughput import run_throughput
 from mjstack.report.record import GateResult, Status
 from mjstack.sim import Simulation
 from mjstack.sim.fused.step import StepPlan
+from mjstack.sim.graph import StepGraph
 from mjstack.sim.native import NativeSimulation
 
 FEW = (
@@ -130,7 +132,7 @@ def episode_of(seconds: float) -> Episode:
 
 @pytest.mark.parametrize(
     ("backend", "repetitions", "played"),
-    [("mjwarp", 3, 2), ("mjwarp", 1, 1), ("native", 3, 2), ("native", 1, 0)],
+    [("mjwarp", 3, 2), ("native", 3, 2), ("native", 1, 0)],
 )
 def test_the_batch_gates_episode_is_the_first_repetition(
     backend: str, repetitions: int, played: int, new_run: NewRun, monkeypatch: Patch
@@ -143,7 +145,7 @@ def test_the_batch_gates_episode_is_the_first_repetition(
     sim.description = "some"
     first = episode_of(1.0)
     more = [episode_of(2.0) for _ in range(played)]
-    monkeypatch.setattr(episode, "_play", lambda *_: more.pop())
+    monkeypatch.setattr(Stage, "play", lambda *_: more.pop())
     measured = episode.measure_episode(run.stage, sim, first)
     assert not more
     assert measured.samples["seconds"] == [1.0] + [2.0] * played
@@ -174,35 +176,26 @@ def test_two_episodes_that_agree_are_enough(new_run: NewRun, monkeypatch: Patch)
     sim.description = "some"
     first = episode_of(1.0)
 
-    def play(stage: Any, sim: Any, meter: Any, out: Measurement) -> Episode:
-        out.samples.setdefault("bare_ratio", []).append(0.25)
-        return episode_of(1.005)
-
-    monkeypatch.setattr(episode, "_play", play)
-    for before, precision, played, bare in (
-        (first, 0.01, 2, 1),
-        (None, 0.01, 2, 2),
-        (first, 0, 3, 2),
-    ):
+    monkeypatch.setattr(Stage, "play", lambda *_: episode_of(1.005))
+    for before, precision, played in ((first, 0.01, 2), (None, 0.01, 2), (first, 0, 3)):
         choices = [f"gate.throughput.precision={precision}", "gate.throughput.cpu_max_seconds=100"]
         run = new_run("sim=native", "nworld=4", *choices)
-        found = episode.measure_episode(run.stage, sim, before).facts
-        assert (found["repetitions"], found["bare_repetitions"]) == (played, bare)
+        assert episode.measure_episode(run.stage, sim, before).facts["repetitions"] == played
 
 
 @pytest.mark.full
-def test_mjwarp_alternates_with_bare_steps_and_tells_warm_up_and_capture_apart(
+def test_physics_alternates_with_bare_steps_and_warm_up_and_capture_are_told_apart(
     new_run: NewRun,
 ) -> None:
     result = measure(new_run, *MJWARP, "gate.throughput.episodes=1")
     assert result.status is Status.passed, result.reason
     m = result.metrics
     assert m["episode.succeeded"] == 1
-    assert m["episode.bare_ratio.median"] == pytest.approx(
-        m["episode.half_seconds.median"] / m["episode.bare_seconds.median"]
-    )
-    assert 0.0 < m["episode.half_seconds.median"] < m["episode.seconds.median"]
-    assert "x bare steps" in result.reason
+    bare, ours = "physics.bare_ms_per_batched_step", "physics.ms_per_batched_step"
+    least, most = m[f"{bare}.min"] / m[f"{ours}.max"], m[f"{bare}.max"] / m[f"{ours}.min"]
+    assert 0.0 < least <= m["physics.speedup_over_bare.median"] <= most
+    assert "times bare mujoco_warp.step" in result.reason
+    assert m["physics.peak_constraint_rows_per_world"] > 0
     # Warp's CPU device: physics is captured, the step around it is not.
     for name in ("episode", "env_step"):
         assert (m[f"{name}.captured"], m[f"{name}.physics_captured"]) == (False, True)
@@ -241,50 +234,40 @@ def test_eager_work_is_void_where_it_should_be_captured(
 
 
 @pytest.mark.full
-def test_bare_steps_play_the_same_trajectory(
-    new_run: NewRun, make_sim: MakeSim, monkeypatch: Patch
-) -> None:
+def test_bare_steps_play_the_same_physics(new_run: NewRun, make_sim: MakeSim) -> None:
     """Warp's CPU device is bit-reproducible: whatever else an arranged step does, the physics of
     both is the same.
     """
-    run = new_run("nworld=1", *at_double_speed())
+    run = new_run("nworld=1")
     sim = make_sim("mjwarp", 1, "sim.step=auto")  # its own, not the one that other tests share
     sim.plan = StepPlan("arranged")
-    run.stage.play(sim, run.cfg.reset)
-    final = sim.qpos.clone()
-    seconds, problem = episode.play_bare(run.stage, sim)  # type: ignore[arg-type]
-    assert seconds > 0.0
-    assert problem == ""
-    assert torch.equal(sim.qpos, final)
-    half = episode.LaterHalf(run.stage.episode_steps // 2)
-    run.stage.play(sim, run.cfg.reset, [half])
-    before = torch.from_numpy(half.state.qpos).float()
-    driver = run.stage.driver(run.stage.start(sim, run.cfg.reset))
-    recorded = torch.stack([driver.command() for _ in range(driver.steps)])
-    for commands in (None, recorded):
+    start = episode.carry_start(run.stage, sim, None)
+    ends = []
+    for bare in (None, sim.bare_step()):  # type: ignore[attr-defined]
+        physics = episode.HeldPhysics(sim, start, 10, bare)
+        sim._d.qacc_warmstart.zero_()  # type: ignore[attr-defined]
+        assert physics.play(3) > 0.0
+        assert not physics.lost.any()
+        ends.append(sim.qpos.clone())
         sim.qpos.fill_(torch.nan)
-        rest, problem = episode.play_bare(run.stage, sim, commands, half)  # type: ignore[arg-type]
-        assert (problem, rest < seconds) == ("", True)
-        assert (sim.qpos - before).abs().max() > 0.01
-        assert torch.allclose(sim.qpos, final, atol=1e-3)  # warm starts are other ones
-    monkeypatch.setattr(type(sim), "bare_step", lambda _: lambda: None)
-    assert episode.play_bare(run.stage, sim)[1] == "1 worlds did not do the task with bare steps"  # type: ignore[arg-type]
+    assert torch.equal(*ends)
+    assert (ends[0] - torch.from_numpy(start.qpos).float()).abs().max() > 0.0
 
 
 @pytest.mark.full
-def test_bare_steps_that_lose_worlds_do_not_count(
-    new_run: NewRun, make_sim: MakeSim, monkeypatch: Patch
-) -> None:
-    """8 rows do not hold two cubes on a table. What bare steps lose is counted once, after them."""
-    run = new_run("nworld=1")
-    sim = make_sim("mjwarp", 1, "batch.njmax=8")
-    make = run.stage.driver
-
-    def short(env: Env) -> Any:
-        return SimpleNamespace(steps=2, command=make(env).command)
-
-    monkeypatch.setattr(run.stage, "driver", short)
-    assert episode.play_bare(run.stage, sim)[1] == "1 worlds overflowed or diverged with bare steps"  # type: ignore[arg-type]
+def test_bare_steps_that_lose_worlds_give_no_ratio(new_run: NewRun, monkeypatch: Patch) -> None:
+    """What bare steps lose is looked for after them; ours keep their figure."""
+    run = new_run("nworld=1", "sim=mjwarp", "sim.device=cpu", "gate.throughput.steps=2")
+    sim = run.stage.batch_simulation(1)
+    lose = StepGraph(lambda: sim.qvel.fill_(torch.nan), sim.device, "off", name="it")
+    monkeypatch.setattr(sim, "bare_step", lambda: lose)
+    measured = episode.measure_physics(run.stage, sim)
+    sim.close()
+    note = measured.notes["speedup_over_bare"]
+    assert note == ("not measured, bare steps: 1 worlds overflowed, diverged or were not stepped")
+    assert not measured.problem
+    assert measured.median("world_steps_per_s") > 0.0
+    assert "speedup_over_bare" not in measured.samples
 
 
 @pytest.mark.full
@@ -546,7 +529,7 @@ def test_missing_power_says_why(monkeypatch: Patch, nvml: FakeNvml | None, why: 
 
 @pytest.mark.full
 @on_cuda
-def test_episode_costs_hardly_more_than_bare_steps(new_run: NewRun) -> None:
+def test_figures_of_2048_worlds_on_cuda(new_run: NewRun) -> None:
     run = new_run(
         "sim=mjwarp",
         "nworld=2048",
@@ -559,7 +542,7 @@ def test_episode_costs_hardly_more_than_bare_steps(new_run: NewRun) -> None:
     assert result.status is Status.passed, result.reason
     m = result.metrics
     assert m["episode.succeeded"] == 2048
-    assert m["episode.bare_ratio.median"] <= 1.04
+    assert m["physics.speedup_over_bare.median"] > 2.0
     for name in ("physics", "episode", "env_step"):
         assert 0.0 < m[f"{name}.gpu_memory_arrays_mib"] <= m[f"{name}.gpu_memory_whole_gpu_mib"]
         watts = m.get(f"{name}.gpu_power_mean_w")

@@ -57,7 +57,7 @@ def run_gates(run: Run, folder: Path) -> None:
         cfg = archive_starts(cfg, folder)
     run = replace(run, stage=stage.with_config(cfg, measured=stage.measured))
     gates = find_gates(run.cfg)
-    compares = "throughput" in gates and "episode" in cfg.gate.throughput.measurements
+    compares = "throughput" in gates and "physics" in cfg.gate.throughput.measurements
     compares = compares and stage.ranks.size == 1 and stage.backend[1] != "cpu"
     with ExitStack() as beside:
         if compares:
