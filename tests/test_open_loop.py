@@ -6,9 +6,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from environments import GetStage
+from environments import GetStage, Patch
 from ik_arm import Arm
 
+from mjstack.drivers import open_loop
 from mjstack.drivers.open_loop import JointTrajectory
 from mjstack.episodes.stage import Stage
 from mjstack.errors import Unreachable
@@ -50,6 +51,13 @@ def target(stage: Stage, phase: str, xy: np.ndarray) -> np.ndarray:
 def grasp_point(stage: Stage, command: np.ndarray) -> np.ndarray:
     """Forward kinematics on the scene's model."""
     return Arm(stage.model, stage.cfg.robot).grasp_point(command[None])[0]
+
+
+@pytest.fixture(autouse=True)
+def several_threads(monkeypatch: Patch) -> None:
+    """As on a large machine with thousands of worlds."""
+    monkeypatch.setattr(open_loop, "available_cores", lambda: 8)
+    monkeypatch.setattr(open_loop, "_WORLDS", 4)
 
 
 @pytest.fixture

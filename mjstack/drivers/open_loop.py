@@ -130,9 +130,11 @@ class OpenLoopPlanner:
                 xy = sources_xy[displaced[part]]
                 return self._solve_knots(xy, worlds[part].tolist(), solve, self._knots)
 
-            # A launch on the CPU has one thread
+            from mjstack.sim.warp_setup import wp  # the nominal plan alone does not need it
+
+            # A launch on the CPU has one thread. Warp's default device is that of all threads.
             parts = min(available_cores(), -(-displaced.size // _WORLDS))
-            with ThreadPoolExecutor(parts) as pool:
+            with wp.ScopedDevice("cpu"), ThreadPoolExecutor(parts) as pool:
                 plans = pool.map(solve_part, np.array_split(np.arange(displaced.size), parts))
                 knots[displaced], error[displaced] = map(np.concatenate, zip(*plans, strict=True))
         trajectory = JointTrajectory(torch.from_numpy(knots), self._weights, self._numbers, error)
