@@ -7,6 +7,7 @@ of 2048 draws, and no draw depends on which other worlds reset.
 """
 
 import operator
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -15,36 +16,42 @@ from torch import Tensor
 from mjstack.errors import ArgumentError
 
 _MASK = 0xFFFFFFFF
-_MULTIPLIERS = np.array([0xD2511F53, 0xCD9E8D57], dtype=np.uint64)
+_MULTIPLIERS = np.array([[0xD2511F53], [0xCD9E8D57]], dtype=np.uint64)
 _WEYL = np.array([0x9E3779B9, 0xBB67AE85], dtype=np.uint64)
+
+
+@lru_cache(maxsize=64)
+def _round_keys(key: tuple[int, int]) -> np.ndarray:
+    """The keys of all rounds, shape ``(10, 2, 1)``."""
+    rounds = np.arange(10, dtype=np.uint64)[:, None]
+    return (np.array(key, dtype=np.uint64) + rounds * _WEYL).astype(np.uint32)[:, :, None]
 
 
 def philox(counter: np.ndarray, key: tuple[int, int]) -> np.ndarray:
     """Philox4x32-10.
 
     Args:
-        counter: Four 32-bit words held in uint64, shape ``(4, n)``.
+        counter: Four words, shape ``(4, n)``, uint32.
         key: Two 32-bit words.
 
     Returns:
-        Four random 32-bit words held in uint64, shape ``(4, n)``.
+        Four random words, shape ``(4, n)``, uint32.
     """
-    mask = np.uint64(_MASK)
-    half = np.uint64(32)
-    keys = np.array(key, dtype=np.uint64) + np.arange(10, dtype=np.uint64)[:, None] * _WEYL & mask
     # Words 0 and 2 are multiplied, words 1 and 3 are mixed in: both pairs go through each round
-    # together, in the memory of the first one.
-    words = counter.copy()
-    multiplied = words[::2]
-    mixed = words[1::2]
-    product = np.empty_like(multiplied)
-    swapped = product[::-1]
-    for round_key in keys[:, :, None]:
-        np.multiply(multiplied, _MULTIPLIERS[:, None], out=product)
-        np.right_shift(swapped, half, out=multiplied)
-        multiplied ^= mixed
+    # together. Mixed in is the lower half of the other pair's product, read where it lies.
+    words = np.empty_like(counter)
+    multiplied = counter[::2].copy()
+    mixed = counter[1::2]
+    products = np.empty((2, *mixed.shape), dtype=np.uint64)
+    lower, upper = (products.view(np.uint32)[:, ::-1, half::2] for half in (0, 1))
+    for number, round_key in enumerate(_round_keys(key)):
+        now = number % 2
+        np.multiply(multiplied, _MULTIPLIERS, out=products[now])
+        np.bitwise_xor(upper[now], mixed, out=multiplied)
         multiplied ^= round_key
-        np.bitwise_and(swapped, mask, out=mixed)
+        mixed = lower[now]
+    words[::2] = multiplied
+    words[1::2] = mixed
     return words
 
 
@@ -65,15 +72,15 @@ def uniform(
         Shape ``(n, size)``, float32.
     """
     blocks = -(-size // 4)
-    counter = np.zeros((4, world.shape[0], blocks), dtype=np.uint64)
+    counter = np.zeros((4, world.shape[0], blocks), dtype=np.uint32)
     for word, numbers in zip(counter, (world, episode, step), strict=False):
         if numbers is not None:
-            word[:] = (numbers.cpu().numpy() & _MASK)[:, None]
+            word[:] = numbers.cpu().numpy()[:, None]  # modulo 2^32
     counter[3] = np.arange(blocks)
     words = philox(counter.reshape(4, -1), (seed & _MASK, stream & _MASK))
     # 24 bits fill a float32 mantissa exactly, so that no rounding can reach 1.
-    words >>= np.uint64(8)
-    out = np.moveaxis(words.reshape(counter.shape), 0, -1).astype(np.float32, order="C")
+    words >>= np.uint32(8)
+    out = words.reshape(counter.shape).transpose(1, 2, 0).astype(np.float32, order="C")
     out *= np.float32(2.0 / (1 << 24))
     out -= np.float32(1.0)
     return torch.from_numpy(out.reshape(-1, 4 * blocks)[:, :size]).to(world.device)

@@ -24,7 +24,7 @@ ffffffff ffffffff ffffffff ffffffff ffffffff ffffffff 408f276d 41c83b0e a20bc7c6
 @pytest.mark.parametrize("line", KNOWN.split("\n")[1:-1])
 def test_philox_known_answers(line: str) -> None:
     words = [int(word, 16) for word in line.split()]
-    columns = np.array([words[:4]] * 3, dtype=np.uint64).T
+    columns = np.array([words[:4]] * 3, dtype=np.uint32).T
     assert philox(columns, (words[4], words[5])).T.tolist() == [words[6:]] * 3
 
 
