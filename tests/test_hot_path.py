@@ -36,13 +36,13 @@ PATHS: dict[str, dict[str, str] | None] = {
         "_ValueManager ResetManager": "reset",
         "_ValueManager": "begin _term_values",
     },
-    "managers/view.py": {"": "random_uniform zero_rows"},
+    "managers/view.py": {"": "random_uniform take_rows zero_rows"},
     "managers/term.py": {"": "shared branches", "Term": "__call__ reset"},
     "mdp/observation.py": None,
     "mdp/reward.py": None,
     "mdp/geometry.py": None,
     "mdp/termination.py": {
-        "": "time_out success non_finite overflow",
+        "": "time_out success non_finite overflow _outside",
         "ObjectOffTable JointLimit": "__call__",
     },
     "mdp/action.py": {

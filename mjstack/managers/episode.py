@@ -121,8 +121,8 @@ class RewardManager(_ValueManager):
         """
         before = None if ended is None else self.values.clone()
         if self._terms:
-            values = torch.stack(self._term_values(), dim=1)
-            torch.mul(values.float(), self.weights, out=self.values)
+            torch.stack(self._term_values(), dim=1, out=self.values)
+            self.values *= self.weights
         for worthless in (void, ended):
             if worthless is not None:
                 self.values.masked_fill_(worthless[:, None], 0.0)

@@ -137,10 +137,12 @@ def branches(device: torch.device, *works: Callable[[], Any]) -> list[Any]:
     """Results of independent works of one pass. Later ones know the values that earlier ones have
     computed, except on CUDA, where they are branches of a graph.
     """
+    if device.type != "cuda":
+        return [work() for work in works]
     results: dict[int, Any] = {}
 
     def keep(number: int, work: Callable[[], Any]) -> None:
-        results[number] = in_one_pass(work) if device.type == "cuda" else work()
+        results[number] = in_one_pass(work)
 
     side_by_side(device, *(partial(keep, *pair) for pair in enumerate(works)))
     return [results[number] for number in range(len(works))]

@@ -124,9 +124,9 @@ def random_uniform(
     """
     dtype = env.sim.qpos.dtype
     stream = zlib.crc32(name.encode())
-    world = env.world[at]
-    episode = env.episode[at]
-    step = None if step is None else step[at]
+    world = take_rows(env.world, at)
+    episode = take_rows(env.episode, at)
+    step = None if step is None else take_rows(step, at)
     if env.device.type == "cuda":  # one kernel; it loads Warp, which native runs do not need
         from mjstack.sim.draws import draw_uniform
 
@@ -141,7 +141,12 @@ def rows_of(mask: Tensor) -> Rows:
     """The worlds of a mask where the host can look at it, and all of them on CUDA: an index for
     what costs by the world.
     """
-    return ALL if mask.is_cuda else mask.nonzero().squeeze(1)
+    return ALL if mask.is_cuda else torch.from_numpy(mask.numpy().nonzero()[0])
+
+
+def take_rows(values: Tensor, at: Rows) -> Tensor:
+    """The rows of some worlds, or the tensor itself for `ALL`."""
+    return values.index_select(0, at) if isinstance(at, Tensor) else values
 
 
 def zero_rows(mask: Tensor, *buffers: Tensor) -> None:

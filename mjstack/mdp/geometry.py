@@ -23,8 +23,8 @@ LOADED = 1e-5  # N: a jaw that presses with more touches the object
 
 
 def write_robot(env: EnvView, mask: Tensor, command: Tensor, at: Rows = ALL) -> None:
-    """Put the masked worlds' robot at a command, shape ``(nworld, n)``: qpos and ctrl. Where ``at``
-    has their numbers, the command has their rows alone.
+    """Put the masked worlds' robot at a command, shape ``(nworld, n)`` or ``(n,)``: qpos and ctrl.
+    Where ``at`` has their numbers, the command has their rows alone.
     """
     tensors = robot(env)
     tensors.qpos.write_masked(env.sim.qpos, mask, command, at)
@@ -102,5 +102,4 @@ def objects_in_hand(index: SceneIndex, sim: Simulation) -> Tensor:
 def jaw_forces(index: SceneIndex, sim: Simulation, name: str) -> Tensor:
     """Contact force of each jaw on an object [N], at the last physics step, ``(nworld, 2)``."""
     require_names("object", [name], index.jaw_force)
-    parts = [sim.sensordata[:, a : a + 3] for a in index.jaw_force[name]]
-    return norm(torch.stack(parts, dim=1))
+    return norm(sim.part("sensordata", index.jaw_columns[name], -1, 3))

@@ -10,7 +10,15 @@ from typing_extensions import override
 from mjstack.config.fields import Count, NotNegative
 from mjstack.config.functions import offered
 from mjstack.errors import ParameterError
-from mjstack.managers.view import EnvView, offers, random_uniform, rows_of, uses_fields, zero_rows
+from mjstack.managers.view import (
+    EnvView,
+    offers,
+    random_uniform,
+    rows_of,
+    take_rows,
+    uses_fields,
+    zero_rows,
+)
 from mjstack.math import quat_from_yaw, quat_mul
 from mjstack.mdp.geometry import Pose, robot, write_robot
 from mjstack.mdp.starts.placement import GAP, Placement, may_meet, require_reach
@@ -22,7 +30,7 @@ from mjstack.scene.index import ALL, Columns, Rows, joint_limits
 def home(env: EnvView, mask: Tensor, *, pose: Pose = "home") -> None:
     """Put the robot at its home, or at ``start``, at rest. Writes qpos, qvel and ctrl."""
     at = rows_of(mask)
-    write_robot(env, mask, getattr(robot(env), pose).expand(len(env.world[at]), -1), at)
+    write_robot(env, mask, getattr(robot(env), pose), at)
     zero_rows(mask, env.sim.qvel)
 
 
@@ -50,7 +58,7 @@ class JointNoise:
         """Write qpos and ctrl."""
         at = rows_of(mask)
         noise = random_uniform(env, self.label, self._width.shape[0], at=at)
-        command = robot(env).ctrl.read(env.sim.ctrl)[at] + self._width * noise
+        command = take_rows(robot(env).ctrl.read(env.sim.ctrl), at) + self._width * noise
         write_robot(env, mask, torch.clamp(command, self._low, self._high), at)
 
 
@@ -286,7 +294,7 @@ def _write_objects(
     it, by x and y [m], shape ``(n, objects, 2)``, and turn it [rad], ``(n, objects)``; the values
     are those of ``at``.
     """
-    now = poses.read(env.sim.qpos)[at].unflatten(1, (-1, 7))
+    now = take_rows(poses.read(env.sim.qpos), at).unflatten(1, (-1, 7))
     # In float64, so that the rounded cosine and sine are the same on every backend
     turned = quat_from_yaw(yaw.double()).to(offset.dtype)
     if any(thing.turned != [1.0, 0.0, 0.0, 0.0] for thing in env.cfg.scene.free.values()):

@@ -2,6 +2,7 @@
 
 import math
 
+import torch
 from torch import Tensor
 
 from mjstack.config.fields import Count, NotNegative
@@ -22,6 +23,14 @@ def success(env: EnvView) -> Tensor:
     return env.success
 
 
+def _outside(values: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """Whether one of a world's values is outside its range, shape ``(nworld,)``, bool."""
+    # Mostly none is, and the host sees it at once; NaN equals nothing
+    if not values.is_cuda and torch.equal(values.clamp(low, high), values):
+        return torch.zeros(len(values), dtype=torch.bool)
+    return ((values < low) | (values > high)).any(1)
+
+
 @ignores_success
 class ObjectOffTable:
     """When an object's centre is beside the table or below its top."""
@@ -29,15 +38,13 @@ class ObjectOffTable:
     def __init__(self, env: EnvView) -> None:
         scene = env.cfg.scene
         x, y, _ = scene.table_half
-        constant = env.index.constant
-        self._center = constant([*scene.table_center[:2], 0.0], env.sim.qpos)
-        self._low = constant([-x, -y, scene.table_top], env.sim.qpos)
-        self._high = constant([x, y, math.inf], env.sim.qpos)
+        triples = ([*scene.table_center[:2], 0.0], [-x, -y, scene.table_top], [x, y, math.inf])
+        numbers = [env.index.constant(three * len(scene.free), env.sim.qpos) for three in triples]
+        self._center, self._low, self._high = numbers
 
     def __call__(self, env: EnvView) -> Tensor:
         """True for worlds with an object off the table, shape ``(nworld,)``."""
-        offset = positions(env).unflatten(1, (-1, 3)) - self._center
-        return ((offset < self._low) | (offset > self._high)).flatten(1).any(1)
+        return _outside(positions(env) - self._center, self._low, self._high)
 
 
 @ignores_success
@@ -60,8 +67,7 @@ class JointLimit:
 
     def __call__(self, env: EnvView) -> Tensor:
         """True for worlds with a joint outside, shape ``(nworld,)``."""
-        q = joint_pos(env)
-        return ((q < self._low) | (q > self._high)).any(1)
+        return _outside(joint_pos(env), self._low, self._high)
 
 
 @ignores_success

@@ -121,6 +121,7 @@ class SceneIndex:
         geoms: Geom indices of every object.
         jaw_force: First sensordata address of each jaw's force on an object (3 numbers), by the
             object's name.
+        jaw_columns: All numbers of these forces, side by side in sensordata, by the object's name.
         support_force: First sensordata addresses of the world's force and of each other object's;
             empty unless ``scene.support_sensors`` is set.
     """
@@ -167,6 +168,10 @@ class SceneIndex:
         pairs = list(combinations(scene.objects, 2))
         self.jaw_force = {
             name: sensors((jaw, name) for jaw in robot.jaw_bodies) for name in scene.objects
+        }
+        self.jaw_columns = {
+            name: Columns([a + i for a in addresses for i in range(3)], host)
+            for name, addresses in self.jaw_force.items()
         }
         self.support_force = {
             name: sensors([(WORLD, name), *(pair for pair in pairs if name in pair)])

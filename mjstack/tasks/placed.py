@@ -38,8 +38,11 @@ class HeldSuccess:
     def __call__(self, env: EnvView) -> Tensor:
         """Process a step; shape ``(nworld,)``, bool."""
         works = [partial(self._holds, condition) for condition in self._conditions]
-        holds = torch.cat(branches(env.device, *works), dim=1)
-        self._length.add_(1).mul_(holds.all(1))
+        if not self._length.is_cuda and not bool(works[0]().all(1).any()):
+            self._length.zero_()  # whatever the other conditions say
+        else:
+            holds = torch.cat(branches(env.device, *works), dim=1)
+            self._length.add_(1).mul_(holds.all(1))
         return self._length >= self._steps
 
     def _holds(self, condition: Condition) -> Tensor:
