@@ -90,11 +90,12 @@ class _Group:
 
     def add_noise(self, step: Tensor, at: Rows) -> None:
         """Add the group's noise to a step of some worlds."""
-        if not len(self._noise):
+        size = len(self._noise_columns.indices)
+        if not size:
             return
         name = f"observation.{self.name}"
-        step_number = self._env.episode_step
-        draw = random_uniform(self._env, name, len(self._noise), step=step_number, at=at).float()
+        now = self._env.episode_step
+        draw = random_uniform(self._env, name, size, step=now, at=at, dtype=torch.float32)
         columns = self._noise_columns.at
         if isinstance(columns, slice):
             step[:, columns].add_(self._noise * draw)

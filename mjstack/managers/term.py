@@ -227,7 +227,10 @@ class Term:
         current_term.label = self.label
         if self._key is None:
             return self.call(*args)
-        return shared(self._key, partial(self.call, *args))
+        values = known_values()
+        if self._key not in values:
+            values[self._key] = self.call(*args)
+        return values[self._key]
 
     def reset(self, mask: Tensor) -> None:
         """Let a term with a memory forget the masked worlds."""

@@ -10,7 +10,7 @@ from torch import Tensor
 from mjstack.config.schema import Config
 from mjstack.rng import uniform
 from mjstack.scene import SceneIndex
-from mjstack.scene.index import ALL, Rows
+from mjstack.scene.index import ALL, Rows, take_rows
 from mjstack.sim import Simulation
 
 
@@ -105,6 +105,7 @@ def random_uniform(
     high: float = 1.0,
     step: Tensor | None = None,
     at: Rows = ALL,
+    dtype: torch.dtype | None = None,
 ) -> Tensor:
     """Random numbers of every world's current episode, which depend neither on nworld nor on which
     worlds reset.
@@ -117,12 +118,12 @@ def random_uniform(
         high: Upper bound.
         step: Step within the episode, shape ``(nworld,)``; 0 if None, which is right for resets.
         at: The worlds, from `rows_of`.
+        dtype: Of the numbers; that of the simulation's floats if None.
 
     Returns:
-        Shape ``(nworld, size)``, or a row for each of ``at``, in the type of the simulation's
-        floats.
+        Shape ``(nworld, size)``, or a row for each of ``at``.
     """
-    dtype = env.sim.qpos.dtype
+    dtype = dtype or env.sim.qpos.dtype
     stream = zlib.crc32(name.encode())
     world = take_rows(env.world, at)
     episode = take_rows(env.episode, at)
@@ -142,11 +143,6 @@ def rows_of(mask: Tensor) -> Rows:
     what costs by the world.
     """
     return ALL if mask.is_cuda else torch.from_numpy(mask.numpy().nonzero()[0])
-
-
-def take_rows(values: Tensor, at: Rows) -> Tensor:
-    """The rows of some worlds, or the tensor itself for `ALL`."""
-    return values.index_select(0, at) if isinstance(at, Tensor) else values
 
 
 def zero_rows(mask: Tensor, *buffers: Tensor) -> None:

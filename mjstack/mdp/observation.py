@@ -89,7 +89,7 @@ def object_pose(env: EnvView, *, object: str) -> Tensor:
 @_in_metres
 def positions(env: EnvView) -> Tensor:
     """Where the objects that can move are [m], world frame, shape ``(nworld, 3 * objects)``."""
-    parts = [pose_w(env, name)[:, :3] for name in env.cfg.scene.free]
+    parts = [pose_w(env, name)[:, :3] for name in env.index.objects]
     return torch.cat([env.sim.qpos[:, :0], *parts], dim=1)
 
 

@@ -10,20 +10,12 @@ from typing_extensions import override
 from mjstack.config.fields import Count, NotNegative
 from mjstack.config.functions import offered
 from mjstack.errors import ParameterError
-from mjstack.managers.view import (
-    EnvView,
-    offers,
-    random_uniform,
-    rows_of,
-    take_rows,
-    uses_fields,
-    zero_rows,
-)
+from mjstack.managers.view import EnvView, offers, random_uniform, rows_of, uses_fields, zero_rows
 from mjstack.math import quat_from_yaw, quat_mul
 from mjstack.mdp.geometry import Pose, robot, write_robot
 from mjstack.mdp.starts.placement import GAP, Placement, may_meet, require_reach
 from mjstack.mdp.starts.randomization import Elements, Randomized, bounds
-from mjstack.scene.index import ALL, Columns, Rows, joint_limits
+from mjstack.scene.index import ALL, Columns, Rows, joint_limits, take_rows
 
 
 @offers("reset term")
@@ -109,8 +101,8 @@ class JitterObjects:
         count = 3 * len(env.index.objects)
         at = rows_of(mask)
         draws = random_uniform(env, self.label, count, at=at).unflatten(1, (-1, 3))
-        xy, yaw = draws.split((2, 1), dim=2)
-        _write_objects(env, mask, self._poses, self._xy * xy, self._yaw * yaw[..., 0], at)
+        xy, yaw = draws[..., :2], draws[..., 2]
+        _write_objects(env, mask, self._poses, self._xy * xy, self._yaw * yaw, at)
 
 
 @offers("reset term", places_objects=True)

@@ -25,6 +25,11 @@ _SHAPES = {
 }
 
 
+def take_rows(values: Tensor, at: Rows) -> Tensor:
+    """The rows of some worlds, or the tensor itself for `ALL`."""
+    return values.index_select(0, at) if isinstance(at, Tensor) else values
+
+
 class Columns:
     """Some columns of a batched view. Where they lie side by side, reading them costs nothing and
     writing is one copy.

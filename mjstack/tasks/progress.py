@@ -96,8 +96,7 @@ class Progress:
         worth = measured / self._ranges
         nearness = worth[..., :3]
         torch.sub(self._nearest, nearness.abs_().tanh_(), out=nearness)
-        worth[..., 3:].clamp_(0.0, 1.0)
-        value = worth.add_(self._number).mul_(reached).amax(-1) / len(STAGES)
+        value = worth.clamp_(0.0, 1.0).add_(self._number).mul_(reached).amax(-1) / len(STAGES)
         if value.shape[1] == 1:
             return value[:, 0]
 
