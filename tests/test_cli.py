@@ -191,24 +191,27 @@ def test_any_error_of_the_run_is_a_line(
 
 @pytest.mark.full
 def test_the_collector_passes_over_what_was_loaded(folder: Path) -> None:
-    """It waits while modules load. Once a job has begun it works, also after MuJoCo Warp."""
+    """It waits while modules load. Once a job has begun it works, also after MuJoCo Warp, which the
+    second load brings.
+    """
     program = """
 import gc, sys
 from mjstack import cli, jobs
 from mjstack.__main__ import main
 
 def note(work):
-    def noted(*args):
+    def noted(*args, **options):
         print("collector", int(gc.isenabled()), gc.get_freeze_count(), flush=True)
-        return work(*args)
+        return work(*args, **options)
     return noted
 
 def stop():
     raise RuntimeError("far enough")
 
 cli.compose = note(cli.compose)
-load = note(jobs.CheckedJob._load)
-jobs.CheckedJob._load = lambda *args: (load(*args), note(stop)())
+load = jobs.CheckedJob._load
+after = iter((note(int), note(stop)))
+jobs.CheckedJob._load = lambda *args, **options: (load(*args, **options), next(after)())
 sys.argv = ["mjstack", "gates=[parity]", "web.episode=false"]
 main()
 """

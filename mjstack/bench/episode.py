@@ -136,7 +136,7 @@ def measure_physics(stage: Stage, sim: Simulation, carry: State | None = None) -
         out.samples["bare_ms_per_batched_step"] = [
             1e3 * seconds / (steps * physics.decimation) for seconds in bare_times
         ]
-        ratios = [bare / ours for bare, ours in zip(bare_times, times, strict=True)]
+        ratios = [slow / fast for slow, fast in zip(bare_times, times, strict=True)]
         out.samples["speedup_over_bare"] = ratios
         out.headline += f", {statistics.median(ratios):.3g} times bare mujoco_warp.step"
     return out

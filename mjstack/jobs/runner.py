@@ -9,9 +9,11 @@ import re
 import socket
 import tempfile
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from threading import Thread
 
 import mujoco
 import numpy as np
@@ -29,7 +31,13 @@ from mjstack.errors import ConfigError, MjstackError
 from mjstack.gates.runner import log_error
 from mjstack.interrupt import check_interrupt, interrupted
 from mjstack.jobs.progress import STATUS_COLOR, ProgressBar
-from mjstack.jobs.showing import draw_episode, find_viewers, save_page, serve_live_view
+from mjstack.jobs.showing import (
+    draw_episode,
+    find_viewers,
+    load_drawing,
+    save_page,
+    serve_live_view,
+)
 from mjstack.mdp.starts.placement import SCHEMA
 from mjstack.process import available_cores
 from mjstack.report.formats import FORMATS, write_formats
@@ -123,9 +131,7 @@ class CheckedJob:
             resumes=self.resumes or self.resumable,
             pictures=page.pictures,
         )
-        # The collector need not look at all that was loaded each time it frees a gate's worlds.
-        gc.collect()
-        gc.freeze()
+        self._load(warp=self.stage.backend[0] is Backend.mjwarp)
         # However it ends, the finished results are in the report.
         try:
             self._do(report, page, console)
@@ -161,7 +167,9 @@ class CheckedJob:
 
         def begin(name: str) -> None:
             bar.start(name)
-            self._load(name)
+            self._load(warp=name == "parity")
+            if name == "capacity":  # it times nothing, and mostly waits for its device
+                Thread(target=load_drawing, daemon=True).start()
             if live is not None:
                 live.begin(name)
 
@@ -183,19 +191,17 @@ class CheckedJob:
         draw_episode(self.stage, folder, run.artifacts.pictured, run.draw)
         page.note = save_page(self.stage, folder, page)
 
-    def _load(self, name: str) -> None:
-        """Load MuJoCo Warp for the part that first plays on it. The collector, which gates call
-        often, passes over what there is as a part begins: kernels are a million objects.
+    def _load(self, *, warp: bool) -> None:
+        """Load MuJoCo Warp, if asked to, and have the collector, which gates call often, pass over
+        all that there is: modules and kernels are a million objects.
         """
-        plays = self.stage.backend[0] is Backend.mjwarp and name != "baseline"
-        gc.collect()
         gc.disable()
-        try:
-            if plays or name == "parity":
+        if warp:
+            with suppress(Exception):  # what plays on it says why
                 importlib.import_module("mjstack.sim.mjwarp")
-            gc.freeze()
-        finally:
-            gc.enable()
+        gc.enable()
+        gc.collect()
+        gc.freeze()
 
     def _end(self, error: BaseException, report: Report, console: Console) -> None:
         """Say why the work has ended early."""

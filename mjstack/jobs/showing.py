@@ -4,7 +4,8 @@ import os
 import secrets
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,13 @@ def check_showing(cfg: Config, ending: str = ".mp4") -> None:
         raise ConfigError("view", "true", expected, "Use view=web or video=true instead")
     if cfg.video:
         picture.require_video(ending)
+
+
+def load_drawing() -> None:
+    """Load what draws pictures and pages, where it is installed."""
+    for name in ("matplotlib.figure", "trimesh"):
+        with suppress(ImportError):
+            import_module(name)
 
 
 def draw_episode(
