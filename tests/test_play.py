@@ -14,7 +14,6 @@ from policies import write_policy
 
 import mjstack
 import mjstack.jobs.play as play
-import mjstack.jobs.runner as runner
 import mjstack.jobs.showing as showing
 from mjstack.cli import run
 from mjstack.episodes.rollout import Hook
@@ -72,7 +71,7 @@ def test_the_expert_plays_without_a_policy_in_the_viewer(
     shown: list[int] = []
 
     hook = Hook(lambda step, sim: shown.append(step))
-    monkeypatch.setattr(runner, "find_viewers", lambda stage: [hook])
+    monkeypatch.setattr(showing, "find_viewers", lambda stage: [hook])
     monkeypatch.setattr(showing.picture, "opens_windows", lambda: True)
     out = tmp_path / "out"
     names = configure("task=reach").controller.phases

@@ -30,14 +30,8 @@ from mjstack.episodes.stage import Progress, Stage
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.gates.runner import log_error
 from mjstack.interrupt import check_interrupt, interrupted
+from mjstack.jobs import showing
 from mjstack.jobs.progress import STATUS_COLOR, ProgressBar
-from mjstack.jobs.showing import (
-    draw_episode,
-    find_viewers,
-    load_drawing,
-    save_page,
-    serve_live_view,
-)
 from mjstack.mdp.starts.placement import SCHEMA
 from mjstack.process import available_cores
 from mjstack.report.formats import FORMATS, write_formats
@@ -169,11 +163,11 @@ class CheckedJob:
             bar.start(name)
             self._load(warp=name == "parity")
             if name == "capacity":  # it times nothing, and mostly waits for its device
-                Thread(target=load_drawing, daemon=True).start()
+                Thread(target=showing.load_drawing, daemon=True).start()
             if live is not None:
                 live.begin(name)
 
-        with ProgressBar(console) as bar, serve_live_view(self.stage, console) as live:
+        with ProgressBar(console) as bar, showing.serve_live_view(self.stage, console) as live:
             self.stage.progress = Progress(bar.print_line, bar.advance)
             self.stage.observers = [live] if live else []
             run = Run(
@@ -182,14 +176,14 @@ class CheckedJob:
                 overrides=report.overrides,
                 begin=begin,
                 record=record,
-                viewers=[live] if live else find_viewers(self.stage),
+                viewers=[live] if live else showing.find_viewers(self.stage),
                 page=page,
             )
             self.work(run, folder)
         report.conclude()
         write_formats(report, page)
-        draw_episode(self.stage, folder, run.artifacts.pictured, run.draw)
-        page.note = save_page(self.stage, folder, page)
+        showing.draw_episode(self.stage, folder, run.artifacts.pictured, run.draw)
+        page.note = showing.save_page(self.stage, folder, page)
 
     def _load(self, *, warp: bool) -> None:
         """Load MuJoCo Warp, if asked to, and have the collector, which gates call often, pass over
