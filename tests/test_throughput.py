@@ -261,13 +261,23 @@ def test_bare_steps_that_lose_worlds_give_no_ratio(new_run: NewRun, monkeypatch:
     sim = run.stage.batch_simulation(1)
     lose = StepGraph(lambda: sim.qvel.fill_(torch.nan), sim.device, "off", name="it")
     monkeypatch.setattr(sim, "bare_step", lambda: lose)
-    measured = episode.measure_physics(run.stage, sim)
+    lost = episode.measure_physics(run.stage, sim)
+
+    def broken() -> StepGraph:
+        raise RuntimeError("out of memory")
+
+    monkeypatch.setattr(sim, "bare_step", broken)
+    missing = episode.measure_physics(run.stage, sim)
     sim.close()
-    note = measured.notes["speedup_over_bare"]
-    assert note == ("not measured, bare steps: 1 worlds overflowed, diverged or were not stepped")
-    assert not measured.problem
-    assert measured.median("world_steps_per_s") > 0.0
-    assert "speedup_over_bare" not in measured.samples
+    reasons = {
+        "1 worlds overflowed, diverged or were not stepped": lost,
+        "out of memory": missing,
+    }
+    for reason, measured in reasons.items():
+        assert measured.notes["speedup_over_bare"] == f"not measured, bare steps: {reason}"
+        assert not measured.problem
+        assert measured.median("world_steps_per_s") > 0.0
+        assert "speedup_over_bare" not in measured.samples
 
 
 @pytest.mark.full
@@ -434,6 +444,27 @@ def test_the_parts_play_one_trajectory(monkeypatch: Patch) -> None:
         assert not np.array_equal(whole.qpos[~same], alone.numpy()[~same])
     assert ended > 12  # 16 steps of episodes of 9: every world once at least
     assert 0 < times.facts["episodes_ended"] < ended  # the first repetition warms up
+
+
+@pytest.mark.parametrize(
+    ("precision", "physics", "made"), [(0.01, 1.0, 2), (0.01, 0.9, 5), (0.0, 1.0, 5)]
+)
+def test_env_step_repeats_until_its_ratio_to_physics_is_narrow(
+    precision: float, physics: float, made: int, monkeypatch: Patch
+) -> None:
+    """The times themselves may grow; ``physics`` is the first repetition's share of them."""
+    cfg = load_config(["sim=native", f"gate.throughput.precision={precision}"])
+    times = iter([0.0, 1.0, 2.0, 2.0, 4.0, 5.0])  # the first one warms up
+
+    def play(parts: Any, steps: int, meter: Any) -> tuple[list[float], float]:
+        whole = next(times)
+        return [1.07 * whole, whole * (physics if whole == 1.0 else 1.0), 0.05 * whole, 0.0], 0.0
+
+    monkeypatch.setattr(env_step._Parts, "play", play)
+    env = build_env(cfg, nworld=1)
+    measured = measure_env_step(env, "env_step", lambda what, done, total: None)
+    env.close()
+    assert measured.facts["repetitions"] == made
 
 
 class FakeNvml:

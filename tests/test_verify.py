@@ -1,11 +1,23 @@
 """The gates from Python."""
 
+import gc
+import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
-from environments import Capture, Patch
+from compositions import load_config
+from environments import Capture, NewRun, Patch
 
 import mjstack
+import mjstack.sim
+from mjstack.config.schema import Backend
+from mjstack.episodes.run import Run
+from mjstack.episodes.stage import Stage
+from mjstack.gates import runner as gate_runner
+from mjstack.jobs import runner as job_runner
+from mjstack.report.record import GateResult
+from mjstack.sim import compiling
 
 REACH = ["task=reach", "sim=native", "nworld=2"]
 
@@ -35,3 +47,49 @@ def test_what_fails_is_said() -> None:
     assert found.gates["baseline"].beyond == ["reached_steps"]
     with pytest.raises(mjstack.MjstackError, match=r"nworld=0: expected"):
         mjstack.verify(["nworld=0"])
+
+
+@pytest.mark.parametrize("change", ["", "measurements", "phases", "import"])
+def test_the_stock_step_compiles_beside_gates_where_it_is_compared(
+    change: str, new_run: NewRun, monkeypatch: Patch, tmp_path: Path
+) -> None:
+    """Not where physics is not measured or has no phases; gates run all the same."""
+    choice = ["gate.throughput.measurements=[episode]"] if change == "measurements" else []
+    run = new_run("sim=native", "nworld=1", "gates=[throughput]", *choice)
+    monkeypatch.setattr(Stage, "backend", (Backend.mjwarp, "cuda:0"))  # which no gate here uses
+    ran: list[str] = []
+    beside: list[object] = []
+
+    def gate(run: Run) -> list[GateResult]:
+        ran.append("throughput")
+        return []
+
+    gates = {"throughput": gate}
+    monkeypatch.setattr(gate_runner, "find_gates", lambda cfg: gates)
+
+    def start(stage: object) -> nullcontext:
+        beside.append(stage)
+        return nullcontext()
+
+    monkeypatch.setattr(compiling, "stock_step_beside", start)
+    if change == "phases":
+        monkeypatch.setattr(Stage, "phases", [])
+    if change == "import":
+        monkeypatch.delattr(mjstack.sim, "compiling")
+        monkeypatch.setitem(sys.modules, "mjstack.sim.compiling", None)
+    gate_runner.run_gates(run, tmp_path)
+    assert ran == ["throughput"]
+    assert len(beside) == (change == "")
+
+
+def test_a_warp_that_cannot_be_loaded_fails_no_run(monkeypatch: Patch) -> None:
+    """The gates that play on it fail."""
+
+    def broken(name: str) -> None:
+        raise OSError(name)
+
+    checked = job_runner.check_job(load_config([*REACH, "gates=[baseline]"]))
+    monkeypatch.setattr(job_runner.importlib, "import_module", broken)
+    checked._load(warp=True)
+    assert gc.isenabled()
+    gc.unfreeze()

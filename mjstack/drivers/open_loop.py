@@ -103,8 +103,8 @@ class OpenLoopPlanner:
         (self._knots,), (self._error,) = plan
 
     def plan(self, sources_xy: ndarray, names: Sequence[int] | None = None) -> JointTrajectory:
-        """Plan one trajectory per world, which does not depend on the other worlds. Cores share the
-        worlds out.
+        """Plan one trajectory per world, which does not depend on the other worlds. The worlds are
+        divided among threads.
 
         Args:
             sources_xy: Position of each object and place at the start [m], shape ``(nworld,
@@ -134,6 +134,8 @@ class OpenLoopPlanner:
 
             # A launch on the CPU has one thread. Warp's default device is that of all threads.
             parts = min(available_cores(), -(-displaced.size // _WORLDS))
+            if parts > 1:
+                self._batched_solve(1)  # else each thread compiles the kernels
             with wp.ScopedDevice("cpu"), ThreadPoolExecutor(parts) as pool:
                 plans = pool.map(solve_part, np.array_split(np.arange(displaced.size), parts))
                 knots[displaced], error[displaced] = map(np.concatenate, zip(*plans, strict=True))

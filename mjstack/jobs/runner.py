@@ -125,7 +125,7 @@ class CheckedJob:
             resumes=self.resumes or self.resumable,
             pictures=page.pictures,
         )
-        self._load(warp=self.stage.backend[0] is Backend.mjwarp)
+        self._load(warp=self.stage.backend[0] is Backend.mjwarp and cfg.gates != ["baseline"])
         # However it ends, the finished results are in the report.
         try:
             self._do(report, page, console)
@@ -162,7 +162,7 @@ class CheckedJob:
         def begin(name: str) -> None:
             bar.start(name)
             self._load(warp=name == "parity")
-            if name == "capacity":  # it times nothing, and mostly waits for its device
+            if name == "capacity":  # it times nothing, and waits for a GPU if there is one
                 Thread(target=showing.load_drawing, daemon=True).start()
             if live is not None:
                 live.begin(name)

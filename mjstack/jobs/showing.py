@@ -38,9 +38,9 @@ def check_showing(cfg: Config, ending: str = ".mp4") -> None:
 
 
 def load_drawing() -> None:
-    """Load what draws pictures and pages, where it is installed."""
+    """Load what draws pictures and pages."""
     for name in ("matplotlib.figure", "trimesh"):
-        with suppress(ImportError):
+        with suppress(Exception):  # what draws says why
             import_module(name)
 
 

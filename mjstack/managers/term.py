@@ -227,7 +227,7 @@ class Term:
         current_term.label = self.label
         if self._key is None:
             return self.call(*args)
-        values = known_values()
+        values = known_values()  # `shared`, without a partial at every call
         if self._key not in values:
             values[self._key] = self.call(*args)
         return values[self._key]

@@ -205,8 +205,8 @@ class ThroughputCfg(GateFuncCfg):
     repetitions: int = spec(ge=1)
     """Repetitions of each measurement, at most."""
     precision: float = spec(0.01, ge=0.0)
-    """physics, episode: repetitions end, from two on, as soon as half their range is less,
-    relative to the median."""
+    """Repetitions end, from two on, as soon as half the range of their times is less, relative to
+    the median (env_step, cameras: of the time over that of physics)."""
     episodes: int = spec(ge=1)
     """episode: repetitions at most."""
     steps: int = spec(unit="steps", ge=1)
