@@ -44,7 +44,7 @@ def drive(get_stage: GetStage, make_sim: MakeSim) -> Callable[..., list[set[str]
     @cache
     def expert(robot: str) -> torch.Tensor:
         stage = get_stage(robot)
-        commands = recorder.Recorder(recorder.COMMANDS)
+        commands = recorder.Recorder(recorder.Channels(recorder.read_commands))
         stage.play(make_sim("native", NWORLD, robot=robot), stage.cfg.reset, [commands])
         return commands.rows["ctrl"].clone()
 

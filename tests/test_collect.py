@@ -30,7 +30,7 @@ from mjstack.datasets.part import PartWriter
 from mjstack.datasets.spec import INDICES
 from mjstack.envs import Env, build_env, demonstration_config
 from mjstack.episodes.batches import Batch, BatchPlan
-from mjstack.episodes.recorder import COMMANDS, Recorder
+from mjstack.episodes.recorder import Channels, Recorder, read_commands
 from mjstack.episodes.rollout import Episode
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError
@@ -67,7 +67,7 @@ def gate_episode(cfg: Config) -> SimpleNamespace:
         stage.model, cfg, cfg.nworld, backend=Backend.native, fields=required_fields(cfg.reset)
     )
     try:
-        recorder = Recorder(COMMANDS)
+        recorder = Recorder(Channels(read_commands))
         episode = stage.play(sim, cfg.reset, [recorder])
         return SimpleNamespace(result=episode.result, commands=recorder.rows["ctrl"])
     finally:

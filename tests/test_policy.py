@@ -29,7 +29,7 @@ from mjstack.config.load import extended_search_path
 from mjstack.config.schema import ObservationTermCfg
 from mjstack.drivers.policy import PolicyDriver
 from mjstack.envs import Env, driven_config
-from mjstack.episodes.recorder import COMMANDS, Recorder
+from mjstack.episodes.recorder import Channels, Recorder, read_commands
 from mjstack.episodes.rollout import rollout
 from mjstack.errors import FolderError, MjstackError
 from mjstack.jobs.gates import check_machine
@@ -529,7 +529,7 @@ def test_the_rollout_plays_a_policy(backend: str) -> None:
     native = driven(3)
     wanted = play(native, PolicyDriver(native, policy), 8)
     env = driven(3, "graph=require", backend=backend)
-    recorder = Recorder(COMMANDS)
+    recorder = Recorder(Channels(read_commands))
     timing = rollout(env, PolicyDriver(env, policy), [recorder], steps=8)
     torch.testing.assert_close(recorder.rows["ctrl"][:8].cpu(), wanted, rtol=0.0, atol=1e-4)
     assert timing.captured == (backend == "mjwarp-cuda")

@@ -59,10 +59,11 @@ class HeldPhysics:
         """Seconds that some control steps take from the state."""
         restore(self.sim, self.state)
         seconds = timed(self.sim, lambda: self._play(steps), meter)
-        counted = steps * self.decimation if self.bare is None else None
-        if self.bare is not None:
+        if self.bare is None:
+            self.lost |= lost_worlds(self.sim, steps * self.decimation)
+        else:  # which counts no steps
             cast("MjwarpSimulation", self.sim).latch()
-        self.lost |= lost_worlds(self.sim, counted)
+            self.lost |= lost_worlds(self.sim)
         return seconds
 
     def _play(self, steps: int) -> None:

@@ -108,11 +108,6 @@ def read_commands(env: Env, driver: Driver) -> Read:
     return lambda: {"ctrl": columns.read(ctrl).float()}
 
 
-COMMANDS = Channels(read_commands)
-"""The joint targets of all worlds: ``steps * nworld * 4 * nu`` bytes on the device, 0.79 GB for
-2,000 steps of 16,384 worlds with six joint targets."""
-
-
 def read_state(env: Env, driver: Driver) -> Read:
     """Read the parts of a `State`, in its precision."""
     sim = env.sim
