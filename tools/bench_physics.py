@@ -17,7 +17,7 @@ from common import count, make_parser, run, spread
 from mjstack.bench.timing import lost_worlds, timed
 from mjstack.config.schema import Backend, Config
 from mjstack.envs.buffers import Advance
-from mjstack.episodes.recorder import COMMANDS, Recorder, Snapshots
+from mjstack.episodes.recorder import Channels, Recorder, Snapshots, read_commands
 from mjstack.episodes.rollout import State, restore, snapshot
 from mjstack.episodes.stage import Progress, Stage
 from mjstack.errors import MjstackError
@@ -97,7 +97,7 @@ def _task_targets(stage: Stage, sim: Simulation, steps: int) -> tuple[State, lis
     """State and joint targets of the task from the measured phase on."""
     first = stage.phase(stage.cfg.gate.throughput.from_phase).start
     snapshots = Snapshots([first - 1])
-    recorder = Recorder(COMMANDS)
+    recorder = Recorder(Channels(read_commands))
     stage.play(sim, stage.cfg.reset, [snapshots, recorder])
     return snapshots.states[first - 1], list(recorder.rows["ctrl"][first : first + steps])
 
