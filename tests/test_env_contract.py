@@ -249,6 +249,44 @@ def test_returned_tensors_are_the_callers(backend: str) -> None:
     assert_rows(returned(env.step(moves[0])), copies[1], slice(None), slice(None), backend)
 
 
+class Change:
+    """A reward term that keeps a tensor of a step for the next one."""
+
+    def __init__(self, env: Env) -> None:
+        """Begin with none."""
+        self.before = env.action.clone()
+
+    def __call__(self, env: Env) -> torch.Tensor:
+        """How much the first action changes."""
+        change = (env.action - self.before)[:, 0]
+        self.before = env.action.clone()
+        return change
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Forget in place."""
+        self.before[mask] = 0.0
+
+
+def test_a_step_is_without_autograd_and_what_it_returns_is_not() -> None:
+    """Terms may write into what they kept, in a later step and in a reset of the caller's; a loss
+    may be taken of what a step returns, and a buffer be written outside.
+    """
+    change = "+reward.change={func: test_env_contract.Change, weight: 1.0}"
+    env = on_new_sim("native", 3, configure(change))
+    env.reset(seed=0)
+    for move in actions(env, 3):
+        obs, reward, *_ = env.step(move)
+    env.reset(mask=mask_of(env, 1))
+    env.step(zeros(env))
+    assert env.reward_manager._terms["change"].call.before.is_inference()
+    layer = torch.nn.Linear(obs["policy"].shape[1], 1)
+    (layer(obs["policy"]).sum() * reward.sum()).backward()
+    assert layer.weight.grad is not None
+    reward.add_(1.0)
+    env.reward_manager.weights.mul_(0.5)
+    env.step(zeros(env))
+
+
 def split(env: Env, group: str, obs: torch.Tensor) -> dict[str, torch.Tensor]:
     """A group's terms by name, from the widths that the configuration implies."""
     n = len(env.cfg.robot.home)

@@ -15,9 +15,7 @@ COPIES = {"tensor", "as_tensor", "from_numpy", "masked_select", "unique", "argwh
 CASTS = {"bool", "int", "float"}
 # The code that runs within a step, by file and class, "" for functions; None for all of a file.
 PATHS: dict[str, dict[str, str] | None] = {
-    "envs/env.py": {
-        "Env": "advance _step_physics _evaluate _reset_ended _start_worlds _reset_managers"
-    },
+    "envs/env.py": {"Env": "advance _step_physics _evaluate _reset_ended _begin _start_worlds"},
     "envs/command_delay.py": {"CommandDelay": "late reset"},
     "envs/faults.py": {"FaultLatch": "record record_reward"},
     "envs/outputs.py": {
@@ -109,7 +107,7 @@ PATHS: dict[str, dict[str, str] | None] = {
     "policy/network.py": {"PolicyNetwork": "normalized forward"},
     "episodes/failures.py": {"FailureMonitor": "update", "": "_of"},
     "kinematics/batched_ik.py": {"BatchedIk": "solve forward _launch _copy_in"},
-    "scene/index.py": {"": "take_rows", "Columns": "read write write_masked"},
+    "scene/index.py": {"Columns": "read write write_masked"},
     "sim/mjwarp.py": {"MjwarpSimulation": "step reset kinematics _decimation _pose _place"},
     "sim/usage.py": {"Usage": "count clear"},
     "sim/fused/constraints.py": {"": "collision solve"},

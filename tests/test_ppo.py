@@ -22,12 +22,10 @@ from environments import (
 from policies import assert_drives, curve, interrupted, report, run_as_torchrun, same
 from rsl_rl.algorithms import PPO
 
-import mjstack.mdp.starts.expert_states as expert_states
 from mjstack.cli import run
 from mjstack.envs import Env
 from mjstack.errors import MjstackError
 from mjstack.policy import load_policy
-from mjstack.scene.index import ALL
 from mjstack.tasks.check import make_check
 from mjstack.train.ppo import PpoLearner
 
@@ -157,15 +155,10 @@ def states_file(path: Path, env: Env, count: int = 3) -> Path:
     return path
 
 
-@pytest.mark.parametrize("masked", [False, True], ids=["by row", "as on CUDA"])
-def test_worlds_start_in_an_experts_states(
-    masked: bool, tmp_path: Path, monkeypatch: Patch
-) -> None:
+def test_worlds_start_in_an_experts_states(tmp_path: Path) -> None:
     """By seed, world and episode, a falling share of them, with fresh counters; the others as they
     would without.
     """
-    if masked:  # the host does not look at the mask
-        monkeypatch.setattr(expert_states, "rows_of", lambda mask: ALL)
     whole = on_new_sim("native", 6, configure("reset=randomized"))
     path = states_file(tmp_path / "states.npz", whole)
     bank = np.load(path)

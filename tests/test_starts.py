@@ -4,17 +4,31 @@ import hashlib
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import ClassVar
 
 import mujoco
 import numpy as np
 import pytest
 import torch
 from box_checker import corners_of
-from environments import configure, on_shared_sim
+from environments import (
+    Trace,
+    actions,
+    assert_traces,
+    configure,
+    mask_of,
+    on_shared_sim,
+    play,
+    returned,
+    state_of,
+    zeros,
+)
 
 import mjstack
 from mjstack.config.schema import Backend, Config
 from mjstack.envs import Env, build_env
+from mjstack.managers import EnvView, repeatable
+from mjstack.mdp.reset import JitterObjects
 from mjstack.mdp.starts.placement import Placement, may_meet
 
 MANY = 200
@@ -250,8 +264,8 @@ def test_joint_zeros_move_the_arm_and_no_measured_joint() -> None:
     another one; both backends have the same.
     """
     width = 0.17
-    zeros = f"+reset.zeros={{func: mjstack.mdp.reset.JointZeros, params: {{arm: {width}}}}}"
-    cfg = configure(zeros, "reset=randomized", "action=joint_absolute")
+    term = f"+reset.zeros={{func: mjstack.mdp.reset.JointZeros, params: {{arm: {width}}}}}"
+    cfg = configure(term, "reset=randomized", "action=joint_absolute")
     zeros_of = []
     for backend in (Backend.native, Backend.mjwarp):
         env = build_env(cfg, nworld=16, backend=backend, device="cpu")
@@ -287,3 +301,102 @@ def check_zeros(env: Env, width: float) -> None:
         np.testing.assert_allclose(env.sim.site_xpos[world], data.site_xpos, rtol=0, atol=1e-9)
         tips.append(data.site_xpos[env.index.grasp_sites[0]].copy())
     assert np.ptp(tips, axis=0).min() > 0.02
+
+
+HISTORY = (
+    "+observation.policy.terms.joint_pos.history=3",
+    "timing.command_delay=1",
+    "timing.random_delay=2",
+    "timing.policy_decimation=3",
+)
+ENDS = {"ends": (), "box": ("task=box",), "fields": ("reset=randomized",), "memory": HISTORY}
+
+
+@pytest.mark.parametrize("overrides", ENDS.values(), ids=ENDS)
+def test_starts_made_ahead_are_those_of_the_moment(overrides: tuple[str, ...]) -> None:
+    """Bit for bit, whichever worlds end, one of them again before another has; after a masked reset
+    too, a new seed, and more ends at once than are worth it.
+    """
+    ahead, written = play_ends(overrides)
+    in_time, _ = play_ends(overrides, ahead=False)
+    assert_traces(ahead, in_time, slice(None), slice(None), "native")
+    assert written.count(True) > 50
+    assert written.count(False) >= 4  # two full resets, and twice four worlds at once
+
+
+def play_ends(overrides: tuple[str, ...], *, ahead: bool = True) -> tuple[Trace, list[bool]]:
+    """Two runs in which worlds end at every step; and which ends were written from starts that had
+    been made before.
+    """
+    env = build_env(configure(*overrides), nworld=24, backend=Backend.native, device="cpu")
+    write = env._starts.write
+    written = []
+
+    def counted(mask: torch.Tensor) -> bool:
+        written.append(ahead and write(mask))
+        return written[-1]
+
+    env._starts.write = counted  # type: ignore[method-assign]
+
+    def end(step: int) -> None:
+        ending = {20: range(4), 21: (3, 4)}.get(step, (step % 9,))
+        env.episode_step[list(ending)] = env.max_episode_steps
+
+    moves = actions(env, 30)
+    trace = []
+    for seed in (3, 4):
+        env.reset(seed=seed)
+        trace += play(env, moves[:12], end)
+        trace.append(returned(env.reset(mask=mask_of(env, 1, 2))))
+        trace += play(env, moves[12:], lambda step: end(step + 12))
+    trace.append({"means": torch.tensor([*env.read_statistics().values()])})
+    trace[-1]["peaks"] = torch.stack(env.sim.lasting_peaks())
+    env.close()
+    return trace, written
+
+
+@repeatable
+class Nominal(JitterObjects):
+    """Puts objects a little off their nominal position, and counts how often."""
+
+    calls: ClassVar[list[int]] = []
+
+    def __call__(self, env: EnvView, mask: torch.Tensor) -> None:
+        """Write qpos, or fail."""
+        if len(self.calls) == 2:
+            raise KeyboardInterrupt
+        self.calls.append(int(mask.sum()))
+        super().__call__(env, mask)
+
+
+class Unmarked(Nominal):
+    """A subclass may do more than its class."""
+
+    calls: ClassVar[list[int]] = []
+
+
+def test_only_marked_terms_are_called_ahead() -> None:
+    """A term that is not may look at what is later known alone. What interrupts it leaves every
+    world where it was.
+    """
+    masks = {}
+    for name in ("Nominal", "Unmarked"):
+        term_cfg = f"reset.cubes={{func: test_starts.{name}, params: {{xy: 0.01, yaw: 0.1}}}}"
+        env = mjstack.make_env([term_cfg, "sim=native"], nworld=16)
+        term = env.reset_manager._terms["cubes"].call
+        env.reset(seed=0)
+        term.calls.clear()
+        for world in (3, 3):
+            env.episode_step[world] = env.max_episode_steps
+            env.step(zeros(env))
+        masks[name] = list(term.calls)
+        term.calls[:] = [16, 16]  # the next call is interrupted
+        if name == "Nominal":
+            env.recapture()
+            before = state_of(env)
+            with pytest.raises(KeyboardInterrupt):
+                env.reset(mask=mask_of(env, 5))
+            after = state_of(env)
+            assert all(torch.equal(before[key], after[key]) for key in before)
+        env.close()
+    assert masks == {"Nominal": [16, 16], "Unmarked": [1, 1]}

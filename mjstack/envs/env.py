@@ -11,7 +11,8 @@ from mjstack.envs.camera_schedule import CameraSchedule
 from mjstack.envs.command_delay import CommandDelay
 from mjstack.envs.faults import FaultLatch
 from mjstack.envs.outputs import EpisodeStatistics, Outputs, ResetResult, StepResult
-from mjstack.envs.threads import few_threads
+from mjstack.envs.starts import NextStarts
+from mjstack.envs.threads import few_threads, without_autograd
 from mjstack.errors import ArgumentError
 from mjstack.managers.action import ActionManager
 from mjstack.managers.episode import ResetManager, RewardManager, TerminationManager
@@ -68,6 +69,7 @@ class Env:
     """
 
     observation_manager: ObservationManager
+    reset_manager: ResetManager
 
     def __init__(
         self,
@@ -126,7 +128,8 @@ class Env:
         self.reward_manager = RewardManager(self, cfg.reward)
         self.observation_manager = ObservationManager(self, cfg.observation)
         self.statistics = EpisodeStatistics(self)
-        self._reset_managers(self._all_worlds)
+        self._starts = NextStarts(self, self._start_worlds)
+        self._begin(self._all_worlds)
         self._draws = CameraSchedule(self)
         self.images = self._draws.images
         self.cameras = self._draws.cameras
@@ -169,15 +172,14 @@ class Env:
             self.seed = check_seed(seed, masked=mask is not None)
             self.key.fill_(self.seed)
             self.episode.fill_(-1)
-        worlds = self._all_worlds if mask is None else mask
-        self._start_worlds(worlds)
+            self._starts.forget()
+        self._begin(self._all_worlds if mask is None else mask)
         if mask is None:
             self.faults.clear()
             self._started = True
-        self._reset_managers(worlds)
-        observed = self.observation_manager.refresh(worlds)
         self._draws.draw_started(mask)
-        return {name: group.clone() for name, group in observed.items()} | self.images, {}
+        observed = self.observation_manager.groups.items()
+        return {name: group.clone() for name, group in observed} | self.images, {}
 
     def step(self, action: Tensor) -> StepResult:
         """Advance every world by one decision of the policy; see the class for the order.
@@ -237,8 +239,11 @@ class Env:
         )
 
     def recapture(self) -> None:
-        """Have every graph captured anew, after a change of something that a graph has baked in."""
+        """Have every graph captured anew, and every start made anew, after a change of something
+        that is baked in.
+        """
         self._version += 1
+        self._starts.forget()
 
     def parts(self) -> tuple[StepGraph, StepGraph, StepGraph]:
         """The physics of a control step, the managers, and the images of all cameras: three graphs,
@@ -278,6 +283,7 @@ class Env:
         with self.command_delay.late():
             self.sim.step(self.cfg.timing.decimation, kinematics=True)
 
+    @without_autograd
     def _evaluate(self, ended: Tensor | None = None, *, last: bool = True) -> Tensor | None:
         """Success, terminations and rewards of the new state; after the ``last`` control step of a
         decision observations and resets.
@@ -343,9 +349,7 @@ class Env:
 
         def restart() -> None:
             self.statistics.update(done)
-            self._start_worlds(done)
-            self._reset_managers(done)
-            in_one_pass(partial(self.observation_manager.refresh, done))
+            self._begin(done)
 
         self._draws.draw_ended(done)
         if ending:
@@ -353,6 +357,21 @@ class Env:
         elif broken is not None:
             self._outputs.restore_observations()
 
+    @without_autograd
+    def _begin(self, mask: Tensor) -> None:
+        """Begin the masked worlds' next episode: start, clear what managers keep, observe."""
+        ready = self._starts.write(mask)
+        if not ready:
+            self._start_worlds(mask)
+        for manager in (self.action_manager, self.termination_manager, self.reward_manager):
+            manager.reset(mask)
+        self.success.masked_fill_(mask, False)
+        if self._success is not None:
+            self._success.reset(mask)
+        if not ready:
+            in_one_pass(partial(self.observation_manager.refresh, mask))
+
+    @without_autograd
     def _start_worlds(self, mask: Tensor) -> None:
         """Start the masked worlds' next episode, from seed, world and episode alone."""
         self.episode += mask
@@ -360,11 +379,3 @@ class Env:
         self.reset_manager.reset(mask)
         self.sim.kinematics(mask)
         self.command_delay.reset(mask)
-
-    def _reset_managers(self, mask: Tensor) -> None:
-        """Clear what managers keep from step to step."""
-        for manager in (self.action_manager, self.termination_manager, self.reward_manager):
-            manager.reset(mask)
-        self.success.masked_fill_(mask, False)
-        if self._success is not None:
-            self._success.reset(mask)

@@ -17,6 +17,7 @@ from mjstack.managers.view import (
     ignores_success,
     offers,
     random_uniform,
+    repeatable,
     uses_fields,
 )
 
@@ -32,6 +33,7 @@ __all__ = [
     "ignores_success",
     "offers",
     "random_uniform",
+    "repeatable",
     "required_fields",
     "uses_fields",
 ]

@@ -13,8 +13,8 @@ from mjstack.config.functions import offered
 from mjstack.config.schema import ObservationGroupCfg, ObservationTermCfg
 from mjstack.errors import TermError
 from mjstack.managers.term import Term, first_value, render_table
-from mjstack.managers.view import EnvView, random_uniform, rows_of
-from mjstack.scene.index import ALL, Columns, Rows
+from mjstack.managers.view import EnvView, random_uniform
+from mjstack.scene.index import Columns
 
 _SLIDE = 0.1  # m: as much noise for a sliding joint as 1 rad for another
 
@@ -86,16 +86,16 @@ class _Group:
             torch.tensor(columns, dtype=torch.int64, device=env.device)
             for columns in (shift, repeat)
         )
-        self._past = torch.zeros((env.nworld, self.dim), dtype=torch.float32, device=env.device)
+        self.past = torch.zeros((env.nworld, self.dim), dtype=torch.float32, device=env.device)
 
-    def add_noise(self, step: Tensor, at: Rows) -> None:
-        """Add the group's noise to a step of some worlds."""
+    def add_noise(self, step: Tensor) -> None:
+        """Add the group's noise to a step."""
         size = len(self._noise_columns.indices)
         if not size:
             return
         name = f"observation.{self.name}"
         now = self._env.episode_step
-        draw = random_uniform(self._env, name, size, step=now, at=at, dtype=torch.float32)
+        draw = random_uniform(self._env, name, size, step=now, dtype=torch.float32)
         columns = self._noise_columns.at
         if isinstance(columns, slice):
             step[:, columns].add_(self._noise * draw)
@@ -108,23 +108,18 @@ class _Group:
         if not self.remembers:
             out.copy_(step)
             return
-        torch.index_select(torch.cat((self._past, step), dim=1), 1, self._shift, out=self._past)
-        out.copy_(self._past)
+        torch.index_select(torch.cat((self.past, step), dim=1), 1, self._shift, out=self.past)
+        out.copy_(self.past)
 
-    def restart(self, out: Tensor, step: Tensor, mask: Tensor, at: Rows) -> None:
-        """The whole history of the masked worlds becomes the current step, which is that of ``at``
-        alone where it has their numbers.
-        """
+    def restart(self, out: Tensor, step: Tensor, mask: Tensor) -> None:
+        """The whole history of the masked worlds becomes the current step."""
         step = step[:, self._columns]
-        into = self._past if self.remembers else out
+        into = self.past if self.remembers else out
         if self.remembers:
             step = step.index_select(1, self._repeat)
-        if isinstance(at, Tensor):
-            into.index_copy_(0, at, step)
-        else:
-            torch.where(mask[:, None], step, into, out=into)
+        torch.where(mask[:, None], step, into, out=into)
         if self.remembers:
-            out.copy_(self._past)
+            out.copy_(self.past)
 
 
 def slide_joints(model: mujoco.MjModel, joints: Sequence[str]) -> list[bool]:
@@ -151,6 +146,8 @@ class ObservationManager:
         term_dims: Width of each term, history included, by group and name, in the order of the
             columns.
         groups: The tensors, by group. They are written anew at every step.
+        terms: All terms.
+        buffers: All that `compute` and `refresh` write, each ``(nworld, n)``.
         remembers: Whether a term has a history, which needs every control step.
         ignores_success: Whether all terms are marked as such.
     """
@@ -175,7 +172,12 @@ class ObservationManager:
         empty = torch.full((env.nworld, 1), math.nan, dtype=torch.float32, device=env.device)
         self.groups = {name: empty.repeat(1, dim) for name, dim in self.group_dims.items()}
         self._parts = [p for group in self._groups.values() for p in group.parts.values()]
-        self.ignores_success = all(part.term.ignores_success for part in self._parts)
+        self.terms = [part.term for part in self._parts]
+        self.buffers = [
+            *self.groups.values(),
+            *(g.past for g in self._groups.values() if g.remembers),
+        ]
+        self.ignores_success = all(term.ignores_success for term in self.terms)
         self._clips = any(part.cfg.clip for part in self._parts)
         self._scales = any(part.cfg.scale != 1.0 for part in self._parts)
         # Limits and scale of each column of one step
@@ -191,7 +193,7 @@ class ObservationManager:
     def compute(self) -> dict[str, Tensor]:
         """Take in a new step of every world, and return `groups`."""
         if self._parts:
-            step = self._step(ALL)
+            step = self._step()
             for name, group in self._groups.items():
                 group.append(self.groups[name], step)
         return self.groups
@@ -201,20 +203,16 @@ class ObservationManager:
         step.
         """
         if self._parts:
-            at = rows_of(mask)
-            step = self._step(at)
+            step = self._step()
             for name, group in self._groups.items():
-                group.restart(self.groups[name], step, mask, at)
+                group.restart(self.groups[name], step, mask)
         return self.groups
 
-    def _step(self, at: Rows) -> Tensor:
-        """One step of all groups in some worlds, shape ``(n, sum of widths)``, float32."""
-        step = torch.cat([part.value(self._env) for part in self._parts], dim=1)
-        if isinstance(at, Tensor):
-            step = step.index_select(0, at)
-        step = step.float()
+    def _step(self) -> Tensor:
+        """One step of all groups, shape ``(nworld, sum of widths)``, float32."""
+        step = torch.cat([part.value(self._env) for part in self._parts], dim=1).float()
         for group in self._groups.values():
-            group.add_noise(step, at)
+            group.add_noise(step)
         if self._clips:
             step.clamp_(self._low, self._high)
         return step.mul_(self._scale) if self._scales else step

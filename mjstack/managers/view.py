@@ -10,7 +10,6 @@ from torch import Tensor
 from mjstack.config.schema import Config
 from mjstack.rng import uniform
 from mjstack.scene import SceneIndex
-from mjstack.scene.index import ALL, Rows, take_rows
 from mjstack.sim import Simulation
 
 
@@ -90,6 +89,15 @@ def ignores_success(term: Any) -> Any:
     return term
 
 
+def repeatable(term: Any) -> Any:
+    """Mark a reset or observation term that reads nothing but the simulation, the last action, what
+    never changes, and random numbers of `random_uniform`: native MuJoCo calls it ahead of time, for
+    many episodes at once. A subclass, or a function that wraps it, is not marked.
+    """
+    term.repeatable = term
+    return term
+
+
 def uses_fields(*names: str) -> Callable[[Any], Any]:
     """Mark a reset term that writes per-world model fields, so that the simulation is built with
     them.
@@ -104,7 +112,6 @@ def random_uniform(
     low: float = -1.0,
     high: float = 1.0,
     step: Tensor | None = None,
-    at: Rows = ALL,
     dtype: torch.dtype | None = None,
 ) -> Tensor:
     """Random numbers of every world's current episode, which depend neither on nworld nor on which
@@ -117,32 +124,23 @@ def random_uniform(
         low: Smallest value.
         high: Upper bound.
         step: Step within the episode, shape ``(nworld,)``; 0 if None, which is right for resets.
-        at: The worlds, from `rows_of`.
         dtype: Of the numbers; that of the simulation's floats if None.
 
     Returns:
-        Shape ``(nworld, size)``, or a row for each of ``at``.
+        Shape ``(nworld, size)``.
     """
     dtype = dtype or env.sim.qpos.dtype
     stream = zlib.crc32(name.encode())
-    world = take_rows(env.world, at)
-    episode = take_rows(env.episode, at)
-    step = None if step is None else take_rows(step, at)
     if env.device.type == "cuda":  # one kernel; it loads Warp, which native runs do not need
         from mjstack.sim.draws import draw_uniform
 
-        return draw_uniform(env.key, stream, world, episode, step, size, low, high).to(dtype)
-    draw = uniform(env.seed, stream, world, episode, step, size).to(dtype)
+        return draw_uniform(env.key, stream, env.world, env.episode, step, size, low, high).to(
+            dtype
+        )
+    draw = uniform(env.seed, stream, env.world, env.episode, step, size).to(dtype)
     if (low, high) == (-1.0, 1.0):  # then all of the below is exact, and changes nothing
         return draw
     return low + 0.5 * (high - low) * (draw + 1.0)
-
-
-def rows_of(mask: Tensor) -> Rows:
-    """The worlds of a mask where the host can look at it, and all of them on CUDA: an index for
-    what costs by the world.
-    """
-    return ALL if mask.is_cuda else torch.from_numpy(mask.numpy().nonzero()[0])
 
 
 def zero_rows(mask: Tensor, *buffers: Tensor) -> None:

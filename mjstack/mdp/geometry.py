@@ -9,7 +9,7 @@ from mjstack.errors import require_names
 from mjstack.managers.term import shared
 from mjstack.managers.view import EnvView, episode_draw
 from mjstack.math import lowest_point, norm, not_finite
-from mjstack.scene.index import ALL, RobotTensors, Rows, SceneIndex
+from mjstack.scene.index import RobotTensors, SceneIndex
 from mjstack.sim.simulation import Simulation
 
 
@@ -22,13 +22,11 @@ Pose = Literal["home", "start"]  # the robot's own commands
 LOADED = 1e-5  # N: a jaw that presses with more touches the object
 
 
-def write_robot(env: EnvView, mask: Tensor, command: Tensor, at: Rows = ALL) -> None:
-    """Put the masked worlds' robot at a command, shape ``(nworld, n)`` or ``(n,)``: qpos and ctrl.
-    Where ``at`` has their numbers, the command has their rows alone.
-    """
+def write_robot(env: EnvView, mask: Tensor, command: Tensor) -> None:
+    """Put the masked worlds' robot at a command, shape ``(nworld, n)`` or ``(n,)``: qpos, ctrl."""
     tensors = robot(env)
-    tensors.qpos.write_masked(env.sim.qpos, mask, command, at)
-    tensors.ctrl.write_masked(env.sim.ctrl, mask, command, at)
+    tensors.qpos.write_masked(env.sim.qpos, mask, command)
+    tensors.ctrl.write_masked(env.sim.ctrl, mask, command)
 
 
 def gripper_opening(env: EnvView) -> Tensor:

@@ -10,12 +10,12 @@ from torch import Tensor
 
 from mjstack.config.fields import Fraction, NotNegative
 from mjstack.errors import MjstackError, ParameterError, suggest
-from mjstack.managers.view import EnvView, random_uniform, rows_of, uses_fields
+from mjstack.managers.view import EnvView, random_uniform, repeatable, uses_fields
 from mjstack.math import quat_mul
 from mjstack.mdp.starts.randomization import Elements, bounds
-from mjstack.scene.index import Rows
 
 
+@repeatable
 @uses_fields("light_pos", "light_dir", "light_diffuse")
 class Light:
     """Moves every light, still aimed at the same point, and changes its brightness and colour."""
@@ -56,20 +56,20 @@ class Light:
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write light_pos, light_dir and light_diffuse."""
-        at = rows_of(mask)
         count = len(self._aim)
-        draw = random_uniform(env, self.label, 7 * count, at=at).unflatten(1, (count, 7))
+        draw = random_uniform(env, self.label, 7 * count).unflatten(1, (count, 7))
         draw = draw.to(self._aim.dtype)
         pos = self._pos.nominal + self._move * draw[..., :3]
         aim = torch.nn.functional.normalize(self._aim - pos, dim=-1)
         low, high = self._brightness
         factor = low + 0.5 * (high - low) * (draw[..., 3:4] + 1.0)
         color = factor * (1.0 + self._tint * draw[..., 4:])
-        self._pos.write(mask, pos, at)
-        self._dir.write(mask, aim, at)
-        self._diffuse.write(mask, (self._diffuse.nominal * color).clamp(0.0, 1.0), at)
+        self._pos.write(mask, pos)
+        self._dir.write(mask, aim)
+        self._diffuse.write(mask, (self._diffuse.nominal * color).clamp(0.0, 1.0))
 
 
+@repeatable
 @uses_fields("geom_rgba")
 class Colors:
     """Changes the colours of things: the scene's objects, its table, its floor."""
@@ -103,15 +103,15 @@ class Colors:
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write geom_rgba."""
-        at = rows_of(mask)
-        draw = random_uniform(env, self.label, 3 * len(self._looks), at=at)
+        draw = random_uniform(env, self.label, 3 * len(self._looks))
         for number, look in enumerate(self._looks):
             change = self._spread * draw[:, None, 3 * number : 3 * number + 3]
             value = look.nominal.expand(len(draw), -1, -1).clone()
             value[..., :3] = (value[..., :3] + change).clamp(0.0, 1.0)
-            look.write(mask, value, at)
+            look.write(mask, value)
 
 
+@repeatable
 @uses_fields("cam_pos", "cam_quat")
 class CameraPoses:
     """Moves and turns every camera."""
@@ -134,16 +134,16 @@ class CameraPoses:
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write cam_pos and cam_quat."""
-        at = rows_of(mask)
-        draw = _draw_cameras(env, self.label, 6, at).to(self._pos.nominal.dtype)
+        draw = _draw_cameras(env, self.label, 6).to(self._pos.nominal.dtype)
         half = 0.5 * self._angle * draw[..., 3:]
         turn = torch.cat((torch.ones_like(half[..., :1]), half), dim=-1)
         turn = torch.nn.functional.normalize(turn, dim=-1)
         quat = self._quat.nominal.expand(len(draw), -1, -1)
-        self._pos.write(mask, self._pos.nominal + self._move * draw[..., :3], at)
-        self._quat.write(mask, quat_mul(quat, turn), at)
+        self._pos.write(mask, self._pos.nominal + self._move * draw[..., :3])
+        self._quat.write(mask, quat_mul(quat, turn))
 
 
+@repeatable
 @uses_fields("cam_fovy")
 class FieldOfView:
     """Scales the vertical field of view of every camera."""
@@ -157,9 +157,8 @@ class FieldOfView:
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write cam_fovy."""
-        at = rows_of(mask)
-        factor = _draw_cameras(env, self.label, 1, at, *self._ends)[..., 0]
-        self._fovy.write(mask, self._fovy.nominal * factor, at)
+        factor = _draw_cameras(env, self.label, 1, *self._ends)[..., 0]
+        self._fovy.write(mask, self._fovy.nominal * factor)
 
 
 def _cameras(env: EnvView) -> list[str]:
@@ -177,11 +176,11 @@ def _require_pictures(env: EnvView, what: str) -> None:
 
 
 def _draw_cameras(
-    env: EnvView, label: str, size: int, at: Rows, low: float = -1.0, high: float = 1.0
+    env: EnvView, label: str, size: int, low: float = -1.0, high: float = 1.0
 ) -> Tensor:
     """Numbers of each camera by its name, so that another camera changes none of them, shape
-    ``(n, cameras, size)``.
+    ``(nworld, cameras, size)``.
     """
     names = _cameras(env)
-    draws = [random_uniform(env, f"{label}.{name}", size, low, high, at=at) for name in names]
+    draws = [random_uniform(env, f"{label}.{name}", size, low, high) for name in names]
     return torch.stack(draws, dim=1)

@@ -10,22 +10,30 @@ from typing_extensions import override
 from mjstack.config.fields import Count, NotNegative
 from mjstack.config.functions import offered
 from mjstack.errors import ParameterError
-from mjstack.managers.view import EnvView, offers, random_uniform, rows_of, uses_fields, zero_rows
+from mjstack.managers.view import (
+    EnvView,
+    offers,
+    random_uniform,
+    repeatable,
+    uses_fields,
+    zero_rows,
+)
 from mjstack.math import quat_from_yaw, quat_mul
 from mjstack.mdp.geometry import Pose, robot, write_robot
 from mjstack.mdp.starts.placement import GAP, Placement, may_meet, require_reach
 from mjstack.mdp.starts.randomization import Elements, Randomized, bounds
-from mjstack.scene.index import ALL, Columns, Rows, joint_limits, take_rows
+from mjstack.scene.index import Columns, joint_limits
 
 
+@repeatable
 @offers("reset term")
 def home(env: EnvView, mask: Tensor, *, pose: Pose = "home") -> None:
     """Put the robot at its home, or at ``start``, at rest. Writes qpos, qvel and ctrl."""
-    at = rows_of(mask)
-    write_robot(env, mask, getattr(robot(env), pose), at)
+    write_robot(env, mask, getattr(robot(env), pose))
     zero_rows(mask, env.sim.qvel)
 
 
+@repeatable
 @offers("reset term", joint_noise=True)
 class JointNoise:
     """Adds uniform noise to the robot's joint positions and targets, within the joints' ranges."""
@@ -48,12 +56,12 @@ class JointNoise:
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write qpos and ctrl."""
-        at = rows_of(mask)
-        noise = random_uniform(env, self.label, self._width.shape[0], at=at)
-        command = take_rows(robot(env).ctrl.read(env.sim.ctrl), at) + self._width * noise
-        write_robot(env, mask, torch.clamp(command, self._low, self._high), at)
+        noise = random_uniform(env, self.label, self._width.shape[0])
+        command = robot(env).ctrl.read(env.sim.ctrl) + self._width * noise
+        write_robot(env, mask, torch.clamp(command, self._low, self._high))
 
 
+@repeatable
 @uses_fields("qpos0")
 class JointZeros:
     """Moves the zero of every joint by a random amount that no sensor shows, as the calibrations of
@@ -71,11 +79,11 @@ class JointZeros:
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write qpos0, from which MuJoCo counts."""
-        at = rows_of(mask)
-        moved = self._width * random_uniform(env, self.label, len(self._width), at=at)
-        robot(env).qpos.write_masked(env.sim.fields["qpos0"], mask, self._nominal - moved, at)
+        moved = self._width * random_uniform(env, self.label, len(self._width))
+        robot(env).qpos.write_masked(env.sim.fields["qpos0"], mask, self._nominal - moved)
 
 
+@repeatable
 @offers("reset term")
 class JitterObjects:
     """Moves each object a little off its nominal position."""
@@ -99,12 +107,12 @@ class JitterObjects:
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write qpos."""
         count = 3 * len(env.index.objects)
-        at = rows_of(mask)
-        draws = random_uniform(env, self.label, count, at=at).unflatten(1, (-1, 3))
+        draws = random_uniform(env, self.label, count).unflatten(1, (-1, 3))
         xy, yaw = draws[..., :2], draws[..., 2]
-        _write_objects(env, mask, self._poses, self._xy * xy, self._yaw * yaw, at)
+        _write_objects(env, mask, self._poses, self._xy * xy, self._yaw * yaw)
 
 
+@repeatable
 @offers("reset term", places_objects=True)
 class RandomizeObjects:
     """Puts each object anywhere in a region around its nominal position where nothing is in its
@@ -163,14 +171,14 @@ class RandomizeObjects:
         """Write qpos."""
         count = len(env.index.objects)
         sizes = (count * (2 * self._candidates + 1), 2 * count * self._more)
-        at = rows_of(mask)
-        draws = random_uniform(env, self.label, sum(sizes), at=at)
+        draws = random_uniform(env, self.label, sum(sizes))
         first, more = (part.unflatten(1, (count, -1)) for part in draws.split(sizes, dim=1))
         candidates = torch.cat((first[..., 1:], more), dim=2).unflatten(2, (-1, 2))
         offsets, _ = self._placement.choose(candidates)
-        _write_objects(env, mask, self._poses, offsets, self._yaw * first[..., 0], at)
+        _write_objects(env, mask, self._poses, offsets, self._yaw * first[..., 0])
 
 
+@repeatable
 @uses_fields("body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0")
 class ObjectMass(Randomized):
     """Scales each object's mass and inertia.
@@ -196,16 +204,17 @@ class ObjectMass(Randomized):
         return self._mass.read()
 
     @override
-    def write(self, mask: Tensor, values: Tensor, at: Rows = ALL) -> None:
+    def write(self, mask: Tensor, values: Tensor) -> None:
         mass = values.to(self._mass.dtype)
         factor = mass.double() / self.nominal
-        self._mass.write(mask, mass, at)
+        self._mass.write(mask, mass)
         for elements in self._scaled:
-            elements.scale(mask, factor, at)
-        self._inverse.scale(mask, 1.0 / factor, at)
-        self._inverse_dofs.scale(mask, (1.0 / factor).repeat_interleave(6, dim=1), at)
+            elements.scale(mask, factor)
+        self._inverse.scale(mask, 1.0 / factor)
+        self._inverse_dofs.scale(mask, (1.0 / factor).repeat_interleave(6, dim=1))
 
 
+@repeatable
 @uses_fields("geom_friction")
 class ObjectFriction(Randomized):
     """Draws the sliding friction of each object, and of the grip where the jaws have a coefficient
@@ -240,13 +249,14 @@ class ObjectFriction(Randomized):
         return torch.stack([group.read(self._view)[:, 0] for group in self._groups], dim=1)
 
     @override
-    def write(self, mask: Tensor, values: Tensor, at: Rows = ALL) -> None:
+    def write(self, mask: Tensor, values: Tensor) -> None:
         values = values.to(self._view.dtype)
         for number, group in enumerate(self._groups):
-            group.write_masked(self._view, mask, values[:, number, None], at)
-        self._lowered.write_masked(self._view, mask, self._least, at)
+            group.write_masked(self._view, mask, values[:, number, None])
+        self._lowered.write_masked(self._view, mask, self._least)
 
 
+@repeatable
 @uses_fields("actuator_gainprm", "actuator_biasprm")
 class ActuatorGains(Randomized):
     """Scales the stiffness and damping of each of the robot's position servos by one factor per
@@ -268,10 +278,10 @@ class ActuatorGains(Randomized):
         return self._gain.read()[..., 0].double() / self._kp
 
     @override
-    def write(self, mask: Tensor, values: Tensor, at: Rows = ALL) -> None:
+    def write(self, mask: Tensor, values: Tensor) -> None:
         factor = (values.double() * self._kp).to(self._gain.dtype).double() / self._kp
-        self._gain.scale(mask, factor, at)
-        self._bias.scale(mask, factor, at)
+        self._gain.scale(mask, factor)
+        self._bias.scale(mask, factor)
 
 
 def _object_poses(env: EnvView) -> Columns:
@@ -279,17 +289,14 @@ def _object_poses(env: EnvView) -> Columns:
     return Columns([qpos + i for qpos in env.index.object_qpos for i in range(7)], env.device)
 
 
-def _write_objects(
-    env: EnvView, mask: Tensor, poses: Columns, offset: Tensor, yaw: Tensor, at: Rows
-) -> None:
+def _write_objects(env: EnvView, mask: Tensor, poses: Columns, offset: Tensor, yaw: Tensor) -> None:
     """Move every object of the masked worlds off the position where the simulation's reset has put
-    it, by x and y [m], shape ``(n, objects, 2)``, and turn it [rad], ``(n, objects)``; the values
-    are those of ``at``.
+    it, by x and y [m], shape ``(nworld, objects, 2)``, and turn it [rad], ``(nworld, objects)``.
     """
-    now = take_rows(poses.read(env.sim.qpos), at).unflatten(1, (-1, 7))
+    now = poses.read(env.sim.qpos).unflatten(1, (-1, 7))
     # In float64, so that the rounded cosine and sine are the same on every backend
     turned = quat_from_yaw(yaw.double()).to(offset.dtype)
     if any(thing.turned != [1.0, 0.0, 0.0, 0.0] for thing in env.cfg.scene.free.values()):
         turned = quat_mul(turned, now[..., 3:])
     value = torch.cat((now[..., :2] + offset, now[..., 2:3], turned), dim=-1).flatten(1)
-    poses.write_masked(env.sim.qpos, mask, value, at)
+    poses.write_masked(env.sim.qpos, mask, value)

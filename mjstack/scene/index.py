@@ -15,19 +15,11 @@ from mjstack.errors import ConfigError, require_names
 from mjstack.math import lowest_point, quat_mul, quat_to_matrix
 from mjstack.scene.build import CAPSULE_TURN, WORLD, force_sensor
 
-Rows = Tensor | slice
-"""Worlds: their numbers, shape ``(n,)``, or all of them."""
-ALL = slice(None)
 _SHAPES = {
     int(mujoco.mjtGeom.mjGEOM_SPHERE): "sphere",
     int(mujoco.mjtGeom.mjGEOM_CAPSULE): "capsule",
     int(mujoco.mjtGeom.mjGEOM_CYLINDER): "cylinder",
 }
-
-
-def take_rows(values: Tensor, at: Rows) -> Tensor:
-    """The rows of some worlds, or the tensor itself for `ALL`."""
-    return values.index_select(0, at) if isinstance(at, Tensor) else values
 
 
 class Columns:
@@ -44,7 +36,7 @@ class Columns:
         self.indices = tuple(map(int, indices))
         first = min(self.indices, default=0)
         stop = first + len(self.indices)
-        self.at: Rows = slice(first, stop)
+        self.at: Tensor | slice = slice(first, stop)
         if self.indices != tuple(range(first, stop)):
             self.at = torch.tensor(self.indices, dtype=torch.int64, device=device)
 
@@ -58,14 +50,9 @@ class Columns:
         """Write all worlds."""
         view[:, self.at] = value
 
-    def write_masked(self, view: Tensor, mask: Tensor, value: Tensor, at: Rows = ALL) -> None:
-        """Write the worlds of a ``(nworld,)`` bool mask. Where ``at`` has their numbers, the value
-        has their rows alone.
-        """
+    def write_masked(self, view: Tensor, mask: Tensor, value: Tensor) -> None:
+        """Write the worlds of a ``(nworld,)`` bool mask."""
         value = value.to(view.dtype)
-        if isinstance(at, Tensor):
-            view[at if isinstance(self.at, slice) else at[:, None], self.at] = value
-            return
         rows = mask.view(-1, *[1] * (view.dim() - 1))
         part = self.read(view)
         if isinstance(self.at, slice):

@@ -173,7 +173,7 @@ class MjwarpSimulation(Simulation):
     @override
     def reset(self, mask: Tensor | None = None) -> None:
         self.check_mask(mask)
-        self._keep_peaks(mask)
+        self.keep_peaks(mask)
         if mask is None:
             self._mask.fill_(True)
             self._usage.views["peak_pool"].zero_()

@@ -147,7 +147,7 @@ class NativeSimulation(Simulation):
         if "qpos0" in self._fields:
             self.qpos.numpy()[rows] = self._fields["qpos0"][rows]
         self._copies["sensordata"][rows] = 0
-        self._keep_peaks(mask)
+        self.keep_peaks(mask)
         self._counts[rows] = 0
         self._steps[rows] = 0
 
@@ -157,10 +157,15 @@ class NativeSimulation(Simulation):
         return [*self._poses, *self._copies.values()]
 
     @property
+    @override
+    def rows(self) -> list[np.ndarray]:
+        counters = (self._counts, self._steps)
+        return [self.batch.state, *self._derived, *counters, *self._fields.values()]
+
+    @property
     def world_bytes(self) -> int:
         """Memory that a world takes."""
-        arrays = (self.batch.state, *self._derived, *self._fields.values())
-        return sum(array.nbytes for array in arrays) // self.nworld
+        return sum(array.nbytes for array in self.rows) // self.nworld
 
     @override
     def option_values(self) -> dict[str, float | int | str]:

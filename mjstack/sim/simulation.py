@@ -6,6 +6,7 @@ from enum import IntFlag
 from functools import cached_property
 
 import mujoco
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -244,6 +245,13 @@ class Simulation(ABC):
     def option_values(self) -> dict[str, float | int | str]:
         """The physics options as this backend holds them, by MuJoCo's names."""
 
+    @property
+    def rows(self) -> list[np.ndarray]:
+        """All arrays that `step` and `reset` write, a row for each world, where the host has them;
+        none elsewhere.
+        """
+        return []
+
     def synchronize(self) -> None:
         """Wait for the device. On native MuJoCo `step` returns when every thread has."""
         return
@@ -261,7 +269,7 @@ class Simulation(ABC):
             text = f"a torch.bool tensor of shape ({self.nworld},) on {self.device}"
             raise ArgumentError("mask", describe_tensor(mask), text)
 
-    def _keep_peaks(self, mask: Tensor | None) -> None:
+    def keep_peaks(self, mask: Tensor | None) -> None:
         """Keep the peaks that a reset of some worlds would erase; drop all in a full one."""
         contacts, rows, bits = self._erased
         if mask is None:

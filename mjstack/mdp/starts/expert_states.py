@@ -10,13 +10,14 @@ from torch import Tensor
 from mjstack.config.fields import Count, Fraction
 from mjstack.errors import ParameterError, first_line
 from mjstack.files import read_npz, write_npz
-from mjstack.managers.view import EnvView, offers, random_uniform, rows_of
+from mjstack.managers.view import EnvView, offers, random_uniform, repeatable
 
 VIEWS = ("qpos", "qvel", "act", "ctrl")
 FIELD = "field."  # in front of a model field's name
 EPISODE = "episode"
 
 
+@repeatable
 @offers("reset term", starts_midway=True)
 class ExpertStates:
     """Some worlds start in a state of an accepted episode of the expert, in any of its phases; the
@@ -77,17 +78,13 @@ class ExpertStates:
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write the state and the model fields."""
-        at = rows_of(mask)
-        draw = random_uniform(env, self.label, 2, 0.0, 1.0, at=at)
-        over = (env.episode[at].to(draw.dtype) / self._episodes).clamp(0.0, 1.0)
+        draw = random_uniform(env, self.label, 2, 0.0, 1.0)
+        over = (env.episode.to(draw.dtype) / self._episodes).clamp(0.0, 1.0)
         chosen = draw[:, 0] < self._share - self._fall * over
         state = (draw[:, 1] * self._count).long().clamp(max=self._count - 1)
         episode = self._source.index_select(0, state)
         for pairs, rows in ((self._views, state), (self._fields, episode)):
             for view, values in pairs:
-                if isinstance(at, Tensor):
-                    view[at[chosen]] = values[rows[chosen]]
-                    continue
                 into = (mask & chosen).view(-1, *[1] * (view.dim() - 1))
                 torch.where(into, values.index_select(0, rows), view, out=view)
 

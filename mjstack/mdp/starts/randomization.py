@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from mjstack.errors import ParameterError
-from mjstack.managers.view import EnvView, random_uniform, rows_of
-from mjstack.scene.index import ALL, Columns, Rows
+from mjstack.managers.view import EnvView, random_uniform
+from mjstack.scene.index import Columns
 
 
 class Randomized(ABC):
@@ -34,19 +34,16 @@ class Randomized(ABC):
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write the model fields."""
-        at = rows_of(mask)
-        factors = random_uniform(env, self.label, len(self.nominal), *self.ends, at=at)
-        self.write(mask, self.nominal.to(factors) * factors, at)
+        factors = random_uniform(env, self.label, len(self.nominal), *self.ends)
+        self.write(mask, self.nominal.to(factors) * factors)
 
     @abstractmethod
     def read(self) -> Tensor:
         """The numbers of every world, shape ``(nworld, n)``."""
 
     @abstractmethod
-    def write(self, mask: Tensor, values: Tensor, at: Rows = ALL) -> None:
-        """Write numbers ``(nworld, n)``, and what follows from them, into the masked worlds. Where
-        ``at`` has their numbers, the values have their rows alone.
-        """
+    def write(self, mask: Tensor, values: Tensor) -> None:
+        """Write numbers ``(nworld, n)``, and what follows from them, into the masked worlds."""
 
 
 def bounds(name: str, values: Sequence[float]) -> tuple[float, float]:
@@ -82,11 +79,11 @@ class Elements:
         """Values of every world."""
         return self._columns.read(self._view)
 
-    def write(self, mask: Tensor, value: Tensor, at: Rows) -> None:
-        """Write the masked worlds' values, a row for each of ``at``."""
-        self._columns.write_masked(self._view, mask, value, at)
+    def write(self, mask: Tensor, value: Tensor) -> None:
+        """Write the masked worlds' values."""
+        self._columns.write_masked(self._view, mask, value)
 
-    def scale(self, mask: Tensor, factor: Tensor, at: Rows) -> None:
+    def scale(self, mask: Tensor, factor: Tensor) -> None:
         """Write nominal times factor, ``(nworld, elements)``, into the masked worlds."""
         factor = factor.view(*factor.shape, *[1] * (self.nominal.dim() - 1))
-        self.write(mask, self.nominal * factor, at)
+        self.write(mask, self.nominal * factor)
