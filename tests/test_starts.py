@@ -329,14 +329,14 @@ def play_ends(overrides: tuple[str, ...], *, ahead: bool = True) -> tuple[Trace,
     been made before.
     """
     env = build_env(configure(*overrides), nworld=24, backend=Backend.native, device="cpu")
-    write = env._starts.write
+    write = env._starts._write
     written = []
 
     def counted(mask: torch.Tensor) -> bool:
         written.append(ahead and write(mask))
         return written[-1]
 
-    env._starts.write = counted  # type: ignore[method-assign]
+    env._starts._write = counted  # type: ignore[method-assign]
 
     def end(step: int) -> None:
         ending = {20: range(4), 21: (3, 4)}.get(step, (step % 9,))

@@ -15,7 +15,6 @@ class CommandDelay:
     Attributes:
         steps: Control steps by which the commands of each world are late, shape ``(nworld,)``,
             int64.
-        buffers: All that changes.
     """
 
     def __init__(self, env: EnvView) -> None:
@@ -27,7 +26,6 @@ class CommandDelay:
         self.steps = torch.full_like(env.world, self._least)
         most = timing.command_delay + timing.random_delay
         self._waiting = env.sim.ctrl.new_zeros((most, *env.sim.ctrl.shape))
-        self.buffers = (self.steps, self._waiting)
 
     @contextmanager
     def late(self) -> Iterator[None]:

@@ -11,8 +11,8 @@ from mjstack.envs.camera_schedule import CameraSchedule
 from mjstack.envs.command_delay import CommandDelay
 from mjstack.envs.faults import FaultLatch
 from mjstack.envs.outputs import EpisodeStatistics, Outputs, ResetResult, StepResult
-from mjstack.envs.starts import NextStarts
-from mjstack.envs.threads import few_threads, without_autograd
+from mjstack.envs.starts import Starts
+from mjstack.envs.threads import few_threads
 from mjstack.errors import ArgumentError
 from mjstack.managers.action import ActionManager
 from mjstack.managers.episode import ResetManager, RewardManager, TerminationManager
@@ -113,23 +113,27 @@ class Env:
         self._started = False
         self._closed = False
         self.command_delay = CommandDelay(self)
+        self._starts = Starts(self)
+        if self.device.type != "cuda":  # a tenth of their time is what autograd keeps
+            for owner, name in ((self, "_evaluate"), (self._starts, "begin")):
+                setattr(owner, name, torch.inference_mode()(getattr(owner, name)))
 
         # Terms are checked on worlds that have started, because a term may read anything.
         self.reset_manager = ResetManager(self, cfg.reset)
-        self._start_worlds(self._all_worlds)
+        self._starts.start(self._all_worlds)
         self.action_manager = ActionManager(self, cfg.action)
         self.action = self.action_manager.action
         self.previous_action = self.action_manager.previous_action
-        self._success: Term | None = None
+        self.success_term: Term | None = None
         if cfg.task.success is not None:
-            self._success = Term("task.success", cfg.task.success, self)
-            first_value(self._success, self, boolean=True)
+            self.success_term = Term("task.success", cfg.task.success, self)
+            first_value(self.success_term, self, boolean=True)
         self.termination_manager = TerminationManager(self, cfg.termination)
         self.reward_manager = RewardManager(self, cfg.reward)
         self.observation_manager = ObservationManager(self, cfg.observation)
         self.statistics = EpisodeStatistics(self)
-        self._starts = NextStarts(self, self._start_worlds)
-        self._begin(self._all_worlds)
+        self._starts.forget()
+        self._starts.begin(self._all_worlds)
         self._draws = CameraSchedule(self)
         self.images = self._draws.images
         self.cameras = self._draws.cameras
@@ -173,7 +177,7 @@ class Env:
             self.key.fill_(self.seed)
             self.episode.fill_(-1)
             self._starts.forget()
-        self._begin(self._all_worlds if mask is None else mask)
+        self._starts.begin(self._all_worlds if mask is None else mask)
         if mask is None:
             self.faults.clear()
             self._started = True
@@ -239,9 +243,7 @@ class Env:
         )
 
     def recapture(self) -> None:
-        """Have every graph captured anew, and every start made anew, after a change of something
-        that is baked in.
-        """
+        """Have graphs captured and starts made anew, after a change of something baked in."""
         self._version += 1
         self._starts.forget()
 
@@ -283,7 +285,6 @@ class Env:
         with self.command_delay.late():
             self.sim.step(self.cfg.timing.decimation, kinematics=True)
 
-    @without_autograd
     def _evaluate(self, ended: Tensor | None = None, *, last: bool = True) -> Tensor | None:
         """Success, terminations and rewards of the new state; after the ``last`` control step of a
         decision observations and resets.
@@ -307,7 +308,7 @@ class Env:
                 ends.begin()
                 return lost
 
-            succeed = partial(self._success, self) if self._success else lambda: self._no_worlds
+            succeed = partial(self.success_term or (lambda _: self._no_worlds), self)
             begun = [partial(rewards.begin, name) for name in rewards.early]
             achieved, lost, *_ = branches(self.device, succeed, begin_ends, *begun, *early)
             # None where the host can see that there are none
@@ -349,33 +350,10 @@ class Env:
 
         def restart() -> None:
             self.statistics.update(done)
-            self._begin(done)
+            self._starts.begin(done)
 
         self._draws.draw_ended(done)
         if ending:
             where_any(done, restart)
         elif broken is not None:
             self._outputs.restore_observations()
-
-    @without_autograd
-    def _begin(self, mask: Tensor) -> None:
-        """Begin the masked worlds' next episode: start, clear what managers keep, observe."""
-        ready = self._starts.write(mask)
-        if not ready:
-            self._start_worlds(mask)
-        for manager in (self.action_manager, self.termination_manager, self.reward_manager):
-            manager.reset(mask)
-        self.success.masked_fill_(mask, False)
-        if self._success is not None:
-            self._success.reset(mask)
-        if not ready:
-            in_one_pass(partial(self.observation_manager.refresh, mask))
-
-    @without_autograd
-    def _start_worlds(self, mask: Tensor) -> None:
-        """Start the masked worlds' next episode, from seed, world and episode alone."""
-        self.episode += mask
-        self.episode_step.masked_fill_(mask, 0)
-        self.reset_manager.reset(mask)
-        self.sim.kinematics(mask)
-        self.command_delay.reset(mask)

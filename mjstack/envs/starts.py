@@ -1,8 +1,6 @@
-"""Starts of episodes to come, made for all worlds at once on native MuJoCo."""
+"""How episodes begin; on native MuJoCo the starts of all worlds are made at once."""
 
-from collections.abc import Callable
 from functools import partial
-from itertools import chain
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,54 +9,65 @@ from torch import Tensor
 
 from mjstack.managers.episode import required_fields
 from mjstack.managers.term import in_one_pass
+from mjstack.sim.native import NativeSimulation
 
 if TYPE_CHECKING:
     from mjstack.envs.env import Env
 
-_FEW = 8  # one of so many worlds: where more end at once, nothing is gained
 
+class Starts:
+    """Begins episodes of an environment.
 
-class NextStarts:
-    """How the next episode of each world starts, and what is observed then.
-
-    Python takes as long for the start of one world as for those of all. So the first world without
-    a start has all of them made, while the worlds' own state is put aside, and a world that ends
-    gets its own copied. Terms that are not `repeatable` may look at more than there is ahead of
-    time; with one of them, or on MJWarp, nothing is made.
+    On native MuJoCo Python takes as long for one start as for all. So the first world that needs
+    one has all made, while the worlds are put aside, and a world that ends gets its own copied. Not
+    so where a term is not `repeatable`, or where fields are not those that reset terms write.
     """
 
-    def __init__(self, env: "Env", start: Callable[[Tensor], None]) -> None:
-        """Find what a start consists of.
-
-        Args:
-            env: The environment, with its managers.
-            start: Puts the masked worlds at the start of their next episode.
-        """
+    def __init__(self, env: "Env") -> None:
+        """Take the environment, which may have no managers but for resets yet."""
         self._env = env
-        self._start = start
-        sim = env.sim
-        observations = env.observation_manager
-        terms = chain(env.reset_manager.terms, observations.terms)
-        # Somebody else may write a field that no term does
-        no_more = sim.fields.keys() == set(required_fields(env.cfg.reset))
-        ahead = sim.rows and no_more and all(term.repeatable for term in terms)
-        self._rows = [*sim.rows, *map(Tensor.numpy, observations.buffers)] if ahead else []
-        self._starts: list[np.ndarray] = []
-        self.forget()
+        self._rows: list[np.ndarray] = []
 
     def forget(self) -> None:
-        """Have all starts made anew."""
-        self._episodes = np.full(self._env.nworld, -1)  # whose starts they are
+        """Have all starts made anew, with the managers that there are now."""
+        env = self._env
+        terms = (*env.reset_manager.terms, *env.observation_manager.terms)
+        fields = set(required_fields(env.cfg.reset))
+        ahead = all(term.repeatable for term in terms) and env.sim.fields.keys() == fields
+        if ahead and isinstance(env.sim, NativeSimulation):
+            groups = map(Tensor.numpy, env.observation_manager.groups.values())
+            self._rows = [*env.sim.rows, *groups]
+        self._episodes = np.full(env.nworld, -1)  # whose starts they are
+        self._starts: list[np.ndarray] = []
 
-    def write(self, mask: Tensor) -> bool:
-        """Start the next episode of the masked worlds, shape ``(nworld,)``, bool; or leave all as
-        they are and return False.
-        """
-        if not self._rows:
-            return False
+    def begin(self, mask: Tensor) -> None:
+        """Begin and observe the next episode of the masked worlds, shape ``(nworld,)``, bool."""
+        env = self._env
+        ready = bool(self._rows) and self._write(mask)
+        if not ready:
+            self.start(mask)
+        env.command_delay.reset(mask)
+        for manager in (env.action_manager, env.termination_manager, env.reward_manager):
+            manager.reset(mask)
+        env.success.masked_fill_(mask, False)
+        if env.success_term is not None:
+            env.success_term.reset(mask)
+        if not ready:
+            in_one_pass(partial(env.observation_manager.refresh, mask))
+
+    def start(self, mask: Tensor) -> None:
+        """Put the masked worlds at their next start, from seed, world and episode alone."""
+        env = self._env
+        env.episode += mask
+        env.episode_step.masked_fill_(mask, 0)
+        env.reset_manager.reset(mask)
+        env.sim.kinematics(mask)
+
+    def _write(self, mask: Tensor) -> bool:
+        """What `start` does and what is observed then, unless too many worlds end."""
         env = self._env
         worlds = np.flatnonzero(mask.numpy())
-        if len(worlds) * _FEW > env.nworld:
+        if 8 * len(worlds) > env.nworld:  # nothing would be gained
             return False
         episode = env.episode.numpy()
         if (self._episodes[worlds] != episode[worlds] + 1).any():
@@ -68,22 +77,16 @@ class NextStarts:
             array[worlds] = starts[worlds]
         episode[worlds] += 1
         env.episode_step.masked_fill_(mask, 0)
-        env.command_delay.reset(mask)
         return True
 
     def _make_all(self) -> None:
         env = self._env
-        others = (
-            env.episode,
-            env.episode_step,
-            env.action_manager.last_two,
-            *env.command_delay.buffers,
-        )
-        arrays = [*self._rows, *map(Tensor.numpy, others)]
+        counters = (env.episode, env.episode_step, env.action, env.previous_action)
+        arrays = [*self._rows, *map(Tensor.numpy, counters)]
         aside = [array.copy() for array in arrays]
         everywhere = torch.ones(env.nworld, dtype=torch.bool)
         try:
-            self._start(everywhere)
+            self.start(everywhere)
             env.action_manager.reset(everywhere)
             in_one_pass(partial(env.observation_manager.refresh, everywhere))
             self._episodes = env.episode.numpy().copy()

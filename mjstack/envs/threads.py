@@ -1,9 +1,7 @@
 """Threads of torch on the CPU."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import wraps
-from typing import Any
 
 import torch
 
@@ -25,16 +23,3 @@ def few_threads(device: torch.device, nworld: int) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-def without_autograd(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Run a method in torch's inference mode on the CPU, where what autograd keeps of each small
-    tensor is a tenth of its time. ``self.device`` says where.
-    """
-    lean = torch.inference_mode()(method)
-
-    @wraps(method)
-    def run(self: Any, *args: Any, **kwargs: Any) -> Any:
-        return (method if self.device.type == "cuda" else lean)(self, *args, **kwargs)
-
-    return run

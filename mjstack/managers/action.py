@@ -47,7 +47,6 @@ class ActionManager:
         action: The last action, shape ``(nworld, action_dim)``, in the type of the simulation's
             floats.
         previous_action: The one before. Both are zero after a reset.
-        last_two: Both in one tensor.
         low: Smallest meaningful action, shape ``(action_dim,)``.
         high: Largest, shape ``(action_dim,)``.
     """
@@ -72,8 +71,8 @@ class ActionManager:
         terms = self.terms.values()
         dims = [term.dim for term in terms]
         self.action_dim = sum(dims)
-        self.last_two = env.sim.qpos.new_zeros((2, env.nworld, self.action_dim))
-        self.action, self.previous_action = self.last_two
+        self._last_two = env.sim.qpos.new_zeros((2, env.nworld, self.action_dim))
+        self.action, self.previous_action = self._last_two
         self._processed = self.action.clone()
         self._whole = not self.action.is_cuda  # as far as it is known
         self._parts = self.action.split(dims, dim=1) if terms else ()
@@ -136,7 +135,7 @@ class ActionManager:
 
     def reset(self, mask: Tensor) -> None:
         """Zero the actions of the masked worlds."""
-        zero_rows(mask, self.last_two)
+        zero_rows(mask, self._last_two)
 
     def __str__(self) -> str:
         terms = self.terms.items()

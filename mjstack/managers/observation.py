@@ -86,7 +86,6 @@ class _Group:
             torch.tensor(columns, dtype=torch.int64, device=env.device)
             for columns in (shift, repeat)
         )
-        self.past = torch.zeros((env.nworld, self.dim), dtype=torch.float32, device=env.device)
 
     def add_noise(self, step: Tensor) -> None:
         """Add the group's noise to a step."""
@@ -105,21 +104,16 @@ class _Group:
     def append(self, out: Tensor, step: Tensor) -> None:
         """Take in a new step of every world, and forget the oldest."""
         step = step[:, self._columns]
-        if not self.remembers:
-            out.copy_(step)
-            return
-        torch.index_select(torch.cat((self.past, step), dim=1), 1, self._shift, out=self.past)
-        out.copy_(self.past)
+        if self.remembers:
+            step = torch.cat((out, step), dim=1).index_select(1, self._shift)
+        out.copy_(step)
 
     def restart(self, out: Tensor, step: Tensor, mask: Tensor) -> None:
         """The whole history of the masked worlds becomes the current step."""
         step = step[:, self._columns]
-        into = self.past if self.remembers else out
         if self.remembers:
             step = step.index_select(1, self._repeat)
-        torch.where(mask[:, None], step, into, out=into)
-        if self.remembers:
-            out.copy_(self.past)
+        torch.where(mask[:, None], step, out, out=out)
 
 
 def slide_joints(model: mujoco.MjModel, joints: Sequence[str]) -> list[bool]:
@@ -145,9 +139,8 @@ class ObservationManager:
         group_dims: Width of each group.
         term_dims: Width of each term, history included, by group and name, in the order of the
             columns.
-        groups: The tensors, by group. They are written anew at every step.
+        groups: The tensors, by group, which are all that the manager keeps.
         terms: All terms.
-        buffers: All that `compute` and `refresh` write, each ``(nworld, n)``.
         remembers: Whether a term has a history, which needs every control step.
         ignores_success: Whether all terms are marked as such.
     """
@@ -173,10 +166,6 @@ class ObservationManager:
         self.groups = {name: empty.repeat(1, dim) for name, dim in self.group_dims.items()}
         self._parts = [p for group in self._groups.values() for p in group.parts.values()]
         self.terms = [part.term for part in self._parts]
-        self.buffers = [
-            *self.groups.values(),
-            *(g.past for g in self._groups.values() if g.remembers),
-        ]
         self.ignores_success = all(term.ignores_success for term in self.terms)
         self._clips = any(part.cfg.clip for part in self._parts)
         self._scales = any(part.cfg.scale != 1.0 for part in self._parts)

@@ -90,9 +90,8 @@ def ignores_success(term: Any) -> Any:
 
 
 def repeatable(term: Any) -> Any:
-    """Mark a reset or observation term that reads nothing but the simulation, the last action, what
-    never changes, and random numbers of `random_uniform`: native MuJoCo calls it ahead of time, for
-    many episodes at once. A subclass, or a function that wraps it, is not marked.
+    """Mark a reset or observation term that reads the simulation, the last action, `random_uniform`
+    and what never changes, so that it may be called for an episode that has not begun.
     """
     term.repeatable = term
     return term
@@ -134,9 +133,8 @@ def random_uniform(
     if env.device.type == "cuda":  # one kernel; it loads Warp, which native runs do not need
         from mjstack.sim.draws import draw_uniform
 
-        return draw_uniform(env.key, stream, env.world, env.episode, step, size, low, high).to(
-            dtype
-        )
+        draw = draw_uniform(env.key, stream, env.world, env.episode, step, size, low, high)
+        return draw.to(dtype)
     draw = uniform(env.seed, stream, env.world, env.episode, step, size).to(dtype)
     if (low, high) == (-1.0, 1.0):  # then all of the below is exact, and changes nothing
         return draw

@@ -10,12 +10,11 @@ from torch import Tensor
 
 from mjstack.config.fields import Fraction, NotNegative
 from mjstack.errors import MjstackError, ParameterError, suggest
-from mjstack.managers.view import EnvView, random_uniform, repeatable, uses_fields
+from mjstack.managers.view import EnvView, random_uniform, uses_fields
 from mjstack.math import quat_mul
 from mjstack.mdp.starts.randomization import Elements, bounds
 
 
-@repeatable
 @uses_fields("light_pos", "light_dir", "light_diffuse")
 class Light:
     """Moves every light, still aimed at the same point, and changes its brightness and colour."""
@@ -69,7 +68,6 @@ class Light:
         self._diffuse.write(mask, (self._diffuse.nominal * color).clamp(0.0, 1.0))
 
 
-@repeatable
 @uses_fields("geom_rgba")
 class Colors:
     """Changes the colours of things: the scene's objects, its table, its floor."""
@@ -111,7 +109,6 @@ class Colors:
             look.write(mask, value)
 
 
-@repeatable
 @uses_fields("cam_pos", "cam_quat")
 class CameraPoses:
     """Moves and turns every camera."""
@@ -143,7 +140,6 @@ class CameraPoses:
         self._quat.write(mask, quat_mul(quat, turn))
 
 
-@repeatable
 @uses_fields("cam_fovy")
 class FieldOfView:
     """Scales the vertical field of view of every camera."""

@@ -7,13 +7,13 @@ import torch
 from torch import Tensor
 
 from mjstack.managers.term import shared
-from mjstack.managers.view import EnvView, ignores_success, offers, repeatable
+from mjstack.managers.view import EnvView, ignores_success, offers
 from mjstack.mdp.geometry import jaw_forces, place_xy, pose_w, robot
 
 
 def _in(unit: str | Sequence[str]) -> Callable[[Any], Any]:
     """Mark an observation of the state alone with its unit."""
-    return lambda term: repeatable(ignores_success(offers("observation term", unit=unit)(term)))
+    return lambda term: ignores_success(offers("observation term", unit=unit)(term))
 
 
 _in_metres = _in("m")

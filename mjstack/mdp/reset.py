@@ -10,14 +10,7 @@ from typing_extensions import override
 from mjstack.config.fields import Count, NotNegative
 from mjstack.config.functions import offered
 from mjstack.errors import ParameterError
-from mjstack.managers.view import (
-    EnvView,
-    offers,
-    random_uniform,
-    repeatable,
-    uses_fields,
-    zero_rows,
-)
+from mjstack.managers.view import EnvView, offers, random_uniform, uses_fields, zero_rows
 from mjstack.math import quat_from_yaw, quat_mul
 from mjstack.mdp.geometry import Pose, robot, write_robot
 from mjstack.mdp.starts.placement import GAP, Placement, may_meet, require_reach
@@ -25,7 +18,6 @@ from mjstack.mdp.starts.randomization import Elements, Randomized, bounds
 from mjstack.scene.index import Columns, joint_limits
 
 
-@repeatable
 @offers("reset term")
 def home(env: EnvView, mask: Tensor, *, pose: Pose = "home") -> None:
     """Put the robot at its home, or at ``start``, at rest. Writes qpos, qvel and ctrl."""
@@ -33,7 +25,6 @@ def home(env: EnvView, mask: Tensor, *, pose: Pose = "home") -> None:
     zero_rows(mask, env.sim.qvel)
 
 
-@repeatable
 @offers("reset term", joint_noise=True)
 class JointNoise:
     """Adds uniform noise to the robot's joint positions and targets, within the joints' ranges."""
@@ -61,7 +52,6 @@ class JointNoise:
         write_robot(env, mask, torch.clamp(command, self._low, self._high))
 
 
-@repeatable
 @uses_fields("qpos0")
 class JointZeros:
     """Moves the zero of every joint by a random amount that no sensor shows, as the calibrations of
@@ -83,7 +73,6 @@ class JointZeros:
         robot(env).qpos.write_masked(env.sim.fields["qpos0"], mask, self._nominal - moved)
 
 
-@repeatable
 @offers("reset term")
 class JitterObjects:
     """Moves each object a little off its nominal position."""
@@ -112,7 +101,6 @@ class JitterObjects:
         _write_objects(env, mask, self._poses, self._xy * xy, self._yaw * yaw)
 
 
-@repeatable
 @offers("reset term", places_objects=True)
 class RandomizeObjects:
     """Puts each object anywhere in a region around its nominal position where nothing is in its
@@ -178,7 +166,6 @@ class RandomizeObjects:
         _write_objects(env, mask, self._poses, offsets, self._yaw * first[..., 0])
 
 
-@repeatable
 @uses_fields("body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0")
 class ObjectMass(Randomized):
     """Scales each object's mass and inertia.
@@ -214,7 +201,6 @@ class ObjectMass(Randomized):
         self._inverse_dofs.scale(mask, (1.0 / factor).repeat_interleave(6, dim=1))
 
 
-@repeatable
 @uses_fields("geom_friction")
 class ObjectFriction(Randomized):
     """Draws the sliding friction of each object, and of the grip where the jaws have a coefficient
@@ -256,7 +242,6 @@ class ObjectFriction(Randomized):
         self._lowered.write_masked(self._view, mask, self._least)
 
 
-@repeatable
 @uses_fields("actuator_gainprm", "actuator_biasprm")
 class ActuatorGains(Randomized):
     """Scales the stiffness and damping of each of the robot's position servos by one factor per

@@ -157,8 +157,8 @@ class NativeSimulation(Simulation):
         return [*self._poses, *self._copies.values()]
 
     @property
-    @override
     def rows(self) -> list[np.ndarray]:
+        """All that a step or a reset writes, a row for each world."""
         counters = (self._counts, self._steps)
         return [self.batch.state, *self._derived, *counters, *self._fields.values()]
 

@@ -6,7 +6,6 @@ from enum import IntFlag
 from functools import cached_property
 
 import mujoco
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -244,13 +243,6 @@ class Simulation(ABC):
     @abstractmethod
     def option_values(self) -> dict[str, float | int | str]:
         """The physics options as this backend holds them, by MuJoCo's names."""
-
-    @property
-    def rows(self) -> list[np.ndarray]:
-        """All arrays that `step` and `reset` write, a row for each world, where the host has them;
-        none elsewhere.
-        """
-        return []
 
     def synchronize(self) -> None:
         """Wait for the device. On native MuJoCo `step` returns when every thread has."""

@@ -3,13 +3,12 @@
 from torch import Tensor
 
 from mjstack.errors import require_names
-from mjstack.managers.view import EnvView, ignores_success, offers, repeatable
+from mjstack.managers.view import EnvView, ignores_success, offers
 from mjstack.mdp.geometry import pose_w
 from mjstack.tasks.box import BoxCheck
 
 
 @ignores_success
-@repeatable
 @offers("observation term", unit="m")
 class ToSlot:
     """From an object's centre to where it rests at its place in the box [m], shape ``(nworld,

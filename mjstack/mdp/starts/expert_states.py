@@ -10,14 +10,13 @@ from torch import Tensor
 from mjstack.config.fields import Count, Fraction
 from mjstack.errors import ParameterError, first_line
 from mjstack.files import read_npz, write_npz
-from mjstack.managers.view import EnvView, offers, random_uniform, repeatable
+from mjstack.managers.view import EnvView, offers, random_uniform
 
 VIEWS = ("qpos", "qvel", "act", "ctrl")
 FIELD = "field."  # in front of a model field's name
 EPISODE = "episode"
 
 
-@repeatable
 @offers("reset term", starts_midway=True)
 class ExpertStates:
     """Some worlds start in a state of an accepted episode of the expert, in any of its phases; the

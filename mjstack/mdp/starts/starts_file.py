@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mjstack.errors import ArgumentError, ConfigError, ParameterError, suggest
 from mjstack.files import read_npz, write_npz
-from mjstack.managers.view import EnvView, offers, repeatable, uses_fields
+from mjstack.managers.view import EnvView, offers, uses_fields
 from mjstack.math import quat_mul
 from mjstack.mdp.geometry import Pose, place_xy, pose_w, robot, write_robot
 from mjstack.mdp.observation import joint_pos
@@ -107,7 +107,6 @@ class StartsTable:
         return self._error(self._key, ", ".join(where), expected, fix)
 
 
-@repeatable
 @offers(reads_file=True)
 @uses_fields(*(name for kind in _RANDOMIZED for name in kind.model_fields))
 class FromStartsFile:
