@@ -35,15 +35,14 @@ class Starts:
         fields = set(required_fields(env.cfg.reset))
         ahead = all(term.repeatable for term in terms) and env.sim.fields.keys() == fields
         if ahead and isinstance(env.sim, NativeSimulation):
-            groups = map(Tensor.numpy, env.observation_manager.groups.values())
-            self._rows = [*env.sim.rows, *groups]
+            self._rows = [*env.sim.rows, *map(Tensor.numpy, env.observation_manager.buffers)]
         self._episodes = np.full(env.nworld, -1)  # whose starts they are
         self._starts: list[np.ndarray] = []
 
     def begin(self, mask: Tensor) -> None:
         """Begin and observe the next episode of the masked worlds, shape ``(nworld,)``, bool."""
         env = self._env
-        ready = bool(self._rows) and self._write(mask)
+        ready = self._write(mask)
         if not ready:
             self.start(mask)
         env.command_delay.reset(mask)
@@ -65,6 +64,8 @@ class Starts:
 
     def _write(self, mask: Tensor) -> bool:
         """What `start` does and what is observed then, unless too many worlds end."""
+        if not self._rows:
+            return False
         env = self._env
         worlds = np.flatnonzero(mask.numpy())
         if 8 * len(worlds) > env.nworld:  # nothing would be gained

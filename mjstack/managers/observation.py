@@ -82,6 +82,8 @@ class _Group:
             repeat += [*newest] * part.cfg.history
             start += part.width
         self.remembers = start < self.dim
+        width = self.dim if self.remembers else 0
+        self.past = torch.zeros((env.nworld, width), dtype=torch.float32, device=env.device)
         self._shift, self._repeat = (
             torch.tensor(columns, dtype=torch.int64, device=env.device)
             for columns in (shift, repeat)
@@ -105,7 +107,8 @@ class _Group:
         """Take in a new step of every world, and forget the oldest."""
         step = step[:, self._columns]
         if self.remembers:
-            step = torch.cat((out, step), dim=1).index_select(1, self._shift)
+            steps = torch.cat((self.past, step), dim=1)
+            step = torch.index_select(steps, 1, self._shift, out=self.past)
         out.copy_(step)
 
     def restart(self, out: Tensor, step: Tensor, mask: Tensor) -> None:
@@ -113,6 +116,7 @@ class _Group:
         step = step[:, self._columns]
         if self.remembers:
             step = step.index_select(1, self._repeat)
+            torch.where(mask[:, None], step, self.past, out=self.past)
         torch.where(mask[:, None], step, out, out=out)
 
 
@@ -139,7 +143,8 @@ class ObservationManager:
         group_dims: Width of each group.
         term_dims: Width of each term, history included, by group and name, in the order of the
             columns.
-        groups: The tensors, by group, which are all that the manager keeps.
+        groups: The tensors, by group. They are written anew at every step.
+        buffers: All that the manager writes, each ``(nworld, n)``.
         terms: All terms.
         remembers: Whether a term has a history, which needs every control step.
         ignores_success: Whether all terms are marked as such.
@@ -166,6 +171,7 @@ class ObservationManager:
         self.groups = {name: empty.repeat(1, dim) for name, dim in self.group_dims.items()}
         self._parts = [p for group in self._groups.values() for p in group.parts.values()]
         self.terms = [part.term for part in self._parts]
+        self.buffers = [*self.groups.values(), *(group.past for group in self._groups.values())]
         self.ignores_success = all(term.ignores_success for term in self.terms)
         self._clips = any(part.cfg.clip for part in self._parts)
         self._scales = any(part.cfg.scale != 1.0 for part in self._parts)
