@@ -308,7 +308,14 @@ HISTORY = (
     "timing.random_delay=2",
     "timing.policy_decimation=3",
 )
-ENDS = {"ends": (), "box": ("task=box",), "fields": ("reset=randomized",), "memory": HISTORY}
+UNMARKED = "+observation.policy.terms.height={func: test_starts.height_of_red, noise: 0.01}"
+ENDS = {
+    "ends": (),
+    "box": ("task=box",),
+    "fields": ("reset=randomized",),
+    "memory": HISTORY,
+    "unmarked observation": (UNMARKED,),
+}
 
 
 @pytest.mark.parametrize("overrides", ENDS.values(), ids=ENDS)
@@ -367,6 +374,11 @@ class Nominal(JitterObjects):
         self.calls.append(int(mask.sum()))
         if self.interrupted:
             raise KeyboardInterrupt
+
+
+def height_of_red(env: EnvView) -> torch.Tensor:
+    """An observation term of somebody who knows no marks."""
+    return env.sim.part("qpos", env.index.object_columns("red")[0])[:, 2]
 
 
 class Unmarked(Nominal):

@@ -19,8 +19,8 @@ class Starts:
     """Begins episodes of an environment.
 
     On native MuJoCo Python takes as long for one start as for all. So the first world that needs
-    one has all made, while the worlds are put aside, and a world that ends gets its own copied. Not
-    so where a term is not `repeatable`, or where fields are not those that reset terms write.
+    one has all made, and observed, while the worlds are put aside; a world that ends gets its own
+    copied. This holds for terms that are `repeatable`, and if reset terms write all fields.
     """
 
     def __init__(self, env: "Env") -> None:
@@ -31,11 +31,14 @@ class Starts:
     def forget(self) -> None:
         """Have all starts made anew, with the managers that there are now."""
         env = self._env
-        terms = (*env.reset_manager.terms, *env.observation_manager.terms)
-        fields = set(required_fields(env.cfg.reset))
-        ahead = all(term.repeatable for term in terms) and env.sim.fields.keys() == fields
-        if ahead and isinstance(env.sim, NativeSimulation):
-            self._rows = [*env.sim.rows, *map(Tensor.numpy, env.observation_manager.buffers)]
+        ahead, self._observed = (
+            all(term.repeatable for term in manager.terms)
+            for manager in (env.reset_manager, env.observation_manager)
+        )
+        same_fields = env.sim.fields.keys() == set(required_fields(env.cfg.reset))
+        if ahead and same_fields and isinstance(env.sim, NativeSimulation):
+            observed = env.observation_manager.buffers if self._observed else ()
+            self._rows = [*env.sim.rows, *map(Tensor.numpy, observed)]
         self._episodes = np.full(env.nworld, -1)  # whose starts they are
         self._starts: list[np.ndarray] = []
 
@@ -51,7 +54,7 @@ class Starts:
         env.success.masked_fill_(mask, False)
         if env.success_term is not None:
             env.success_term.reset(mask)
-        if not ready:
+        if not (ready and self._observed):
             in_one_pass(partial(env.observation_manager.refresh, mask))
 
     def start(self, mask: Tensor) -> None:
@@ -88,8 +91,9 @@ class Starts:
         everywhere = torch.ones(env.nworld, dtype=torch.bool)
         try:
             self.start(everywhere)
-            env.action_manager.reset(everywhere)
-            in_one_pass(partial(env.observation_manager.refresh, everywhere))
+            if self._observed:
+                env.action_manager.reset(everywhere)
+                in_one_pass(partial(env.observation_manager.refresh, everywhere))
             self._episodes = env.episode.numpy().copy()
             self._starts = [array.copy() for array in self._rows]
         finally:

@@ -95,8 +95,7 @@ class JitterObjects:
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write qpos."""
-        count = 3 * len(env.index.objects)
-        draws = random_uniform(env, self.label, count).unflatten(1, (-1, 3))
+        draws = random_uniform(env, self.label, 3 * len(env.index.objects)).unflatten(1, (-1, 3))
         xy, yaw = draws[..., :2], draws[..., 2]
         _write_objects(env, mask, self._poses, self._xy * xy, self._yaw * yaw)
 

@@ -55,6 +55,7 @@ class NativeSimulation(Simulation):
 
     Attributes:
         batch: The worlds in MuJoCo's hands.
+        rows: All that a step or a reset writes, a row for each world.
     """
 
     backend = "native"
@@ -122,6 +123,8 @@ class NativeSimulation(Simulation):
         self.fields = Fields(
             {name: torch.from_numpy(values) for name, values in self._fields.items()}
         )
+        counters = (self._counts, self._steps)
+        self.rows = [batch.state, *self._derived, *counters, *self._fields.values()]
         self._derive: Callable[[], None] | None = None
         if not self._fields.keys().isdisjoint(SIMPLE_FIELDS):
             self._derive = simple_inertia(m, self._fields, batch.expand("dof_M0"))
@@ -155,12 +158,6 @@ class NativeSimulation(Simulation):
     def _derived(self) -> list[np.ndarray]:
         """What a step writes besides the state."""
         return [*self._poses, *self._copies.values()]
-
-    @property
-    def rows(self) -> list[np.ndarray]:
-        """All that a step or a reset writes, a row for each world."""
-        counters = (self._counts, self._steps)
-        return [self.batch.state, *self._derived, *counters, *self._fields.values()]
 
     @property
     def world_bytes(self) -> int:

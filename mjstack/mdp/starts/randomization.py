@@ -3,6 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from functools import partial
 from typing import ClassVar
 
 import torch
@@ -63,25 +64,21 @@ class Elements:
     Attributes:
         dtype: The field's type.
         nominal: The model's own values of them.
+        read: Reads the values of every world.
+        write: Writes values into the masked worlds, as ``(mask, value)``.
     """
 
     def __init__(
         self, env: EnvView, name: str, elements: Sequence[int], *, exact: bool = True
     ) -> None:
         """Find them; nominal values are ``exact`` in float64, or of the field's type."""
-        self._view = env.sim.fields[name]
-        self._columns = Columns(elements, env.device)
-        self.dtype = self._view.dtype
+        view = env.sim.fields[name]
+        columns = Columns(elements, env.device)
+        self.read = partial(columns.read, view)
+        self.write = partial(columns.write_masked, view)
+        self.dtype = view.dtype
         nominal = torch.from_numpy(getattr(env.sim.model, name)[list(elements)].copy())
         self.nominal = nominal.to(env.device, torch.float64 if exact else self.dtype)
-
-    def read(self) -> Tensor:
-        """Values of every world."""
-        return self._columns.read(self._view)
-
-    def write(self, mask: Tensor, value: Tensor) -> None:
-        """Write the masked worlds' values."""
-        self._columns.write_masked(self._view, mask, value)
 
     def scale(self, mask: Tensor, factor: Tensor) -> None:
         """Write nominal times factor, ``(nworld, elements)``, into the masked worlds."""
