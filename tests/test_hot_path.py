@@ -54,7 +54,7 @@ PATHS: dict[str, dict[str, str] | None] = {
         "JointNoise JointZeros JitterObjects RandomizeObjects": "__call__",
         "ObjectMass ObjectFriction ActuatorGains": "read write",
     },
-    "mdp/starts/randomization.py": {"Randomized": "__call__", "Elements": "read write scale"},
+    "mdp/starts/randomization.py": {"Randomized": "__call__", "Elements": "scale"},
     "mdp/starts/starts_file.py": {"FromStartsFile": "__call__"},
     "mdp/starts/expert_states.py": {"ExpertStates": "__call__"},
     "episodes/recorder.py": {"Recorder": "update", "": "_read_world read_commands read_state"},

@@ -176,9 +176,9 @@ class Env:
             self.seed = check_seed(seed, masked=mask is not None)
             self.key.fill_(self.seed)
             self.episode.fill_(-1)
-            self._starts.forget()
         self._starts.begin(self._all_worlds if mask is None else mask)
         if mask is None:
+            self._starts.forget()
             self.faults.clear()
             self._started = True
         self._draws.draw_started(mask)

@@ -28,6 +28,7 @@ from mjstack.episodes.rollout import (
     Reset,
     play_episode,
     reset_worlds,
+    rollout,
 )
 from mjstack.errors import ConfigError
 from mjstack.managers.episode import required_fields
@@ -267,6 +268,11 @@ class Stage:
         env = self.start(sim, reset, **options)
         return play_episode(env, self.driver(env), observers, advance=self.progress.advance)
 
+    def drive(self, sim: Simulation, reset: Reset) -> None:
+        """Roll out one episode that nobody judges."""
+        env = self.start(sim, reset)
+        rollout(env, self.driver(env), advance=self.progress.advance)
+
     # Simulations
 
     def batch_simulation(self, nworld: int) -> Simulation:
@@ -307,7 +313,7 @@ class Stage:
         if "task" not in self.measured:
             source = f"the driven task in {self.measuring_nworld} worlds"
             with closing(self.measuring_worlds()) as worlds:
-                task = worlds.play(lambda sim: self.play(sim, self.cfg.reset))
+                task = worlds.play(lambda sim: self.drive(sim, self.cfg.reset))
             self.measured["task"] = measured_sizes(self.cfg, task, source)
             self.progress.print_line(str(self.measured["task"]))
         return apply_configured(self.cfg, self.measured["task"])

@@ -62,8 +62,8 @@ def run_capacity(run: Run) -> list[GateResult]:
     steps = t.random_steps or min(most, cfg.task.episode_steps)
     plays: dict[str, Play] = {
         "random_actions": partial(play_random_actions, cfg, steps, advance=stage.progress.advance),
-        "randomized": lambda sim: stage.play(sim, t.reset),
-        "task": lambda sim: stage.play(sim, cfg.reset),
+        "randomized": lambda sim: stage.drive(sim, t.reset),
+        "task": lambda sim: stage.drive(sim, cfg.reset),
     }
     loads = {}
     with closing(stage.measuring_worlds(t.reset)) as worlds:
