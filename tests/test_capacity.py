@@ -39,7 +39,6 @@ from mjstack.envs.buffers import (
     read_peaks,
     recommend_sizes,
 )
-from mjstack.episodes.rollout import Episode
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Progress, Stage
 from mjstack.errors import FaultError, Unreachable
@@ -406,8 +405,8 @@ def test_worlds_of_the_recommended_sizes_have_the_same_peaks(
     stage = run.stage
     other = run.cfg.gate.capacity.reset
     plays: dict[str, Callable[[Simulation], object]] = {
-        "": lambda sim: stage.play(sim, run.cfg.reset),
-        "randomized.": lambda sim: stage.play(sim, other),
+        "": lambda sim: stage.drive(sim, run.cfg.reset),
+        "randomized.": lambda sim: stage.drive(sim, other),
         "random_actions.": partial(play_random_actions, run.cfg, 20),
     }
     for prefix, play in plays.items():
@@ -461,14 +460,14 @@ def test_defaults_too_small_for_environments_fail(new_run: NewRun) -> None:
 def test_native_tells_what_it_cannot_know_and_a_layout_out_of_reach_leaves_the_rest(
     new_run: NewRun, monkeypatch: Patch
 ) -> None:
-    play = Stage.play
+    drive = Stage.drive
 
-    def unreachable(stage: Stage, sim: Simulation, reset: dict) -> Episode:
+    def unreachable(stage: Stage, sim: Simulation, reset: dict) -> None:
         if reset is stage.cfg.gate.capacity.reset:
             raise Unreachable(0, "grasp_red", "red", (0.9, 0.0, 0.0), 0.3, 5e-4)
-        return play(stage, sim, reset)
+        drive(stage, sim, reset)
 
-    monkeypatch.setattr(Stage, "play", unreachable)
+    monkeypatch.setattr(Stage, "drive", unreachable)
     _, result, lines = measure(new_run, *NATIVE, "nworld=1", "gate.capacity.random_steps=5")
     assert result.status is Status.passed
     assert any("randomised starts: not measured: world 0" in text for text in result.details)
@@ -504,7 +503,7 @@ def made_up(monkeypatch: Patch, randomized: dict, play: Callable[[str], Workload
         return "randomized" if reset is randomized else "task"
 
     monkeypatch.setattr("mjstack.episodes.stage.MeasuringWorlds", Worlds)
-    monkeypatch.setattr(Stage, "play", episode)
+    monkeypatch.setattr(Stage, "drive", episode)
     monkeypatch.setattr(capacity_module, "play_random_actions", lambda *_, **__: "random_actions")
 
 
