@@ -3,7 +3,9 @@
 import hashlib
 import math
 from collections.abc import Sequence
+from functools import wraps
 from pathlib import Path
+from types import SimpleNamespace
 from typing import ClassVar
 
 import mujoco
@@ -24,9 +26,11 @@ from environments import (
 )
 
 import mjstack
-from mjstack.config.schema import Backend, Config
+from mjstack.config.schema import Backend, Config, TermCfg
 from mjstack.envs import Env, build_env
 from mjstack.managers import EnvView, repeatable
+from mjstack.managers.term import Term
+from mjstack.mdp.observation import joint_pos
 from mjstack.mdp.reset import JitterObjects
 from mjstack.mdp.starts.placement import Placement, may_meet
 
@@ -303,31 +307,37 @@ def check_zeros(env: Env, width: float) -> None:
 
 
 HISTORY = (
-    "+observation.policy.terms.joint_pos.history=3",
+    "+observation.policy.terms.joint_pos.history=5",
     "timing.command_delay=1",
     "timing.random_delay=2",
     "timing.policy_decimation=3",
 )
 UNMARKED = "+observation.policy.terms.height={func: test_starts.height_of_red, noise: 0.01}"
+SUCCESS = (
+    "task.success={func: test_starts.always, params: {}}",
+    "~termination.success",
+    "+observation.policy.terms.success={func: mjstack.mdp.reward.success}",
+)
 ENDS = {
     "ends": (),
     "box": ("task=box",),
     "fields": ("reset=randomized",),
     "memory": HISTORY,
     "unmarked observation": (UNMARKED,),
+    "success": SUCCESS,
 }
 
 
 @pytest.mark.parametrize("overrides", ENDS.values(), ids=ENDS)
 def test_starts_made_ahead_are_those_of_the_moment(overrides: tuple[str, ...]) -> None:
-    """Bit for bit, whichever worlds end, one of them again before another has; after a masked reset
-    too, a new seed, and more ends at once than are worth it.
+    """Bit for bit, whichever worlds end, one again before another has, or many at once; and after
+    masked resets, one of no world, too, and after a change of seed, numbers of worlds or fields.
     """
     ahead, written = play_ends(overrides)
     in_time, _ = play_ends(overrides, ahead=False)
     assert_traces(ahead, in_time, slice(None), slice(None), "native")
     assert written.count(True) > 50
-    assert written.count(False) >= 4  # two full resets, and twice four worlds at once
+    assert written.count(False) >= 6  # full resets, empty ones, and four worlds at once
 
 
 def play_ends(overrides: tuple[str, ...], *, ahead: bool = True) -> tuple[Trace, list[bool]]:
@@ -352,9 +362,17 @@ def play_ends(overrides: tuple[str, ...], *, ahead: bool = True) -> tuple[Trace,
     trace = []
     for seed in (3, 4):
         env.reset(seed=seed)
+        trace.append(returned(env.reset(mask=mask_of(env))))
         trace += play(env, moves[:12], end)
-        trace.append(returned(env.reset(mask=mask_of(env, 1, 2))))
-        trace += play(env, moves[12:], lambda step: end(step + 12))
+        trace.append(returned(env.reset(mask=mask_of(env, 1, 2))) | state_of(env))
+        env.seed += 7
+        trace += play(env, moves[12:15], lambda step: end(step + 12))
+        env.world += 100
+        trace += play(env, moves[15:18], lambda step: end(step + 15))
+        for field in env.sim.fields.values():
+            field *= 1.01
+        trace += play(env, moves[18:], lambda step: end(step + 18))
+        trace.append(state_of(env))
     trace.append({"means": torch.tensor([*env.read_statistics().values()])})
     trace[-1]["peaks"] = torch.stack(env.sim.lasting_peaks())
     env.close()
@@ -381,6 +399,17 @@ def height_of_red(env: EnvView) -> torch.Tensor:
     return env.sim.part("qpos", env.index.object_columns("red")[0])[:, 2]
 
 
+@wraps(joint_pos)
+def jaws(env: EnvView) -> torch.Tensor:
+    """A function that looks like one of mjstack's."""
+    return env.success[:, None] * joint_pos(env)
+
+
+def always(env: EnvView) -> torch.Tensor:
+    """A success that holds from the start."""
+    return torch.ones(env.nworld, dtype=torch.bool)
+
+
 class Unmarked(Nominal):
     """A subclass may do more than its class."""
 
@@ -402,6 +431,7 @@ def test_only_marked_terms_are_called_ahead(monkeypatch: pytest.MonkeyPatch) -> 
             env.episode_step[world] = env.max_episode_steps
             env.step(actions(env, 1)[0])
         masks[name] = list(term.calls)
+        assert not Term("wrapped", TermCfg("test_starts.jaws"), env).repeatable
         if name == "Nominal":
             env.recapture()
             before = state_of(env)
@@ -410,5 +440,8 @@ def test_only_marked_terms_are_called_ahead(monkeypatch: pytest.MonkeyPatch) -> 
                 env.reset(mask=mask_of(env, 5))
             after = state_of(env)
             assert all(torch.equal(before[key], after[key]) for key in before)
+            env.reset_manager.terms = [SimpleNamespace(repeatable=False)]
+            env.recapture()
+            assert not env._starts._write(mask_of(env, 5))
         env.close()
     assert masks == {"Unmarked": [1, 1], "Nominal": [16, 16]}

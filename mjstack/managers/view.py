@@ -90,8 +90,9 @@ def ignores_success(term: Any) -> Any:
 
 
 def repeatable(term: Any) -> Any:
-    """Mark a reset or observation term that reads the simulation, the last action, `random_uniform`
-    and what never changes, so that it may be called for an episode that has not begun.
+    """Mark a reset or observation term that reads of the simulation what a reset writes, the last
+    action, `random_uniform` and what never changes: native MuJoCo may call it for an episode that
+    has not begun.
     """
     term.repeatable = term
     return term

@@ -55,7 +55,7 @@ class NativeSimulation(Simulation):
 
     Attributes:
         batch: The worlds in MuJoCo's hands.
-        rows: All that a step or a reset writes, a row for each world.
+        rows: The arrays that a reset writes, a row for each world.
     """
 
     backend = "native"
@@ -123,8 +123,8 @@ class NativeSimulation(Simulation):
         self.fields = Fields(
             {name: torch.from_numpy(values) for name, values in self._fields.items()}
         )
-        counters = (self._counts, self._steps)
-        self.rows = [batch.state, *self._derived, *counters, *self._fields.values()]
+        derived = (*self._poses, self._copies["sensordata"], self._counts, self._steps)
+        self.rows = [batch.state, *derived, *self._fields.values()]
         self._derive: Callable[[], None] | None = None
         if not self._fields.keys().isdisjoint(SIMPLE_FIELDS):
             self._derive = simple_inertia(m, self._fields, batch.expand("dof_M0"))
@@ -162,7 +162,8 @@ class NativeSimulation(Simulation):
     @property
     def world_bytes(self) -> int:
         """Memory that a world takes."""
-        return sum(array.nbytes for array in self.rows) // self.nworld
+        arrays = (self.batch.state, *self._derived, *self._fields.values())
+        return sum(array.nbytes for array in arrays) // self.nworld
 
     @override
     def option_values(self) -> dict[str, float | int | str]:
