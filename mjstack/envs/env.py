@@ -47,8 +47,8 @@ class Env:
     after the last one, and with a history after each.
 
     On CUDA the whole step is one graph: the first step after a build runs eagerly, the second is
-    captured, and later ones replay it. After a change of anything that it has baked in, such as a
-    term's Python number, call `recapture`.
+    captured, and later ones replay it. After a change of anything that it, or a start made ahead of
+    time, has baked in, such as a term's Python number, call `recapture`.
 
     Values that derive from contacts (``sensordata``, ``contact_count``) are those of the last
     physics step before, and zero in a world that has just been reset. Attributes are those of
