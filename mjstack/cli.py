@@ -119,7 +119,8 @@ def _dispatch(flags: Namespace, overrides: list[str]) -> int:
             if demonstrates and _results:
                 from mjstack.jobs.demo import show_demo  # the other commands need no browser
 
-                show_demo(_results[-1].folder)
+                arm = "so101" if "robot=rebot" in overrides else "rebot"
+                show_demo(_results[-1].folder, arm)
             return status
     return 0
 

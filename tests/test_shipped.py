@@ -175,7 +175,7 @@ def test_no_browser_is_no_error(browser: str | None, folder: Path, monkeypatch: 
         return found
 
     monkeypatch.setattr(webbrowser, "get", get)
-    show_demo(folder)
+    show_demo(folder, "so101")
 
 
 def test_without_viser_it_shows_the_report(
@@ -183,9 +183,11 @@ def test_without_viser_it_shows_the_report(
 ) -> None:
     monkeypatch.setattr("mjstack.jobs.demo.lacks_viser", lambda: "needs viser")
     monkeypatch.setattr(webbrowser, "get", lambda: webbrowser.GenericBrowser("none"))
-    show_demo(folder)
+    show_demo(folder, "so101")
     uri = (folder / "report.html").as_uri()
-    assert capsys.readouterr().out.startswith(f"needs viser\nIn a browser: {uri}\n")
+    out = capsys.readouterr().out
+    assert out.startswith(f"needs viser\nIn a browser: {uri}\n")
+    assert "  mjstack demo robot=so101                   # another arm" in out
 
 
 BAD = [
