@@ -63,11 +63,16 @@ def measure(what: str, worlds: int, gpus: int, args: argparse.Namespace) -> Run:
                 run: Run = {"status": child.wait(), "seconds": child.seconds}
             finally:
                 stop_all([child])
+        text = (Path(place) / "output.log").read_text(errors="replace").strip()
+        if run["status"] == 2:  # the command line is wrong, for every run
+            print(text, file=sys.stderr)
+            sys.exit(2)
         try:
+            if what == "sweep" and run["status"]:
+                raise ValueError("a job failed")
             run |= read(what, folder, gpus, run["seconds"])
         except (OSError, KeyError, ValueError, IndexError) as error:
-            text = (Path(place) / "output.log").read_text(errors="replace")
-            run["error"] = f"{error!r}: {text.strip()[-400:]}"
+            run["error"] = f"{error!r}: {text[-400:]}"
         return run
 
 
@@ -175,7 +180,6 @@ def main() -> None:
     args = parser.parse_args()
     if args.gpus < 2:
         parser.error(f"--gpus {args.gpus}: expected at least 2, which are compared with one")
-    args.folder.mkdir(parents=True, exist_ok=True)
     log = args.folder / "many.jsonl"
     runs = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
     first = 1 + max((run["round"] for run in runs), default=-1)
@@ -185,6 +189,7 @@ def main() -> None:
                 facts = {"what": args.what, "worlds": worlds, "gpus": gpus, "round": number}
                 run = facts | measure(args.what, worlds, gpus, args)
                 print(json.dumps(run), flush=True)
+                args.folder.mkdir(parents=True, exist_ok=True)
                 with log.open("a") as file:
                     file.write(json.dumps(run) + "\n")
                 runs.append(run)

@@ -77,6 +77,23 @@ def test_two_ranks_beside_one(tmp_path: Path) -> None:
     assert (tmp_path / "many/many.png").exists()
 
 
+@pytest.mark.parametrize("what", ["weak", "sweep"])
+def test_a_mistyped_override_ends_a_comparison(what: str, tmp_path: Path) -> None:
+    """In one line, before the runs that would say the same; no rate of runs that did nothing."""
+    command = [
+        sys.executable,
+        str(SCRIPT.parent / "bench_many.py"),
+        f"--what={what}",
+        "robot=so110",
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=tmp_path)
+    (line,) = done.stderr.splitlines()
+    assert done.returncode == 2
+    assert "so110" in line
+    assert not done.stdout
+    assert not [*tmp_path.iterdir()]
+
+
 def test_ranks_collect_images(tmp_path: Path) -> None:
     """Videos of both ranks: each frame is that of the world as one rank draws it."""
     args = ["job=collect", *CAMERA, "nworld=3", "job.keep_failures=true", "job.episodes=3"]

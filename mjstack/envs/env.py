@@ -114,7 +114,7 @@ class Env:
         self._closed = False
         self.command_delay = CommandDelay(self)
         self._starts = Starts(self)
-        if self.device.type != "cuda":  # a tenth of their time is what autograd keeps
+        if self.device.type != "cuda":  # autograd's records take a tenth of their time
             for owner, name in ((self, "_evaluate"), (self._starts, "begin")):
                 setattr(owner, name, torch.inference_mode()(getattr(owner, name)))
 
@@ -178,7 +178,6 @@ class Env:
             self.episode.fill_(-1)
         self._starts.begin(self._all_worlds if mask is None else mask)
         if mask is None:
-            self._starts.forget()
             self.faults.clear()
             self._started = True
         self._draws.draw_started(mask)

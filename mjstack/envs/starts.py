@@ -15,13 +15,11 @@ if TYPE_CHECKING:
 
 
 class _Ready(NamedTuple):
-    """The next start of every world, and what it follows from: a row for each world in all arrays,
-    of `Starts` by the same names.
-    """
+    """The next start of every world, and what it follows from; arrays have a row for each world."""
 
     seed: int
-    inputs: list[np.ndarray]
-    rows: list[np.ndarray]
+    inputs: list[np.ndarray]  # copies of `Starts._inputs` at the time
+    rows: list[np.ndarray]  # what goes into `Starts._rows`
 
 
 class Starts:

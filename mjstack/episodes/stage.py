@@ -269,7 +269,7 @@ class Stage:
         return play_episode(env, self.driver(env), observers, advance=self.progress.advance)
 
     def drive(self, sim: Simulation, reset: Reset) -> None:
-        """Roll out one episode that nobody judges."""
+        """Roll out one episode without the task's check."""
         env = self.start(sim, reset)
         rollout(env, self.driver(env), advance=self.progress.advance)
 
