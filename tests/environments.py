@@ -338,3 +338,7 @@ class StubViews(SimpleNamespace):
     def part(self, name: str, columns: Any, *shape: int) -> torch.Tensor:
         view = getattr(self, name)[:, getattr(columns, "at", columns)]
         return view.unflatten(1, shape) if shape else view
+
+    @property
+    def nowhere(self) -> torch.Tensor:
+        return torch.zeros(len(self.qpos), dtype=torch.bool)

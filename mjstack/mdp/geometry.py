@@ -8,7 +8,7 @@ from torch import Tensor
 from mjstack.errors import require_names
 from mjstack.managers.term import shared
 from mjstack.managers.view import EnvView, episode_draw
-from mjstack.math import lowest_point, norm, not_finite
+from mjstack.math import all_finite, lowest_point, norm, not_finite
 from mjstack.scene.index import RobotTensors, SceneIndex
 from mjstack.sim.simulation import Simulation
 
@@ -44,9 +44,16 @@ def pose_w(env: EnvView, name: str) -> Tensor:
 
 
 def lost_state(env: EnvView) -> Tensor:
-    """Whether a state is not finite, shape ``(nworld,)``, bool. Do not write into it."""
+    """Whether a state is not finite, shape ``(nworld,)``, bool; ``sim.nowhere`` where the host can
+    see that none is. Do not write into it.
+    """
     sim = env.sim
-    return shared((id(env), lost_state), lambda: not_finite(sim.qpos, sim.qvel))
+
+    def compute() -> Tensor:
+        fine = all_finite(sim.qpos, sim.qvel)
+        return sim.nowhere if fine else not_finite(sim.qpos, sim.qvel)
+
+    return shared((id(env), lost_state), compute)
 
 
 def above_table(env: EnvView, name: str) -> Tensor:

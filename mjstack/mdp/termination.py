@@ -23,11 +23,11 @@ def success(env: EnvView) -> Tensor:
     return env.success
 
 
-def _outside(values: Tensor, low: Tensor, high: Tensor) -> Tensor:
+def _outside(env: EnvView, values: Tensor, low: Tensor, high: Tensor) -> Tensor:
     """Whether one of a world's values is outside its range, shape ``(nworld,)``, bool."""
     # Mostly none is, and the host sees it at once; NaN equals nothing
     if not values.is_cuda and torch.equal(values.clamp(low, high), values):
-        return torch.zeros(len(values), dtype=torch.bool)
+        return env.sim.nowhere
     return ((values < low) | (values > high)).any(1)
 
 
@@ -44,7 +44,7 @@ class ObjectOffTable:
 
     def __call__(self, env: EnvView) -> Tensor:
         """True for worlds with an object off the table, shape ``(nworld,)``."""
-        return _outside(positions(env) - self._center, self._low, self._high)
+        return _outside(env, positions(env) - self._center, self._low, self._high)
 
 
 @ignores_success
@@ -67,7 +67,7 @@ class JointLimit:
 
     def __call__(self, env: EnvView) -> Tensor:
         """True for worlds with a joint outside, shape ``(nworld,)``."""
-        return _outside(joint_pos(env), self._low, self._high)
+        return _outside(env, joint_pos(env), self._low, self._high)
 
 
 @ignores_success

@@ -176,6 +176,14 @@ class Simulation(ABC):
         return self._parts[key]
 
     @cached_property
+    def nowhere(self) -> Tensor:
+        """No world, shape ``(nworld,)``, bool: what the host need not look at. Not to be written
+        into.
+        """
+        with torch.inference_mode(False):
+            return torch.zeros(self.nworld, dtype=torch.bool, device=self.device)
+
+    @cached_property
     def _parts(self) -> dict[tuple, Tensor]:
         return {}
 

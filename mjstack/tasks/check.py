@@ -40,6 +40,7 @@ from mjstack.errors import ConfigError, TermError, require_names
 from mjstack.managers.view import EnvView
 from mjstack.math import not_finite
 from mjstack.mdp.geometry import LOADED
+from mjstack.scene.index import Columns
 from mjstack.scene.phases import Phase
 from mjstack.sim.simulation import LOST_PHYSICS
 from mjstack.tasks.view import PhaseNames, Step, TaskView
@@ -324,6 +325,15 @@ class EpisodeCheck(ABC):
         """Whether each object is where it belongs, in the order of ``objects``, shape ``(nworld,
         objects)``, bool. No host read.
         """
+
+    def arrived(self, step: Step, carried: Columns) -> Tensor:
+        """What `placed` says of the objects of `goals`, shape ``(nworld, goals)``, bool.
+
+        Args:
+            step: The state.
+            carried: Their columns.
+        """
+        return carried.read(self.placed(step))
 
     def goals(self, step: Step) -> dict[str, Tensor]:
         """Where the centre of each object that is carried belongs [m], each ``(nworld, 3)``, by

@@ -36,13 +36,15 @@ class HeldSuccess:
         self._length = torch.zeros(env.nworld, dtype=torch.int32, device=env.device)
 
     def __call__(self, env: EnvView) -> Tensor:
-        """Process a step; shape ``(nworld,)``, bool."""
+        """Process a step; shape ``(nworld,)``, bool. Not to be written into."""
         works = [partial(self._holds, condition) for condition in self._conditions]
-        if not self._length.is_cuda and not bool(works[0]().all(1).any()):
-            self._length.zero_()  # whatever the other conditions say
-        else:
-            holds = torch.cat(branches(env.device, *works), dim=1)
-            self._length.add_(1).mul_(holds.all(1))
+        # Mostly the host can see that nothing holds, whatever the other conditions say
+        self.idle = not self._length.is_cuda and not bool(works[0]().all(1).any())
+        if self.idle:
+            self._length.zero_()
+            return env.sim.nowhere
+        holds = torch.cat(branches(env.device, *works), dim=1)
+        self._length.add_(1).mul_(holds.all(1))
         return self._length >= self._steps
 
     def _holds(self, condition: Condition) -> Tensor:

@@ -12,6 +12,7 @@ from typing_extensions import override
 from mjstack.config.fields import spec
 from mjstack.managers.term import branches
 from mjstack.managers.view import EnvView
+from mjstack.scene.index import Columns
 from mjstack.sim.graph import where_any
 from mjstack.tasks import parts
 from mjstack.tasks.check import EpisodeCheck, Rule
@@ -105,10 +106,23 @@ class StackCheck(EpisodeCheck):
             parts.InWindow("RELEASED", f"{t.object} not released", self.released, t.window),
         ]
 
-    @once_per_step
+    @override
     def placed(self, step: Step) -> Tensor:
         """Whether the object is on the other one, and that one on the table."""
-        return torch.stack((self.stacked(step), self.supported(step)), dim=1)
+        return torch.cat((self.on_top(step), self.on_table(step)), dim=1)
+
+    @once_per_step
+    def on_top(self, step: Step) -> Tensor:
+        """Whether the object is on the other one, shape ``(nworld, 1)``, bool."""
+        return self.stacked(step)[:, None]
+
+    def on_table(self, step: Step) -> Tensor:
+        """Whether the other one is on the table, shape ``(nworld, 1)``, bool."""
+        return self.supported(step)[:, None]
+
+    @override
+    def arrived(self, step: Step, carried: Columns) -> Tensor:
+        return self.on_top(step)
 
     @override
     def goals(self, step: Step) -> dict[str, Tensor]:
@@ -141,7 +155,7 @@ class StackSuccess(HeldSuccess):
         """
         check = StackCheck(env.cfg)
         view = check.view(env)
-        super().__init__(env, view, [check.placed, check.released], check.t.window)
+        super().__init__(env, view, [check.on_top, check.on_table, check.released], check.t.window)
         ring = (check.t.window, len(view.objects))
         # Where the oldest step is, in every world.
         self._slot = torch.zeros(1, dtype=torch.int64, device=env.device)
@@ -157,7 +171,7 @@ class StackSuccess(HeldSuccess):
     def __call__(self, env: EnvView) -> Tensor:
         """Process a step; shape ``(nworld,)``, bool."""
         achieved, _ = branches(env.device, partial(super().__call__, env), self._look)
-        if achieved.is_cuda or bool(achieved.any()):
+        if achieved.is_cuda or (not self.idle and bool(achieved.any())):
             largest = torch.cat((self._energy.mean(1), self._apart.amax((1, 2))), dim=1)
             achieved &= (largest <= self._limits).all(1)
         return achieved
@@ -168,7 +182,8 @@ class StackSuccess(HeldSuccess):
         """
         self._slot.add_(1).remainder_(self._steps)
         # No window that holds a step without a standing object can pass: its slot is never judged.
-        where_any(self._length, self._replace_oldest)
+        if not self.idle:
+            where_any(self._length, self._replace_oldest)
 
     def _replace_oldest(self) -> None:
         step = self._view.step()
