@@ -189,6 +189,17 @@ def _alive(pid: int) -> bool:
     return state not in "ZX"
 
 
+def see_one_gpu() -> None:
+    """Leave this rank its own GPU alone, which is ``cuda:0`` then: libraries take that one for
+    granted. To be called before CUDA is used.
+    """
+    count = torch.cuda.device_count()  # asks the driver's management library, which begins nothing
+    if count > 1:
+        names = os.environ.get("CUDA_VISIBLE_DEVICES") or ",".join(map(str, range(count)))
+        number = int(os.environ.get("LOCAL_RANK", 0)) % count
+        os.environ["CUDA_VISIBLE_DEVICES"] = names.split(",")[number].strip()
+
+
 @contextmanager
 def joined() -> Iterator[Ranks]:
     """Join the processes of the job that torchrun has started.
@@ -197,6 +208,7 @@ def joined() -> Iterator[Ranks]:
         MjstackError: Not all of them came, or the port is in use.
     """
     global _current, _store
+    see_one_gpu()
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if count:
         torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", 0)) % count)

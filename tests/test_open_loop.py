@@ -1,11 +1,13 @@
 """The scripted plan against kinematics of its own, on the whole scene."""
 
+import threading
 from collections.abc import Callable
 from functools import cache
 from itertools import pairwise
 
 import numpy as np
 import pytest
+import torch
 from environments import GetStage, Patch
 from ik_arm import Arm
 
@@ -14,6 +16,7 @@ from mjstack.drivers.open_loop import JointTrajectory
 from mjstack.episodes.stage import Stage
 from mjstack.errors import Unreachable
 from mjstack.scene.phases import nominal_xy
+from mjstack.sim.warp_setup import wp
 
 # Anchor, approach heights, offset [m] and gripper of each phase, from the task's definition.
 PHASES = {
@@ -204,6 +207,33 @@ def test_plan_does_not_depend_on_the_other_worlds(stage: Stage) -> None:
     planner.plan(xy[:2])
     assert planner.plan(xy) is not among
     assert len(np.unique(among.knots.numpy().round(4), axis=0)) == 38
+
+
+def test_planning_threads_leave_the_cuda_device_alone(stage: Stage, monkeypatch: Patch) -> None:
+    """Warp keeps one CUDA context for all scopes of its CPU device: a thread's scope would put the
+    thread's in place of the caller's. So threads enter none, here as if the GPUs were counted.
+    """
+    entered = []
+
+    class Counted(wp.ScopedDevice):
+        def __enter__(self) -> wp.Device:
+            entered.append(threading.current_thread())
+            return super().__enter__()
+
+    monkeypatch.setattr(wp, "ScopedDevice", Counted)
+    stage.planner.plan(nominal(stage) + np.random.default_rng(9).uniform(-0.02, 0.02, (40, 2, 2)))
+    assert threading.main_thread() in entered
+    assert {*entered} == {threading.main_thread()}
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two CUDA devices")
+def test_planning_leaves_the_second_gpu_current(stage: Stage) -> None:
+    with torch.cuda.device(1):
+        torch.zeros(1, device="cuda:1")
+        xy = nominal(stage) + np.random.default_rng(10).uniform(-0.02, 0.02, (40, 2, 2))
+        stage.planner.plan(xy)
+        assert torch.cuda.current_device() == 1
 
 
 def test_plans_are_those_that_mink_makes(stage: Stage) -> None:

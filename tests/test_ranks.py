@@ -28,7 +28,7 @@ import mjstack
 from mjstack.cli import run
 from mjstack.config.schema import Backend, Config
 from mjstack.datasets import read_dataset
-from mjstack.distributed import Ranks, current_ranks
+from mjstack.distributed import Ranks, current_ranks, see_one_gpu
 from mjstack.episodes.batches import BatchPlan, play_batches
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.seeds import _record as record_of
@@ -221,6 +221,28 @@ def test_a_rank_that_breaks(
 
 
 @pytest.mark.full
+@pytest.mark.parametrize(
+    ("visible", "count", "rank", "expected"),
+    [
+        (None, 4, "1", "1"),
+        ("5,7", 2, "1", "7"),
+        ("GPU-a, GPU-b", 2, "3", "GPU-b"),
+        ("6", 1, "1", "6"),
+        (None, 0, "1", None),
+    ],
+)
+def test_a_rank_sees_its_own_gpu_alone(
+    monkeypatch: Patch, visible: str | None, count: int, rank: str, expected: str | None
+) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible or "")
+    if visible is None:
+        monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
+    monkeypatch.setenv("LOCAL_RANK", rank)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: count)
+    see_one_gpu()
+    assert os.environ.get("CUDA_VISIBLE_DEVICES") == expected
+
+
 @pytest.mark.parametrize("script", [False, True], ids=["devices=2", "torchrun scripts/run.py"])
 def test_a_killed_first_rank_is_named(script: bool, trap: list[str], tmp_path: Path) -> None:
     """It would have said so itself: the lowest rank that is left does, alone, and the command that

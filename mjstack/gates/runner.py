@@ -2,6 +2,7 @@
 
 import logging
 import time
+import traceback
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
@@ -10,7 +11,7 @@ from pathlib import Path
 from mjstack.config.complete import typed
 from mjstack.config.functions import resolve_func
 from mjstack.config.schema import Config
-from mjstack.distributed import Ranks
+from mjstack.distributed import Ranks, current_ranks
 from mjstack.episodes.earlier_run import archive_starts, archived_starts
 from mjstack.episodes.rollout import lacks_episode
 from mjstack.episodes.run import Run
@@ -158,12 +159,17 @@ def _with_note(results: list[GateResult], text: str) -> list[GateResult]:
 
 
 def log_error(error: BaseException) -> str:
-    """An error in one line. The traceback of an unexpected one goes to run.log.
+    """An error in one line. The traceback of an unexpected one goes to run.log, or where this rank
+    writes none to stderr.
 
     Raises:
         KeyboardInterrupt: The command was interrupted, which may have caused the error.
     """
     check_interrupt()
+    place = "run.log"
     if not isinstance(error, MjstackError):
         log.error("unexpected error", exc_info=error)
-    return describe_error(error, "run.log has the traceback")
+        if not current_ranks().writes:
+            place = "stderr"
+            traceback.print_exception(error)
+    return describe_error(error, f"{place} has the traceback")

@@ -211,7 +211,7 @@ class BatchedIk:
         self._settings = [iterations, guided, _DAMPING, _MAX_STEP, *gains, near]
 
         # The chain and all buffers, each a Warp array and a torch view of it
-        with wp.ScopedDevice(self._device):
+        with torch_stream_scope(self._device):
             self._chain, shape = build_chain(model, robot)
             self._array = {
                 "home": wp.array(np.tile(locked_home(robot), (nworld, 1)), dtype=float),

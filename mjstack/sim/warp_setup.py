@@ -1,5 +1,7 @@
 """Warp, set up before its first use, and ordered with torch's work."""
 
+from contextlib import AbstractContextManager, nullcontext
+
 import torch
 import warp as wp
 
@@ -12,18 +14,19 @@ __all__ = ["torch_stream_scope", "wp"]
 _STREAMS: dict[tuple[str, int], wp.Stream] = {}
 
 
-def torch_stream_scope(device: wp.Device) -> wp.ScopedStream | wp.ScopedDevice:
+def torch_stream_scope(device: wp.Device) -> AbstractContextManager[object]:
     """A context in which Warp's work on a device goes to torch's current stream there.
 
     Reads and writes of shared memory by torch, before and after, are then ordered with it, and
     neither waits. On Warp's CPU device, which has no streams, it only makes the device the current
-    one.
+    one, where it is not. Warp's own scope for it would put one thread's CUDA device in place of
+    another's, which then uses the first GPU.
 
     Args:
         device: The Warp device.
     """
     if not device.is_cuda:
-        return wp.ScopedDevice(device)
+        return nullcontext() if wp.get_device() == device else wp.ScopedDevice(device)
     current = torch.cuda.current_stream(wp.device_to_torch(device))
     key = (str(device), current.cuda_stream)
     if key not in _STREAMS:
