@@ -7,7 +7,6 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-import torch
 from environments import GetStage, Patch
 from ik_arm import Arm
 
@@ -224,16 +223,6 @@ def test_planning_threads_leave_the_cuda_device_alone(stage: Stage, monkeypatch:
     stage.planner.plan(nominal(stage) + np.random.default_rng(9).uniform(-0.02, 0.02, (40, 2, 2)))
     assert threading.main_thread() in entered
     assert {*entered} == {threading.main_thread()}
-
-
-@pytest.mark.gpu
-@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two CUDA devices")
-def test_planning_leaves_the_second_gpu_current(stage: Stage) -> None:
-    with torch.cuda.device(1):
-        torch.zeros(1, device="cuda:1")
-        xy = nominal(stage) + np.random.default_rng(10).uniform(-0.02, 0.02, (40, 2, 2))
-        stage.planner.plan(xy)
-        assert torch.cuda.current_device() == 1
 
 
 def test_plans_are_those_that_mink_makes(stage: Stage) -> None:

@@ -19,8 +19,8 @@ def torch_stream_scope(device: wp.Device) -> AbstractContextManager[object]:
 
     Reads and writes of shared memory by torch, before and after, are then ordered with it, and
     neither waits. On Warp's CPU device, which has no streams, it only makes the device the current
-    one, where it is not. Warp's own scope for it would put one thread's CUDA device in place of
-    another's, which then uses the first GPU.
+    one, where it is not: all of Warp's scopes of that device keep one CUDA context between them, so
+    a thread's scope would hand its own context to the thread that waits for it.
 
     Args:
         device: The Warp device.
