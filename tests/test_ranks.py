@@ -34,6 +34,8 @@ from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.seeds import _record as record_of
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ArgumentError, ConfigError, MjstackError
+from mjstack.gates import runner
+from mjstack.gates.runner import log_error
 from mjstack.jobs import check_job, check_ranks, count_devices
 
 SHORT = ["sim=native", "gates=[batch]", *one_second_episode()]
@@ -241,6 +243,16 @@ def test_a_rank_sees_its_own_gpu_alone(
     monkeypatch.setattr(torch.cuda, "device_count", lambda: count)
     see_one_gpu()
     assert os.environ.get("CUDA_VISIBLE_DEVICES") == expected
+
+
+def test_a_rank_without_a_log_prints_the_traceback(
+    monkeypatch: Patch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(runner, "current_ranks", lambda: Ranks(1, 2))
+    assert log_error(ValueError("no")) == "ValueError: no (stderr has the traceback)"
+    assert "ValueError: no" in capsys.readouterr().err
+    assert log_error(MjstackError("seen")) == "seen."
+    assert not capsys.readouterr().err
 
 
 @pytest.mark.parametrize("script", [False, True], ids=["devices=2", "torchrun scripts/run.py"])
