@@ -191,7 +191,7 @@ def _alive(pid: int) -> bool:
 
 def see_one_gpu() -> None:
     """Leave this rank its own GPU alone, which is ``cuda:0`` then: libraries take that one for
-    granted. To be called before CUDA is used.
+    granted. To be called before anything asks for CUDA, be it whether there is some.
     """
     count = torch.cuda.device_count()  # asks the driver's management library, which begins nothing
     if count > 1:

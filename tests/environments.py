@@ -340,5 +340,5 @@ class StubViews(SimpleNamespace):
         return view.unflatten(1, shape) if shape else view
 
     @property
-    def nowhere(self) -> torch.Tensor:
+    def no_worlds(self) -> torch.Tensor:
         return torch.zeros(len(self.qpos), dtype=torch.bool)

@@ -60,7 +60,7 @@ PATHS: dict[str, dict[str, str] | None] = {
     "episodes/recorder.py": {"Recorder": "update", "": "_read_world read_commands read_state"},
     "episodes/replay.py": {"": "_read_trace"},
     "mdp/starts/placement.py": {"Placement": "choose"},
-    "tasks/check.py": {"EpisodeCheck": "update"},
+    "tasks/check.py": {"EpisodeCheck": "update placed_of"},
     "tasks/view.py": {
         "TaskView": "step clear",
         "Step": (
@@ -76,7 +76,7 @@ PATHS: dict[str, dict[str, str] | None] = {
     },
     "tasks/placed.py": {"HeldSuccess": "__call__ _holds reset"},
     "tasks/stack.py": {
-        "StackCheck": "placed goals",
+        "StackCheck": "placed placed_of on_top on_table goals",
         "StackSuccess": "_look _replace_oldest __call__",
     },
     "tasks/box.py": {

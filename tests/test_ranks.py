@@ -4,6 +4,7 @@ on with in another number of ranks.
 
 import contextlib
 import csv
+import logging
 import os
 import re
 import shutil
@@ -222,7 +223,6 @@ def test_a_rank_that_breaks(
     assert len(report["provenance"]["earlier_calls"]) == 1
 
 
-@pytest.mark.full
 @pytest.mark.parametrize(
     ("visible", "count", "rank", "expected"),
     [
@@ -249,12 +249,18 @@ def test_a_rank_without_a_log_prints_the_traceback(
     monkeypatch: Patch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(runner, "current_ranks", lambda: Ranks(1, 2))
-    assert log_error(ValueError("no")) == "ValueError: no (stderr has the traceback)"
-    assert "ValueError: no" in capsys.readouterr().err
+    monkeypatch.setattr(logging.getLogger(), "handlers", [])  # as in a rank
+    with pytest.raises(ValueError, match="no") as caught:
+        raise ValueError("no")
+    assert re.fullmatch(
+        r"ValueError: no \(test_ranks.py:\d+; stderr has the traceback\)", log_error(caught.value)
+    )
+    assert capsys.readouterr().err.count("Traceback") == 1
     assert log_error(MjstackError("seen")) == "seen."
     assert not capsys.readouterr().err
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("script", [False, True], ids=["devices=2", "torchrun scripts/run.py"])
 def test_a_killed_first_rank_is_named(script: bool, trap: list[str], tmp_path: Path) -> None:
     """It would have said so itself: the lowest rank that is left does, alone, and the command that

@@ -108,7 +108,7 @@ class Env:
         self.given_places: dict[str, Tensor] = {}
         self.success = torch.zeros(sim.nworld, dtype=torch.bool, device=sim.device)
         self._all_worlds = torch.ones_like(self.success)
-        self._no_worlds = sim.nowhere
+        self._no_worlds = sim.no_worlds
         self._version = 0
         self._started = False
         self._closed = False
@@ -311,8 +311,8 @@ class Env:
             begun = [partial(rewards.begin, name) for name in rewards.early]
             achieved, lost, *_ = branches(self.device, succeed, begin_ends, *begun, *early)
             # None where the host can see that there are none
-            seen = lost is self._no_worlds or not (lost.is_cuda or bool(lost.any()))
-            broken = None if seen else lost
+            none_lost = lost is self._no_worlds or not (lost.is_cuda or bool(lost.any()))
+            broken = None if none_lost else lost
             if ended is not None:  # their success stays
                 achieved = torch.where(ended, self.success, achieved)
             torch.gt(achieved, lost, out=self.success)  # achieved and not lost

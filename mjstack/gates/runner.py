@@ -168,8 +168,9 @@ def log_error(error: BaseException) -> str:
     check_interrupt()
     place = "run.log"
     if not isinstance(error, MjstackError):
-        log.error("unexpected error", exc_info=error)
-        if not current_ranks().writes:
+        if current_ranks().writes:
+            log.error("unexpected error", exc_info=error)
+        else:
             place = "stderr"
             traceback.print_exception(error)
     return describe_error(error, f"{place} has the traceback")

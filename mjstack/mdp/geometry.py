@@ -44,14 +44,14 @@ def pose_w(env: EnvView, name: str) -> Tensor:
 
 
 def lost_state(env: EnvView) -> Tensor:
-    """Whether a state is not finite, shape ``(nworld,)``, bool; ``sim.nowhere`` where the host can
-    see that none is. Do not write into it.
+    """Whether a state is not finite, shape ``(nworld,)``, bool; ``sim.no_worlds`` where the host
+    can see that none is. Do not write into it.
     """
     sim = env.sim
 
     def compute() -> Tensor:
         fine = all_finite(sim.qpos, sim.qvel)
-        return sim.nowhere if fine else not_finite(sim.qpos, sim.qvel)
+        return sim.no_worlds if fine else not_finite(sim.qpos, sim.qvel)
 
     return shared((id(env), lost_state), compute)
 

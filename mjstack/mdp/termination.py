@@ -23,11 +23,11 @@ def success(env: EnvView) -> Tensor:
     return env.success
 
 
-def _outside(env: EnvView, values: Tensor, low: Tensor, high: Tensor) -> Tensor:
+def _outside(values: Tensor, low: Tensor, high: Tensor) -> Tensor:
     """Whether one of a world's values is outside its range, shape ``(nworld,)``, bool."""
     # Mostly none is, and the host sees it at once; NaN equals nothing
     if not values.is_cuda and torch.equal(values.clamp(low, high), values):
-        return env.sim.nowhere
+        return torch.zeros(len(values), dtype=torch.bool)
     return ((values < low) | (values > high)).any(1)
 
 
@@ -44,7 +44,7 @@ class ObjectOffTable:
 
     def __call__(self, env: EnvView) -> Tensor:
         """True for worlds with an object off the table, shape ``(nworld,)``."""
-        return _outside(env, positions(env) - self._center, self._low, self._high)
+        return _outside(positions(env) - self._center, self._low, self._high)
 
 
 @ignores_success
@@ -67,14 +67,14 @@ class JointLimit:
 
     def __call__(self, env: EnvView) -> Tensor:
         """True for worlds with a joint outside, shape ``(nworld,)``."""
-        return _outside(env, joint_pos(env), self._low, self._high)
+        return _outside(joint_pos(env), self._low, self._high)
 
 
 @ignores_success
 @offers(ends_on="non_finite")
 def non_finite(env: EnvView) -> Tensor:
     """When a position or velocity is NaN or infinite: such a world cannot go on."""
-    return lost_state(env)
+    return lost_state(env).clone()  # which is not to be written into
 
 
 @ignores_success

@@ -36,7 +36,7 @@ def resolve_device(requested: str) -> str:
     if requested.startswith("cuda") and int(requested.partition(":")[2]) >= count:
         devices = ", ".join(f"cuda:{number}" for number in range(count)) or "no CUDA device"
         raise DeviceError(
-            f"sim.device={requested}: this machine has {devices}. Use sim.device=auto or"
+            f"sim.device={requested}: this process sees {devices}. Use sim.device=auto or"
             " sim.device=cpu."
         )
     return requested

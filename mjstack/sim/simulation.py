@@ -176,10 +176,8 @@ class Simulation(ABC):
         return self._parts[key]
 
     @cached_property
-    def nowhere(self) -> Tensor:
-        """No world, shape ``(nworld,)``, bool: what the host need not look at. Not to be written
-        into.
-        """
+    def no_worlds(self) -> Tensor:
+        """All False, shape ``(nworld,)``, bool: known by its identity. Nobody may write into it."""
         with torch.inference_mode(False):
             return torch.zeros(self.nworld, dtype=torch.bool, device=self.device)
 

@@ -326,7 +326,7 @@ class EpisodeCheck(ABC):
         objects)``, bool. No host read.
         """
 
-    def arrived(self, step: Step, carried: Columns) -> Tensor:
+    def placed_of(self, step: Step, carried: Columns) -> Tensor:
         """What `placed` says of the objects of `goals`, shape ``(nworld, goals)``, bool.
 
         Args:

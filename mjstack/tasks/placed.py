@@ -34,15 +34,16 @@ class HeldSuccess:
         self._conditions = conditions
         self._steps = steps
         self._length = torch.zeros(env.nworld, dtype=torch.int32, device=env.device)
+        self.none_hold = False  # in the last step, as far as the host could see
 
     def __call__(self, env: EnvView) -> Tensor:
-        """Process a step; shape ``(nworld,)``, bool. Not to be written into."""
+        """Process a step; shape ``(nworld,)``, bool."""
         works = [partial(self._holds, condition) for condition in self._conditions]
         # Mostly the host can see that nothing holds, whatever the other conditions say
-        self.idle = not self._length.is_cuda and not bool(works[0]().all(1).any())
-        if self.idle:
+        self.none_hold = not self._length.is_cuda and not bool(works[0]().all(1).any())
+        if self.none_hold:
             self._length.zero_()
-            return env.sim.nowhere
+            return torch.zeros_like(self._length, dtype=torch.bool)
         holds = torch.cat(branches(env.device, *works), dim=1)
         self._length.add_(1).mul_(holds.all(1))
         return self._length >= self._steps

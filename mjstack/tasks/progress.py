@@ -107,7 +107,7 @@ class Progress:
         return value.mean(1)
 
     def _placed(self) -> Tensor:
-        return self._check.arrived(self._view.step(), self._columns)
+        return self._check.placed_of(self._view.step(), self._columns)
 
     def _measure(self) -> tuple[Tensor, Tensor]:
         """Of each object: its distance from the grasp point, and from its goal horizontally and

@@ -121,7 +121,8 @@ class StackCheck(EpisodeCheck):
         return self.supported(step)[:, None]
 
     @override
-    def arrived(self, step: Step, carried: Columns) -> Tensor:
+    def placed_of(self, step: Step, carried: Columns) -> Tensor:
+        """As `placed`: a subclass that changes the one changes the other."""
         return self.on_top(step)
 
     @override
@@ -155,7 +156,9 @@ class StackSuccess(HeldSuccess):
         """
         check = StackCheck(env.cfg)
         view = check.view(env)
-        super().__init__(env, view, [check.on_top, check.on_table, check.released], check.t.window)
+        # The host can mostly tell by the first. On CUDA a branch of a graph shares no value.
+        placed = [check.placed] if env.device.type == "cuda" else [check.on_top, check.on_table]
+        super().__init__(env, view, [*placed, check.released], check.t.window)
         ring = (check.t.window, len(view.objects))
         # Where the oldest step is, in every world.
         self._slot = torch.zeros(1, dtype=torch.int64, device=env.device)
@@ -171,7 +174,7 @@ class StackSuccess(HeldSuccess):
     def __call__(self, env: EnvView) -> Tensor:
         """Process a step; shape ``(nworld,)``, bool."""
         achieved, _ = branches(env.device, partial(super().__call__, env), self._look)
-        if achieved.is_cuda or (not self.idle and bool(achieved.any())):
+        if achieved.is_cuda or (not self.none_hold and bool(achieved.any())):
             largest = torch.cat((self._energy.mean(1), self._apart.amax((1, 2))), dim=1)
             achieved &= (largest <= self._limits).all(1)
         return achieved
@@ -182,7 +185,7 @@ class StackSuccess(HeldSuccess):
         """
         self._slot.add_(1).remainder_(self._steps)
         # No window that holds a step without a standing object can pass: its slot is never judged.
-        if not self.idle:
+        if not self.none_hold:
             where_any(self._length, self._replace_oldest)
 
     def _replace_oldest(self) -> None:
