@@ -327,11 +327,8 @@ class EpisodeCheck(ABC):
         """
 
     def placed_of(self, step: Step, carried: Columns) -> Tensor:
-        """What `placed` says of the objects of `goals`, shape ``(nworld, goals)``, bool.
-
-        Args:
-            step: The state.
-            carried: Their columns.
+        """What `placed` says of the objects of `goals`, which have these columns, shape ``(nworld,
+        goals)``, bool. No host read.
         """
         return carried.read(self.placed(step))
 
