@@ -177,7 +177,7 @@ class Simulation(ABC):
 
     @cached_property
     def no_worlds(self) -> Tensor:
-        """All False, shape ``(nworld,)``, bool: known by its identity. Nobody may write into it."""
+        """A mask of no world, shape ``(nworld,)``, bool. It must not be written into."""
         with torch.inference_mode(False):
             return torch.zeros(self.nworld, dtype=torch.bool, device=self.device)
 
