@@ -327,8 +327,8 @@ class EpisodeCheck(ABC):
         """
 
     def placed_of(self, step: Step, carried: Columns) -> Tensor:
-        """Whether each object of `goals` is where it belongs, shape ``(nworld, goals)``, bool: those
-        columns of `placed`. No host read.
+        """Whether each object of `goals` is where it belongs: those columns of `placed`, shape
+        ``(nworld, goals)``, bool. No host read.
         """
         return carried.read(self.placed(step))
 
