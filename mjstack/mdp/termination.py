@@ -8,7 +8,8 @@ from torch import Tensor
 from mjstack.config.fields import Count, NotNegative
 from mjstack.managers.view import EnvView, ignores_success, offers
 from mjstack.mdp.geometry import lost_state, robot
-from mjstack.mdp.observation import joint_pos, positions
+from mjstack.mdp.observation import joint_pos
+from mjstack.scene.index import Columns
 from mjstack.sim import LOST_PHYSICS
 
 
@@ -41,10 +42,13 @@ class ObjectOffTable:
         triples = ([*scene.table_center[:2], 0.0], [-x, -y, scene.table_top], [x, y, math.inf])
         numbers = [env.index.constant(three * len(scene.free), env.sim.qpos) for three in triples]
         self._center, self._low, self._high = numbers
+        columns = [first + axis for first in env.index.object_qpos for axis in range(3)]
+        self._columns = Columns(columns, env.device)
 
     def __call__(self, env: EnvView) -> Tensor:
         """True for worlds with an object off the table, shape ``(nworld,)``."""
-        return _outside(positions(env) - self._center, self._low, self._high)
+        at = env.sim.part("qpos", self._columns)
+        return _outside(at - self._center, self._low, self._high)
 
 
 @ignores_success

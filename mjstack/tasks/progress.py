@@ -71,6 +71,7 @@ class Progress:
         # Of away, across, above, low and opening, see `_measure`: the range over which each counts
         # (an open_fraction of 0 takes any opening), the number of the stage that it measures, and
         # from where to where it unlocks stages.
+        self._scale, self._near = scale, near
         constant = self._view.constant
         self._ranges = constant(scale, scale, scale, height, max(open_fraction, 1e-6))
         self._nearest = constant(1.0)
@@ -85,7 +86,33 @@ class Progress:
 
     def __call__(self, env: EnvView) -> Tensor:
         """The reward, shape ``(nworld,)``."""
-        (measured, in_hand), placed = branches(env.device, self._measure, self._placed)
+        (parts, in_hand), placed = branches(env.device, self._measure, self._placed)
+        if self._beyond_reach(parts, in_hand, placed):
+            value = self._stages(parts, in_hand, placed)
+        else:
+            value = torch.sub(1.0, (parts[0] / self._scale).tanh_()) / len(STAGES)
+        if value.shape[1] == 1:
+            return value[:, 0]
+
+        # One object after the other
+        finished = (placed & ~in_hand)[:, :-1]
+        value[:, :-1].masked_fill_(finished, 1.0)
+        value[:, 1:].mul_(finished.cumprod(1))
+        return value.mean(1)
+
+    def _beyond_reach(self, parts: list[Tensor], in_hand: Tensor, placed: Tensor) -> bool:
+        """Whether an object may have got beyond the first stage: mostly the host sees that none
+        has.
+        """
+        if in_hand.is_cuda:
+            return True
+        _, across, above = parts
+        over = (across <= self._near) & (above >= -BELOW)
+        return bool(over.logical_or_(in_hand).logical_or_(placed).any())
+
+    def _stages(self, parts: list[Tensor], in_hand: Tensor, placed: Tensor) -> Tensor:
+        """How far each object has got, shape ``(nworld, objects)``."""
+        measured = torch.stack(parts if in_hand.is_cuda else parts + self._heights(), dim=-1)
 
         # Which stages each object has got to
         within = measured.clamp(self._least, self._most) == measured
@@ -96,31 +123,26 @@ class Progress:
         worth = measured / self._ranges
         nearness = worth[..., :3]
         torch.sub(self._nearest, nearness.abs_().tanh_(), out=nearness)
-        value = worth.clamp_(0.0, 1.0).add_(self._number).mul_(reached).amax(-1) / len(STAGES)
-        if value.shape[1] == 1:
-            return value[:, 0]
-
-        # One object after the other
-        finished = (placed & ~in_hand)[:, :-1]
-        value[:, :-1].masked_fill_(finished, 1.0)
-        value[:, 1:].mul_(finished.cumprod(1))
-        return value.mean(1)
+        return worth.clamp_(0.0, 1.0).add_(self._number).mul_(reached).amax(-1) / len(STAGES)
 
     def _placed(self) -> Tensor:
         return self._check.placed_of(self._view.step(), self._columns)
 
-    def _measure(self) -> tuple[Tensor, Tensor]:
+    def _measure(self) -> tuple[list[Tensor], Tensor]:
         """Of each object: its distance from the grasp point, and from its goal horizontally and
-        upwards, the height of its lowest point [m], and the gripper's opening, shape ``(nworld,
-        objects, 5)``; and whether it is in the hand.
+        upwards [m], on CUDA `_heights` too; and whether it is in the hand; each ``(nworld,
+        objects)``.
         """
         step = self._view.step()
         pos = self._columns.read(step.pos)
         goals = list(self._check.goals(step).values())
         offset = pos - (torch.stack(goals, dim=1) if len(goals) > 1 else goals[0][:, None])
         away = norm(pos - grasp_point_pos(step.view.env).float()[:, None])
+        parts = [away, norm(offset[..., :2]), offset[..., 2]]
+        return parts + (self._heights() if away.is_cuda else []), self._columns.read(step.in_hand)
+
+    def _heights(self) -> list[Tensor]:
+        """The height of each object's lowest point [m], and the gripper's opening."""
+        step = self._view.step()
         low = self._columns.read(step.height)
-        across = norm(offset[..., :2])
-        opening = step.narrowest.expand_as(low)
-        measured = torch.stack((away, across, offset[..., 2], low, opening), dim=-1)
-        return measured, self._columns.read(step.in_hand)
+        return [low, step.narrowest.expand_as(low)]
