@@ -300,6 +300,12 @@ def test_what_is_set_wins() -> None:
     assert resolve_sizes(cfg).njmax == resolve_env_sizes(cfg).njmax == 500
     assert resolve_measuring_sizes(cfg).njmax == 768
     assert resolve_measuring_sizes(load_config(["batch.njmax=900"])).njmax == 900
+    # A driven task needs less, and its steps are faster in less
+    robot = load_config([])
+    assert resolve_measuring_sizes(robot, driven=True) == resolve_sizes(robot)
+    for njmax, room in ((100, 300), (500, 500)):
+        cfg = load_config([f"batch.njmax={njmax}"])
+        assert resolve_measuring_sizes(cfg, driven=True).njmax == room
 
 
 @pytest.mark.full
@@ -490,7 +496,7 @@ def made_up(monkeypatch: Patch, randomized: dict, play: Callable[[str], Workload
     """Have workloads made up from their names, in the place of playing them."""
 
     class Worlds(MeasuringWorlds):
-        def __init__(self, *_: object) -> None:
+        def __init__(self, *_: object, **__: object) -> None:
             pass
 
         def play(self, play_name: Callable) -> Workload:
@@ -592,7 +598,7 @@ def test_environment_is_sized_by_a_probe() -> None:
 @pytest.mark.full
 def test_a_probe_that_lost_physics_makes_no_environment(monkeypatch: Patch) -> None:
     small = BatchSizes(nconmax=128, njmax=4)  # and 32 after the last growth
-    monkeypatch.setattr("mjstack.envs.buffers.resolve_measuring_sizes", lambda _: small)
+    monkeypatch.setattr("mjstack.envs.buffers.resolve_measuring_sizes", lambda _, driven: small)
     made: list[weakref.ref[Env]] = []
 
     def keep(*args: object, **kwargs: object) -> Env:

@@ -330,6 +330,30 @@ def test_a_wall_that_leaves_no_room_is_said() -> None:
         placement_of(cfg, model).require_room([0.05, 0.05], 16)
 
 
+def test_a_region_with_room_is_tried_once_and_one_without_each_time(monkeypatch: Patch) -> None:
+    tried = []
+    choose = Placement.choose
+    monkeypatch.setattr(
+        Placement, "choose", lambda self, draws: tried.append(1) or choose(self, draws)
+    )
+    cfg = configure("reset=randomized")
+    xy = (0.0301, 0.0203)  # of no other test
+
+    def tries(scene: Config, model: mujoco.MjModel | None = None, *, gap: float = 0.0) -> int:
+        tried.clear()
+        placement_of(scene, model, region=xy, gap=gap).require_room(xy, 16)
+        return len(tried)
+
+    assert tries(cfg) > 0
+    assert tries(cfg) == 0
+    assert tries(cfg, gap=0.005) > 0
+    wall = with_wall(cfg, tuple(cfg.scene.objects["red"].xy), (0.1, 0.1))
+    for _ in range(2):
+        with pytest.raises(ParameterError, match="found none in"):
+            tries(cfg, wall)
+    assert tries(cfg) == 0
+
+
 @pytest.mark.full
 def test_cubes_that_are_close_find_a_pair_that_fits() -> None:
     """Three of four pairs of free positions are too close."""

@@ -156,16 +156,18 @@ class MeasuringWorlds:
         backend: Backend,
         device: str,
         *resets: Mapping[str, TermCfg],
+        driven: bool = False,
     ) -> None:
         """Make worlds with room to spare, which may grow. They can start as the configuration and
-        ``resets`` say; other arguments as of `make_simulation`.
+        ``resets`` say, and have room for the ``driven`` task or for random actions; other arguments
+        as of `make_simulation`.
         """
         fields = required_fields(cfg.reset, *resets)
         self._make = partial(
             make_simulation, model, cfg, nworld, backend=backend, device=device, fields=fields
         )
         self._sim: Simulation | None = None
-        self._room = resolve_measuring_sizes(cfg)
+        self._room = resolve_measuring_sizes(cfg, driven=driven)
         self._most = (_GROWTH * self._room.njmax, _GROWTH * self._room.nconmax)
 
     def play(self, play: Play) -> Workload:
@@ -198,7 +200,8 @@ class MeasuringWorlds:
         gc.collect()  # an environment and its managers refer to each other, and hold the worlds
 
     def _play_once(self, play: Play) -> Workload:
-        gc.collect()  # the environment of the workload before, its graphs and their memory
+        if self._sim is not None:
+            gc.collect()  # the environment of the workload before, its graphs and their memory
         self._sim = sim = self._sim or self._make(sizes=self._room)
         for name, field in sim.fields.items():
             field.copy_(torch.from_numpy(getattr(sim.model, name)))

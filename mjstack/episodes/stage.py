@@ -312,7 +312,7 @@ class Stage:
             return resolve_sizes(self.cfg)
         if "task" not in self.measured:
             source = f"the driven task in {self.measuring_nworld} worlds"
-            with closing(self.measuring_worlds()) as worlds:
+            with closing(self.measuring_worlds(driven=True)) as worlds:
                 task = worlds.play(lambda sim: self.drive(sim, self.cfg.reset))
             self.measured["task"] = measured_sizes(self.cfg, task, source)
             self.progress.print_line(str(self.measured["task"]))
@@ -333,9 +333,12 @@ class Stage:
         on_cuda = self.backend[1].startswith("cuda")
         return self.cfg.nworld if on_cuda else min(self.cfg.nworld, most)
 
-    def measuring_worlds(self, *resets: Reset) -> MeasuringWorlds:
-        """Worlds that size the buffers, which can start as ``resets`` say, too."""
-        return MeasuringWorlds(self.cfg, self.model, self.measuring_nworld, *self.backend, *resets)
+    def measuring_worlds(self, *resets: Reset, driven: bool = False) -> MeasuringWorlds:
+        """Worlds that size the buffers, which can start as ``resets`` say, too; see
+        `MeasuringWorlds`.
+        """
+        which = (self.cfg, self.model, self.measuring_nworld, *self.backend)
+        return MeasuringWorlds(*which, *resets, driven=driven)
 
     def native_env(self, cfg: Config, nworld: int = 1) -> closing[Env]:
         """An environment of the scene on native MuJoCo, to find out about its terms."""

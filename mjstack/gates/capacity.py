@@ -49,8 +49,9 @@ def run_capacity(run: Run) -> list[GateResult]:
     """Find the buffer sizes that the driven task, randomised starts and random actions need.
 
     Peaks are over all steps and all worlds, in worlds with room to spare: one that has lost physics
-    moves differently. All workloads are played in the same worlds, once: room for a peak holds it
-    exactly, and what follows plays in the sizes in force.
+    moves differently. Each workload is played once: room for a peak holds it exactly, and what
+    follows plays in the sizes in force. Random actions need more room, which makes every step
+    slower, so that they have worlds of their own.
     """
     cfg = run.cfg
     t = cfg.gate.capacity
@@ -60,21 +61,15 @@ def run_capacity(run: Run) -> list[GateResult]:
     stage = run.stage
     most = _RANDOM_STEPS if stage.backend[1].startswith("cuda") else cfg.task.episode_steps
     steps = t.random_steps or min(most, cfg.task.episode_steps)
-    plays: dict[str, Play] = {
-        "random_actions": partial(play_random_actions, cfg, steps, advance=stage.progress.advance),
-        "randomized": lambda sim: stage.drive(sim, t.reset),
-        "task": lambda sim: stage.drive(sim, cfg.reset),
-    }
-    loads = {}
-    with closing(stage.measuring_worlds(t.reset)) as worlds:
-        for name, play in plays.items():
-            try:
-                loads[name] = worlds.play(play)
-            except Unreachable as error:
-                if name != "randomized":
-                    raise
-                # Starts of the user's own; the rest stands
-                result.details.append(f"randomised starts: not measured: {error}")
+    act: Play = partial(play_random_actions, cfg, steps, advance=stage.progress.advance)
+    with closing(stage.measuring_worlds()) as worlds:
+        loads = {"random_actions": worlds.play(act)}
+    with closing(stage.measuring_worlds(t.reset, driven=True)) as worlds:
+        try:
+            loads["randomized"] = worlds.play(lambda sim: stage.drive(sim, t.reset))
+        except Unreachable as error:  # starts of the user's own; the rest stands
+            result.details.append(f"randomised starts: not measured: {error}")
+        loads["task"] = worlds.play(lambda sim: stage.drive(sim, cfg.reset))
     task = _recommend(run, resolve_sizes(cfg), {"task": loads.pop("task")})
     env = _recommend(run, resolve_env_sizes(cfg), loads)
 

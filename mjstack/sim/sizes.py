@@ -54,14 +54,16 @@ def resolve_env_sizes(cfg: Config) -> BatchSizes:
     return apply_configured(cfg, resolve_measuring_sizes(cfg))
 
 
-def resolve_measuring_sizes(cfg: Config) -> BatchSizes:
-    """Room to measure in: the robot's sizes for random actions, or the configured ones where those
-    are larger.
+def resolve_measuring_sizes(cfg: Config, *, driven: bool = False) -> BatchSizes:
+    """Room to measure in: the robot's sizes for random actions, or for the driven task, or the
+    configured ones where those are larger.
     """
-    placements = _placements(cfg)
+    sizes = _placements(cfg)
+    nconmax, njmax = sizes.env_nconmax, sizes.env_njmax
+    if driven:
+        nconmax, njmax = sizes.nconmax, sizes.njmax
     return BatchSizes(
-        nconmax=max(placements.env_nconmax, cfg.batch.nconmax or 0),
-        njmax=max(placements.env_njmax, cfg.batch.njmax or 0),
+        nconmax=max(nconmax, cfg.batch.nconmax or 0), njmax=max(njmax, cfg.batch.njmax or 0)
     )
 
 
