@@ -4,7 +4,7 @@ uses them.
 
 import math
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
@@ -30,6 +30,7 @@ import mjstack
 from mjstack.config.schema import Backend
 from mjstack.envs import Env, build_env
 from mjstack.envs.buffers import (
+    SIZED,
     MeasuringWorlds,
     Peaks,
     Workload,
@@ -147,10 +148,10 @@ def test_peaks_join() -> None:
 
 
 def tried(
-    monkeypatch: Patch, *losses: Callable[[BatchSizes], int]
+    monkeypatch: Patch, *losses: Callable[[BatchSizes], int], driven: Sequence[bool] = ()
 ) -> tuple[list[BatchSizes], list[Workload]]:
     """The sizes of the worlds that some workloads are tried in, and the last run of each; they lose
-    physics.
+    physics. By default none is driven.
     """
     made: list[BatchSizes] = []
 
@@ -172,7 +173,8 @@ def tried(
     # process has much to look through
     monkeypatch.setattr("mjstack.envs.buffers.read_peaks", read)
     worlds = MeasuringWorlds(load_config([]), None, 4, Backend.mjwarp, "cpu")  # type: ignore[arg-type]
-    runs = [worlds.play(partial(workload, loss)) for loss in losses]  # type: ignore[arg-type]
+    pairs = zip(losses, driven or [False] * len(losses), strict=True)
+    runs = [worlds.play(partial(workload, loss), driven=task) for loss, task in pairs]  # type: ignore[arg-type]
     worlds.close()
     return made, runs
 
@@ -219,6 +221,31 @@ def test_workloads_share_worlds_and_the_room_that_one_of_them_needs(monkeypatch:
     assert all(run.peaks.overflow.any() for run in runs)
 
 
+def test_a_driven_workload_begins_with_less_room_and_gets_as_much(monkeypatch: Patch) -> None:
+    def calm(_: BatchSizes) -> int:
+        return 0
+
+    def rows(sizes: BatchSizes) -> int:
+        return int(Overflow.NEFC) * (sizes.njmax < 5000)
+
+    def always(_: BatchSizes) -> int:
+        return SIZED
+
+    task, random = resolve_sizes(load_config([])), resolve_measuring_sizes(load_config([]))
+    assert (task.njmax, task.nconmax, random.njmax, random.nconmax) == (300, 128, 768, 128)
+    made, runs = tried(monkeypatch, calm, calm, calm, driven=(False, True, True))
+    assert [(s.njmax, s.nconmax) for s in made] == [(768, 128), (300, 128)]
+    assert [run.sizes for run in runs] == [made[0], made[1], made[1]]
+    # Where it is too little, that of random actions is next
+    made, runs = tried(monkeypatch, calm, rows, calm, driven=(False, True, True))
+    assert [s.njmax for s in made] == [768, 300, 768, 1536, 3072, 6144]
+    assert [run.sizes for run in runs] == [made[0], made[5], made[5]]
+    for driven in (False, True):
+        made, (run,) = tried(monkeypatch, always, driven=[driven])
+        assert (made[-1].njmax, made[-1].nconmax) == (6144, 1024)
+        assert run.peaks.overflow.any()
+
+
 def test_a_workload_in_used_worlds_ends_as_in_new_ones(backend: str, new_run: NewRun) -> None:
     """Nothing of the workload before acts on: fields, state, counters. Fields that it does not need
     change nothing either.
@@ -253,19 +280,25 @@ def test_a_workload_in_used_worlds_ends_as_in_new_ones(backend: str, new_run: Ne
 
     ends: list[bytes] = []
 
-    def last(*workloads: Callable[[Simulation], None], resets: tuple = ()) -> Peaks:
+    def last(*workloads: Callable[[Simulation], None], resets: tuple = (), driven: int) -> Peaks:
+        """Of the last one; so many of them are driven."""
         with closing(stage.measuring_worlds(*resets)) as worlds:
-            return [worlds.play(workload) for workload in workloads][-1].peaks
+            first = len(workloads) - driven
+            plays = [worlds.play(w, driven=n >= first) for n, w in enumerate(workloads)]
+            return plays[-1].peaks
 
-    expected = last(task)
-    for seen in (last(task, resets=(randomized,)), last(wild, task, resets=(randomized,))):
+    expected = last(task, driven=0)
+    resets = (randomized,)
+    many = [last(task, resets=resets, driven=1)]
+    many += [last(wild, task, resets=resets, driven=driven) for driven in (1, 2)]
+    for seen in many:
         assert not seen.overflow.any()
         if where["device"] != "cpu":  # sums have no fixed order
             continue
         for name in ("contacts", "rows"):
             assert getattr(seen, name).tolist() == getattr(expected, name).tolist()
         assert seen.pools == expected.pools
-    assert len(ends) == 3
+    assert len(ends) == 4
     assert where["device"] != "cpu" or len({*ends}) == 1
 
 
@@ -496,11 +529,13 @@ def made_up(monkeypatch: Patch, randomized: dict, play: Callable[[str], Workload
     """Have workloads made up from their names, in the place of playing them."""
 
     class Worlds(MeasuringWorlds):
-        def __init__(self, *_: object, **__: object) -> None:
+        def __init__(self, *_: object) -> None:
             pass
 
-        def play(self, play_name: Callable) -> Workload:
-            return play(play_name(None))
+        def play(self, play_name: Callable, *, driven: bool = False) -> Workload:
+            name = play_name(None)
+            assert driven == (name != "random_actions")
+            return play(name)
 
         def close(self) -> None:
             pass
@@ -598,7 +633,9 @@ def test_environment_is_sized_by_a_probe() -> None:
 @pytest.mark.full
 def test_a_probe_that_lost_physics_makes_no_environment(monkeypatch: Patch) -> None:
     small = BatchSizes(nconmax=128, njmax=4)  # and 32 after the last growth
-    monkeypatch.setattr("mjstack.envs.buffers.resolve_measuring_sizes", lambda _, driven: small)
+    monkeypatch.setattr(
+        "mjstack.envs.buffers.resolve_measuring_sizes", lambda _, driven=False: small
+    )
     made: list[weakref.ref[Env]] = []
 
     def keep(*args: object, **kwargs: object) -> Env:

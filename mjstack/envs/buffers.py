@@ -156,40 +156,43 @@ class MeasuringWorlds:
         backend: Backend,
         device: str,
         *resets: Mapping[str, TermCfg],
-        driven: bool = False,
     ) -> None:
-        """Make worlds with room to spare, which may grow. They can start as the configuration and
-        ``resets`` say, and have room for the ``driven`` task or for random actions; other arguments
-        as of `make_simulation`.
+        """Make nothing yet. Worlds can start as the configuration and ``resets`` say; other
+        arguments as of `make_simulation`.
         """
         fields = required_fields(cfg.reset, *resets)
         self._make = partial(
             make_simulation, model, cfg, nworld, backend=backend, device=device, fields=fields
         )
         self._sim: Simulation | None = None
-        self._room = resolve_measuring_sizes(cfg, driven=driven)
-        self._most = (_GROWTH * self._room.njmax, _GROWTH * self._room.nconmax)
+        self._room = self._first = resolve_measuring_sizes(cfg)  # of the worlds; for random actions
+        self._rooms = {False: self._first, True: resolve_measuring_sizes(cfg, driven=True)}
 
-    def play(self, play: Play) -> Workload:
-        """Play a workload, and again in worlds of twice the room wherever that was too little and
-        may grow.
+    def play(self, play: Play, *, driven: bool = False) -> Workload:
+        """Play a workload, and again in worlds of more room, at least twice as much, wherever it
+        was too little and may grow.
 
         Peaks of a run that lost physics are those of another motion. Where the last run, which is
         returned, has lost some too, its ``overflow`` tells: nothing may be sized from it.
+
+        Args:
+            play: What to play.
+            driven: Begin with the room of the driven task, not with that of random actions, which
+                is larger, so that steps take longer.
         """
         while True:
-            run = self._play_once(play)
+            room = self._rooms[driven]
+            run = self._play_once(play, room)
             bits = int(np.bitwise_or.reduce(run.peaks.overflow)) & SIZED
             # In this room convex pairs have as much as contacts, so they grow together.
             room = replace(
-                self._room,
-                njmax=min(self._room.njmax * (2 if bits & ROWS else 1), self._most[0]),
-                nconmax=min(self._room.nconmax * (2 if bits & ~ROWS else 1), self._most[1]),
+                room,
+                njmax=_grown(room.njmax, self._first.njmax, bits & ROWS),
+                nconmax=_grown(room.nconmax, self._first.nconmax, bits & ~ROWS),
             )
-            if run.sizes is None or room == self._room:
+            if run.sizes is None or room == self._rooms[driven]:
                 return run
-            self.close()
-            self._room = room
+            self._rooms[driven] = room
             log.info("%s overflow while measuring: again, %s", Overflow(bits), room.as_overrides())
 
     def close(self) -> None:
@@ -199,15 +202,25 @@ class MeasuringWorlds:
         self._sim = None
         gc.collect()  # an environment and its managers refer to each other, and hold the worlds
 
-    def _play_once(self, play: Play) -> Workload:
-        if self._sim is not None:
-            gc.collect()  # the environment of the workload before, its graphs and their memory
-        self._sim = sim = self._sim or self._make(sizes=self._room)
+    def _play_once(self, play: Play, room: BatchSizes) -> Workload:
+        if self._sim is not None and self._sim.sizes is not None and room != self._room:
+            self.close()
+        else:
+            gc.collect()  # what was before: an environment, its graphs and their memory
+        self._room = room
+        self._sim = sim = self._sim or self._make(sizes=room)
         for name, field in sim.fields.items():
             field.copy_(torch.from_numpy(getattr(sim.model, name)))
         sim.reset()
         play(sim)
         return Workload(peaks=read_peaks(sim), sizes=sim.sizes, description=sim.description)
+
+
+def _grown(room: int, first: int, lacking: int) -> int:
+    """Twice the room where it is ``lacking``, from the ``first`` of random actions on to `_GROWTH`
+    times that.
+    """
+    return max(room, min(max(2 * room, first), _GROWTH * first)) if lacking else room
 
 
 def measured_sizes(cfg: Config, run: Workload, source: str) -> BatchSizes:

@@ -5,7 +5,7 @@ them. All that a trainer or a benchmark needs of a run.
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -312,8 +312,8 @@ class Stage:
             return resolve_sizes(self.cfg)
         if "task" not in self.measured:
             source = f"the driven task in {self.measuring_nworld} worlds"
-            with closing(self.measuring_worlds(driven=True)) as worlds:
-                task = worlds.play(lambda sim: self.drive(sim, self.cfg.reset))
+            with closing(self.measuring_worlds()) as worlds:
+                task = worlds.play(partial(self.drive, reset=self.cfg.reset), driven=True)
             self.measured["task"] = measured_sizes(self.cfg, task, source)
             self.progress.print_line(str(self.measured["task"]))
         return apply_configured(self.cfg, self.measured["task"])
@@ -333,12 +333,9 @@ class Stage:
         on_cuda = self.backend[1].startswith("cuda")
         return self.cfg.nworld if on_cuda else min(self.cfg.nworld, most)
 
-    def measuring_worlds(self, *resets: Reset, driven: bool = False) -> MeasuringWorlds:
-        """Worlds that size the buffers, which can start as ``resets`` say, too; see
-        `MeasuringWorlds`.
-        """
-        which = (self.cfg, self.model, self.measuring_nworld, *self.backend)
-        return MeasuringWorlds(*which, *resets, driven=driven)
+    def measuring_worlds(self, *resets: Reset) -> MeasuringWorlds:
+        """Worlds that size the buffers, which can start as ``resets`` say, too."""
+        return MeasuringWorlds(self.cfg, self.model, self.measuring_nworld, *self.backend, *resets)
 
     def native_env(self, cfg: Config, nworld: int = 1) -> closing[Env]:
         """An environment of the scene on native MuJoCo, to find out about its terms."""

@@ -36,11 +36,11 @@ _TITLES = {"task": "driven task", "env": "environments (random actions, randomis
 class _Group:
     """Workloads whose worlds have the same buffer sizes."""
 
-    runs: dict[str, Workload]  # with room to spare
+    runs: dict[str, Workload]
     peaks: Peaks  # the most that any of them used
     sizes: BatchSizes  # in force
     advice: BatchSizes  # recommended
-    lost: str  # physics that was lost with room to spare; nothing may be sized from it then
+    lost: str  # physics that was lost in all room tried; nothing may be sized from it then
 
 
 @each_rank
@@ -48,10 +48,9 @@ class _Group:
 def run_capacity(run: Run) -> list[GateResult]:
     """Find the buffer sizes that the driven task, randomised starts and random actions need.
 
-    Peaks are over all steps and all worlds, in worlds with room to spare: one that has lost physics
-    moves differently. Each workload is played once: room for a peak holds it exactly, and what
-    follows plays in the sizes in force. Random actions need more room, which makes every step
-    slower, so that they have worlds of their own.
+    Peaks are over all steps and all worlds, in room that grows until nothing is lost: a world that
+    has lost physics moves differently. A workload that has lost nothing is not played again: room
+    for a peak holds it exactly, and what follows plays in the sizes in force.
     """
     cfg = run.cfg
     t = cfg.gate.capacity
@@ -62,14 +61,13 @@ def run_capacity(run: Run) -> list[GateResult]:
     most = _RANDOM_STEPS if stage.backend[1].startswith("cuda") else cfg.task.episode_steps
     steps = t.random_steps or min(most, cfg.task.episode_steps)
     act: Play = partial(play_random_actions, cfg, steps, advance=stage.progress.advance)
-    with closing(stage.measuring_worlds()) as worlds:
+    with closing(stage.measuring_worlds(t.reset)) as worlds:
         loads = {"random_actions": worlds.play(act)}
-    with closing(stage.measuring_worlds(t.reset, driven=True)) as worlds:
         try:
-            loads["randomized"] = worlds.play(lambda sim: stage.drive(sim, t.reset))
+            loads["randomized"] = worlds.play(partial(stage.drive, reset=t.reset), driven=True)
         except Unreachable as error:  # starts of the user's own; the rest stands
             result.details.append(f"randomised starts: not measured: {error}")
-        loads["task"] = worlds.play(lambda sim: stage.drive(sim, cfg.reset))
+        loads["task"] = worlds.play(partial(stage.drive, reset=cfg.reset), driven=True)
     task = _recommend(run, resolve_sizes(cfg), {"task": loads.pop("task")})
     env = _recommend(run, resolve_env_sizes(cfg), loads)
 

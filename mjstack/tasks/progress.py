@@ -34,7 +34,8 @@ class Progress:
     Each is worth a fifth, so every state of a later stage is worth more than any of an earlier one.
     An object that is where it belongs and not in the hand is done, and the next one's stages begin;
     the mean over the objects is returned. It is a function of the state alone, so that an episode
-    may start anywhere. Along an expert's episode the stage never falls.
+    may start anywhere. Along an expert's episode the stage never falls. A state that is not finite
+    has no defined reward.
     """
 
     def __init__(
@@ -68,10 +69,10 @@ class Progress:
             expected = "a check with goals, which this reward follows"
             raise ConfigError("task.check.func", type(self._check).__name__, expected)
         self._columns = self._view.columns(names)
+        self._scale, self._near = scale, near
         # Of away, across, above, low and opening, see `_measure`: the range over which each counts
         # (an open_fraction of 0 takes any opening), the number of the stage that it measures, and
         # from where to where it unlocks stages.
-        self._scale, self._near = scale, near
         constant = self._view.constant
         self._ranges = constant(scale, scale, scale, height, max(open_fraction, 1e-6))
         self._nearest = constant(1.0)
@@ -86,11 +87,11 @@ class Progress:
 
     def __call__(self, env: EnvView) -> Tensor:
         """The reward, shape ``(nworld,)``."""
-        (parts, in_hand), placed = branches(env.device, self._measure, self._placed)
-        if self._beyond_reach(parts, in_hand, placed):
-            value = self._stages(parts, in_hand, placed)
+        (distances, heights, in_hand), placed = branches(env.device, self._measure, self._placed)
+        if self._beyond_reach(distances, in_hand, placed):
+            value = self._stages(distances + (heights or self._heights()), in_hand, placed)
         else:
-            value = torch.sub(1.0, (parts[0] / self._scale).tanh_()) / len(STAGES)
+            value = torch.sub(1.0, (distances[0] / self._scale).tanh_()) / len(STAGES)
         if value.shape[1] == 1:
             return value[:, 0]
 
@@ -100,19 +101,19 @@ class Progress:
         value[:, 1:].mul_(finished.cumprod(1))
         return value.mean(1)
 
-    def _beyond_reach(self, parts: list[Tensor], in_hand: Tensor, placed: Tensor) -> bool:
+    def _beyond_reach(self, distances: list[Tensor], in_hand: Tensor, placed: Tensor) -> bool:
         """Whether an object may have got beyond the first stage: mostly the host sees that none
         has.
         """
         if in_hand.is_cuda:
             return True
-        _, across, above = parts
+        _, across, above = distances
         over = (across <= self._near) & (above >= -BELOW)
         return bool(over.logical_or_(in_hand).logical_or_(placed).any())
 
     def _stages(self, parts: list[Tensor], in_hand: Tensor, placed: Tensor) -> Tensor:
         """How far each object has got, shape ``(nworld, objects)``."""
-        measured = torch.stack(parts if in_hand.is_cuda else parts + self._heights(), dim=-1)
+        measured = torch.stack(parts, dim=-1)
 
         # Which stages each object has got to
         within = measured.clamp(self._least, self._most) == measured
@@ -128,18 +129,19 @@ class Progress:
     def _placed(self) -> Tensor:
         return self._check.placed_of(self._view.step(), self._columns)
 
-    def _measure(self) -> tuple[list[Tensor], Tensor]:
+    def _measure(self) -> tuple[list[Tensor], list[Tensor], Tensor]:
         """Of each object: its distance from the grasp point, and from its goal horizontally and
-        upwards [m], on CUDA `_heights` too; and whether it is in the hand; each ``(nworld,
-        objects)``.
+        upwards [m]; on CUDA, where the host cannot look first, `_heights`; and whether it is in the
+        hand; each ``(nworld, objects)``.
         """
         step = self._view.step()
         pos = self._columns.read(step.pos)
         goals = list(self._check.goals(step).values())
         offset = pos - (torch.stack(goals, dim=1) if len(goals) > 1 else goals[0][:, None])
         away = norm(pos - grasp_point_pos(step.view.env).float()[:, None])
-        parts = [away, norm(offset[..., :2]), offset[..., 2]]
-        return parts + (self._heights() if away.is_cuda else []), self._columns.read(step.in_hand)
+        distances = [away, norm(offset[..., :2]), offset[..., 2]]
+        heights = self._heights() if away.is_cuda else []
+        return distances, heights, self._columns.read(step.in_hand)
 
     def _heights(self) -> list[Tensor]:
         """The height of each object's lowest point [m], and the gripper's opening."""

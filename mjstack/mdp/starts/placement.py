@@ -29,7 +29,7 @@ _FIRST = 3  # candidates that are tried first
 # [m] between an object and the arm at its start, noise included: it is the arm that moves away
 _ARM_ROOM = 0.001
 _GRID = 0.02  # [m] between the positions whose reach is tried
-_WITH_ROOM: set[tuple] = set()  # what was tried: every environment of a run asks the same
+_ROOMY: set[tuple] = set()  # regions that have room, by all that `require_room` depends on
 _UNDER = 1e-5  # m: a box is under an object if its top is this much higher at most
 
 
@@ -126,7 +126,7 @@ class Placement:
         """
         count = len(self._apart)
         key = (candidates, str(self._apart), *(t.numpy().tobytes() for t in self._tensors))
-        if key in _WITH_ROOM:
+        if key in _ROOMY:  # every environment of a run asks the same
             return
         draws = _trials(2 * count * candidates).view(_TRIALS, count, candidates, 2)
         # The first few do for most worlds, which saves time.
@@ -137,7 +137,7 @@ class Placement:
             expected = f"a region with a free position for every object; {problem}"
             fix = "Make the region or the gap smaller, or move the objects (scene.objects.NAME.xy)"
             raise ParameterError("xy", xy, expected, fix)
-        _WITH_ROOM.add(key)
+        _ROOMY.add(key)
 
     def choose(self, draws: Tensor) -> tuple[Tensor, Tensor]:
         """The first candidates that fit together.
