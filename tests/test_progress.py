@@ -52,8 +52,8 @@ class Terms(Observer):
         self.success = Term("task.success", self.cfg.task.success, env)
         progress = self.terms[0].call
         # With a small ``near``, what is placed is not near its goal
-        strict = isinstance(progress, Progress)
-        self.progress = [progress, Progress(env, near=1e-5)] if strict else []
+        staged = isinstance(progress, Progress)
+        self.progress = [progress, Progress(env, near=1e-5)] if staged else []
 
     def update(self) -> None:
         for progress in self.progress:

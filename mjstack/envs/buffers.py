@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 
 ROWS = int(Overflow.NEFC | Overflow.NJMAX_NNZ)
 SIZED = ROWS | POOL | int(Overflow.CCD)
-_GROWTH = 8  # of the room to measure in, at most, by 2 each time
+_GROWTH = 8  # times the room to measure in, at most
 _STEP = 8  # sizes are multiples of this
 # Sizes above _LARGE are multiples of _COARSE. Every njmax needs another solver kernel, which takes
 # seconds to compile, and on CUDA random actions differ from run to run.
@@ -165,12 +165,13 @@ class MeasuringWorlds:
             make_simulation, model, cfg, nworld, backend=backend, device=device, fields=fields
         )
         self._sim: Simulation | None = None
-        self._room = self._first = resolve_measuring_sizes(cfg)  # of the worlds; for random actions
+        self._first = resolve_measuring_sizes(cfg)  # for random actions
+        self._room = self._first  # of the worlds as they are
         self._rooms = {False: self._first, True: resolve_measuring_sizes(cfg, driven=True)}
 
     def play(self, play: Play, *, driven: bool = False) -> Workload:
-        """Play a workload, and again in worlds of more room, at least twice as much, wherever it
-        was too little and may grow.
+        """Play a workload, and again in worlds of more room, twice as much or more, wherever it
+        was too little, up to a limit.
 
         Peaks of a run that lost physics are those of another motion. Where the last run, which is
         returned, has lost some too, its ``overflow`` tells: nothing may be sized from it.
@@ -206,7 +207,7 @@ class MeasuringWorlds:
         if self._sim is not None and self._sim.sizes is not None and room != self._room:
             self.close()
         else:
-            gc.collect()  # what was before: an environment, its graphs and their memory
+            gc.collect()  # what the play before left: an environment, its graphs and their memory
         self._room = room
         self._sim = sim = self._sim or self._make(sizes=room)
         for name, field in sim.fields.items():
@@ -217,8 +218,8 @@ class MeasuringWorlds:
 
 
 def _grown(room: int, first: int, lacking: int) -> int:
-    """Twice the room where it is ``lacking``, from the ``first`` of random actions on to `_GROWTH`
-    times that.
+    """The room to try next: where it is ``lacking`` twice as much, at least the ``first`` room of
+    random actions, and at most `_GROWTH` times that.
     """
     return max(room, min(max(2 * room, first), _GROWTH * first)) if lacking else room
 

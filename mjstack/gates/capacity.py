@@ -48,9 +48,9 @@ class _Group:
 def run_capacity(run: Run) -> list[GateResult]:
     """Find the buffer sizes that the driven task, randomised starts and random actions need.
 
-    Peaks are over all steps and all worlds, in room that grows until nothing is lost: a world that
-    has lost physics moves differently. A workload that has lost nothing is not played again: room
-    for a peak holds it exactly, and what follows plays in the sizes in force.
+    Peaks are over all steps and all worlds, in room that grows, up to a limit, until nothing is
+    lost: a world that has lost physics moves differently. A workload that has lost nothing is not
+    played again: room for a peak holds it exactly, and what follows plays in the sizes in force.
     """
     cfg = run.cfg
     t = cfg.gate.capacity

@@ -55,8 +55,8 @@ def resolve_env_sizes(cfg: Config) -> BatchSizes:
 
 
 def resolve_measuring_sizes(cfg: Config, *, driven: bool = False) -> BatchSizes:
-    """Room to begin to measure in: the robot's sizes for random actions, or where a task is
-    ``driven`` those for it, and the configured ones where they are larger.
+    """Room to begin to measure in: the robot's sizes for random actions, or for a ``driven``
+    task; configured ones where they are larger.
     """
     sizes = _placements(cfg)
     nconmax, njmax = sizes.env_nconmax, sizes.env_njmax

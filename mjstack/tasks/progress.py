@@ -103,7 +103,7 @@ class Progress:
 
     def _beyond_reach(self, distances: list[Tensor], in_hand: Tensor, placed: Tensor) -> bool:
         """Whether an object may have got beyond the first stage: mostly the host sees that none
-        has.
+        has. Always true on CUDA, where it cannot look.
         """
         if in_hand.is_cuda:
             return True
