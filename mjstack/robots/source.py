@@ -1,20 +1,21 @@
 """Robot descriptions as MjSpec: any MJCF file, mjstack's own mesh-free ones, or Menagerie's."""
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
-from mjstack.config.schema import ModelCfg, RobotCfg, ServoCfg
-from mjstack.errors import ConfigError, MjstackError, UnknownName, first_line, require_names
+from mjstack.config.schema import ModelCfg, RobotCfg
+from mjstack.errors import ConfigError, MjstackError, first_line, require_names
+from mjstack.robots.guest import as_guest
+from mjstack.robots.servos import prepare_servos
 
 BUILTIN = Path(__file__).parent
 _MENAGERIE_FIX = "Set MENAGERIE_ROOT to a checkout of MuJoCo Menagerie, or use model=builtin."
 
 _CONTACT = ("contype", "conaffinity", "condim", "friction", "solref", "solimp", "priority")
-_GEOM_DEFAULTS = ("type", "density", "mass", "gap", "margin", "solmix", "group", "material", "rgba")
 
 
 def robot_spec(robot: RobotCfg, model: ModelCfg) -> mujoco.MjSpec:
@@ -25,8 +26,8 @@ def robot_spec(robot: RobotCfg, model: ModelCfg) -> mujoco.MjSpec:
         model: Where its description comes from.
 
     Returns:
-        A spec with the robot's two grasp sites, servos named after their joints and, where the
-        profile has one, the arm's force limit. It has no keyframes.
+        A scene with the robot alone, as a guest: its two grasp sites, and servos named after their
+        joints.
 
     Raises:
         MjstackError: The description cannot be found or read.
@@ -41,28 +42,9 @@ def robot_spec(robot: RobotCfg, model: ModelCfg) -> mujoco.MjSpec:
     _require("robot.jaw_bodies: body", robot.jaw_bodies, spec.bodies)
     _require("robot.approach_body: body", [robot.approach_body or None], spec.bodies)
     _add_grasp_sites(spec, robot)
-    _split_tendon_servos(spec, robot.gripper_joints)
-    for key in ("arm_joints", "gripper_joints"):
-        for name in getattr(robot, key):
-            _require(f"robot.{key}: joint", [name], spec.joints)
-            _prepare_joint(spec, name)
-    fresh = mujoco.MjSpec().default.geom
-    # The file's own defaults would count for the scene's geoms too
-    for field in (*_GEOM_DEFAULTS, *_CONTACT):
-        setattr(spec.default.geom, field, getattr(fresh, field))
-    for key in list(spec.keys):  # keyframes of the robot alone do not fit a scene's state
-        spec.delete(key)
-    if robot.arm_force_limit is not None:
-        for name in robot.arm_joints:
-            spec.actuator(name).forcerange = [-robot.arm_force_limit, robot.arm_force_limit]
-    for name, servo in robot.servos.items():
-        if name not in robot.joints:
-            problem = UnknownName("robot.servos: joint", name, robot.joints)
-            raise MjstackError(
-                f"{problem}", "Or set actuator to a choice for this robot, or default"
-            )
-        _set_servo(spec, name, servo)
-    return spec
+    _require("robot.arm_joints, robot.gripper_joints: joint", robot.joints, spec.joints)
+    prepare_servos(spec, robot)
+    return as_guest(spec)
 
 
 def read_mjcf(path: str | Path, fix: str) -> mujoco.MjSpec:
@@ -140,66 +122,6 @@ def _add_grasp_sites(spec: mujoco.MjSpec, robot: RobotCfg) -> None:
         _require("geom", parts, spec.geoms)
         geoms = [spec.geom(name) for name in parts]
         geoms[0].parent.add_site(name=site, pos=np.mean([g.pos for g in geoms], axis=0), group=4)
-
-
-def _split_tendon_servos(spec: mujoco.MjSpec, joints: Sequence[str]) -> None:
-    """Put a servo of each finger in place of a position servo that moves them by a tendon.
-
-    Its target is the finger's position, whatever the tendon's unit is. Gains and force are the
-    finger's share, so that fingers which move alike feel the same.
-    """
-    for servo in list(spec.actuators):
-        if servo.trntype != mujoco.mjtTrn.mjTRN_TENDON:
-            continue
-        share = {part.target.name: part.coef for part in spec.tendon(servo.target).path}
-        offset, stiffness, damping = servo.biasprm[:3] * [1.0, -1.0, -1.0]
-        if not share.keys() <= set(joints) or not stiffness > 0.0:
-            continue
-        moved = sum(share.values())  # of the tendon, where all fingers move by 1
-        span = (servo.gainprm[0] * servo.ctrlrange + offset) / (stiffness * moved)
-        for name, part in share.items():
-            actuator = spec.add_actuator(name=name, target=name, ctrlrange=np.sort(span))
-            actuator.trntype = mujoco.mjtTrn.mjTRN_JOINT
-            actuator.set_to_position(kp=part * moved * stiffness, kv=part * moved * damping)
-            actuator.forcerange = part * servo.forcerange
-        spec.delete(servo)
-
-
-def _prepare_joint(spec: mujoco.MjSpec, name: str) -> None:
-    """Name a joint's servo after it, with the joint's range unless it has its own."""
-    low, high = spec.joint(name).range
-    if not low < high:
-        raise ConfigError(
-            f"range of joint {name}", [float(low), float(high)], "a range in the robot's file"
-        )
-    servos = [a for a in spec.actuators if a.target == name]
-    positions = [a for a in servos if a.gainprm[0] and a.biasprm[1] == -a.gainprm[0]]
-    if len(servos) != 1 or not positions:
-        names = ", ".join(a.name for a in servos) or "none"
-        raise ConfigError(f"actuators of joint {name}", names, "one <position> in the robot's file")
-    (servo,) = servos
-    servo.name = name
-    if not servo.ctrlrange[0] < servo.ctrlrange[1]:
-        servo.inheritrange = 1.0
-
-
-def _set_servo(spec: mujoco.MjSpec, name: str, servo: ServoCfg) -> None:
-    """Replace the values of a joint and its servo that are given."""
-    actuator = spec.actuator(name)
-    if servo.stiffness is not None:
-        actuator.gainprm[0] = servo.stiffness
-        actuator.biasprm[1] = -servo.stiffness
-    if servo.damping is not None:
-        actuator.biasprm[2] = -servo.damping
-    if servo.effort is not None:
-        actuator.forcerange = [-servo.effort, servo.effort]
-    joint = spec.joint(name)
-    if servo.armature is not None:
-        joint.armature = servo.armature
-    if servo.dry_friction is not None:
-        joint.frictionloss = servo.dry_friction
-    if servo.viscous_friction is not None:
-        joint.damping[0] = servo.viscous_friction  # what follows is for higher powers of velocity
 
 
 def _require(kind: str, names: Iterable[str | None], available: Iterable) -> None:

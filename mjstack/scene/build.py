@@ -13,6 +13,7 @@ import numpy as np
 from mjstack.config.schema import BoxCfg, CameraCfg, Config, ObjectCfg, SceneCfg
 from mjstack.errors import ConfigError, MjstackError, UnknownName
 from mjstack.robots import read_mjcf, robot_spec
+from mjstack.robots.guest import compile_scene
 
 TABLE = "table"
 WORLD = "world"  # MuJoCo's name of the body that never moves
@@ -118,7 +119,7 @@ def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> m
         spec.visual.quality.shadowsize = 1024  # without a GPU, MuJoCo's 4096 doubles the time
     else:
         spec.compiler.discardvisual = True
-    model = spec.compile()
+    model = compile_scene(spec)
     _require_clear(model, scene)
     return model
 

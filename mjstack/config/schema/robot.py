@@ -112,7 +112,10 @@ class RobotCfg:
     arm_force_limit: float | None = spec(None, unit="N m, N", gt=0.0)
     """Largest force of the arm's servos. null: the file's own."""
     servos: dict[str, ServoCfg] = spec({})
-    """Servos by joint, which the group ``actuator`` chooses; other joints have the file's own."""
+    """Servos by joint, which the group ``actuator`` chooses; other joints have the file's own. One
+    with stiffness, damping and effort is made where the file has a motor, or none."""
+    ranges: dict[str, list[float]] = spec({}, unit="rad, m", length=2)
+    """Ranges of joints, in place of the file's own."""
 
     locked: dict[str, float] = spec({}, unit="rad, m")
     """Arm joints that inverse kinematics holds, with their values."""
