@@ -1,28 +1,50 @@
 """A robot as a guest in a scene: what of its file comes along, and what stays behind."""
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import mujoco
 import numpy as np
 
+from mjstack.config.schema import RobotCfg
+from mjstack.errors import MjstackError, require_names
+
+WORLD = "world"  # MuJoCo's name of the body that never moves
+
 # Figures of the solver that the group `solver` leaves to the robot's file where they are null
 _SOLVER = ("iterations", "ls_iterations", "impratio", "tolerance")
+_FREE = mujoco.mjtJoint.mjJNT_FREE
+_PREFIX = "robot_"
+_NAMED = ("geoms", "bodies", "cameras")  # elements that a scene has too
+_NAMING = {  # elements with the names of others
+    "pairs": ("geomname1", "geomname2"),
+    "excludes": ("bodyname1", "bodyname2"),
+    "equalities": ("name1", "name2"),
+    "sensors": ("objname", "refname"),
+}
 _FLAGS = {"disableflags": mujoco.mjtDisableBit, "enableflags": mujoco.mjtEnableBit}
 
 
-def as_guest(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+def as_guest(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) -> mujoco.MjSpec:
     """A fresh scene with the robot in it. Its compiler settings act on its bodies alone, and its
-    options, sizes and keyframes stay behind.
+    options, sizes, keyframes, lights, floors and free bodies stay behind.
 
     Args:
         spec: The robot; it is changed in place, and goes on to live in the scene.
+        robot: Its profile, which says where it stands, and which subtree it is.
+        reserved: Names of the scene's own geoms, bodies and cameras.
     """
     fresh = mujoco.MjSpec()
     fresh.modelname = spec.modelname
-    for key in list(spec.keys):
-        spec.delete(key)
+    for element in _strangers(spec, robot):
+        spec.delete(element)
+    geoms = {geom.name for geom in spec.geoms}
+    for pair in list(spec.pairs):  # MuJoCo leaves them behind
+        if not {pair.geomname1, pair.geomname2} <= geoms:
+            spec.delete(pair)
+    _rename(spec, robot, reserved)
     if spec.compiler.settotalmass > 0.0:  # it counts all bodies of a compilation
         _fix_masses(spec)
     for name in _fields(spec.option):
@@ -31,7 +53,8 @@ def as_guest(spec: mujoco.MjSpec) -> mujoco.MjSpec:
         else:
             setattr(spec.option, name, getattr(fresh.option, name))
     with _without_prefix():
-        fresh.attach(spec, frame=fresh.worldbody.add_frame(), prefix="")
+        base = fresh.worldbody.add_frame(pos=robot.base.pos, quat=robot.base.quat)
+        fresh.attach(spec, frame=base, prefix="")
     return fresh
 
 
@@ -56,12 +79,16 @@ def _without_prefix() -> Iterator[None]:
         mujoco.set_mju_user_warning(hook)
 
 
-def left_behind(spec: mujoco.MjSpec, model: mujoco.MjModel) -> Iterator[str]:
+def left_behind(
+    spec: mujoco.MjSpec, robot: RobotCfg, model: mujoco.MjModel, reserved: Collection[str]
+) -> Iterator[str]:
     """What a robot's file asks for and the scene does not do, a line each.
 
     Args:
         spec: The file as it was read.
+        robot: Its profile.
         model: The compiled scene.
+        reserved: As of `as_guest`.
     """
     fresh = mujoco.MjSpec().option
     for name in _fields(fresh):
@@ -71,11 +98,80 @@ def left_behind(spec: mujoco.MjSpec, model: mujoco.MjModel) -> Iterator[str]:
         if kind := _FLAGS.get(name):
             bits = [b.name.rpartition("_")[2].lower() for b in kind if b & asked & ~there]
             if bits:
-                yield f"flag {', '.join(bits)}"
-            continue
-        yield f"option {name} {_text(asked)}: the scene has {_text(there)}"
-    if spec.keys:
-        yield f"{len(spec.keys)} keyframes"
+                yield f"flags {', '.join(bits)}"
+        else:
+            yield f"option {name} {_text(asked)}: the scene has {_text(there)}"
+    strangers = [
+        f"{type(e).__name__[3:].lower()} {e.name}".strip() for e in _strangers(spec, robot)
+    ]
+    if strangers:
+        yield f"left out: {', '.join(sorted(set(strangers)))}"
+    if names := _clashes(spec, reserved):
+        yield f"renamed to {_PREFIX}NAME: {', '.join(sorted(names))}"
+
+
+def _strangers(spec: mujoco.MjSpec, robot: RobotCfg) -> list[Any]:
+    """Elements of the file that are not the robot: all outside of ``robot.root`` if that is given,
+    else floors, lights, and bodies that are free; and keyframes, which fit no scene.
+    """
+    world = spec.worldbody
+    planes = [geom for geom in world.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]
+    joints = {name: spec.joint(name) for name in robot.joints}
+    trees = {_tree(joint.parent).name for joint in joints.values()}
+    free = [
+        body
+        for body in world.bodies
+        if body.name not in trees and any(j.type == _FREE for b in _below(body) for j in b.joints)
+    ]
+    out = [*spec.keys, *world.lights, *planes, *free]
+    if robot.root:
+        require_names("robot.root: body", [robot.root], [body.name for body in spec.bodies])
+        root = spec.body(robot.root)
+        kept = {body.name for body in (*_below(root), *_above(root))}
+        outside = [b for b in spec.bodies if b.name not in kept and b.parent.name in kept]
+        missing = [n for n, joint in joints.items() if joint.parent.name not in kept]
+        require_names(
+            f"robot.root={robot.root}: joint",
+            missing,
+            [j.name for b in _below(root) for j in b.joints],
+        )
+        out = [*spec.keys, *world.lights, *world.geoms, *outside]
+    return out
+
+
+def _tree(body: mujoco.MjsBody) -> mujoco.MjsBody:
+    """The child of the world that a body hangs below."""
+    return [body, *_above(body)][-2] if body.name != WORLD else body
+
+
+def _above(body: mujoco.MjsBody) -> list[mujoco.MjsBody]:
+    """A body's ancestors, up to the world."""
+    return [] if body.name == WORLD else [body.parent, *_above(body.parent)]
+
+
+def _below(body: mujoco.MjsBody) -> list[mujoco.MjsBody]:
+    """A body and its descendants."""
+    return [body, *(low for child in body.bodies for low in _below(child))]
+
+
+def _clashes(spec: mujoco.MjSpec, reserved: Collection[str]) -> list[str]:
+    return [e.name for kind in _NAMED for e in getattr(spec, kind) if e.name in reserved]
+
+
+def _rename(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) -> None:
+    """Put a prefix in front of names that the scene needs, and wherever they are named."""
+    clashes = _clashes(spec, reserved)
+    profile = {*robot.joints, *robot.jaw_bodies, *robot.grasp_sites, robot.approach_body}
+    if names := profile & set(clashes):
+        raise MjstackError(
+            f"robot {robot.name}: the scene has {', '.join(sorted(names))} too, expected other"
+            " names in the robot's file. Rename them there"
+        )
+    for kind in (*_NAMED, *_NAMING):
+        for element in getattr(spec, kind):
+            for field in ("name", *_NAMING.get(kind, ())):
+                if getattr(element, field) in clashes:
+                    setattr(element, field, _PREFIX + getattr(element, field))
 
 
 def _fields(option: object) -> list[str]:

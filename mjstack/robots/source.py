@@ -1,7 +1,7 @@
 """Robot descriptions as MjSpec: any MJCF file, mjstack's own mesh-free ones, or Menagerie's."""
 
 import os
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 
 import mujoco
@@ -18,12 +18,13 @@ _MENAGERIE_FIX = "Set MENAGERIE_ROOT to a checkout of MuJoCo Menagerie, or use m
 _CONTACT = ("contype", "conaffinity", "condim", "friction", "solref", "solimp", "priority")
 
 
-def robot_spec(robot: RobotCfg, model: ModelCfg) -> mujoco.MjSpec:
+def robot_spec(robot: RobotCfg, model: ModelCfg, reserved: Collection[str] = ()) -> mujoco.MjSpec:
     """Load a robot and make it ready for the task.
 
     Args:
         robot: The robot's profile.
         model: Where its description comes from.
+        reserved: Names of the scene's own geoms, bodies and cameras.
 
     Returns:
         A scene with the robot alone, as a guest: its two grasp sites, and servos named after their
@@ -34,17 +35,22 @@ def robot_spec(robot: RobotCfg, model: ModelCfg) -> mujoco.MjSpec:
         UnknownName: It lacks a joint, body or site of the profile.
         ConfigError: A joint has no range or no servo.
     """
-    menagerie = model.source == "menagerie"
-    path = _menagerie_path(robot) if menagerie else _file_path(robot)
-    spec = read_mjcf(path, _MENAGERIE_FIX if menagerie else "Correct the file (robot.file).")
-    if menagerie and robot.replace_collision:
+    spec = read_robot(robot, model)
+    if model.source == "menagerie" and robot.replace_collision:
         _replace_collision(spec, robot)
     _require("robot.jaw_bodies: body", robot.jaw_bodies, spec.bodies)
     _require("robot.approach_body: body", [robot.approach_body or None], spec.bodies)
     _add_grasp_sites(spec, robot)
     _require("robot.arm_joints, robot.gripper_joints: joint", robot.joints, spec.joints)
     prepare_servos(spec, robot)
-    return as_guest(spec)
+    return as_guest(spec, robot, reserved)
+
+
+def read_robot(robot: RobotCfg, model: ModelCfg) -> mujoco.MjSpec:
+    """The robot's file as it is; errors as of `robot_spec`."""
+    menagerie = model.source == "menagerie"
+    path = _menagerie_path(robot) if menagerie else _file_path(robot)
+    return read_mjcf(path, _MENAGERIE_FIX if menagerie else "Correct the file (robot.file).")
 
 
 def read_mjcf(path: str | Path, fix: str) -> mujoco.MjSpec:

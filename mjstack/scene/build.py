@@ -13,10 +13,9 @@ import numpy as np
 from mjstack.config.schema import BoxCfg, CameraCfg, Config, ObjectCfg, SceneCfg
 from mjstack.errors import ConfigError, MjstackError, UnknownName
 from mjstack.robots import read_mjcf, robot_spec
-from mjstack.robots.guest import compile_scene
+from mjstack.robots.guest import WORLD, compile_scene
 
 TABLE = "table"
-WORLD = "world"  # MuJoCo's name of the body that never moves
 CAPSULE_TURN = np.array([math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0])
 """MuJoCo's capsule stands along z; an object's lies along x."""
 _TOUCH = 1e-5  # m: objects closer together by less only touch
@@ -34,7 +33,7 @@ def build_model(cfg: Config, *, visuals: bool = False) -> mujoco.MjModel:
     Raises:
         MjstackError: The robot's file does not fit the scene, such as one with a geom named table.
     """
-    spec = robot_spec(cfg.robot, cfg.model)
+    spec = robot_spec(cfg.robot, cfg.model, scene_names(cfg.scene))
     try:
         return build_scene(spec, cfg, visuals=visuals)
     except ValueError as error:
@@ -43,6 +42,12 @@ def build_model(cfg: Config, *, visuals: bool = False) -> mujoco.MjModel:
             f"robot {cfg.robot.name} in scene {cfg.scene.name}: {problem}. Correct the robot's file"
             " or the scene, whose names (floor, table and the objects) the robot cannot have."
         ) from error
+
+
+def scene_names(scene: SceneCfg) -> set[str]:
+    """Names of the scene's own geoms, bodies and cameras."""
+    walls = (f"box_{name}" for name in ("floor", "near", "far", "right", "left"))
+    return {"floor", TABLE, *scene.objects, *scene.cameras, *walls}
 
 
 def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> mujoco.MjModel:

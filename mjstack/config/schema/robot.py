@@ -1,6 +1,6 @@
 """The robot: names in its MJCF file, servos, and where each scene's objects stand for it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from omegaconf import MISSING
 
@@ -65,6 +65,16 @@ class ServoCfg:
 
 
 @dataclass(slots=True)
+class BasePoseCfg:
+    """Where a robot stands: the frame of its file in the world."""
+
+    pos: list[float] = spec([0.0, 0.0, 0.0], unit="m", length=3)
+    """Position."""
+    quat: list[float] = spec([1.0, 0.0, 0.0, 0.0], length=4)
+    """Rotation (w, x, y, z)."""
+
+
+@dataclass(slots=True)
 class RobotCfg:
     """An arm with a gripper: names in its MJCF file, and joint targets of its tasks.
 
@@ -80,6 +90,11 @@ class RobotCfg:
     file: str | None = None
     """An MJCF file: an absolute path, or one relative to the YAML that names it, or to the working
     folder. null: mjstack's own file of the robot."""
+    root: str = ""
+    """Body of the file that is the robot, with all below it; the rest is left out. Empty: the whole
+    file, without floors, lights and free bodies."""
+    base: BasePoseCfg = field(default_factory=BasePoseCfg)
+    """Where the file's origin stands in the world, such as on a pedestal."""
     menagerie_name: str = ""
     """The robot's folder in MuJoCo Menagerie, for ``model=menagerie``."""
     menagerie_file: str = ""
