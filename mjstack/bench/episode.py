@@ -1,8 +1,7 @@
-"""Physics steps with the object in hand, on MJWarp beside bare ones; the whole judged episode."""
+"""Physics steps with the object in hand, and the whole judged episode."""
 
 import statistics
 import time
-from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -22,13 +21,9 @@ from mjstack.bench.timing import (
 from mjstack.config.schema import Backend
 from mjstack.episodes.rollout import Episode, State, restore, rollout, snapshot
 from mjstack.episodes.stage import Stage
-from mjstack.errors import first_line, name_worlds
+from mjstack.errors import name_worlds
 from mjstack.mdp.geometry import objects_in_hand
 from mjstack.sim import Simulation
-from mjstack.sim.graph import StepGraph
-
-if TYPE_CHECKING:
-    from mjstack.sim.mjwarp import MjwarpSimulation
 
 
 class HeldPhysics:
@@ -37,17 +32,13 @@ class HeldPhysics:
     Attributes:
         lost: Worlds that overflowed, diverged or were not stepped in some repetition, shape
             ``(nworld,)``, bool.
-        bare: What plays; None: the simulation's own steps.
     """
 
-    def __init__(
-        self, sim: Simulation, state: State, decimation: int, bare: StepGraph | None = None
-    ) -> None:
+    def __init__(self, sim: Simulation, state: State, decimation: int) -> None:
         """Put the worlds into the state in which every repetition starts."""
         self.sim = sim
         self.state = state
         self.decimation = decimation
-        self.bare = bare
         restore(sim, state)
         self.lost = lost_worlds(sim)
 
@@ -59,24 +50,16 @@ class HeldPhysics:
         """Seconds that some control steps take from the state."""
         restore(self.sim, self.state)
         seconds = timed(self.sim, lambda: self._play(steps), meter)
-        if self.bare is None:
-            self.lost |= lost_worlds(self.sim, steps * self.decimation)
-        else:  # which counts no steps
-            cast("MjwarpSimulation", self.sim).latch()
-            self.lost |= lost_worlds(self.sim)
+        self.lost |= lost_worlds(self.sim, steps * self.decimation)
         return seconds
 
     def _play(self, steps: int) -> None:
-        for _ in range(steps * self.decimation if self.bare else steps):
-            if self.bare:
-                self.bare()
-            else:
-                self.sim.step(self.decimation)
+        for _ in range(steps):
+            self.sim.step(self.decimation)
 
 
 def measure_physics(stage: Stage, sim: Simulation, carry: State | None = None) -> Measurement:
-    """Measure physics steps under a held joint target, the object in hand; on MJWarp in turns with
-    bare steps from the same state.
+    """Measure physics steps under a held joint target, the object in hand.
 
     A grasp may be empty at the start, about to be retried. The number of full ones is reported, and
     there is no figure if they are less than half. The figure includes the rest of a simulation's
@@ -97,25 +80,12 @@ def measure_physics(stage: Stage, sim: Simulation, carry: State | None = None) -
             return out
 
     # The repetitions
-    bare: HeldPhysics | None = None
-    bare_problem = ""
-    seconds = physics.warm_up()
-    if sim.backend == "mjwarp":
-        try:
-            step = cast("MjwarpSimulation", sim).bare_step()
-            bare = HeldPhysics(sim, physics.state, physics.decimation, step)
-            seconds += bare.warm_up()
-        except Exception as error:  # our figure stands without it
-            bare = None
-            bare_problem = first_line(error)
-    steps = steps_that_fit(t.steps, time_budget(stage.cfg, sim), t.repetitions * seconds)
+    seconds = t.repetitions * physics.warm_up()
+    steps = steps_that_fit(t.steps, time_budget(stage.cfg, sim), seconds)
     meter = EnergyMeter(str(sim.device))
     times: list[float] = []
-    bare_times: list[float] = []
     for repetition in range(t.repetitions):
-        if bare is not None:
-            bare_times.append(bare.play(steps))
-        times.append(physics.play(steps, meter))  # last: it leaves the peaks
+        times.append(physics.play(steps, meter))
         stage.progress.advance("physics, repetitions", repetition + 1, t.repetitions)
         if settled(stage.cfg, times):
             break
@@ -135,18 +105,6 @@ def measure_physics(stage: Stage, sim: Simulation, carry: State | None = None) -
     )
     if full < sim.nworld:
         out.headline += f" ({sim.nworld - full} of them with an empty grasp)"
-    if bare is not None and bare.bare is not None:
-        eager = sim.device.type == "cuda" and stage.cfg.graph != "off" and not bare.bare.captured
-        bare_problem = "they could not be captured" if eager else describe_lost(bare.lost)
-    if bare_problem:
-        out.notes["speedup_over_bare"] = f"not measured, bare steps: {bare_problem}"
-    elif bare_times:
-        out.samples["bare_ms_per_batched_step"] = [
-            1e3 * seconds / (steps * physics.decimation) for seconds in bare_times
-        ]
-        ratios = [slow / fast for slow, fast in zip(bare_times, times, strict=True)]
-        out.samples["speedup_over_bare"] = ratios
-        out.headline += f", {statistics.median(ratios):.3g} times bare mujoco_warp.step"
     return out
 
 
