@@ -2,6 +2,7 @@
 
 import statistics
 import time
+from functools import partial
 
 import numpy as np
 
@@ -26,38 +27,6 @@ from mjstack.mdp.geometry import objects_in_hand
 from mjstack.sim import Simulation
 
 
-class HeldPhysics:
-    """Physics under a held joint target, timed again and again from one state.
-
-    Attributes:
-        lost: Worlds that overflowed, diverged or were not stepped in some repetition, shape
-            ``(nworld,)``, bool.
-    """
-
-    def __init__(self, sim: Simulation, state: State, decimation: int) -> None:
-        """Put the worlds into the state in which every repetition starts."""
-        self.sim = sim
-        self.state = state
-        self.decimation = decimation
-        restore(sim, state)
-        self.lost = lost_worlds(sim)
-
-    def warm_up(self) -> float:
-        """Compile and capture the step; return the seconds that one takes then."""
-        return [timed(self.sim, lambda: self._play(1)) for _ in range(WARM_UP)][-1]
-
-    def play(self, steps: int, meter: EnergyMeter = NO_METER) -> float:
-        """Seconds that some control steps take from the state."""
-        restore(self.sim, self.state)
-        seconds = timed(self.sim, lambda: self._play(steps), meter)
-        self.lost |= lost_worlds(self.sim, steps * self.decimation)
-        return seconds
-
-    def _play(self, steps: int) -> None:
-        for _ in range(steps):
-            self.sim.step(self.decimation)
-
-
 def measure_physics(stage: Stage, sim: Simulation, carry: State | None = None) -> Measurement:
     """Measure physics steps under a held joint target, the object in hand.
 
@@ -68,7 +37,10 @@ def measure_physics(stage: Stage, sim: Simulation, carry: State | None = None) -
     """
     t = stage.cfg.gate.throughput
     out = Measurement(name="physics")
-    physics = HeldPhysics(sim, carry_start(stage, sim, carry), stage.cfg.timing.decimation)
+    decimation = stage.cfg.timing.decimation
+    state = carry_start(stage, sim, carry)
+    restore(sim, state)
+    lost = lost_worlds(sim)
     carried = stage.phase(t.from_phase).carried
     full = sim.nworld
     if carried >= 0:  # both jaws press on the phase's object
@@ -80,25 +52,31 @@ def measure_physics(stage: Stage, sim: Simulation, carry: State | None = None) -
             return out
 
     # The repetitions
-    seconds = t.repetitions * physics.warm_up()
-    steps = steps_that_fit(t.steps, time_budget(stage.cfg, sim), seconds)
+    def play(count: int) -> None:
+        for _ in range(count):
+            sim.step(decimation)
+
+    seconds = [timed(sim, partial(play, 1)) for _ in range(WARM_UP)][-1]
+    steps = steps_that_fit(t.steps, time_budget(stage.cfg, sim), t.repetitions * seconds)
     meter = EnergyMeter(str(sim.device))
     times: list[float] = []
     for repetition in range(t.repetitions):
-        times.append(physics.play(steps, meter))
+        restore(sim, state)
+        times.append(timed(sim, partial(play, steps), meter))
+        lost |= lost_worlds(sim, steps * decimation)
         stage.progress.advance("physics, repetitions", repetition + 1, t.repetitions)
         if settled(stage.cfg, times):
             break
 
     # The result
-    graph = sim.graph_of(physics.decimation)
+    graph = sim.graph_of(decimation)
     captured = graph is not None and graph.captured
     out.add_repetitions(sim, stage.cfg, times, steps, meter, graph, captured=captured, whole=False)
     out.facts |= {
         "peak_contacts_per_world": int(sim.peak_contacts.max()),
         "peak_constraint_rows_per_world": int(sim.peak_constraints.max()),
     }
-    out.problem = describe_lost(physics.lost) or out.problem
+    out.problem = describe_lost(lost) or out.problem
     out.headline = (
         f"{out.median('world_steps_per_s'):,.0f} world-steps/s,"
         f" {out.median('ms_per_batched_step'):.3g} ms per step of {sim.nworld} worlds"
@@ -111,26 +89,22 @@ def measure_physics(stage: Stage, sim: Simulation, carry: State | None = None) -
 def carry_start(stage: Stage, sim: Simulation, state: State | None) -> State:
     """States at the start of the measured phase.
 
-    Those of gate *batch*, ``state``, or those of some native worlds over and over.
+    Those of gate *batch*, ``state``, or those of some native worlds over and over, played from the
+    configured starts.
     """
     if state is not None and state.qpos.shape[0] == sim.nworld:
         return state
     count = min(sim.nworld, stage.cfg.gate.throughput.start_worlds)
     native = stage.simulation(count, Backend.native, "cpu")
-    state = play_to_phase(stage, native)
-    native.close()
-    rows = np.arange(sim.nworld) % count
-    return State(state.qpos[rows], state.qvel[rows], state.ctrl[rows])
-
-
-def play_to_phase(stage: Stage, sim: Simulation) -> State:
-    """The state of every world as the measured phase begins, played from the configured starts."""
+    env = stage.start(native, stage.cfg.reset)
     phase = stage.cfg.gate.throughput.from_phase
-    env = stage.start(sim, stage.cfg.reset)
     steps = stage.phase(phase).start
     label = f"steps to {phase}"
     rollout(env, stage.driver(env), steps=steps, advance=stage.progress.advance, label=label)
-    return snapshot(sim)
+    state = snapshot(native)
+    native.close()
+    rows = np.arange(sim.nworld) % count
+    return State(state.qpos[rows], state.qvel[rows], state.ctrl[rows])
 
 
 def measure_episode(
