@@ -15,8 +15,7 @@ COPIES = {"tensor", "as_tensor", "from_numpy", "masked_select", "unique", "argwh
 CASTS = {"bool", "int", "float"}
 # The code that runs within a step, by file and class, "" for functions; None for all of a file.
 PATHS: dict[str, dict[str, str] | None] = {
-    "envs/env.py": {"Env": "advance _step_physics _evaluate _reset_ended"},
-    "envs/starts.py": {"Starts": "begin start"},
+    "envs/env.py": {"Env": "advance _step_physics _evaluate _reset_ended _begin _start"},
     "envs/command_delay.py": {"CommandDelay": "late reset"},
     "envs/faults.py": {"FaultLatch": "record record_reward"},
     "envs/outputs.py": {

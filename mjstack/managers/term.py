@@ -178,7 +178,6 @@ class Term:
         model_fields: Per-world model fields that it writes.
         has_memory: Whether it keeps something from step to step.
         ignores_success: Whether it is marked as such.
-        repeatable: Whether it is marked as such; all terms of mjstack are.
     """
 
     def __init__(
@@ -211,8 +210,6 @@ class Term:
         check_params(label, func, self.params, 1 if is_class or not masked else 2)
         self.model_fields: Sequence[str] = getattr(func, "model_fields", ())
         self.ignores_success = getattr(func, "ignores_success", None) is func
-        known = str(func.__module__).startswith("mjstack.") and not hasattr(func, "__wrapped__")
-        self.repeatable = known or getattr(func, "repeatable", None) is func
         self.call: Any = partial(func, **self.params)
         if is_class:
             with blamed(label):
