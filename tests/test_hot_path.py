@@ -107,7 +107,6 @@ PATHS: dict[str, dict[str, str] | None] = {
     "policy/network.py": {"PolicyNetwork": "normalized forward"},
     "episodes/failures.py": {"FailureMonitor": "update", "": "_of"},
     "kinematics/batched_ik.py": {"BatchedIk": "solve forward _launch _copy_in"},
-    "scene/index.py": {"Columns": "read write write_masked"},
     "sim/mjwarp.py": {"MjwarpSimulation": "step reset kinematics _decimation _pose _place"},
     "sim/usage.py": {"Usage": "count clear"},
     "sim/fused/constraints.py": {"": "collision solve"},
@@ -115,7 +114,7 @@ PATHS: dict[str, dict[str, str] | None] = {
     "sim/fused/step.py": {"": "rearranged_step"},
     "sim/graph.py": {"": "side_by_side where_any"},
     "sim/draws.py": {"": "draw_uniform"},
-    "sim/simulation.py": {"Simulation": "part"},
+    "sim/simulation.py": {"Columns": "read write write_masked", "Simulation": "part"},
     "math.py": None,
 }
 

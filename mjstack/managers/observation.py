@@ -14,7 +14,7 @@ from mjstack.config.schema import ObservationGroupCfg, ObservationTermCfg
 from mjstack.errors import TermError
 from mjstack.managers.term import Term, first_value, render_table
 from mjstack.managers.view import EnvView, random_uniform
-from mjstack.scene.index import Columns
+from mjstack.sim.simulation import Columns
 
 _SLIDE = 0.1  # m: as much noise for a sliding joint as 1 rad for another
 
