@@ -148,6 +148,8 @@ BAD_VALUES = [
     ("timing.decimation=0", "timing.decimation=0"),
     ("timing.decimation=11", "expected 0.02 s, because task.control_hz=50. Change both together"),
     ("timing.physics_dt=nan", "timing.physics_dt"),
+    ("solver.cone=round", "one of elliptic, pyramidal"),
+    ("solver.gripper_condim=2", "1, 3, 4, 6"),
     ("gates=[parityy]", "Did you mean 'parity'?"),
     ("gates=[]", "gates"),
     ("sim.device=gpu", "auto, cpu or cuda:N"),

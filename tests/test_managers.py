@@ -24,7 +24,7 @@ from mjstack.managers import (
 from mjstack.managers.term import Term, in_one_pass, shared
 from mjstack.mdp import reward as reward_terms
 from mjstack.scene import SceneIndex
-from mjstack.scene.index import Columns
+from mjstack.sim.simulation import Columns
 from mjstack.tasks.progress import Progress
 
 

@@ -10,15 +10,23 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from compositions import load_config
 from doc_blocks import ROOT, write_files
 
 import mjstack
 from mjstack.config.schema import Backend
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
-from mjstack.gates.parity import compare_states, differences, end_state, turn_between
+from mjstack.gates.parity import (
+    compare_options,
+    compare_states,
+    differences,
+    end_state,
+    turn_between,
+)
 from mjstack.math import quat_mul
 from mjstack.report.record import GateResult, Status
+from mjstack.scene import build_model
 from mjstack.sim import make_simulation
 
 SCENES = {"box": "stack", "cylinder": "lift", "box in the jaws": "peg"}
@@ -133,3 +141,17 @@ def test_a_turn_that_nothing_shows_is_none(shape: str, axis: list[float], expect
     start = torch.tensor([0.5, 0.5, 0.5, 0.5], dtype=torch.float64)
     half = torch.tensor([math.cos(0.15), *(math.sin(0.15) * x for x in axis)], dtype=torch.float64)
     assert turn_between(shape, start, quat_mul(start, half)) == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
+def test_the_cone_reaches_both_backends(cone: str) -> None:
+    cfg = load_config([f"solver.cone={cone}"])
+    model = build_model(cfg)
+    native, mjwarp = (
+        make_simulation(model, cfg, 1, backend=kind, device="cpu")
+        for kind in (Backend.native, Backend.mjwarp)
+    )
+    configured, compiled, uploaded, equal = compare_options(cfg, native, mjwarp)["cone"]
+    assert configured == compiled == uploaded == f"mjCONE_{cone.upper()}"
+    assert equal

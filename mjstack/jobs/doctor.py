@@ -9,7 +9,6 @@ from typing import cast
 
 import torch
 
-import mjstack
 from mjstack.config.load import load_config
 from mjstack.errors import MjstackError
 from mjstack.report.gl import require_offscreen
@@ -46,7 +45,7 @@ def findings(overrides: Sequence[str]) -> Iterator[tuple[str, str]]:
     cfg = load_config(overrides)
     facts = collect_provenance()
     versions = cast(dict[str, str], facts["versions"])
-    folder = Path(mjstack.__file__).parent
+    folder = Path(__file__).parents[1]
     yield "mjstack", f"{versions.pop('mjstack')}, commit {facts['git_commit']}, {folder}"
     yield "system", f"{platform.platform()}, Python {versions.pop('python')}"
     yield "packages", ", ".join(f"{name} {version}" for name, version in versions.items())

@@ -161,8 +161,6 @@ def _draw_bars(path: Path, plot: Plot, rows: Sequence[Row]) -> None:
             whiskers = np.array((middle - low, high - middle))
             style = {} if np.isnan(whiskers).all() else {"xerr": np.nan_to_num(whiskers)}
             axes.barh(places, middle, color=colors, ecolor="0.4", capsize=2, **style)
-            if metric.endswith("ratio"):
-                axes.axvline(1.0, color="0.3", linewidth=1.0)
             axes.set(xlabel=label)
             axes.grid(alpha=0.3, axis="x")
         panels[0].set_yticks(places, names)

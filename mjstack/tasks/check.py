@@ -40,9 +40,8 @@ from mjstack.errors import ConfigError, TermError, require_names
 from mjstack.managers.view import EnvView
 from mjstack.math import not_finite
 from mjstack.mdp.geometry import LOADED
-from mjstack.scene.index import Columns
 from mjstack.scene.phases import Phase
-from mjstack.sim.simulation import LOST_PHYSICS
+from mjstack.sim.simulation import LOST_PHYSICS, Columns
 from mjstack.tasks.view import PhaseNames, Step, TaskView
 
 _EVERY_TASK = {
