@@ -1,14 +1,15 @@
 """A run: the stage on which it plays, its folder, its records, and the products of its gates."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mjstack.config.schema import Backend, Config
-from mjstack.episodes.motion import draw_seen
+from mjstack.episodes.motion import draw_seen, world_fields, world_places
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.recorder import Snapshots, WorldRecorder
 from mjstack.episodes.rollout import NOMINAL, Episode, Observer, State
@@ -55,14 +56,14 @@ class Artifacts:
         carry_start: States of all worlds as the phase ``gate.throughput.from_phase`` begins, from
             *batch*.
         timed_episode: Time of the first seed's episode, from *batch*.
-        pictured: Title of the one-world episode that pictures show, and its positions, shape
-            ``(steps, nq)``.
+        pictured: The one-world episode that pictures show, its title as label, with positions at
+            every step end.
     """
 
     results: dict[str, GateResult] = field(default_factory=dict)
     carry_start: State | None = None
     timed_episode: Episode | None = None
-    pictured: tuple[str, np.ndarray] | None = None
+    pictured: World | None = None
 
 
 @dataclass(eq=False)
@@ -157,6 +158,7 @@ class Run:
         qpos: np.ndarray,
         status: Status,
         sim: Simulation,
+        places: Mapping[str, np.ndarray],
         title: str = "",
     ) -> None:
         """Show a world that was played alone, on the run's page if that has worlds in motion.
@@ -167,14 +169,17 @@ class Run:
             qpos: Positions at every step end, shape ``(steps, nq)``.
             status: How it ended.
             sim: The world.
+            places: As of `start_places`.
             title: Title of the run's pictures, if they show it too.
         """
+        (fields,) = world_fields(self.stage, sim, [0])
+        scene: dict[str, Any] = {"fields": fields, "places": world_places(self.stage, places, 0)}
         if self.page.motion:
             stride = frame_stride(self.cfg.timing.step_dt)
             frames = qpos[::stride]
             seen = draw_seen(self.stage, frames, sim, stride=stride)
             failed = status is Status.failed
-            world = World(label=label, qpos=frames, failed=failed, images=seen)
-            self.page.worlds3d[part] = [world]
+            shown = World(label=label, qpos=frames, failed=failed, images=seen, **scene)
+            self.page.worlds3d[part] = [shown]
         if title:
-            self.artifacts.pictured = (title, qpos)
+            self.artifacts.pictured = World(label=title, qpos=qpos, **scene)

@@ -26,7 +26,9 @@ def run_baseline(run: Run) -> list[GateResult]:
         metrics["path_error_m"] = run.stage.planner.path_error()
         thresholds["waypoint_error_m"] = cfg.controller.ik_tolerance
     qpos = run.nominal.world.qpos
-    run.show_world("baseline", "baseline, native", qpos, status, sim, "baseline world")
+    run.show_world(
+        "baseline", "baseline, native", qpos, status, sim, episode.places, "baseline world"
+    )
     result = GateResult(name="baseline", status=status, reason=reason or headline)
     result.thresholds = thresholds
     result.metrics = metrics

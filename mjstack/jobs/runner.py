@@ -182,7 +182,7 @@ class CheckedJob:
             self.work(run, folder)
         report.conclude()
         write_formats(report, page)
-        showing.draw_episode(self.stage, folder, run.artifacts.pictured, run.draw)
+        showing.draw_episode(self.stage, folder, run.artifacts.pictured, page, run.draw)
         page.note = showing.save_page(self.stage, folder, page)
 
     def _load(self, *, warp: bool) -> None:
