@@ -189,8 +189,10 @@ def _worlds(tally: EpisodeTally, run: Run) -> Worlds:
         if name in objects and name not in judged:
             worlds.unjudged.append(name)
             continue
-        xy = objects[name][0] + np.arange(2) if name in objects else []
-        ways = [(world.label, world.failed, world.qpos[:, xy]) for world in moving if len(xy)]
+        ways = []
+        if name in objects:
+            xy = slice(objects[name][0], objects[name][0] + 2)
+            ways = [(world.label, world.failed, world.qpos[:, xy]) for world in moving]
         worlds.maps.append(
             Map(title=name, xy=places[plotted, :2], table=table, ways=ways, marks=marks)
         )

@@ -95,7 +95,7 @@ class Stage:
             server.scene.add_batched_meshes_simple(
                 f"/place/{name}",
                 *disc,
-                np.tile(np.float32([1.0, 0.0, 0.0, 0.0]), (len(rows), 1)),
+                np.tile([1.0, 0.0, 0.0, 0.0], (len(rows), 1)),
                 np.column_stack((xy + self._offsets[rows], np.full(len(rows), height))),
                 batched_colors=_PLACE,
                 lod="off",
