@@ -1,7 +1,8 @@
 """Worlds in motion, for the run's 3-D page: recorded on the device, failing ones first."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import closing
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,11 @@ from torch import Tensor
 
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
-from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.recorder import Channels, Read, Recorder
 from mjstack.episodes.rollout import POLICY
 from mjstack.episodes.stage import Stage
 from mjstack.files import read_npz, reading, write_npz
+from mjstack.mdp.geometry import place_xy
 from mjstack.report.geometry import Fields, is_visible, match_geoms
 from mjstack.report.page import MOST_WORLDS, Page, World, frame_stride
 from mjstack.report.write import safely_write
@@ -23,7 +24,6 @@ from mjstack.sim import Simulation
 MOST_SEEN = 4  # worlds of a gate with what their driver saw
 _BYTES = 64 * 2**20  # of one recording
 _PARTS = ("label", "failed", "qpos")  # of a world, in the file
-_BY_NAME = ("fields", "places")  # parts that have names
 
 
 def motion_recorder(step_dt: float) -> Recorder:
@@ -44,39 +44,26 @@ def motion_recorder(step_dt: float) -> Recorder:
     return Recorder(Channels(bind, ends))
 
 
-def world_fields(stage: Stage, sim: Simulation, worlds: Sequence[int]) -> list[Fields]:
-    """Model fields of some worlds that pictures show, those of the model with visuals.
-
-    Args:
-        stage: It has the model with visuals. That of the worlds may have none, and fewer geoms.
-        sim: All worlds.
-        worlds: Their places among them.
+def world_fields(stage: Stage, env: Env, worlds: Sequence[int]) -> list[Fields]:
+    """Model fields of some worlds that pictures show, with the drawn places, those of the model
+    with visuals.
     """
-    rows: dict[str, np.ndarray] = {}
-    for name in filter(is_visible, sim.fields):
-        values = sim.fields[name][list(worlds)].cpu().numpy()
-        visual = stage.assets.visual_model
-        nominal = getattr(visual, name)
-        if name.startswith("geom_"):
-            full = np.repeat(nominal[None], len(worlds), 0)
-            full[:, match_geoms(sim.model, visual)] = values
-            values = full
-        if values[0].shape == nominal.shape:  # a model without visuals has no lights
-            rows[name] = values
-    return [{name: values[row] for name, values in rows.items()} for row in range(len(worlds))]
-
-
-def world_places(
-    stage: Stage, drawn: Mapping[str, np.ndarray], world: int
-) -> dict[str, np.ndarray]:
-    """Where the scene's places are in a world, x and y [m] of each by name; ``drawn`` is as of
-    `start_places`.
-    """
-    places = stage.cfg.scene.places
-    return {
-        name: drawn[name][world, :2] if name in drawn else np.array(place.xy)
-        for name, place in places.items()
+    visual = stage.assets.visual_model
+    sim = env.sim
+    rows = {
+        n: values[list(worlds)].cpu().numpy() for n, values in sim.fields.items() if is_visible(n)
     }
+    geoms = match_geoms(sim.model, visual) if rows else []
+    for name, values in rows.items():
+        if name.startswith("geom_"):  # physics has fewer of them
+            rows[name] = np.repeat(getattr(visual, name)[None], len(values), 0)
+            rows[name][:, geoms] = values
+    for name, place in env.cfg.scene.places.items():
+        if any(place.random_xy):
+            nominal = np.repeat(visual.geom_pos[None], len(worlds), 0)
+            xy = place_xy(env, name)[list(worlds)].cpu().numpy()
+            rows.setdefault("geom_pos", nominal)[:, visual.geom(f"place/{name}").id, :2] = xy
+    return [{name: values[row] for name, values in rows.items()} for row in range(len(worlds))]
 
 
 def draw_seen(
@@ -120,8 +107,8 @@ def show_batch(
     path: Path,
     gate: str,
     qpos: Tensor,
-    sim: Simulation,
-    record: EpisodeRecord,
+    env: Env,
+    failed: np.ndarray,
 ) -> None:
     """Add a gate's worlds to the page, failing ones first. A file keeps them for a resumed run.
 
@@ -131,37 +118,25 @@ def show_batch(
         path: The file.
         gate: The gate's name.
         qpos: Positions that `motion_recorder` has recorded of the configured seed.
-        sim: The worlds that have played it.
-        record: That of these worlds.
+        env: The worlds that have played it.
+        failed: Bits of the task's rules, shape ``(nworld,)``.
     """
-    failed = record.failed
-    starts = record.worlds.get("start_places", np.empty((len(failed), 0, 3))).swapaxes(0, 1)
-    places = dict(zip(record.object_names, starts, strict=True))
     rules = stage.check.rules
     chosen = np.argsort(failed[: qpos.shape[1]] == 0, kind="stable")[:MOST_WORLDS].tolist()
     motions = qpos[:, chosen].float().swapaxes(0, 1).cpu().numpy()
-    fields = world_fields(stage, sim, chosen)
+    fields = world_fields(stage, env, chosen)
     moving: list[World] = []
     stride = frame_stride(stage.cfg.timing.step_dt)
     for world, motion, values in zip(chosen, motions, fields, strict=True):
         problem = rules.describe(failed[world])
         label = f"{world}: {problem}" if problem else str(world)
-        seen = draw_seen(stage, motion, sim, world, stride) if len(moving) < MOST_SEEN else {}
+        seen = draw_seen(stage, motion, env.sim, world, stride) if len(moving) < MOST_SEEN else {}
         moving.append(
-            World(
-                label=label,
-                qpos=motion,
-                failed=bool(problem),
-                images=seen,
-                fields=values,
-                places=world_places(stage, places, world),
-            )
+            World(label=label, qpos=motion, failed=bool(problem), images=seen, fields=values)
         )
     page.worlds3d[gate] = moving
     arrays = {name: [getattr(world, name) for world in moving] for name in _PARTS}
-    for kind in _BY_NAME:
-        for name in getattr(moving[0], kind):
-            arrays[f"{kind}.{name}"] = [getattr(world, kind)[name] for world in moving]
+    arrays |= {name: [values[name] for values in fields] for name in fields[0]}
     if problem := safely_write(path, write_npz, arrays, stops=False):
         stage.progress.print_line(problem)
 
@@ -176,19 +151,8 @@ def restore_batch(page: Page, path: Path, gate: str) -> None:
         with reading(path, "Remove it"):
             arrays = read_npz(path)
             parts = zip(*(arrays.pop(name) for name in _PARTS), strict=True)
+            fields = [dict(zip(arrays, row, strict=True)) for row in zip(*arrays.values())]
             page.worlds3d[gate] = [
-                World(
-                    label=str(label),
-                    failed=bool(failed),
-                    qpos=qpos,
-                    **{
-                        kind: {
-                            name.removeprefix(f"{kind}."): rows[row]
-                            for name, rows in arrays.items()
-                            if name.startswith(f"{kind}.")
-                        }
-                        for kind in _BY_NAME
-                    },
-                )
-                for row, (label, failed, qpos) in enumerate(parts)
+                World(label=str(label), failed=bool(failed), qpos=qpos, fields=values)
+                for (label, failed, qpos), values in zip(parts, cycle(fields or [{}]))
             ]

@@ -1,19 +1,20 @@
 """A run: the stage on which it plays, its folder, its records, and the products of its gates."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from mjstack.config.schema import Backend, Config
-from mjstack.episodes.motion import draw_seen, world_fields, world_places
+from mjstack.envs import Env
+from mjstack.episodes.motion import draw_seen, world_fields
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.recorder import Snapshots, WorldRecorder
-from mjstack.episodes.rollout import NOMINAL, Episode, Observer, State
+from mjstack.episodes.rollout import Episode, Observer, State
 from mjstack.episodes.stage import Stage, TextHook
+from mjstack.managers.episode import required_fields
 from mjstack.managers.view import offers
 from mjstack.report.page import Page, World, frame_stride
 from mjstack.report.record import GateResult, Status
@@ -107,13 +108,15 @@ class Run:
 
     @cached_property
     def nominal(self) -> NominalRun:
-        """One native world from the nominal start: the reference of baseline and parity."""
+        """One native world from the start of *baseline*: the reference of that gate and parity."""
         stage = self.stage
-        sim = make_simulation(stage.model, self.cfg, 1, backend=Backend.native)
+        reset = self.cfg.gate.baseline.reset
+        fields = required_fields(reset)
+        sim = make_simulation(stage.model, self.cfg, 1, backend=Backend.native, fields=fields)
         world = WorldRecorder()
         snapshots = Snapshots(self.parity_steps.values())
         viewers = () if "parity" in self.cfg.gates else self.viewers
-        episode = stage.play(sim, NOMINAL, [*viewers, world, snapshots])
+        episode = stage.play(sim, reset, [*viewers, world, snapshots])
         return NominalRun(sim=sim, episode=episode, world=world, states=snapshots.states)
 
     @property
@@ -157,8 +160,7 @@ class Run:
         label: str,
         qpos: np.ndarray,
         status: Status,
-        sim: Simulation,
-        places: Mapping[str, np.ndarray],
+        env: Env,
         title: str = "",
     ) -> None:
         """Show a world that was played alone, on the run's page if that has worlds in motion.
@@ -168,18 +170,16 @@ class Run:
             label: Its text on the page.
             qpos: Positions at every step end, shape ``(steps, nq)``.
             status: How it ended.
-            sim: The world.
-            places: As of `start_places`.
+            env: The world.
             title: Title of the run's pictures, if they show it too.
         """
-        (fields,) = world_fields(self.stage, sim, [0])
-        scene: dict[str, Any] = {"fields": fields, "places": world_places(self.stage, places, 0)}
+        (fields,) = world_fields(self.stage, env, [0])
         if self.page.motion:
             stride = frame_stride(self.cfg.timing.step_dt)
             frames = qpos[::stride]
-            seen = draw_seen(self.stage, frames, sim, stride=stride)
+            seen = draw_seen(self.stage, frames, env.sim, stride=stride)
             failed = status is Status.failed
-            shown = World(label=label, qpos=frames, failed=failed, images=seen, **scene)
-            self.page.worlds3d[part] = [shown]
+            world = World(label=label, qpos=frames, failed=failed, images=seen, fields=fields)
+            self.page.worlds3d[part] = [world]
         if title:
-            self.artifacts.pictured = World(label=title, qpos=qpos, **scene)
+            self.artifacts.pictured = World(label=title, qpos=qpos, fields=fields)

@@ -119,7 +119,7 @@ def _play(
                     tally.details.append(problem)
             if path is not None and record.seed == seeds[0]:
                 qpos = motion.rows.pop("qpos")
-                show_batch(run.stage, run.page, path, tally.gate, qpos, sim, record)
+                show_batch(run.stage, run.page, path, tally.gate, qpos, batch.env, record.failed)
             _count(run, tally, record)
     except Exception as error:
         check_interrupt()

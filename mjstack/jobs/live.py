@@ -159,7 +159,7 @@ class LiveView(Observer):
         elif numbers != self._numbers:
             self._numbers = numbers
             self._view = None
-        fields = world_fields(self._stage, env.sim, self._numbers)
+        fields = world_fields(self._stage, env, self._numbers)
         content = [values.tobytes() for world in fields for values in world.values()]
         if content != self._fields:  # an episode may draw them anew
             self._fields = content

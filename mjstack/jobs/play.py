@@ -13,7 +13,7 @@ from mjstack.config.schema import Config, PlayJobCfg
 from mjstack.episodes.motion import draw_seen, world_fields
 from mjstack.episodes.recorder import WorldRecorder
 from mjstack.episodes.replay import simulate_alone
-from mjstack.episodes.rollout import POLICY, play_episode, rollout, start_places
+from mjstack.episodes.rollout import POLICY, play_episode, rollout
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError
@@ -70,14 +70,13 @@ def play_worlds(run: Run) -> list[GateResult]:
     positions = []
     seen = []
     fields = []
-    shown: list[Fields] = []
+    scenes: list[Fields] = []
     details = []
     succeeded = 0
     with closing(simulate_alone(stage, *stage.backend)) as sim:
         for world in range(cfg.nworld):
             env = stage.start(sim, cfg.reset, worlds=[world])
             driver = stage.driver(env)
-            places = start_places(env)
             recorder = WorldRecorder()
             observers = [*run.viewers, recorder]
             label = f"steps of world {world}"
@@ -93,9 +92,9 @@ def play_worlds(run: Run) -> list[GateResult]:
             positions.append(recorder.qpos)
             if cfg.video and job.camera is None:
                 seen.append(draw_seen(stage, recorder.qpos, sim))
-                shown += world_fields(stage, sim, [0])
+            scenes += world_fields(stage, env, [0])
             fields.append({name: value.clone() for name, value in sim.fields.items()})
-            run.show_world(f"{NAME}_{world}", str(world), recorder.qpos, status, sim, places)
+            run.show_world(f"{NAME}_{world}", str(world), recorder.qpos, status, env)
             details.append(f"world {world}: {outcome}")
             run.print_line(details[-1])
     result = GateResult(
@@ -107,7 +106,7 @@ def play_worlds(run: Run) -> list[GateResult]:
         details=details,
     )
     if cfg.video:
-        _save(run, np.stack(positions), fields, seen, shown, result)
+        _save(run, np.stack(positions), fields, scenes, seen, result)
     return [result]
 
 
@@ -115,8 +114,8 @@ def _save(
     run: Run,
     qpos: np.ndarray,
     fields: Sequence[Mapping[str, torch.Tensor]],
+    scenes: Sequence[Fields],
     seen: Sequence[Mapping[str, np.ndarray]],
-    shown: Sequence[Fields],
     result: GateResult,
 ) -> None:
     """Write the video; without one there is nothing to look at, and the job fails."""
@@ -134,7 +133,7 @@ def _save(
             save_video, path, model, qpos, step_dt, advance, fps=job.fps, width=job.width
         )
         if job.camera is None:
-            save(seen=seen, fields=shown)
+            save(seen=seen, fields=scenes)
             return
         looks = {field: torch.cat([world[field] for world in fields]) for field in fields[0]}
         name = f"images.{job.camera}"

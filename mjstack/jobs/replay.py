@@ -249,7 +249,7 @@ def _replay(
         status, reason, metrics, beyond = run.judge_one(episode)
         title = f"world {plan.world} of seed {plan.seed}, replayed ({backend})" if first else ""
         label = f"{plan.world}, {backend}"
-        run.show_world(f"replay_{backend}", label, qpos, status, sim, episode.places, title)
+        run.show_world(f"replay_{backend}", label, qpos, status, trace.env, title)
     agrees, comparison = _compare(plan, number, episode, qpos[-1], changes, run)
     lines += [_first_sign(monitor, episode) for monitor in monitors]
     for line in lines:

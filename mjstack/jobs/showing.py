@@ -69,7 +69,7 @@ def draw_episode(
     geoms = np.flatnonzero(np.isin(model.body_rootid[model.geom_bodyid], bodies))
     fixed = geom_corners(model, geoms)
     places = {
-        name: (pictured.places.get(name, place.xy), place.xy, place.random_xy)
+        name: (model.geom(f"place/{name}").pos[:2], place.xy, place.random_xy)
         for name, place in cfg.scene.places.items()
     }
     columns = [at + axis for at in stage.index.object_qpos for axis in range(3)]
@@ -137,10 +137,11 @@ def find_viewers(stage: Stage) -> list[Observer]:
         if not handle.is_running():
             return
         began = time.perf_counter()
-        write_fields(model, world_fields(stage, sim, [0])[0])
+        write_fields(model, *world_fields(stage, hook.env, [0]))
         data.qpos[:] = sim.qpos[0].cpu().numpy()
         mujoco.mj_forward(model, data)
         handle.sync()
         time.sleep(max(0.0, stage.cfg.timing.step_dt - (time.perf_counter() - began)))
 
-    return [Hook(show)]
+    hook = Hook(show)
+    return [hook]

@@ -13,6 +13,13 @@ _MESH = 1.5e-3  # m, the detail of meshes from files
 _SECTIONS = 20  # of a circle
 _BALL = (_SECTIONS // 2, _SECTIONS)  # sections from pole to pole, and around
 _SAME = 1e-6  # [m], and of rotation matrices and colours: less is rounding, which backends do
+_HALVES = {  # columns of the size that are half the box around a geom
+    mujoco.mjtGeom.mjGEOM_BOX: [0, 1, 2],
+    mujoco.mjtGeom.mjGEOM_ELLIPSOID: [0, 1, 2],
+    mujoco.mjtGeom.mjGEOM_SPHERE: [0, 0, 0],
+    mujoco.mjtGeom.mjGEOM_CYLINDER: [0, 0, 1],
+    mujoco.mjtGeom.mjGEOM_CAPSULE: [0, 0, 1],
+}
 _POSES = ("qpos0", "body_pos", "body_quat", "jnt_pos", "jnt_axis", "geom_pos", "geom_quat")
 _VISIBLE = (*_POSES, "geom_size", "geom_rgba", "site_", "cam_", "light_", "mat_")  # beginnings
 _UNCOLORED = (0.5, 0.5, 0.5, 1.0)  # of a geom, with which MuJoCo shows its material's colour
@@ -28,17 +35,11 @@ def write_fields(model: mujoco.MjModel, fields: Fields) -> None:
     for name, values in fields.items():
         getattr(model, name)[:] = values
     if "geom_size" in fields:
-        kinds = mujoco.mjtGeom
-        x, y, z = model.geom_size.T
-        for kind, half in {
-            kinds.mjGEOM_BOX: (x, y, z),
-            kinds.mjGEOM_ELLIPSOID: (x, y, z),
-            kinds.mjGEOM_SPHERE: (x, x, x),
-            kinds.mjGEOM_CYLINDER: (x, x, y),
-            kinds.mjGEOM_CAPSULE: (x, x, x + y),
-        }.items():
-            which = model.geom_type == kind
-            model.geom_aabb[which, 3:] = np.column_stack(half)[which]
+        for kind, columns in _HALVES.items():
+            rows = model.geom_type == kind
+            model.geom_aabb[rows, 3:] = model.geom_size[rows][:, columns]
+        rows = model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE
+        model.geom_aabb[rows, 5] += model.geom_size[rows, 0]
 
 
 def with_fields(model: mujoco.MjModel, fields: Fields) -> mujoco.MjModel:
@@ -232,14 +233,6 @@ class Shapes:
                 points = shape.mesh[0] @ matrix.reshape(3, 3).T + places[world, shape.pose]
                 corners += [points.min(0), points.max(0)]
         return np.min(corners, 0), np.max(corners, 0)
-
-
-def disc_mesh(radius: float) -> Mesh:
-    """A flat disc that lies at the origin [m]."""
-    from trimesh import creation
-
-    mesh = creation.cylinder(radius, 1e-3, _SECTIONS)
-    return np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces)
 
 
 def _tessellate(model: mujoco.MjModel, geom: int, size: np.ndarray) -> Mesh | None:

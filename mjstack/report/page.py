@@ -61,7 +61,6 @@ class World:
         failed: Whether it failed, which colours its table.
         images: What its driver saw, by camera, each ``(frames, height, width, 3)``, uint8.
         fields: Its model fields that pictures show, those of the model with visuals, by name.
-        places: Where the places of its episode are: x and y [m] of each by name.
     """
 
     label: str
@@ -69,7 +68,6 @@ class World:
     failed: bool = False
     images: Mapping[str, np.ndarray] = field(default_factory=dict)
     fields: Mapping[str, np.ndarray] = field(default_factory=dict)
-    places: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
 @dataclass(kw_only=True, slots=True)

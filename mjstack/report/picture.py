@@ -64,10 +64,10 @@ def _render(
     states: np.ndarray,
     width: int,
     height: int,
-    fields: Sequence[Fields] = (),
+    fields: Sequence[Fields] = ({},),
 ) -> Iterator[np.ndarray]:
-    """Draw states offscreen, shape ``(n, nq)``: images of shape ``(height, width, 3)``, uint8. The
-    states are of worlds with these model fields in turn.
+    """Draw states offscreen, shape ``(n, nq)``, of worlds with these model fields in turn: images
+    of shape ``(height, width, 3)``, uint8.
 
     Raises:
         MjstackError: This machine cannot draw offscreen.
@@ -83,7 +83,7 @@ def _render(
     camera.azimuth = 140.0
     camera.elevation = -24.0
     with renderer:
-        for state, values in zip(states, itertools.cycle(fields or [{}]), strict=False):
+        for state, values in zip(states, itertools.cycle(fields), strict=False):
             check_interrupt()
             write_fields(model, values)
             data.qpos[:] = state
@@ -113,7 +113,7 @@ def save_video(
     width: int | None = None,
     draw: Draw | None = None,
     seen: Sequence[Mapping[str, np.ndarray]] = (),
-    fields: Sequence[Fields] = (),
+    fields: Sequence[Fields] = ({},),
 ) -> None:
     """Write a video of episodes in real time, side by side: an mp4, or a GIF or WebP that loops, by
     the file's ending.
@@ -250,7 +250,7 @@ def save_trajectories(
     positions: np.ndarray,
     objects: Mapping[str, tuple[Sequence[float], Sequence[float]]],
     fixed: np.ndarray,
-    places: Mapping[str, tuple[Sequence[float], Sequence[float], Sequence[float]]],
+    places: Mapping[str, Sequence[Sequence[float]]],
     title: str,
 ) -> None:
     """Plot the objects' way among what does not move.
@@ -261,8 +261,7 @@ def save_trajectories(
         objects: Half sizes [m] and colour of each object by name.
         fixed: Corners of the boxes that hold fixed things [m], shape ``(n, 8, 3)``, in the order of
             their signs.
-        places: Position [m] of each place by name, and the middle and half-widths of the region
-            from which it may be drawn.
+        places: Position of each place by name, and middle and half-widths of its region [m].
         title: The picture's.
     """
     with figure(path, title, 3, figsize=(13, 4)) as (_, (side, above, height)):

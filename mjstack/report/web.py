@@ -23,7 +23,7 @@ import numpy as np
 
 from mjstack.errors import ConfigError, MissingExtra, MjstackError
 from mjstack.interrupt import check_interrupt
-from mjstack.report.geometry import Shape, Shapes, disc_mesh
+from mjstack.report.geometry import Shape, Shapes
 from mjstack.report.page import MOST_WORLDS, World
 
 EPISODE = "episode.html"
@@ -34,8 +34,6 @@ _MESSAGE = 2**16  # bytes, the largest of a browser
 _MARGIN = 0.12  # m between worlds
 _UNSEEN = ("site_", "cam_", "light_", "mat_")  # beginnings of model fields that it does not show
 _FAILED = np.array([0.86, 0.35, 0.32])
-_DISC = 0.012  # m, radius of a place
-_PLACE = (40, 40, 40)  # its colour
 _IMAGE = 0.16  # m, height of what a driver saw
 _UPRIGHT = (0.5, -0.5, -0.5, 0.5)  # it faces the viewer
 
@@ -84,22 +82,6 @@ class Stage:
                 lod="off",
             )
             self._handles.append((shape, handle))
-
-        # Places as discs on the table, one mesh for all of each name
-        top = shapes.model.geom("table")
-        height = float(top.pos[2] + top.size[2])
-        disc = disc_mesh(_DISC)
-        for name in worlds[0].places:
-            rows = [number for number, world in enumerate(worlds) if name in world.places]
-            xy = np.array([worlds[number].places[name] for number in rows])
-            server.scene.add_batched_meshes_simple(
-                f"/place/{name}",
-                *disc,
-                np.tile([1.0, 0.0, 0.0, 0.0], (len(rows), 1)),
-                np.column_stack((xy + self._offsets[rows], np.full(len(rows), height))),
-                batched_colors=_PLACE,
-                lod="off",
-            )
 
         # Texts, images, the floor, and where one looks from
         self._images: list[tuple[np.ndarray, Any]] = []
