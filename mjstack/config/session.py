@@ -280,8 +280,12 @@ def _once(load: Callable[..., DictConfig]) -> Callable[..., DictConfig]:
     def load_once(*, overrides: list[str], run_mode: RunMode, **options: Any) -> DictConfig:
         key = (*overrides, run_mode)
         if key not in composed:
-            typed = _add_entries(overrides)
-            composed[key] = load(overrides=typed, run_mode=run_mode, **options)
+            from mjstack.config.task_terms import choose_observation  # it reads CONFIG_FOLDER
+
+            def compose(overrides: list[str]) -> DictConfig:
+                return load(overrides=_add_entries(overrides), run_mode=run_mode, **options)
+
+            composed[key] = compose(choose_observation(overrides, compose))
         return composed[key]
 
     return load_once
