@@ -59,8 +59,12 @@ def test_shapes_are_mujocos() -> None:
     """Vertices lie on the surfaces, in the frame of the body that moves them."""
     model = mujoco.MjModel.from_xml_string(PRIMITIVES)
     shapes = Shapes(model)
-    assert shapes.bodies == [0, 1]  # a body without joints is part of the one that holds it
-    found = {rgba[:3]: mesh[0] for number, rgba, mesh in shapes.meshes if number == 1}
+    colors = [tuple(shape.rgba[0, :3].tolist()) for shape in shapes.meshes]
+    found = {
+        rgba: shape.mesh[0]
+        for rgba, shape in zip(colors, shapes.meshes, strict=True)
+        if shape.pose == 1
+    }
     assert len(found) == 7  # neither the hidden nor the invisible one
     box = (
         (found[1, 0, 0] - [0.1, 0.0, 0.0])
@@ -80,6 +84,7 @@ def test_shapes_are_mujocos() -> None:
     assert np.allclose(np.linalg.norm(found[1, 0, 1] / [0.1, 0.2, 0.3], axis=1), 1.0)
     assert np.allclose(np.ptp(found[0, 1, 0], 0), 0.1, atol=2e-3)
     places, turns = shapes.poses(model.qpos0[None])
+    # A body without joints is part of the one that holds it.
     assert np.allclose(places[0], [[0, 0, 0], [1, 2, 3]])
     assert np.allclose(turns[0, 1], model.qpos0[3:])
 
@@ -116,7 +121,7 @@ def test_a_page_holds_every_frame(get_stage: GetStage, tmp_path: Path) -> None:
         if message["type"] == "BatchedMeshesMessage"
     }
     assert len(names) == len(shapes.meshes)
-    numbers = [number for number, *_ in shapes.meshes]
+    numbers = [shape.pose for shape in shapes.meshes]
     name = f"/{numbers.index(rising)}"
     updates = [
         (time, message["updates"]["batched_positions"])

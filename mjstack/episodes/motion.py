@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from contextlib import closing
-from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -48,21 +47,27 @@ def world_fields(stage: Stage, env: Env, worlds: Sequence[int]) -> list[Fields]:
     """Model fields of some worlds that pictures show, with the drawn places, those of the model
     with visuals.
     """
-    visual = stage.assets.visual_model
     sim = env.sim
-    rows = {
-        n: values[list(worlds)].cpu().numpy() for n, values in sim.fields.items() if is_visible(n)
-    }
-    geoms = match_geoms(sim.model, visual) if rows else []
-    for name, values in rows.items():
+    places = env.cfg.scene.places.items()
+    centers = {name: place_xy(env, name) for name, place in places if any(place.random_xy)}
+    fields = {name: values for name, values in sim.fields.items() if is_visible(name)}
+    if not centers and not fields:
+        return [{}] * len(worlds)
+    visual = stage.assets.visual_model
+    geoms = match_geoms(sim.model, visual)
+    rows = {}
+    for name, values in fields.items():
+        array = values[list(worlds)].cpu().numpy()
+        nominal = np.repeat(getattr(visual, name)[None], len(worlds), 0)
         if name.startswith("geom_"):  # physics has fewer of them
-            rows[name] = np.repeat(getattr(visual, name)[None], len(values), 0)
-            rows[name][:, geoms] = values
-    for name, place in env.cfg.scene.places.items():
-        if any(place.random_xy):
-            nominal = np.repeat(visual.geom_pos[None], len(worlds), 0)
-            xy = place_xy(env, name)[list(worlds)].cpu().numpy()
-            rows.setdefault("geom_pos", nominal)[:, visual.geom(f"place/{name}").id, :2] = xy
+            nominal[:, geoms] = array
+        elif array.shape == nominal.shape:  # physics may have no light
+            nominal[:] = array
+        rows[name] = nominal
+    for name, xy in centers.items():
+        nominal = np.repeat(visual.geom_pos[None], len(worlds), 0)
+        disc = visual.geom(f"place/{name}").id
+        rows.setdefault("geom_pos", nominal)[:, disc, :2] = xy[list(worlds)].cpu().numpy()
     return [{name: values[row] for name, values in rows.items()} for row in range(len(worlds))]
 
 
@@ -151,8 +156,12 @@ def restore_batch(page: Page, path: Path, gate: str) -> None:
         with reading(path, "Remove it"):
             arrays = read_npz(path)
             parts = zip(*(arrays.pop(name) for name in _PARTS), strict=True)
-            fields = [dict(zip(arrays, row, strict=True)) for row in zip(*arrays.values())]
             page.worlds3d[gate] = [
-                World(label=str(label), failed=bool(failed), qpos=qpos, fields=values)
-                for (label, failed, qpos), values in zip(parts, cycle(fields or [{}]))
+                World(
+                    label=str(label),
+                    failed=bool(failed),
+                    qpos=qpos,
+                    fields={name: rows[number] for name, rows in arrays.items()},
+                )
+                for number, (label, failed, qpos) in enumerate(parts)
             ]

@@ -26,8 +26,8 @@ def run_baseline(run: Run) -> list[GateResult]:
         metrics["path_error_m"] = run.stage.planner.path_error()
         thresholds["waypoint_error_m"] = cfg.controller.ik_tolerance
     world = run.nominal.world
-    shown = (world.qpos, status, world.env)
-    run.show_world("baseline", "baseline, native", *shown, "baseline world")
+    label = "baseline, native"
+    run.show_world("baseline", label, world.qpos, status, world.env, "baseline world")
     result = GateResult(name="baseline", status=status, reason=reason or headline)
     result.thresholds = thresholds
     result.metrics = metrics

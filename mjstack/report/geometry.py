@@ -2,9 +2,8 @@
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import cycle
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -76,8 +75,7 @@ def geom_colors(model: mujoco.MjModel) -> np.ndarray:
     return rgba
 
 
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Shape:
+class Shape(NamedTuple):
     """A mesh in some worlds.
 
     Attributes:
@@ -85,7 +83,7 @@ class Shape:
         worlds: Numbers of the worlds.
         rgba: Its colour in each of them, shape ``(worlds, 4)``.
         mesh: The mesh, in the frame of its pose.
-        table: Whether it is the table, or of all that stands still in every world alike.
+        table: Whether it is the table, or all that stands still in every world alike.
     """
 
     pose: int
@@ -96,16 +94,11 @@ class Shape:
 
 
 class Shapes:
-    """The geometry of worlds.
-
-    Geoms that are the same in all worlds are joined: a mesh for each colour of each body that moves
-    by itself. A geom whose size, colour or place in its body differs has a pose of its own, and a
-    mesh for each size.
+    """The geometry of worlds. Geoms that are the same in all worlds are one mesh for each colour of
+    each body that moves by itself. A geom whose size, colour or place in its body differs has a
+    pose of its own, and a mesh for each size.
 
     Attributes:
-        model: A copy of the model, into which each world's fields are written.
-        bodies: Numbers of the bodies that have poses; the first is the world, which never moves.
-        geoms: Numbers of the geoms that have; their poses follow those of the bodies.
         rest: Positions in the model's own state, shape ``(worlds, nq)``.
         meshes: The meshes.
         missing: Names of geoms that differ and are not drawn, such as a plane.
@@ -120,68 +113,50 @@ class Shapes:
         """
         from trimesh.util import append_faces  # comes with viser
 
-        self.model = copy.copy(model)
+        self._model = copy.copy(model)
         self._data = mujoco.MjData(model)
         nominal = {name: getattr(model, name).copy() for fields in worlds for name in fields}
         self._worlds = [nominal | dict(fields) for fields in worlds]
         self.rest = np.stack([fields.get("qpos0", model.qpos0) for fields in self._worlds])
-        visible = np.flatnonzero(model.geom_group <= 2)
-        count = len(worlds) if nominal else 1
-        # Place and rotation matrix in the body, size and colour
-        states = np.stack([self._geom_states(world)[visible] for world in range(count)])
-        differs = (np.abs(states - states[0]) > _SAME).any((0, 2))
-
-        joined: dict[int, dict[tuple[float, ...], list[Mesh]]] = {0: {}}
-        alone: list[tuple[int, np.ndarray, np.ndarray, Mesh]] = []
         self.missing: list[str] = []
+        pieces: dict[tuple[int, bytes, bytes], list[Mesh]] = {}
+        visible = np.flatnonzero(model.geom_group <= 2)
+        states = np.stack([self._geom_states(world)[visible] for world in range(len(worlds))])
+        differs = (np.abs(states - states[0]) > _SAME).any((0, 2))
         for number, geom in enumerate(visible.tolist()):
             place, turn, sizes, rgba = np.split(states[:, number], (3, 12, 15), axis=1)
-            worlds_shown = np.flatnonzero(rgba[:, 3] > 0.0)
-            distinct, which = np.unique(sizes[worlds_shown].round(6), axis=0, return_inverse=True)
-            for row, size in enumerate(distinct):
-                if (mesh := _tessellate(model, geom, size)) is None:
-                    if differs[number]:
-                        self.missing.append(model.geom(geom).name or f"geom {geom}")
-                    break
-                if differs[number]:
-                    rows = worlds_shown[which.ravel() == row]
-                    alone.append((geom, rows, rgba[rows], mesh))
-                    continue
-                vertices = mesh[0] @ turn[0].reshape(3, 3).T + place[0]
-                body = int(model.body_weldid[model.geom_bodyid[geom]])
-                meshes = joined.setdefault(body, {}).setdefault(tuple(rgba[0].tolist()), [])
-                meshes.append((vertices, mesh[1]))
-        self.bodies = sorted(joined)
-        self.geoms = list(dict.fromkeys(geom for geom, *_ in alone))
-        everywhere = np.arange(len(worlds))
+            rendered = np.flatnonzero(rgba[:, 3] > 0.0)
+            distinct, which = np.unique(sizes[rendered].round(6), axis=0, return_inverse=True)
+            meshes = [_tessellate(model, geom, size) for size in distinct]
+            if None in meshes and differs[number]:
+                self.missing.append(model.geom(geom).name or f"geom {geom}")
+            for row, mesh in enumerate(filter(None, meshes)):
+                pose = model.nbody + geom
+                if not differs[number]:
+                    pose = int(model.body_weldid[model.geom_bodyid[geom]])
+                    mesh = mesh[0] @ turn[0].reshape(3, 3).T + place[0], mesh[1]
+                rows = rendered[which.ravel() == row]
+                key = (pose, rows.tobytes(), rgba[rows].tobytes())
+                pieces.setdefault(key, []).append(mesh)
+        # Bodies by number, then geoms; the first is the world, which never moves
+        self._poses = sorted({0, *(pose for pose, *_ in pieces)})
+        table = (0, model.nbody + mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "table"))
         self.meshes = [
             Shape(
-                pose=number,
-                worlds=everywhere,
-                rgba=np.tile(rgba, (len(worlds), 1)),
-                mesh=append_faces(*zip(*meshes, strict=True)),
-                table=body == 0,
+                self._poses.index(pose),
+                np.frombuffer(rows, int),
+                np.frombuffer(rgba).reshape(-1, 4),
+                append_faces(*zip(*meshes, strict=True)),
+                pose in table,
             )
-            for number, body in enumerate(self.bodies)
-            for rgba, meshes in joined[body].items()
-        ]
-        first = len(self.bodies)
-        self.meshes += [
-            Shape(
-                pose=first + self.geoms.index(geom),
-                worlds=rows,
-                rgba=rgba,
-                mesh=mesh,
-                table=model.geom(geom).name == "table",
-            )
-            for geom, rows, rgba, mesh in alone
+            for (pose, rows, rgba), meshes in sorted(pieces.items(), key=lambda item: item[0][0])
         ]
 
     def _geom_states(self, world: int) -> np.ndarray:
         """Place and rotation matrix in the body that moves it, size and colour of each geom in a
         world, shape ``(ngeom, 19)``.
         """
-        model, data = self.model, self._data
+        model, data = self._model, self._data
         write_fields(model, self._worlds[world])
         data.qpos[:] = self.rest[world]
         mujoco.mj_kinematics(model, data)
@@ -205,20 +180,18 @@ class Shapes:
             Positions [m], shape ``(n, poses, 3)``, and quaternions (w, x, y, z), of shape ``(n,
             poses, 4)``.
         """
-        bodies = len(self.bodies)
-        size = (len(qpos), bodies + len(self.geoms))
-        places = np.empty((*size, 3))
-        turns = np.empty((*size, 4))
-        data = self._data
-        state, xpos, xquat = data.qpos, data.xpos, data.xquat  # each access makes a new array
+        model, data = self._model, self._data
+        places = np.empty((len(qpos), len(self._poses), 3))
+        turns = np.empty((len(qpos), len(self._poses), 4))
+        bodies = [pose for pose in self._poses if pose < model.nbody]
+        geoms = [pose - model.nbody for pose in self._poses[len(bodies) :]]
         for world, (row, fields) in enumerate(zip(qpos, cycle(self._worlds), strict=False)):
-            write_fields(self.model, fields)
-            state[:] = row
-            mujoco.mj_kinematics(self.model, data)
-            xpos.take(self.bodies, 0, places[world, :bodies])
-            xquat.take(self.bodies, 0, turns[world, :bodies])
-            for number, geom in enumerate(self.geoms, bodies):
-                places[world, number] = data.geom_xpos[geom]
+            write_fields(model, fields)
+            data.qpos[:] = row
+            mujoco.mj_kinematics(model, data)
+            places[world] = *data.xpos[bodies], *data.geom_xpos[geoms]
+            turns[world, : len(bodies)] = data.xquat[bodies]
+            for number, geom in enumerate(geoms, len(bodies)):
                 mujoco.mju_mat2Quat(turns[world, number], data.geom_xmat[geom])
         return places, turns
 
