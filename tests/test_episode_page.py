@@ -6,21 +6,28 @@ import re
 import urllib.parse
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import matplotlib.image
 import mujoco
 import numpy as np
 import pytest
+import torch
 from browser import EXECUTABLE, Tab, browse, messages
-from environments import Capture, GetStage, MakeSim, Patch, one_second_episode
+from environments import Capture, GetStage, MakeSim, Patch, configure, one_second_episode
+from torch import Tensor
 
 import mjstack.report.web as web
 from mjstack.cli import run
-from mjstack.episodes.motion import motion_recorder
+from mjstack.config.schema import TermCfg
+from mjstack.episodes.motion import motion_recorder, restore_batch, show_batch
 from mjstack.episodes.rollout import Hook
+from mjstack.episodes.stage import Stage
+from mjstack.managers import EnvView, random_uniform, uses_fields
+from mjstack.math import quat_to_matrix
 from mjstack.report.geometry import Shapes
-from mjstack.report.page import World, frame_stride
+from mjstack.report.page import Page, World, frame_stride
 from mjstack.report.web import choose_worlds, save_episode
 
 PRIMITIVES = """
@@ -87,6 +94,97 @@ def test_shapes_are_mujocos() -> None:
     # A body without joints is part of the one that holds it.
     assert np.allclose(places[0], [[0, 0, 0], [1, 2, 3]])
     assert np.allclose(turns[0, 1], model.qpos0[3:])
+
+
+@uses_fields("body_pos", "body_quat")
+def move_wall(env: EnvView, mask: Tensor) -> None:
+    """Move and turn the wall, which stands still."""
+    body = env.sim.model.body("wall").id
+    draw = random_uniform(env, "move", 2)
+    env.sim.fields["body_pos"][mask, body, :2] += 0.05 * draw[mask]
+    half = 0.5 * draw[mask, 0]
+    env.sim.fields["body_quat"][mask, body] = torch.stack(
+        (half.cos(), 0.0 * half, 0.0 * half, half.sin()), 1
+    )
+
+
+@uses_fields("geom_size")
+def resize_wall(env: EnvView, mask: Tensor) -> None:
+    """Make the wall higher."""
+    factor = 1.5 + 0.4 * random_uniform(env, "size", 1)
+    env.sim.fields["geom_size"][mask, env.sim.model.geom("wall").id, 2:] *= factor[mask]
+
+
+@uses_fields("geom_rgba")
+def paint_wall(env: EnvView, mask: Tensor) -> None:
+    """Give the wall a colour."""
+    draw = random_uniform(env, "paint", 3, 0.0, 1.0)
+    env.sim.fields["geom_rgba"][mask, env.sim.model.geom("wall").id, :3] = draw[mask]
+
+
+TERMS = (move_wall, resize_wall, paint_wall)
+
+
+def placed_meshes(path: Path) -> list[tuple[list[int], np.ndarray]]:
+    """Colour and vertices in the scene of every mesh of a page at its start."""
+    placed = []
+    for _, message in messages(path):
+        if message["type"] == "BatchedMeshesMessage":
+            props = message["props"]
+            vertices = props["vertices"].reshape(-1, 3)
+            quats = props["batched_wxyzs"].reshape(-1, 4)
+            colors = np.broadcast_to(props["batched_colors"].reshape(-1, 3), (len(quats), 3))
+            turns = quat_to_matrix(torch.from_numpy(quats.copy())).numpy()
+            for turn, place, color in zip(
+                turns, props["batched_positions"].reshape(-1, 3), colors, strict=True
+            ):
+                placed.append((color.tolist(), vertices @ turn.T + place))
+    return placed
+
+
+def test_a_page_shows_the_model_fields_of_each_world(tmp_path: Path) -> None:
+    """A body that stands still is moved and turned, its geom resized and painted: page, file of
+    motion, and MuJoCo agree.
+    """
+    wall = "+scene.objects.wall={fixed: true, size: [0.01, 0.05, 0.02], xy: [0.2, 0.15]}"
+    cfg = configure(wall, "sim=native", "nworld=3")
+    terms = {f.__name__: TermCfg(func=f"{__name__}.{f.__name__}") for f in TERMS}
+    stage = Stage(replace(cfg, reset=dict(cfg.reset) | terms))
+    sim = stage.batch_simulation(3)
+    env = stage.start(sim, stage.cfg.reset)
+    page = Page()
+    failed = np.array([0, stage.check.rules["STACKED"], 0], np.int32)
+    show_batch(stage, page, tmp_path / "m.npz", "batch", sim.qpos[None], env, failed)
+    restored = Page()
+    restore_batch(restored, tmp_path / "m.npz", "batch")
+    visual = stage.assets.visual_model
+    assert visual.ngeom > sim.model.ngeom  # so that numbers of geoms differ
+    table_size = 2.0 * np.array(stage.cfg.scene.table_half[:2])
+    for shown in (page, restored):
+        worlds = shown.worlds3d["batch"]
+        save_episode(tmp_path / "episode.html", visual, worlds, 0.04)
+        placed = placed_meshes(tmp_path / "episode.html")
+        tables = [
+            mesh for color, mesh in placed if np.allclose(np.ptp(mesh, 0)[:2], table_size, atol=1e-3)
+        ]
+        assert len(tables) == 3
+        for world, table in zip((1, 0, 2), tables, strict=True):  # the one that failed first
+            fields = {name: values[world].numpy() for name, values in sim.fields.items()}
+            geom = sim.model.geom("wall").id
+            color = np.round(255.0 * fields["geom_rgba"][geom, :3]).astype(int).tolist()
+            (mesh,) = (mesh for found, mesh in placed if found == color)
+            corners = np.array(list(product((-1.0, 1.0), repeat=3))) * fields["geom_size"][geom]
+            body = sim.model.body("wall").id
+            turn = quat_to_matrix(torch.from_numpy(fields["body_quat"][body])).numpy()
+            expected = corners @ turn.T + fields["body_pos"][body]
+            offset = table.mean(0)[:2] - stage.cfg.scene.table_center[:2]
+            expected[:, :2] += offset
+            gaps = np.linalg.norm(mesh[:, None] - expected, axis=2)
+            assert gaps.min(1).max() < 1e-3
+            assert gaps.min(0).max() < 1e-3
+            (xpos,) = mesh.mean(0)[None] - [*offset, 0.0]
+            assert np.allclose(xpos, sim.xpos[world, body], atol=1e-3)
+    sim.close()
 
 
 def motion(get_stage: GetStage, worlds: int, frames: int) -> list[World]:
