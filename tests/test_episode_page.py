@@ -1,5 +1,6 @@
 """The 3-D page of a run's worlds: geometry and poses are MuJoCo's, and a browser shows them."""
 
+import csv
 import io
 import json
 import re
@@ -20,6 +21,7 @@ from torch import Tensor
 
 import mjstack.report.web as web
 from mjstack.cli import run
+from mjstack.config.load import load_config
 from mjstack.config.schema import TermCfg
 from mjstack.episodes.motion import motion_recorder, restore_batch, show_batch
 from mjstack.episodes.rollout import Hook
@@ -28,7 +30,7 @@ from mjstack.managers import EnvView, random_uniform, uses_fields
 from mjstack.math import quat_to_matrix
 from mjstack.report.geometry import Shapes
 from mjstack.report.page import Page, World, frame_stride
-from mjstack.report.web import choose_worlds, save_episode
+from mjstack.report.web import choose_worlds, not_shown, save_episode
 
 PRIMITIVES = """
 <mujoco>
@@ -165,7 +167,9 @@ def test_a_page_shows_the_model_fields_of_each_world(tmp_path: Path) -> None:
         save_episode(tmp_path / "episode.html", visual, worlds, 0.04)
         placed = placed_meshes(tmp_path / "episode.html")
         tables = [
-            mesh for color, mesh in placed if np.allclose(np.ptp(mesh, 0)[:2], table_size, atol=1e-3)
+            mesh
+            for color, mesh in placed
+            if np.allclose(np.ptp(mesh, 0)[:2], table_size, atol=1e-3)
         ]
         assert len(tables) == 3
         for world, table in zip((1, 0, 2), tables, strict=True):  # the one that failed first
@@ -185,6 +189,69 @@ def test_a_page_shows_the_model_fields_of_each_world(tmp_path: Path) -> None:
             (xpos,) = mesh.mean(0)[None] - [*offset, 0.0]
             assert np.allclose(xpos, sim.xpos[world, body], atol=1e-3)
     sim.close()
+
+
+def test_one_looks_at_the_first_failing_world(get_stage: GetStage, tmp_path: Path) -> None:
+    model = get_stage("so101").assets.visual_model
+    looks = []
+    for failing in ((), (4,), (4, 7)):
+        worlds = [replace(w, failed=int(w.label) in failing) for w in motion(get_stage, 9, 2)]
+        save_episode(tmp_path / "e.html", model, worlds, 0.04)
+        sent = [message for _, message in messages(tmp_path / "e.html")]
+        (look,) = [m for m in sent if m["type"] == "SetCameraLookAtMessage"]
+        looks.append(look["look_at"][:2])
+        (first,) = [m for m in sent if "props" in m and m.get("name") == "/0"]
+        places = first["props"]["batched_positions"]
+    offsets = places.reshape(-1, 3)[:, :2]
+    apart = np.linalg.norm(offsets[0] - offsets[1])
+    assert np.linalg.norm(offsets[4] + [0.15, 0.0] - looks[1]) < 0.5 * apart
+    assert np.allclose(looks[1], looks[2])
+    assert not np.allclose(looks[0], looks[1])
+
+
+def test_a_page_says_what_it_does_not_show(get_stage: GetStage) -> None:
+    model = get_stage("so101").assets.visual_model
+    (world,) = motion(get_stage, 1, 2)
+    floor = model.geom_rgba.copy()
+    floor[model.geom("floor").id] = [1.0, 0.0, 0.0, 1.0]
+    same = {"light_pos": model.light_pos, "geom_rgba": model.geom_rgba}
+    other = {"light_pos": model.light_pos + 1.0, "geom_rgba": floor}
+    assert not_shown(model, [replace(world, fields=same)] * 2) == []
+    worlds = [replace(world, fields=fields) for fields in (same, other)]
+    line = "episode.html does not show how worlds differ in light_pos, floor"
+    assert not_shown(model, worlds) == [line]
+
+
+@pytest.mark.full
+def test_drawn_places_are_in_every_file(tmp_path: Path) -> None:
+    """The goal of examples/push: tables, map and 3-D page."""
+    conf = str(Path(__file__).parents[1] / "examples" / "push" / "conf")
+    cfg = load_config(["task=push"], config_dir=conf)
+    quick = [f"controller.phases.{name}.seconds=0.1" for name in cfg.controller.phases]
+    args = ["--config-dir", conf, "task=push", "sim=native", "gates=[success]", "nworld=3", *quick]
+    args += ["task.check.window=5", "task.success.params.steps=5", "gate.success.cell_episodes=1"]
+    out = tmp_path / "out"
+    assert run([*args, f"hydra.run.dir={out}"]) == 1
+    goals = np.load(out / "starts_seed0.npz")["goal_xy"]
+    assert np.ptp(goals, 0).min() > 1e-4
+    with (out / "failing_worlds.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    cells = [[float(row["goal_x_m"]), float(row["goal_y_m"])] for row in rows]
+    assert np.allclose(cells, goals, atol=1e-5)
+    assert "goal_yaw_rad" not in rows[0]
+    with (out / "success_regions.csv").open() as file:
+        assert {row["object"] for row in csv.DictReader(file)} == {"puck", "goal"}
+    text = (out / "report.html").read_text()
+    (figure,) = re.findall(r"<figure><figcaption>goal</figcaption>.*?</figure>", text)
+    assert figure.count("<path class=x") == 3
+    assert "no sign before the result: " in text  # and the rules that broke
+    placed = placed_meshes(out / "episode.html")
+    table = 2.0 * np.array(cfg.scene.table_half[:2])
+    tables = [m for _, m in placed if np.allclose(np.ptp(m, 0)[:2], table, atol=1e-3)]
+    discs = [m for color, m in placed if color == [51, 51, 51]]
+    for goal, disc, mesh in zip(goals, discs, tables, strict=True):
+        offset = 0.5 * (mesh.max(0) + mesh.min(0))[:2] - cfg.scene.table_center[:2]
+        assert np.allclose(disc.mean(0)[:2] - offset, goal, atol=1e-3)
 
 
 def motion(get_stage: GetStage, worlds: int, frames: int) -> list[World]:
