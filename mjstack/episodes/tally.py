@@ -216,26 +216,20 @@ class EpisodeTally:
             tables.append(Table(title="Seeds", header=header, rows=rows))
         failed = np.flatnonzero(self.array("failed"))
         if "sign" in last.worlds and len(failed):
-            signs: dict[tuple[int, int, int], list[str]] = {}
-            keys = [self.array(name)[failed].tolist() for name in ("sign_phase", "sign")]
-            # Where there is no sign, the rules say more.
-            bits = np.where(self.array("sign")[failed] == 0, self.array("failed")[failed], 0)
-            keys.append(bits.tolist())
-            for name, *key in zip(self.names(failed), *keys, strict=True):
-                signs.setdefault(tuple(key), []).append(name)
+            signs: dict[tuple[int, int, str], list[str]] = {}
+            keys = (self.array(name)[failed].tolist() for name in ("sign_phase", "sign", "failed"))
+            for name, phase, sign, bits in zip(self.names(failed), *keys, strict=True):
+                # Where there is no sign, the rules say more.
+                rules = "" if sign else f": {self.check.rules.describe(bits)}"
+                signs.setdefault((phase, sign, rules), []).append(name)
             phases = [*last.phase_names, ""]  # the last one for no sign, -1
             rows = [
                 [
-                    ": ".join(
-                        filter(
-                            None,
-                            (describe_sign(sign, phases[phase]), self.check.rules.describe(broken)),
-                        )
-                    ),
+                    describe_sign(sign, phases[phase]) + rules,
                     str(len(names)),
                     ", ".join(names[:8]) + (", ..." if len(names) > 8 else ""),
                 ]
-                for (phase, sign, broken), names in sorted(signs.items())
+                for (phase, sign, rules), names in sorted(signs.items())
             ]
             header = ["first sign of failure", "failed episodes", "which"]
             tables.append(Table(title="Where it went wrong", header=header, rows=rows))

@@ -186,7 +186,7 @@ class CheckedJob:
         report.conclude()
         write_formats(report, page)
         showing.draw_episode(self.stage, folder, run.artifacts.pictured, page, run.draw)
-        page.note = showing.save_page(self.stage, folder, page)
+        showing.save_page(self.stage, folder, page)
 
     def _load(self, *, warp: bool) -> None:
         """Load MuJoCo Warp, if asked to, and have the collector, which gates call often, pass over

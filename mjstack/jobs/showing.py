@@ -84,11 +84,12 @@ def draw_episode(
         stage.progress.print_line(problem or f"video: {path}")
 
 
-def save_page(stage: Stage, folder: Path, page: Page) -> str:
-    """Write the 3-D page of the run's worlds, if there were any; return why there is none."""
+def save_page(stage: Stage, folder: Path, page: Page) -> None:
+    """Write the 3-D page of the run's worlds, if there were any."""
     cfg = stage.cfg
     if not cfg.web.episode:
-        return "web.episode=false: no 3-D page"
+        page.notes.append("web.episode=false: no 3-D page")
+        return
     path = folder / web.EPISODE
     worlds = web.choose_worlds(page.worlds3d)
     problem = web.lacks_viser()
@@ -96,12 +97,12 @@ def save_page(stage: Stage, folder: Path, page: Page) -> str:
         frame_dt = frame_stride(cfg.timing.step_dt) * cfg.timing.step_dt
         model = stage.assets.visual_model
         problem = safely_write(path, web.save_episode, model, worlds, frame_dt)
-        page.notes += web.not_shown(model, worlds)
+        page.notes += [] if problem else web.not_shown(model, worlds)
     if path.exists():  # perhaps an earlier call's, of seeds that were read back
         page.episode = web.EPISODE
     if problem:
+        page.notes.append(problem)
         stage.progress.print_line(problem)
-    return problem
 
 
 @contextmanager

@@ -81,8 +81,7 @@ class Page:
         worlds3d: Worlds in motion, by the part of the run that played them.
         pictures: Files that parts of the run have drawn.
         episode: Name of the file with the episode in 3-D; empty without one.
-        note: Why there is none.
-        notes: What else it does not show, and why.
+        notes: What it does not show, and why.
     """
 
     title: str = "mjstack run"
@@ -91,7 +90,6 @@ class Page:
     worlds3d: dict[str, list[World]] = field(default_factory=dict)
     pictures: list[str] = field(default_factory=list)
     episode: str = ""
-    note: str = ""
     notes: list[str] = field(default_factory=list)
 
 

@@ -74,15 +74,12 @@ class Section:
 def make_sections(report: Report, page: Page) -> list[Section]:
     """The whole run: summary, pictures, then every gate, and the provenance."""
     facts = report.provenance
-    episode = page.note
-    if page.episode:
-        text = f"Play it in 3-D: {page.episode} (red tables: failed worlds)"
-        episode = Marked(text, link=page.episode)
+    text = f"Play it in 3-D: {page.episode} (red tables: failed worlds)"
     head: list[Part] = [
         ", ".join(str(facts[name]) for name in ("date", "device") if name in facts),
         " ".join(report.overrides),
         summarize(report.gates),
-        episode,
+        Marked(text, link=page.episode) if page.episode else "",
         page.notes,
         *(report.folder / name for name in report.pictures),
     ]
