@@ -28,7 +28,7 @@ from mjstack.episodes.rollout import Hook
 from mjstack.episodes.stage import Stage
 from mjstack.managers import EnvView, random_uniform, uses_fields
 from mjstack.math import quat_to_matrix
-from mjstack.report.geometry import Shapes
+from mjstack.report.geometry import Shapes, with_fields
 from mjstack.report.page import Page, World, frame_stride
 from mjstack.report.web import choose_worlds, not_shown, save_episode
 
@@ -96,6 +96,79 @@ def test_shapes_are_mujocos() -> None:
     # A body without joints is part of the one that holds it.
     assert np.allclose(places[0], [[0, 0, 0], [1, 2, 3]])
     assert np.allclose(turns[0, 1], model.qpos0[3:])
+
+
+ARM = """
+<mujoco>
+  <asset><material name="green" rgba="0 1 0 1"/></asset>
+  <worldbody>
+    <body name="base" pos=".1 .2 .3">
+      <geom type="capsule" size=".02 .1" rgba="1 0 0 1"/>
+      <body name="nested" pos="0 0 .2"><geom type="box" size=".1 .02 .03" material="green"/></body>
+      <body name="link" pos=".3 0 0">
+        <joint axis="0 0 1" pos=".05 0 0"/>
+        <geom type="cylinder" size=".03 .06" pos=".1 0 0" material="green"/>
+        <geom type="ellipsoid" size=".03 .06 .02" pos="0 .1 0" rgba="0 0 1 1"/>
+      </body>
+    </body>
+    <body name="ball" pos="0 0 1"><freejoint/><geom size=".05" rgba="1 1 0 1"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("body_pos", "body_quat", "geom_pos", "geom_quat", "geom_size", "geom_rgba", "mat_rgba"),
+        *("jnt_pos", "jnt_axis", "qpos0", "geom_friction"),
+    ],
+)
+def test_shapes_are_where_mujoco_draws_any_model_field(name: str) -> None:
+    """The middle, the extent and the colour of every geom of three worlds, in the same state."""
+    model = mujoco.MjModel.from_xml_string(ARM)
+    rng = np.random.default_rng(1)
+    nominal = getattr(model, name)
+    worlds = [{name: nominal + rng.uniform(0.0, 0.01, nominal.shape)} for _ in range(2)]
+    if name.endswith(("quat", "axis")):
+        for fields in worlds:
+            fields[name] = nominal + rng.uniform(-0.3, 0.3, nominal.shape)
+            fields[name] /= np.linalg.norm(fields[name], axis=1, keepdims=True)
+    if name.endswith("rgba"):
+        for fields in worlds:
+            fields[name] = np.clip(rng.uniform(0.0, 1.0, nominal.shape), 0.1, 1.0)
+    qpos = model.qpos0 + 0.4
+    qpos[4:] = [1.0, 0.0, 0.0, 0.0]
+    shapes = Shapes(model, [*worlds, {}])
+    places, turns = shapes.poses(np.tile(qpos, (3, 1)))
+    matrices = quat_to_matrix(torch.from_numpy(turns)).numpy()
+    for world, fields in enumerate([*worlds, {}]):
+        drawn = []
+        for shape in shapes.meshes:
+            for row in np.flatnonzero(shape.worlds == world):
+                place = places[world, shape.pose]
+                points = shape.mesh[0] @ matrices[world, shape.pose].T + place
+                drawn.append((shape.rgba[row], points))
+        scene_model = with_fields(model, fields)
+        data = mujoco.MjData(scene_model)
+        data.qpos[:] = qpos
+        mujoco.mj_forward(scene_model, data)
+        scene = mujoco.MjvScene(scene_model, 100)
+        camera = mujoco.MjvCamera()
+        option = mujoco.MjvOption()
+        every = mujoco.mjtCatBit.mjCAT_ALL
+        perturb = mujoco.MjvPerturb()
+        mujoco.mjv_updateScene(scene_model, data, option, perturb, camera, every, scene)
+        geoms = [g for g in scene.geoms[: scene.ngeom] if g.objtype == mujoco.mjtObj.mjOBJ_GEOM]
+        assert len(geoms) == model.ngeom
+        for geom in geoms:
+            near = [points for rgba, points in drawn if np.allclose(rgba, geom.rgba, atol=1e-3)]
+            local = np.concatenate([(points - geom.pos) @ geom.mat for points in near])
+            number = geom.objid
+            half = scene_model.geom_aabb[number, 3:]
+            inside = local[(np.abs(local) <= half + 2e-3).all(1)]
+            assert np.allclose(inside.max(0), half, atol=2e-3), (world, number)
+            assert np.allclose(inside.min(0), -half, atol=2e-3), (world, number)
 
 
 @uses_fields("body_pos", "body_quat")
