@@ -161,7 +161,7 @@ def restore_batch(page: Page, path: Path, gate: str) -> None:
                     label=str(label),
                     failed=bool(failed),
                     qpos=qpos,
-                    fields={name: rows[number] for name, rows in arrays.items()},
+                    fields={n: rows[number] for n, rows in arrays.items() if is_visible(n)},
                 )
                 for number, (label, failed, qpos) in enumerate(parts)
             ]
