@@ -153,8 +153,9 @@ class EpisodeRecord:
     def arrays(self) -> dict[str, Any]:
         """The content of its file, `record_name`."""
         arrays: dict[str, Any] = self.worlds | {name: getattr(self, name) for name in _FACTS}
-        arrays |= {name: getattr(self, name) for name in _NAMES if getattr(self, name)}
+        arrays["object_names"] = self.object_names
         if "sign" in arrays:
+            arrays["phase_names"] = self.phase_names
             arrays["sign_names"] = [sign.name for sign in Sign]
         ranks = {"rank_first_world": list(self.ranks), "rank_place": list(self.ranks.values())}
         return arrays | ranks
