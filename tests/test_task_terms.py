@@ -21,6 +21,8 @@ from mjstack.episodes.stage import Stage
 from mjstack.gates.parity import run_parity
 from mjstack.jobs.train import judged_stage
 from mjstack.report.record import Status
+from mjstack.train.clone_network import input_noise
+from mjstack.train.trainer import with_observation
 
 TURN = 0.2  # rad, of the shoulder at the start
 FRICTION = 0.3  # of the first geom
@@ -250,3 +252,13 @@ def test_a_policy_sees_what_a_task_writes(turned: Path) -> None:
     chosen = load_config([*more, "job.observation=task"])
     assert chosen.job.observation == chosen.observation
     assert not chosen.unused_terms
+
+
+def test_terms_without_noise_get_some_in_a_training(turned: Path) -> None:
+    stage = Stage(composed(turned, "job=train", "trainer=clone", "job.input_noise=2.0"))
+    cfg = with_observation(stage.cfg)
+    spread = torch.full((7,), 0.5)
+    noise = input_noise(cfg, stage.model, {"joint_pos": 6, "shoulder": 1}, spread)
+    torch.testing.assert_close(noise, torch.tensor([0.02] * 6 + [0.02]))
+    stage.cfg.job.input_noise = 0.0
+    assert not input_noise(cfg, stage.model, {"joint_pos": 6, "shoulder": 1}, spread).any()
