@@ -81,7 +81,7 @@ def _compare(run: Run, mjwarp: Simulation) -> GateResult:
 
     headline = run.stage.check.headline(judged)
     run.print_line(f"{cfg.task.name} check: {headline} ({mjwarp.description})")
-    run.show_world("parity", "parity, MJWarp", world.qpos, status, mjwarp, "parity world")
+    run.show_world("parity", "parity, MJWarp", world.qpos, status, world.env, "parity world")
     ends = [f"final.{name}.position_m" for name in run.stage.index.objects]
     apart = max((result.metrics[end] for end in ends), default=0.0)
     summary = f"{headline}; objects end at most {1e3 * apart:.2f} mm from native's"

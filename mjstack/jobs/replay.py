@@ -248,7 +248,8 @@ def _replay(
         qpos = trace.arrays["qpos"]
         status, reason, metrics, beyond = run.judge_one(episode)
         title = f"world {plan.world} of seed {plan.seed}, replayed ({backend})" if first else ""
-        run.show_world(f"replay_{backend}", f"{plan.world}, {backend}", qpos, status, sim, title)
+        label = f"{plan.world}, {backend}"
+        run.show_world(f"replay_{backend}", label, qpos, status, trace.env, title)
     agrees, comparison = _compare(plan, number, episode, qpos[-1], changes, run)
     lines += [_first_sign(monitor, episode) for monitor in monitors]
     for line in lines:

@@ -185,8 +185,8 @@ class CheckedJob:
             self.work(run, folder)
         report.conclude()
         write_formats(report, page)
-        showing.draw_episode(self.stage, folder, run.artifacts.pictured, run.draw)
-        page.note = showing.save_page(self.stage, folder, page)
+        showing.draw_episode(self.stage, folder, run.artifacts.pictured, page, run.draw)
+        showing.save_page(self.stage, folder, page)
 
     def _load(self, *, warp: bool) -> None:
         """Load MuJoCo Warp, if asked to, and have the collector, which gates call often, pass over

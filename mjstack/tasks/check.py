@@ -319,6 +319,11 @@ class EpisodeCheck(ABC):
                 broken[name] = f" ({', '.join(words)})"
         return broken, beyond
 
+    @property
+    def limits(self) -> dict[str, tuple[float, float]]:
+        """The least and the largest of each measured value for which its rule holds, by name."""
+        return dict(chain(*(limits.items() for r in self._rules for limits in r.limits)))
+
     @abstractmethod
     def placed(self, step: Step) -> Tensor:
         """Whether each object is where it belongs, in the order of ``objects``, shape ``(nworld,
