@@ -37,10 +37,16 @@ def gripper_opening(env: EnvView) -> Tensor:
 
 
 def pose_w(env: EnvView, name: str) -> Tensor:
-    """Position [m] and quaternion (wxyz) of an object, never stale, shape ``(nworld, 7)``."""
-    if name in env.index.fixed:
-        return env.index.constant(env.index.fixed[name], env.sim.qpos).expand(env.nworld, -1)
-    return env.sim.part("qpos", env.index.object_columns(name)[0])
+    """Position [m] and quaternion (wxyz) of an object, never stale, shape ``(nworld, 7)``. A fixed
+    object is where the world's model fields have it.
+    """
+    if name not in env.index.fixed:
+        return env.sim.part("qpos", env.index.object_columns(name)[0])
+    pose = env.index.constant(env.index.fixed[name], env.sim.qpos).expand(env.nworld, -1)
+    body = env.index.bodies[name]
+    parts = {"body_pos": pose[:, :3], "body_quat": pose[:, 3:]}
+    moved = [env.sim.fields[f][:, body] if f in env.sim.fields else parts[f] for f in parts]
+    return pose if parts.keys().isdisjoint(env.sim.fields) else torch.cat(moved, dim=1)
 
 
 @shared
