@@ -1,17 +1,92 @@
 """Warp, set up before its first use, and ordered with torch's work."""
 
+import ctypes
+import logging
+import os
+import tempfile
 from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
 
 import torch
 import warp as wp
 
-wp.config.log_level = wp.LOG_ERROR  # it would greet on every run
+from mjstack.errors import MjstackError, first_line
 
 __all__ = ["torch_stream_scope", "wp"]
+
+log = logging.getLogger(__name__)
 
 # One object per torch stream, until the process ends: a second one for the same stream would
 # unregister it when freed.
 _STREAMS: dict[tuple[str, int], wp.Stream] = {}
+_CACHE = "WARP_CACHE_PATH"  # processes that this one starts read it
+
+
+def _kernel_cache() -> tuple[str, str, object]:
+    """The folder where Warp keeps compiled kernels. In place of one that cannot be written it is a
+    temporary folder, with links to the kernels of that one.
+
+    Returns:
+        The folder, what is wrong with the usual one, and the owner of a temporary folder.
+
+    Raises:
+        MjstackError: No folder can be written.
+    """
+    caches = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    usual = Path(os.environ.get(_CACHE) or f"{caches}/warp")
+    try:
+        usual = usual.expanduser()
+        version = usual / wp.config.version  # Warp adds it
+        version.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=version).close()
+        return str(usual), "", None
+    except (OSError, RuntimeError) as error:  # the other one: there is no home folder
+        reason = getattr(error, "strerror", None) or first_line(error)
+        problem = f"kernel cache {usual}: cannot be written ({reason})"
+    fix = f"Set {_CACHE} to a folder of yours"
+    try:
+        owner = tempfile.TemporaryDirectory(prefix="mjstack-kernels-")
+    except OSError as error:
+        raise MjstackError(f"{problem}, and there is no temporary folder", fix) from error
+    for file in (usual / wp.config.version).rglob("*"):
+        if file.is_file():
+            link = owner.name / file.relative_to(usual)
+            link.parent.mkdir(parents=True, exist_ok=True)
+            link.symlink_to(file.absolute())
+    os.environ[_CACHE] = owner.name
+    problem = f"{problem}, so that new kernels are compiled in every run. {fix}."
+    log.warning("%s", problem)
+    return owner.name, problem, owner
+
+
+def _init_without_driver() -> None:
+    """Initialize Warp on a machine without a CUDA driver. Its C++ code would write a line about
+    that to standard error, also for runs on the CPU; all else that it writes stays.
+    """
+    try:
+        error_output = os.dup(2)
+    except OSError:  # a closed one
+        return
+    reader, writer = os.pipe()
+    os.dup2(writer, 2)
+    os.close(writer)
+    try:
+        wp.init()
+    finally:
+        os.dup2(error_output, 2)
+        with open(reader, "rb") as pipe, open(error_output, "wb") as output:
+            output.writelines(line for line in pipe if b"load the NVIDIA CUDA driver" not in line)
+
+
+def _has_driver() -> bool:
+    """Whether Warp will find a CUDA driver."""
+    for name in ("libcuda.so", "libcuda.so.1"):
+        try:
+            ctypes.CDLL(name)
+        except OSError:
+            continue
+        return True
+    return False
 
 
 def torch_stream_scope(device: wp.Device) -> AbstractContextManager[object]:
@@ -32,3 +107,11 @@ def torch_stream_scope(device: wp.Device) -> AbstractContextManager[object]:
     if key not in _STREAMS:
         _STREAMS[key] = wp.stream_from_torch(current)
     return wp.ScopedStream(_STREAMS[key], sync_enter=False, sync_exit=False)
+
+
+wp.config.log_level = wp.LOG_ERROR  # it would greet on every run
+CACHE_PROBLEM = ""  # a sentence; empty if kernels are kept for later runs
+if wp.config.kernel_cache_dir is None:  # else the caller has set it, or has used Warp
+    wp.config.kernel_cache_dir, CACHE_PROBLEM, _owner = _kernel_cache()
+if not _has_driver():
+    _init_without_driver()
