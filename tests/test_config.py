@@ -3,8 +3,11 @@ one line.
 """
 
 import runpy
+from collections.abc import Iterator
+from dataclasses import Field, fields, is_dataclass
 from itertools import zip_longest
 from pathlib import Path
+from typing import Any, get_args, get_origin, get_type_hints
 
 import compositions
 import pytest
@@ -12,12 +15,16 @@ from check_cases import limits
 from compositions import checked, refusal
 from doc_blocks import ROOT
 from environments import Patch
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 import mjstack
-from mjstack.config import load_config
+from mjstack.config import fields as config_fields
+from mjstack.config import load_config, schema
 from mjstack.config.help import list_keys
 from mjstack.config.schema import Backend, CloneJobCfg, Config
 from mjstack.config.session import CONFIG_FOLDER
+from mjstack.errors import ConfigError
 from mjstack.jobs.gates import check_machine
 from mjstack.tasks.check import make_check
 
@@ -267,7 +274,7 @@ BAD = [
     (
         ["job=compare", "job.against=policy=a"],
         "one of = , : ; # & ! < > ^ ~ ` needs double quotes inside of single ones:"
-        " 'starts=\"run(1).csv\"', or in a list 'job.against=[\"policy=DIR\"]'.",
+        " 'policy=\"run (1)\"', or in a list 'job.against=[\"policy=DIR\"]'.",
     ),
     (["+nworld=4"], "An item is already at 'nworld'."),
     (["~nworld"], "~nworld: expected a term of"),
@@ -415,3 +422,65 @@ def test_sizes_of_a_training_follow_the_device(
     job = compositions.load_config(["job=train", *overrides]).job
     assert isinstance(job, CloneJobCfg)
     assert (job.episodes, job.leave_out) == (episodes, leave_out)
+
+
+def schema_floats() -> Iterator[tuple[type, Field, Any]]:
+    """Every field of the schema that is a float or holds floats, with its type."""
+    for owner in vars(schema).values():
+        for item in fields(owner) if is_dataclass(owner) else ():
+            hint = get_type_hints(owner)[item.name]
+            if config_fields.field_range(item).vectors:
+                hint = dict[str, list[float]]
+            if "float" in str(hint):
+                yield owner, item, hint  # type: ignore[misc]
+
+
+def filled(hint: Any, value: object, length: int) -> Any:
+    """A value of a type, filled with one number."""
+    kinds = get_args(hint)
+    if get_origin(hint) is list:
+        return [filled(kinds[0], value, length)] * length
+    if get_origin(hint) is dict:
+        return {"x": filled(kinds[1], value, length)}
+    return filled(kinds[0], value, length) if kinds else value
+
+
+def taken(owner: type, item: Field, value: object) -> Any:
+    """The value of a field of a class as a configuration has it."""
+    merged = OmegaConf.merge(OmegaConf.structured(owner), {item.name: value})
+    plain = OmegaConf.to_container(merged)[item.name]  # type: ignore[call-overload,index]
+    config_fields._check(item.name, plain, owner, item)
+    return plain
+
+
+@pytest.mark.parametrize(
+    ("owner", "item", "hint"),
+    list(schema_floats()),
+    ids=lambda v: getattr(v, "name", None) or str(v),
+)
+def test_a_whole_number_is_a_float(owner: type, item: Field, hint: Any) -> None:
+    """Also inside of lists and mappings, and of those in each other. A bool is none."""
+    limits = config_fields.field_range(item)
+    value = next(n for n in (0, 1, 5) if limits.holds(n))
+    got = taken(owner, item, filled(hint, value, limits.length or 2))
+    assert got == filled(hint, value, limits.length or 2)
+    assert "." in repr(got)
+    with pytest.raises((OmegaConfBaseException, ConfigError)):
+        taken(owner, item, filled(hint, True, limits.length or 2))
+
+
+@pytest.mark.parametrize("value", ["[0,0,true]", "[0,0,up]", "[0,1]", "3", "up", "null"])
+def test_a_place_that_is_no_list_of_numbers(value: str) -> None:
+    given = f"+robot.grasp_pos={{x: {value}}}"
+    assert "expected a list of 3 numbers [m]" in refusal(lambda: load_config([given]))
+    given = f"robot.placements.stack.objects.red={'[0.3]' if value == '[0,1]' else value}"
+    line = refusal(lambda: load_config([given]))
+    assert line.startswith("robot.placements.stack.objects.red=")
+    assert "expected a list of 2 numbers [m]" in line
+
+
+def test_places_of_whole_numbers() -> None:
+    cfg = load_config(["+robot.grasp_pos={x: [0, 0, -1]}", "scene.objects.red.mass=1"])
+    assert repr(cfg.robot.grasp_pos) == "{'x': [0.0, 0.0, -1.0]}"
+    cfg = load_config(["robot.placements.stack.objects.red=[0.3, 0]"])
+    assert repr(cfg.scene.objects["red"].xy) == "[0.3, 0.0]"

@@ -8,6 +8,7 @@ from numpy import ndarray
 
 from mjstack.envs import Env
 from mjstack.errors import ArgumentError, ConfigError, MissingExtra, require_names
+from mjstack.rng import check_seed
 
 try:
     import gymnasium
@@ -95,8 +96,9 @@ class GymnasiumVectorEnv(VectorEnv):
         require_names("reset option", rest, ("reset_mask",))
         if mask is not None:
             mask = torch.as_tensor(mask, device=self.inner.device)
+        if seed is not None:  # before any world is reset; Gymnasium takes Python's integers alone
+            seed = check_seed(seed, masked=mask is not None)
         obs, _ = self.inner.reset(seed=seed, mask=mask)
-        # After the environment, whose message about a wrong seed says more.
         super().reset(seed=seed)
         return _numpy(obs, self.group), {}
 
@@ -181,7 +183,7 @@ class GymnasiumEnv(gymnasium.Env):
         if seed is not None or first is None:
             first, _ = self._worlds.reset(seed=seed)
         self._first = None
-        super().reset(seed=seed)
+        super().reset(seed=None if seed is None else check_seed(seed))
         return _row(first, 0), {}
 
     def step(self, action: ndarray) -> tuple[Observation, float, bool, bool, Info]:

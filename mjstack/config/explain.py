@@ -66,7 +66,7 @@ def parse(override: str) -> Override:
             f"override {override!r} cannot be read: expected key=value without spaces around the"
             " sign, such as nworld=64. A value with a bracket, a quote, a letter beyond ASCII or"
             " one of = , : ; # & ! < > ^ ~ ` needs double quotes inside of single ones:"
-            " 'starts=\"run(1).csv\"', or in a list 'job.against=[\"policy=DIR\"]'."
+            " 'policy=\"run (1)\"', or in a list 'job.against=[\"policy=DIR\"]'."
         ) from error
 
 

@@ -12,7 +12,7 @@ import re
 import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from importlib.metadata import entry_points
 from importlib.util import find_spec
@@ -21,11 +21,15 @@ from typing import Any
 
 import yaml  # type: ignore[import-untyped]
 from hydra import initialize_config_dir
+from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.core.singleton import Singleton
+from hydra.errors import HydraException
+from hydra.plugins.config_source import ConfigResult
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
@@ -91,10 +95,24 @@ def search_path_args(folders: Sequence[Path] | None = None) -> list[str]:
     return [arg for folder in folders for arg in ("--config-dir", str(folder))]
 
 
-def quoted(path: Path) -> str:
-    """A path as a value of an override."""
-    text = str(path).replace("\\", "\\\\").replace("'", "\\'")
-    return f"'{text}'"
+def assign(key: str, value: object) -> str:
+    """An override that sets a key to a text or a path. It has quotes where Hydra would take the
+    text for anything else.
+    """
+    text = str(value)
+    plain = f"{key}={text}"
+    with suppress(HydraException):
+        if "${" not in text and OverridesParser.create().parse_override(plain).value() == text:
+            return plain
+    text = re.sub(r"(\\*)\$\{", r"\1\1\\${", text)  # else an interpolation
+    text = re.sub(r'(\\*)"', r'\1\1\\"', text)
+    text = re.sub(r"(\\+)$", r"\1\1", text)
+    return f'{key}="{text}"'
+
+
+def command(*overrides: str) -> str:
+    """A command on the current search path, as a shell takes it."""
+    return shlex.join(["mjstack", *search_path_args(), *overrides])
 
 
 def add_folder(saved: Path) -> str:
@@ -249,6 +267,7 @@ def hydra_session() -> Iterator[Any]:
     GlobalHydra.instance().clear()
     try:
         Plugins.instance().register(_Folders)
+        Plugins.instance().register(_Folder)
         # All gates of the search path are composed, as mjstack's are.
         added = [
             n for n in list_choices()["gate"] if not (CONFIG_FOLDER / f"gate/{n}.yaml").exists()
@@ -264,13 +283,31 @@ def hydra_session() -> Iterator[Any]:
         Singleton.set_state(outer)
 
 
+class _Folder(FileConfigSource):
+    """A folder of the search path. A file may begin with a byte order mark, which would hide its
+    header from Hydra.
+    """
+
+    @staticmethod
+    @override
+    def scheme() -> str:
+        return "mjstack"
+
+    @override
+    def load_config(self, config_path: str) -> ConfigResult:
+        result = super().load_config(config_path)
+        path = Path(self.path, self._normalize_file_name(config_path))
+        result.header = self._get_header_dict(path.read_text("utf-8-sig"))
+        return result
+
+
 class _Folders(SearchPathPlugin):
     """Lets Hydra find the folders of the current search path."""
 
     @override
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         for folder in config_folders():
-            search_path.append(PROVIDER, f"{_FILE}{folder}")
+            search_path.append(PROVIDER, f"{_Folder.scheme()}://{folder}")
 
 
 def _once(load: Callable[..., DictConfig]) -> Callable[..., DictConfig]:

@@ -11,6 +11,7 @@ from pathlib import Path
 from mjstack.config.complete import typed
 from mjstack.config.functions import resolve_func
 from mjstack.config.schema import Config
+from mjstack.config.session import assign, command
 from mjstack.distributed import Ranks, current_ranks
 from mjstack.episodes.earlier_run import archive_starts, archived_starts
 from mjstack.episodes.rollout import lacks_episode
@@ -112,7 +113,9 @@ def run_guarded(run: Run, name: str, gate: Gate, spread: str = "") -> None:
         gone = isinstance(cause, RankError) and cause.gone
         over = cause if gone or (ranks.size > 1 and spread == "worlds") else None
         if over is not None and run.cfg.job.name == "gates" and run.folder is not None:
-            results[0].reason += f" To go on after the last finished seed: resume={run.folder}"
+            rest = [o for o in run.overrides if not o.startswith("resume=")]
+            again = command(*rest, assign("resume", run.folder))
+            results[0].reason += f" To go on after the last finished seed: {again}"
     seconds = time.perf_counter() - began
     for result in results:
         if result.status is not Status.skipped and not result.seconds:

@@ -15,7 +15,7 @@ import torch
 
 from mjstack.config import spec
 from mjstack.config.complete import typed
-from mjstack.config.session import quoted, search_path_args
+from mjstack.config.session import assign, search_path_args
 from mjstack.errors import ConfigError, FolderError, first_line
 from mjstack.files import check_unused, lock, move_aside, refuse_links, write_atomic
 from mjstack.interrupt import interrupted
@@ -307,7 +307,7 @@ class _Queue:
                     return False
                 locks.enter_context(gpu)
             key = "resume" if job.set_aside() else "hydra.run.dir"
-            args = [*job.overrides, f"{key}={quoted(job.folder)}", *search_path_args()]
+            args = [*job.overrides, assign(key, job.folder), *search_path_args()]
             logged = log.tell()
             child = Child(args, log, env=slot.env, cores=slot.cores)
             self.running[slot] = _Running(job, child, logged, locks.pop_all())

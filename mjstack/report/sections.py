@@ -79,7 +79,7 @@ def make_sections(report: Report, page: Page) -> list[Section]:
         episode = Marked(text, link=page.episode)
     head: list[Part] = [
         ", ".join(str(facts[name]) for name in ("date", "device") if name in facts),
-        " ".join(report.overrides),
+        page.command,
         summarize(report.gates),
         episode,
         *(report.folder / name for name in report.pictures),
