@@ -8,10 +8,9 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from mjstack.config.explain import own_overrides, parse
+from mjstack.config.explain import assign, own_overrides, parse
 from mjstack.config.load import compose
 from mjstack.config.schema import SweepCfg
-from mjstack.config.session import assign
 from mjstack.errors import ConfigError, MjstackError, is_out_of_memory
 from mjstack.files import claim_folder
 from mjstack.report.record import Report

@@ -15,8 +15,9 @@ from omegaconf import OmegaConf
 
 import mjstack
 from mjstack.cli import run
+from mjstack.config.explain import assign, command
 from mjstack.config.load import compose
-from mjstack.config.session import assign, command, hydra_session, search_path
+from mjstack.config.session import hydra_session, search_path
 
 NASTY = (
     r"""

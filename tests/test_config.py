@@ -22,8 +22,9 @@ import mjstack
 from mjstack.config import fields as config_fields
 from mjstack.config import load_config, schema
 from mjstack.config.help import list_keys
+from mjstack.config.load import compose
 from mjstack.config.schema import Backend, CloneJobCfg, Config
-from mjstack.config.session import CONFIG_FOLDER
+from mjstack.config.session import CONFIG_FOLDER, hydra_session, search_path
 from mjstack.errors import ConfigError
 from mjstack.jobs.gates import check_machine
 from mjstack.tasks.check import make_check
@@ -385,6 +386,84 @@ def test_a_swapped_function_does_not_inherit_parameters() -> None:
     assert term.params == {"mine": 2, "scale": 1}
     whole = "{func: mjstack.mdp.reward.action_rate, params: {mine: 3}}"
     assert load_config([task, f"+reward.reach={whole}"]).reward["reach"].params == {"mine": 3}
+
+
+SWAPS = {
+    "action.arm": ["scale", "joints", "mode", "pose"],
+    "controller.action.arm": ["joints", "mode"],
+    "observation.policy.terms.red_to_blue": ["a", "b"],
+    "job.observation.policy.terms.goals": [],
+    "reset.cubes": ["xy", "yaw"],
+    "gate.success.reset.cubes": ["xy", "gap"],
+    "gate.capacity.reset.cubes": ["xy", "gap"],
+    "termination.joint_limit": ["margin"],
+    "reward.progress": ["scale"],
+    "task.success": [],
+    "task.check": ["window", "xy_err"],
+}
+
+
+def term_of(cfg: Config, key: str) -> dict[str, Any]:
+    """Function and parameters of a term as a mapping."""
+    node: Any = cfg
+    for name in key.split("."):
+        node = node[name] if isinstance(node, dict) else getattr(node, name)
+    return node if isinstance(node, dict) else {"func": node.func, **node.params}
+
+
+def write_yaml(path: Path, values: dict[str, Any]) -> None:
+    """A file of a group whose keys are those of the whole configuration."""
+    nested = OmegaConf.create()
+    for key, value in values.items():
+        OmegaConf.update(nested, key, value, force_add=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"# @package _global_\n{OmegaConf.to_yaml(nested)}")
+
+
+@pytest.mark.parametrize("key", SWAPS)
+def test_a_file_swaps_a_function_as_the_command_line_does(key: str, tmp_path: Path) -> None:
+    """Parameters of the other function are left out: those that come with the new one, or after it
+    on the command line, stay. With the same function all stay.
+    """
+    job = ["job=train", "trainer=clone"] if key.startswith("job.") else []
+    before = term_of(load_config(job), key)
+    assert {*SWAPS[key]} <= {*before}
+    own = {"mine": 3} if key == "task.check" else {"params": {"mine": 3}}
+    write_yaml(tmp_path / "conf/experiment/swap.yaml", {key: {"func": "lab.mine", **own}})
+    write_yaml(tmp_path / "conf/experiment/keep.yaml", {key: {"func": before["func"], **own}})
+    section = key if key == "task.check" else f"{key}.params"
+    more = [*job, f"+{section}.more=4"]
+
+    def composed(*overrides: str) -> dict[str, Any]:
+        return term_of(load_config(overrides, config_dir=tmp_path / "conf"), key)
+
+    swapped = {"func": "lab.mine", "mine": 3, "more": 4}
+    assert composed("experiment=swap", *more) == swapped
+    assert composed("experiment=keep", *more) == before | {"mine": 3, "more": 4}
+    assert composed(f"{key}.func=lab.mine", f"++{section}.mine=3", *more) == swapped
+    # A later file or the command line swaps it back: parameters from before do not come back.
+    back = [f"{key}.func={before['func']}", *more]
+    assert composed("experiment=swap", *back) == {"func": before["func"], "more": 4}
+    assert composed("experiment=[swap,keep]", *job) == {"func": before["func"], "mine": 3}
+
+
+def test_parameters_that_are_another_terms_stay_its(tmp_path: Path) -> None:
+    interpolated = {"func": "lab.mine", "params": "${reward.progress.params}"}
+    write_yaml(tmp_path / "conf/experiment/swap.yaml", {"action.arm": interpolated})
+    cfg = load_config(["experiment=swap"], config_dir=tmp_path / "conf")
+    assert cfg.action["arm"].params == cfg.reward["progress"].params
+    assert "within" in cfg.reward["progress"].params
+
+
+def test_the_next_composition_is_not_touched(tmp_path: Path) -> None:
+    """In one session each composition has its own files."""
+    write_yaml(tmp_path / "conf/experiment/swap.yaml", {"action.arm": {"func": "lab.mine"}})
+    with search_path([tmp_path / "conf"]), hydra_session():
+        swapped, plain = ["experiment=swap"], ["nworld=3"]
+        seen = [compose(o).action.arm.params for o in (swapped, plain, swapped, plain)]
+    assert seen[0] == seen[2] == {}
+    assert seen[1] == seen[3]
+    assert seen[1].scale == 1.2
 
 
 @pytest.mark.full

@@ -106,7 +106,7 @@ class GymnasiumVectorEnv(VectorEnv):
         """Advance every world by one control interval.
 
         Args:
-            actions: Shape ``(num_envs, action_dim)``, float32.
+            actions: Shape ``(num_envs, action_dim)``, numbers.
 
         Returns:
             Observations ``(num_envs, dim)``, float32; rewards ``(num_envs,)``, float32;
@@ -190,7 +190,7 @@ class GymnasiumEnv(gymnasium.Env):
         """Advance the world by one control interval.
 
         Args:
-            action: Shape ``(action_dim,)``, float32.
+            action: Shape ``(action_dim,)``, numbers.
 
         Returns:
             The observation ``(dim,)``, float32, the reward, whether the episode terminated, whether
@@ -236,7 +236,7 @@ def _row(obs: Observation, world: int) -> Observation:
 
 
 def _array(action: Any, space: spaces.Space) -> ndarray:
-    expected = f"a float32 array of shape {space.shape}"
+    expected = f"an array of numbers of shape {space.shape}"
     try:
         array = np.asarray(action, np.float32)
     except (TypeError, ValueError) as error:

@@ -1,11 +1,14 @@
-"""One line for what is wrong with overrides: what was given, what was expected, what to do.
+"""Overrides, read and written, and one line for what is wrong with them: what was given, what was
+expected, what to do.
 
 Some overrides are checked before Hydra sees them, which answers with a traceback or with words
 about its own parser; its chained, multi-line errors about the others are turned into one line.
 """
 
 import re
+import shlex
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
 from typing import Any
@@ -68,6 +71,26 @@ def parse(override: str) -> Override:
             " one of = , : ; # & ! < > ^ ~ ` needs double quotes inside of single ones:"
             " 'policy=\"run (1)\"', or in a list 'job.against=[\"policy=DIR\"]'."
         ) from error
+
+
+def assign(key: str, value: object) -> str:
+    """An override that sets a key to a text or a path. It has quotes where Hydra would take the
+    text for anything else.
+    """
+    text = str(value)
+    plain = f"{key}={text}"
+    with suppress(HydraException):
+        if "${" not in text and OverridesParser.create().parse_override(plain).value() == text:
+            return plain
+    text = re.sub(r"(\\*)\$\{", r"\1\1\\${", text)  # else an interpolation
+    text = re.sub(r'(\\*)"', r'\1\1\\"', text)
+    text = re.sub(r"(\\+)$", r"\1\1", text)
+    return f'{key}="{text}"'
+
+
+def command(*overrides: str) -> str:
+    """A command on the current search path, as a shell takes it."""
+    return shlex.join(["mjstack", *session.search_path_args(), *overrides])
 
 
 def check_added(section: DictConfig, overrides: Sequence[str], parent: str = "") -> None:

@@ -11,8 +11,8 @@ import os
 import re
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from contextvars import ContextVar
 from importlib.metadata import entry_points
 from importlib.util import find_spec
@@ -25,10 +25,8 @@ from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.core.singleton import Singleton
-from hydra.errors import HydraException
 from hydra.plugins.config_source import ConfigResult
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.types import RunMode
@@ -93,26 +91,6 @@ def search_path_args(folders: Sequence[Path] | None = None) -> list[str]:
     """Arguments of a command that adds folders; those of the current search path if None."""
     folders = _added.get() if folders is None else folders
     return [arg for folder in folders for arg in ("--config-dir", str(folder))]
-
-
-def assign(key: str, value: object) -> str:
-    """An override that sets a key to a text or a path. It has quotes where Hydra would take the
-    text for anything else.
-    """
-    text = str(value)
-    plain = f"{key}={text}"
-    with suppress(HydraException):
-        if "${" not in text and OverridesParser.create().parse_override(plain).value() == text:
-            return plain
-    text = re.sub(r"(\\*)\$\{", r"\1\1\\${", text)  # else an interpolation
-    text = re.sub(r'(\\*)"', r'\1\1\\"', text)
-    text = re.sub(r"(\\+)$", r"\1\1", text)
-    return f'{key}="{text}"'
-
-
-def command(*overrides: str) -> str:
-    """A command on the current search path, as a shell takes it."""
-    return shlex.join(["mjstack", *search_path_args(), *overrides])
 
 
 def add_folder(saved: Path) -> str:
@@ -276,8 +254,7 @@ def hydra_session() -> Iterator[Any]:
         ConfigStore.instance().store("added_gates", {"defaults": defaults}, provider="mjstack")
         initialize_config_dir(str(CONFIG_FOLDER), "run", version_base="1.3")
         hydra: Any = GlobalHydra.instance().hydra
-        loader = hydra.config_loader
-        loader.load_configuration = _once(loader.load_configuration)
+        _compose_once(hydra.config_loader)
         yield hydra
     finally:
         Singleton.set_state(outer)
@@ -310,18 +287,31 @@ class _Folders(SearchPathPlugin):
             search_path.append(PROVIDER, f"{_Folder.scheme()}://{folder}")
 
 
-def _once(load: Callable[..., DictConfig]) -> Callable[..., DictConfig]:
-    """Return the composition of an earlier call with the same overrides."""
+def _compose_once(loader: Any) -> None:
+    """Let a loader of Hydra return the composition of an earlier call with the same overrides, and
+    keep in ``loader.files``, by the composition's id, the keys and values of each file behind it.
+    """
+    load, load_file = loader.load_configuration, loader._load_single_config
     composed: dict[tuple, DictConfig] = {}
+    files: list[dict[str, object]] = []
+    loader.files = {}
+
+    def load_one_file(default: Any, repo: Any) -> ConfigResult:
+        result = load_file(default, repo)
+        files.append(dict(list_items(result.config)))
+        return result
 
     def load_once(*, overrides: list[str], run_mode: RunMode, **options: Any) -> DictConfig:
         key = (*overrides, run_mode)
         if key not in composed:
+            files.clear()
             typed = _add_entries(overrides)
             composed[key] = load(overrides=typed, run_mode=run_mode, **options)
+            loader.files[id(composed[key])] = files.copy()
         return composed[key]
 
-    return load_once
+    loader._load_single_config = load_one_file
+    loader.load_configuration = load_once
 
 
 def _add_entries(overrides: Sequence[str]) -> list[str]:

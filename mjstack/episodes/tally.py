@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mjstack.config.session import assign, command
+from mjstack.config.explain import assign, command
 from mjstack.episodes.failures import describe_sign
 from mjstack.episodes.record import FAILING, EpisodeRecord
 from mjstack.episodes.rollout import Episode

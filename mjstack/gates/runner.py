@@ -9,9 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from mjstack.config.complete import typed
+from mjstack.config.explain import assign, command
 from mjstack.config.functions import resolve_func
 from mjstack.config.schema import Config
-from mjstack.config.session import assign, command
 from mjstack.distributed import Ranks, current_ranks
 from mjstack.episodes.earlier_run import archive_starts, archived_starts
 from mjstack.episodes.rollout import lacks_episode

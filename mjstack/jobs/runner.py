@@ -21,10 +21,10 @@ import torch
 from rich.markup import escape
 
 from mjstack.config import load_config
+from mjstack.config.explain import command
 from mjstack.config.fingerprint import config_content, config_hash, differences
 from mjstack.config.functions import find_object
 from mjstack.config.schema import Backend, Config
-from mjstack.config.session import command
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Progress, Stage

@@ -15,7 +15,8 @@ import torch
 
 from mjstack.config import spec
 from mjstack.config.complete import typed
-from mjstack.config.session import assign, search_path_args
+from mjstack.config.explain import assign
+from mjstack.config.session import search_path_args
 from mjstack.errors import ConfigError, FolderError, first_line
 from mjstack.files import check_unused, lock, move_aside, refuse_links, write_atomic
 from mjstack.interrupt import interrupted
