@@ -97,12 +97,11 @@ def test_a_kernel_cache_without_a_home(monkeypatch: Patch, tmp_path: Path) -> No
     for name in (CACHE, "XDG_CACHE_HOME"):
         monkeypatch.setenv(name, "")
     monkeypatch.chdir(tmp_path)
-    folder, problem, owner = warp_setup._kernel_cache()
+    folder, problem = warp_setup._kernel_cache()
     assert [path.name for path in tmp_path.iterdir()] == [Path(folder).name]
     assert problem.startswith(
         "kernel cache ~/.cache/warp: cannot be written (Could not determine home"
     )
-    del owner
 
 
 def test_kernels_of_a_cache_that_is_read_alone(monkeypatch: Patch, tmp_path: Path) -> None:
@@ -116,7 +115,7 @@ def test_kernels_of_a_cache_that_is_read_alone(monkeypatch: Patch, tmp_path: Pat
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(tempfile, "TemporaryFile", denied)
-    folder, problem, _owner = warp_setup._kernel_cache()
+    folder, problem = warp_setup._kernel_cache()
     copy = Path(folder, *kernel.parts[-3:])
     assert copy.read_bytes() == b"compiled"
     (copy.parent / "more.o").write_bytes(b"new")

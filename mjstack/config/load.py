@@ -175,11 +175,7 @@ def _drop_inherited(
 ) -> None:
     """Leave a term, and the check, whose ``func`` a file or an override swaps with the parameters
     that are given with the new one or after it: those of the other function are not its own.
-
-    Args:
-        cfg: The composition.
-        files: Keys and values of each file, in the order of composition.
-        overrides: The command line, which comes last.
+    ``files`` are the keys and values of each, in the order of composition.
     """
     typed: dict[str, object] = {}
     for override in map(parse, own_overrides(overrides)):
@@ -202,13 +198,11 @@ def _drop_inherited(
             given.setdefault(section, set()).add(name)
     for section in swapped:
         parent, _, name = section.rpartition(".")
-        owner = OmegaConf.select(cfg, parent)
-        if owner is None or OmegaConf.is_interpolation(owner, name):  # another's mapping
-            continue
-        node = owner.get(name) or {}
-        with open_dict(cfg):
-            for name in node.keys() - given[section]:
-                del node[name]
+        owner = OmegaConf.select(cfg, parent) or {}
+        if name in owner and not OmegaConf.is_interpolation(owner, name):  # another's mapping
+            with open_dict(cfg):
+                for key in owner[name].keys() - given[section]:
+                    del owner[name][key]
 
 
 def load_saved(path: Path) -> Config:

@@ -15,7 +15,6 @@ from mjstack.config.schema import Config
 from mjstack.errors import describe_error
 from mjstack.report.gl import require_offscreen
 from mjstack.report.provenance import collect_provenance
-from mjstack.report.record import Provenance
 from mjstack.scene import build_model
 from mjstack.sim import resolve_backend, resolve_sizes
 from mjstack.sim.build import cuda_driver
@@ -38,8 +37,8 @@ _GIB = 2**30
 
 def findings(overrides: Sequence[str]) -> Iterator[tuple[str, str]]:
     """Versions, processor, GPUs, OpenGL, the kernel cache, and the memory that the buffers of a
-    configuration take: a name and a sentence each. No kernel is compiled. Where
-    one fails, its sentence has the error, and the next one follows.
+    configuration take: a name and a sentence each, which has the error of one that fails. No
+    kernel is compiled.
 
     Raises:
         MjstackError: The configuration is wrong.
@@ -54,7 +53,7 @@ def findings(overrides: Sequence[str]) -> Iterator[tuple[str, str]]:
     yield "extras", ", ".join(f"{extra}: {_version(name)}" for extra, name in _EXTRAS.items())
     yield "torch", f"{torch.__version__}, built for CUDA {torch.version.cuda or 'not at all'}"
     sections: dict[str, Callable[[], Iterable[str]]] = {
-        "processor": lambda: [_processor(facts)],
+        "processor": lambda: [f"{facts['cpu']}, {facts['cpu_count']} cores, {_free_memory()}"],
         "GPU": _gpus,
         "kernel cache": lambda: [_kernel_cache()],
         "OpenGL": lambda: [_pictures(cfg)],
@@ -68,9 +67,8 @@ def findings(overrides: Sequence[str]) -> Iterator[tuple[str, str]]:
             yield name, f"none: {describe_error(error)}"
 
 
-def _processor(facts: Provenance) -> str:
-    free = available_memory() / _GIB
-    return f"{facts['cpu']}, {facts['cpu_count']} cores, {free:.1f} GiB of memory free"
+def _free_memory() -> str:
+    return f"{available_memory() / _GIB:.1f} GiB of memory free"
 
 
 def _gpus() -> Iterator[str]:

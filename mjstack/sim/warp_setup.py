@@ -1,10 +1,12 @@
 """Warp, set up before its first use, and ordered with torch's work."""
 
+import atexit
 import ctypes
 import logging
 import os
+import shutil
 import tempfile
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
 
 import torch
@@ -22,12 +24,9 @@ _STREAMS: dict[tuple[str, int], wp.Stream] = {}
 _CACHE = "WARP_CACHE_PATH"  # processes that this one starts read it
 
 
-def _kernel_cache() -> tuple[str, str, object]:
-    """The folder where Warp keeps compiled kernels. In place of one that cannot be written it is a
-    temporary folder, with links to the kernels of that one.
-
-    Returns:
-        The folder, what is wrong with the usual one, and the owner of a temporary folder.
+def _kernel_cache() -> tuple[str, str]:
+    """The folder for compiled kernels, and what is wrong with the usual one. In place of one that
+    cannot be written it is a temporary folder, with links to the kernels of that one.
 
     Raises:
         MjstackError: No folder can be written.
@@ -39,34 +38,40 @@ def _kernel_cache() -> tuple[str, str, object]:
         version = usual / wp.config.version  # Warp adds it
         version.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=version).close()
-        return str(usual), "", None
+        return str(usual), ""
     except (OSError, RuntimeError) as error:  # the other one: there is no home folder
         reason = getattr(error, "strerror", None) or first_line(error)
         problem = f"kernel cache {usual}: cannot be written ({reason})"
     fix = f"Set {_CACHE} to a folder of yours"
     try:
-        owner = tempfile.TemporaryDirectory(prefix="mjstack-kernels-")
+        folder = tempfile.mkdtemp(prefix="mjstack-kernels-")
     except OSError as error:
         raise MjstackError(f"{problem}, and there is no temporary folder", fix) from error
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     for file in (usual / wp.config.version).rglob("*"):
+        link = folder / file.relative_to(usual)
         if file.is_file():
-            link = owner.name / file.relative_to(usual)
             link.parent.mkdir(parents=True, exist_ok=True)
             link.symlink_to(file.absolute())
-    os.environ[_CACHE] = owner.name
+    os.environ[_CACHE] = folder
     problem = f"{problem}, so that new kernels are compiled in every run. {fix}."
     log.warning("%s", problem)
-    return owner.name, problem, owner
+    return folder, problem
+
+
+def _has_driver() -> bool:
+    """Whether Warp will find a CUDA driver."""
+    for name in ("libcuda.so", "libcuda.so.1"):
+        with suppress(OSError):
+            return bool(ctypes.CDLL(name))
+    return False
 
 
 def _init_without_driver() -> None:
-    """Initialize Warp on a machine without a CUDA driver. Its C++ code would write a line about
-    that to standard error, also for runs on the CPU; all else that it writes stays.
+    """Initialize Warp without what its C++ code writes, also for runs on the CPU, where there is no
+    CUDA driver.
     """
-    try:
-        error_output = os.dup(2)
-    except OSError:  # a closed one
-        return
+    error_output = os.dup(2)
     reader, writer = os.pipe()
     os.dup2(writer, 2)
     os.close(writer)
@@ -76,17 +81,6 @@ def _init_without_driver() -> None:
         os.dup2(error_output, 2)
         with open(reader, "rb") as pipe, open(error_output, "wb") as output:
             output.writelines(line for line in pipe if b"load the NVIDIA CUDA driver" not in line)
-
-
-def _has_driver() -> bool:
-    """Whether Warp will find a CUDA driver."""
-    for name in ("libcuda.so", "libcuda.so.1"):
-        try:
-            ctypes.CDLL(name)
-        except OSError:
-            continue
-        return True
-    return False
 
 
 def torch_stream_scope(device: wp.Device) -> AbstractContextManager[object]:
@@ -112,6 +106,7 @@ def torch_stream_scope(device: wp.Device) -> AbstractContextManager[object]:
 wp.config.log_level = wp.LOG_ERROR  # it would greet on every run
 CACHE_PROBLEM = ""  # a sentence; empty if kernels are kept for later runs
 if wp.config.kernel_cache_dir is None:  # else the caller has set it, or has used Warp
-    wp.config.kernel_cache_dir, CACHE_PROBLEM, _owner = _kernel_cache()
+    wp.config.kernel_cache_dir, CACHE_PROBLEM = _kernel_cache()
 if not _has_driver():
-    _init_without_driver()
+    with suppress(OSError):  # of a closed error output, which shows nothing anyway
+        _init_without_driver()
