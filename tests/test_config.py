@@ -532,10 +532,13 @@ def taken(owner: type, item: Field, value: object) -> Any:
     return plain
 
 
+FLOATS = list(schema_floats())
+
+
 @pytest.mark.parametrize(
     ("owner", "item", "hint"),
-    list(schema_floats()),
-    ids=lambda v: getattr(v, "name", None) or str(v),
+    FLOATS,
+    ids=[f"{owner.__name__}.{item.name}" for owner, item, _ in FLOATS],
 )
 def test_a_whole_number_is_a_float(owner: type, item: Field, hint: Any) -> None:
     """Also inside of lists and mappings, and of those in each other. A bool is none."""

@@ -183,7 +183,7 @@ def _drop_inherited(
         typed |= {override.key_or_group: value}
         typed |= dict(session.list_items(value, f"{override.key_or_group}."))
     functions: dict[str, object] = {}  # by the mapping of their parameters
-    given: dict[str, set[str]] = {}
+    params: dict[str, set[str]] = {}
     swapped = set()
     for source in (*files, typed):
         for key, value in source.items():
@@ -191,17 +191,19 @@ def _drop_inherited(
             section = term if term == "task.check" else f"{term}.params"
             if name == "func" and functions.setdefault(section, value) != value:
                 functions[section] = value
-                given[section] = {"func"}
+                params[section] = {"func"}
                 swapped.add(section)
         for key in source:
             section, _, name = key.rpartition(".")
-            given.setdefault(section, set()).add(name)
+            params.setdefault(section, set()).add(name)
     for section in swapped:
         parent, _, name = section.rpartition(".")
-        owner = OmegaConf.select(cfg, parent) or {}
-        if name in owner and not OmegaConf.is_interpolation(owner, name):  # another's mapping
+        owner = OmegaConf.select(cfg, parent)
+        if not isinstance(owner, DictConfig) or name not in owner:
+            continue
+        if isinstance(owner[name], DictConfig) and not OmegaConf.is_interpolation(owner, name):
             with open_dict(cfg):
-                for key in owner[name].keys() - given[section]:
+                for key in owner[name].keys() - params[section]:
                     del owner[name][key]
 
 

@@ -114,8 +114,8 @@ def run_guarded(run: Run, name: str, gate: Gate, spread: str = "") -> None:
         over = cause if gone or (ranks.size > 1 and spread == "worlds") else None
         if over is not None and run.cfg.job.name == "gates" and run.folder is not None:
             rest = [o for o in run.overrides if not o.startswith("resume=")]
-            again = command(*rest, assign("resume", run.folder))
-            results[0].reason += f" To go on after the last finished seed: {again}"
+            resuming = command(*rest, assign("resume", run.folder))
+            results[0].reason += f" To go on after the last finished seed: {resuming}"
     seconds = time.perf_counter() - began
     for result in results:
         if result.status is not Status.skipped and not result.seconds:

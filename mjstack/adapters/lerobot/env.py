@@ -152,8 +152,9 @@ class LerobotVectorEnv(VectorEnv):
         """
         env = self.inner
         if seed is not None:
-            one = np.ndim(seed) == 0
-            seed = check_seed(seed) + np.arange(env.nworld) if one else [*map(check_seed, seed)]
+            if np.ndim(seed) == 0:
+                seed = check_seed(seed) + np.arange(env.nworld)
+            seed = [*map(check_seed, seed)]
             if len(seed) != env.nworld:
                 expected = f"one for each of {env.nworld} worlds"
                 raise ArgumentError("seed", f"{len(seed)} numbers", expected)
