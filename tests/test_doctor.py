@@ -128,8 +128,8 @@ def test_the_page_ends_where_no_folder_can_be_written(tmp_path: Path) -> None:
     """Not even a temporary one; in a process of its own, which has not loaded Warp."""
     script = (
         "import sys, tempfile\n"
-        "def none(**kwargs): raise FileNotFoundError(2, 'No usable temporary directory')\n"
-        "tempfile.TemporaryDirectory = none\n"
+        "def none(*args, **kwargs): raise FileNotFoundError(2, 'No usable temporary directory')\n"
+        "tempfile.mkdtemp = none\n"
         "from mjstack.cli import run\n"
         "sys.exit(run(['doctor', 'nworld=3']))"
     )

@@ -124,10 +124,7 @@ def explain(error: Exception, overrides: Sequence[str] = ()) -> MjstackError:
     else:
         problem = _explain(error, overrides)
     inside = re.match(r"In '([^']+)': ", str(error))
-    if inside is None or inside[1] in (
-        session.CONFIG_NAME,
-        "hydra/config",
-    ):  # an override does not fit
+    if inside is None or inside[1] in (session.CONFIG_NAME, "hydra/config"):  # an override's
         return problem
     name = f"{inside[1]}.yaml"
     paths = [folder / name for folder in session.config_folders() if (folder / name).is_file()]
@@ -155,7 +152,7 @@ def _explain(error: Exception, overrides: Sequence[str]) -> MjstackError:
         value_text = settings[-1].partition("=")[2]
         one_name = settings[-1] in overrides and re.match(r"(?!null$)[^\[{]", value_text)
         names = expected.startswith("a list of names")
-        cure = f" Write '{key}=[{value_text}]'." if one_name and names else ""
+        cure = f" Write {shlex.quote(f'{key}=[{value_text}]')}." if one_name and names else ""
         return MjstackError(f"{settings[-1]}: expected {expected}.{cure}")
     return MjstackError(f"{key or ' '.join(overrides) or 'the values'}: {text}.")
 
