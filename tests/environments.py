@@ -17,7 +17,7 @@ import torch
 from compositions import load_config
 from numpy.typing import ArrayLike
 
-from mjstack.config.schema import Backend, Config
+from mjstack.config.schema import Backend, Config, TermCfg
 from mjstack.envs import Env
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.run import Run
@@ -36,6 +36,7 @@ CUDA = [
 ]
 DEVICES = ["cpu", pytest.param("cuda:0", marks=CUDA)]
 TASKS = ("stack", "reach")
+NOMINAL = {"home": TermCfg(func="mjstack.mdp.reset.home")}
 # Of task=reach, episodes of half the length, in which the expert still succeeds
 SHORT_REACH = (
     "controller.phases.hold.seconds=0.4",

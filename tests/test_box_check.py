@@ -14,14 +14,13 @@ import pytest
 import torch
 from check_cases import BLUE, RED, Altered, Cases, rules_of
 from compositions import load_config
-from environments import CUDA, at_double_speed
+from environments import CUDA, NOMINAL, at_double_speed
 from recordings import World, faster_stage, feed, put_cube, recording
 
 from mjstack.cli import run
 from mjstack.config.schema import Backend
 from mjstack.envs import Env
 from mjstack.episodes.failures import Sign
-from mjstack.episodes.rollout import NOMINAL
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
 from mjstack.gates.success import run_success

@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 import pytest
 import torch
 from compositions import checked, load_config, refusal
+from environments import NOMINAL
 
 from mjstack.config.fields import spec
 from mjstack.config.schema import Backend
 from mjstack.config.schema.scene import PlaceCfg
-from mjstack.episodes.rollout import NOMINAL
 from mjstack.episodes.stage import Stage
 from mjstack.errors import UnknownName
 from mjstack.scene import SceneIndex, build_model

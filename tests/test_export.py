@@ -15,7 +15,7 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
-from environments import Patch, configure, has_gl
+from environments import NOMINAL, Patch, configure, has_gl
 from policies import make_policy, write_policy
 
 import mjstack
@@ -24,7 +24,6 @@ from mjstack.config import load_config
 from mjstack.config.schema import Config
 from mjstack.config.session import search_path
 from mjstack.drivers.policy import PolicyDriver
-from mjstack.episodes.rollout import NOMINAL
 from mjstack.episodes.stage import Stage
 from mjstack.errors import FolderError, MissingExtra, MjstackError
 from mjstack.jobs import play as play_job

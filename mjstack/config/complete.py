@@ -20,6 +20,7 @@ _TERMS = {
     "action": schema.TermCfg,
     "controller.action": schema.TermCfg,
     "reset": schema.TermCfg,
+    "gate.baseline.reset": schema.TermCfg,
     "gate.capacity.reset": schema.TermCfg,
     "gate.success.reset": schema.TermCfg,
     "termination": schema.TerminationTermCfg,

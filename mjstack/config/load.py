@@ -22,6 +22,7 @@ from mjstack.config.complete import complete
 from mjstack.config.explain import check_added, check_overrides, explain, own_overrides, parse
 from mjstack.config.fingerprint import POLICY_FILE, policy_folder
 from mjstack.config.schema import JOB_SCHEMAS, TRAINER_SCHEMAS, Backend, Config
+from mjstack.config.task_terms import complete_terms
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.files import read_inside, reading
 
@@ -163,6 +164,7 @@ def compose(overrides: Sequence[str], run_mode: RunMode = RunMode.RUN) -> DictCo
         if run_mode is RunMode.RUN:
             check_added(session.without_hydra(cfg), overrides)
             _drop_inherited(cfg, loader.files[id(cfg)], overrides)
+            complete_terms(cfg, overrides)
     except (HydraException, OmegaConfBaseException, AssertionError, TypeError, ValueError) as error:
         raise explain(error, overrides) from error
     except YAMLError as error:

@@ -304,9 +304,13 @@ def _compose_once(loader: Any) -> None:
     def load_once(*, overrides: list[str], run_mode: RunMode, **options: Any) -> DictConfig:
         key = (*overrides, run_mode)
         if key not in composed:
-            files.clear()
-            typed = _add_entries(overrides)
-            composed[key] = load(overrides=typed, run_mode=run_mode, **options)
+            from mjstack.config.task_terms import choose_observation  # it reads CONFIG_FOLDER
+
+            def compose(overrides: list[str]) -> DictConfig:
+                files.clear()
+                return load(overrides=_add_entries(overrides), run_mode=run_mode, **options)
+
+            composed[key] = compose(choose_observation(overrides, compose))
             loader.files[id(composed[key])] = files.copy()
         return composed[key]
 

@@ -25,7 +25,6 @@ POLICY = "policy"
 FEEDBACK = (CLOSED_LOOP, STATE_BASED, POLICY)
 PHASELESS = (STATE_BASED, POLICY)
 Reset = dict[str, TermCfg]
-NOMINAL: Reset = {"home": TermCfg(func="mjstack.mdp.reset.home")}
 
 
 class Observer:

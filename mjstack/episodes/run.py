@@ -11,8 +11,9 @@ from mjstack.config.schema import Backend, Config
 from mjstack.episodes.motion import draw_seen
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.recorder import Snapshots, WorldRecorder
-from mjstack.episodes.rollout import NOMINAL, Episode, Observer, State
+from mjstack.episodes.rollout import Episode, Observer, State
 from mjstack.episodes.stage import Stage, TextHook
+from mjstack.managers.episode import required_fields
 from mjstack.managers.view import offers
 from mjstack.report.page import Page, World, frame_stride
 from mjstack.report.record import GateResult, Status
@@ -106,13 +107,15 @@ class Run:
 
     @cached_property
     def nominal(self) -> NominalRun:
-        """One native world from the nominal start: the reference of baseline and parity."""
+        """One native world from the start of *baseline*: the reference of that gate and parity."""
         stage = self.stage
-        sim = make_simulation(stage.model, self.cfg, 1, backend=Backend.native)
+        reset = self.cfg.gate.baseline.reset
+        fields = required_fields(reset)
+        sim = make_simulation(stage.model, self.cfg, 1, backend=Backend.native, fields=fields)
         world = WorldRecorder()
         snapshots = Snapshots(self.parity_steps.values())
         viewers = () if "parity" in self.cfg.gates else self.viewers
-        episode = stage.play(sim, NOMINAL, [*viewers, world, snapshots])
+        episode = stage.play(sim, reset, [*viewers, world, snapshots])
         return NominalRun(sim=sim, episode=episode, world=world, states=snapshots.states)
 
     @property

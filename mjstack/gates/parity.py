@@ -2,6 +2,7 @@
 
 import copy
 import math
+from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import asdict
 
@@ -13,9 +14,10 @@ from torch import Tensor
 from mjstack.config.check import PARITY_FIELDS
 from mjstack.config.schema import Backend, Config
 from mjstack.episodes.recorder import WorldRecorder
-from mjstack.episodes.rollout import NOMINAL, State, restore
+from mjstack.episodes.rollout import State, restore
 from mjstack.episodes.run import Run, needs_episode
 from mjstack.gates.images import compare_images
+from mjstack.managers.episode import required_fields
 from mjstack.math import quat_angle, quat_to_matrix
 from mjstack.report.record import GateResult, Status
 from mjstack.sim import Simulation, describe_overflow, make_simulation
@@ -29,6 +31,7 @@ _SEARCHED = [
 _CONVERGED = 1e-12  # tolerance of the solver in float64
 _CONVERGED_FLOAT32 = 1e-8  # of what float32 can still tell
 _DISPLACED = 32  # worlds
+_PLACES = ("geom_pos", "geom_quat")
 _OFF = 1e-5  # m and parts of a quaternion: ten times the tolerance of MuJoCo's search
 _RANGES = 2.0
 _WIDTHS = {"xpos": 3, "xquat": 4, "site_xpos": 3}
@@ -38,7 +41,8 @@ _CAPTURED = 10  # steps of a graph: one of fifty takes longer to capture than to
 @needs_episode
 def run_parity(run: Run) -> list[GateResult]:
     """Compare steps from equal states, the options of each backend, and the whole task."""
-    world = make_simulation(run.stage.model, run.cfg, 1, backend=Backend.mjwarp)
+    fields = required_fields(run.cfg.gate.baseline.reset)
+    world = make_simulation(run.stage.model, run.cfg, 1, backend=Backend.mjwarp, fields=fields)
     with closing(world) as mjwarp:
         return [_compare(run, mjwarp)]
 
@@ -60,7 +64,7 @@ def _compare(run: Run, mjwarp: Simulation) -> GateResult:
         problems += [] if equal else [line]
 
     world = WorldRecorder()
-    episode = run.stage.play(mjwarp, NOMINAL, [*run.viewers, world])
+    episode = run.stage.play(mjwarp, run.cfg.gate.baseline.reset, [*run.viewers, world])
     status, reason, judged, result.beyond = run.judge_one(episode)
     if status is Status.failed:
         problems.append(reason)
@@ -99,8 +103,12 @@ def compare_states(run: Run, mjwarp: Simulation, result: GateResult) -> list[str
     limits = run.cfg.gate.parity
     model = copy.copy(run.stage.model)
     model.opt.tolerance = _CONVERGED
-    native = NativeSimulation(model, 1)
-    near = _displaced(model)
+    fields = run.nominal.sim.fields  # the task's own reset terms may have changed them
+    native = NativeSimulation(model, 1, fields=[*fields])
+    near = _displaced(model, fields)
+    for name, values in fields.items():
+        native.fields[name].copy_(values)
+        mjwarp.fields[name].copy_(values)
     tolerance = mjwarp.solver_tolerance
     assert tolerance is not None
     configured = tolerance.clone()
@@ -141,17 +149,21 @@ def compare_states(run: Run, mjwarp: Simulation, result: GateResult) -> list[str
     return problems
 
 
-def _displaced(model: mujoco.MjModel) -> Simulation | None:
+def _displaced(model: mujoco.MjModel, fields: Mapping[str, Tensor]) -> Simulation | None:
     """Native worlds in which shapes whose contacts MuJoCo has to search for, such as cylinders, lie
-    elsewhere by less than a search in float32 can tell; None if there are no such shapes.
+    elsewhere by less than a search in float32 can tell; None if there are no such shapes. The
+    fields are those of the one world.
     """
     solid = (model.geom_contype | model.geom_conaffinity) > 0
     geoms = np.flatnonzero(np.isin(model.geom_type, _SEARCHED) & solid)
     if not len(geoms):
         return None
-    sim = NativeSimulation(model, _DISPLACED, fields=["geom_pos", "geom_quat"])
+    sim = NativeSimulation(model, _DISPLACED, fields=[*_PLACES, *fields])
+    for name, values in fields.items():
+        sim.fields[name].copy_(values)
     generator = torch.Generator().manual_seed(0)
-    for field in sim.fields.values():
+    for name in _PLACES:
+        field = sim.fields[name]
         shape = (_DISPLACED, len(geoms), field.shape[-1])
         field[:, geoms] += _OFF * (2.0 * torch.rand(shape, generator=generator).double() - 1.0)
     return sim

@@ -148,6 +148,9 @@ class CheckedJob:
         folder = report.folder
         where = escape(f"{self.title} -> {folder}")
         console.print(f"[bold]{escape(self.stage.cfg.robot.title)}[/], {where}")
+        for line in self.stage.cfg.unused_terms:
+            console.print(line, markup=False)
+            log.warning("%s", line)
         report.provenance = run_provenance(self.stage)
         if self.earlier:
             report.provenance["earlier_calls"] = list(self.earlier)
@@ -344,6 +347,7 @@ def run_provenance(stage: Stage) -> Provenance:
         "config_sha256": config_hash(config),
         "model_sha256": hashlib.sha256(model_bytes(stage.model).hex().encode()).hexdigest(),
         "starts_schema": SCHEMA,
+        **({"unused_terms": stage.cfg.unused_terms} if stage.cfg.unused_terms else {}),
         **({"policy": config["policy"]} if stage.cfg.policy else {}),
     }
 

@@ -103,12 +103,12 @@ def _run(trainer: Trainer, run: Run, folder: Path) -> None:
 
 
 def judged_stage(stage: Stage, policy: Path) -> Stage:
-    """The stage on which a policy is judged: it starts as the configuration says, under seeds
-    that training has not used.
+    """The stage on which a policy is judged: it starts as training does, or as the command line has
+    it for gate *success*, under seeds that training has not used.
     """
     cfg = stage.cfg
     gate = copy.copy(cfg.gate)
-    gate.success = replace(gate.success, reset=whole_starts(cfg.reset))
+    gate.success = replace(gate.success, reset=whole_starts(gate.success.reset))
     judged = replace(
         cfg,
         seed=cfg.job.test_seed,

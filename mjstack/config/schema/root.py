@@ -92,3 +92,5 @@ class Config:
     has it, or one."""
     world: str | None = spec(None)
     """job=replay: 17; of seed 3, 3:17; success:3:17 where batch ran too; failing: all those."""
+    unused_terms: list[str] = spec([])
+    """Terms of the task that this job does not use, a line each; mjstack fills it in."""

@@ -133,6 +133,14 @@ class GateFuncCfg:
 
 
 @dataclass(slots=True)
+class BaselineCfg(GateFuncCfg):
+    """The one world of baseline and parity."""
+
+    reset: dict[str, Any] = spec({})
+    """Reset terms of that world: the nominal start, and the terms of the task's own."""
+
+
+@dataclass(slots=True)
 class ParityCfg(GateFuncCfg):
     """Tolerances of MJWarp against native MuJoCo."""
 
@@ -247,14 +255,15 @@ class SuccessGateCfg(GateFuncCfg):
     worst_regions: int = spec(unit="cells", ge=1)
     """Worst cells in report.md."""
     reset: dict[str, Any] = spec({})
-    """Reset terms, unless ``reset=starts_file`` names a file."""
+    """Reset terms, unless ``reset=starts_file`` names a file: what they add to the task's own terms
+    of ``reset``, or replace by name."""
 
 
 @dataclass  # without slots: OmegaConf sets what is no field, see `complete`
 class GateCfg:
     """The gates by name, in the order in which they run; those of the search path come last."""
 
-    baseline: GateFuncCfg = field(default_factory=GateFuncCfg)
+    baseline: BaselineCfg = field(default_factory=BaselineCfg)
     """A single native world."""
     parity: ParityCfg = field(default_factory=ParityCfg)
     """MJWarp against native MuJoCo."""

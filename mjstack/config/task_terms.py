@@ -1,0 +1,170 @@
+"""Terms that a task, an experiment or a command line writes: where they act, and where they do not.
+
+A group such as ``reset`` is a choice among mjstack's files and what is written over it. Gates and
+trainers have copies of groups, each with a choice of its own. A term that is written over a group
+acts in its copies too.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import DictConfig, OmegaConf, open_dict
+
+from mjstack.config.schema import CloneJobCfg
+from mjstack.config.session import CONFIG_FOLDER
+
+Terms = dict[str, Any]
+
+_JUDGED = "gate.success.reset"
+_COPIES = ("gate.baseline.reset", "gate.capacity.reset", _JUDGED)
+_SEEN = "observation@job.observation="
+_TASK_SEEN = f"{_SEEN}task"
+# Groups that a job leaves out, and what stands in their place
+_LEFT_OUT = {
+    "action": "drivers command controller.action, policies their own action",
+    "termination": "task.check judges whole episodes",
+    "reward": "the policy learns from an expert",
+}
+
+
+def choose_observation(
+    overrides: Sequence[str], compose: Callable[[list[str]], DictConfig]
+) -> list[str]:
+    """Let a new policy see the task's own observation: where the overrides say so, or where they
+    say nothing and the task writes all of its terms, without a choice of a file.
+
+    Args:
+        overrides: Of the command line.
+        compose: Composes a configuration.
+
+    Returns:
+        The overrides with that choice, whose terms are ready for the next composition.
+    """
+    chosen = [o for o in overrides if o.startswith(_SEEN)]
+    trains = any(o.startswith(("job=train", "trainer=", "experiment=")) for o in overrides)
+    if _TASK_SEEN not in chosen and (chosen or not trains):
+        return list(overrides)
+    _store_observation({})
+    # An override of one of its terms fits only where the choice has been made.
+    cfg = compose([o for o in overrides if "job.observation" not in o])
+    choices = cfg.hydra.runtime.choices
+    alone = choices.get("observation") is None and bool(cfg.observation)
+    if not (chosen or (alone and choices.get(_SEEN.rstrip("=")) == "state")):
+        return list(overrides)
+    _store_observation(OmegaConf.to_container(cfg.observation))
+    return [*(o for o in overrides if o != _TASK_SEEN), _TASK_SEEN]
+
+
+def _store_observation(terms: Any) -> None:
+    """Set what ``conf/observation/task.yaml`` includes."""
+    node = OmegaConf.create(terms)
+    ConfigStore.instance().store("task_observation", node, provider="mjstack")
+
+
+def complete_terms(cfg: DictConfig, overrides: Sequence[str]) -> None:
+    """Put the terms that are written over ``reset`` into its copies, and a line for each term that
+    does not act into ``unused_terms``, in place.
+
+    Args:
+        cfg: A composition, with Hydra's part.
+        overrides: Of the command line.
+    """
+    chosen = any(o.startswith(f"reset@{_JUDGED}=") for o in overrides)
+    with open_dict(cfg):
+        if cfg.job.name == "train" and not chosen:  # judged from starts as training has them
+            terms = {name: f"${{reset.{name}}}" for name in cfg.reset}
+            cfg.gate.success.reset = terms | _written(cfg, _JUDGED)
+        lines = [line for key in _COPIES for line in _complete_copy(cfg, key)]
+        cfg.unused_terms = [*lines, *_left_out(cfg), *_unseen(cfg)]
+
+
+def _complete_copy(cfg: DictConfig, key: str) -> Iterator[str]:
+    """Put the terms that are written over ``reset`` into a copy of it.
+
+    Yields:
+        A line for each that does not act in gate *success*, if that runs.
+    """
+    shipped = _shipped(cfg, "reset")
+    copy = _terms(cfg, key)
+    explicit = _written(cfg, key)
+    for name, term in _written(cfg, "reset").items():
+        func = _func(term)
+        there = _func(copy.get(name))
+        added = func != _func(shipped.get(name)) and not (there and func.startswith("mjstack."))
+        if name not in explicit and (term is None or func == there or added):
+            OmegaConf.select(cfg, key)[name] = None if term is None else f"${{reset.{name}}}"
+        elif key == _JUDGED and "success" in cfg.gates:
+            place = f"{key}.{name} takes its place" if there else f"{key} has no {name}"
+            yield f"reset.{name} does not act in gate success: {place}"
+
+
+def _left_out(cfg: DictConfig) -> Iterator[str]:
+    """A line for each group of which a job leaves out written terms."""
+    job = cfg.job.name
+    taught = OmegaConf.get_type(cfg.job) is CloneJobCfg
+    driven = taught or job in ("gates", "collect", "play", "compare")
+    where = " but gate throughput" if job == "gates" else ""
+    for group, place in _LEFT_OUT.items():
+        names = [f"{group}.{name}" for name, term in _written(cfg, group).items() if term]
+        if names and (taught or (driven and group != "reward")):
+            yield f"job={job}{where} leaves out {', '.join(names)}: {place}"
+
+
+def _unseen(cfg: DictConfig) -> Iterator[str]:
+    """A line for terms of the task's observation that a new policy does not see."""
+    if "observation" not in cfg.job:
+        return
+    seen = _terms(cfg, "job.observation", cfg.job.group)
+    known = [_content(term) for term in seen.values()]
+    written = _written(cfg, "observation", cfg.job.group)
+    if unseen := [n for n, term in written.items() if term and _content(term) not in known]:
+        line = f"the policy sees {', '.join(seen)}; the task's own {', '.join(unseen)}"
+        yield f"{line} it does not see ({_TASK_SEEN} has them)"
+
+
+def _terms(cfg: DictConfig, key: str, group: str = "") -> Terms:
+    """Terms by name, without their interpolations' values; of observations those of a group."""
+    node = OmegaConf.select(cfg, f"{key}.{group}.terms" if group else key)
+    return {} if node is None else OmegaConf.to_container(node, resolve=False)  # type: ignore[return-value]
+
+
+def _written(cfg: DictConfig, key: str, group: str = "") -> Terms:
+    """Terms that are not as the chosen file of mjstack has them; None for those left out."""
+    shipped = _shipped(cfg, key, group)
+    terms = _terms(cfg, key, group)
+    names = dict.fromkeys([*shipped, *terms])
+    return {n: terms.get(n) for n in names if terms.get(n) != shipped.get(n)}
+
+
+def _shipped(cfg: DictConfig, key: str, group: str = "") -> Terms:
+    """Terms of the chosen file of a group, if it is mjstack's; looks are reset terms."""
+    kind = key.rpartition(".")[2]
+    at = "" if kind == key else f"@{key}"
+    files = ("reset", "looks") if kind == "reset" else (kind,)
+    choices = cfg.hydra.runtime.choices
+    terms: Terms = {}
+    for name in files:
+        terms |= _file_terms(name, choices.get(f"{name}{at}"), group)
+    return terms
+
+
+def _file_terms(kind: str, choice: str | None, group: str) -> Terms:
+    """Terms of a file of mjstack, with those of the files that it includes."""
+    file = CONFIG_FOLDER / kind / f"{choice}.yaml"
+    if not file.is_file():
+        return {}
+    content: Terms = OmegaConf.to_container(OmegaConf.load(file), resolve=False)  # type: ignore[assignment]
+    included = content.pop("defaults", [])
+    terms = content.get(group, {}).get("terms", {}) if group else content
+    for name in included:
+        terms = _file_terms(kind, name, group) | terms
+    return terms
+
+
+def _content(term: Any) -> tuple[str, Any]:
+    return _func(term), term.get("params", {})
+
+
+def _func(term: Any) -> str:
+    return str(term.get("func")) if isinstance(term, dict) else ""
