@@ -235,8 +235,8 @@ def test_text_is_not_markup(tmp_path: Path) -> None:
     worlds = Worlds(
         names=[bad] * 2, broken=[[bad], []], rules={bad: bad}, values={bad: two}, maps=maps
     )
-    report = Report(folder=tmp_path, overrides=[bad], provenance={bad: bad}, gates=[gate])
-    shown = Page(title=bad, worlds={bad: worlds}, notes=[bad])
+    report = Report(folder=tmp_path, provenance={bad: bad}, gates=[gate])
+    shown = Page(title=bad, command=bad, worlds={bad: worlds}, notes=[bad])
     reader = Reader(to_html(make_sections(report, shown)))
     assert "script" not in reader.tags
     assert reader.open == []

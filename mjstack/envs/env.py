@@ -184,7 +184,7 @@ class Env:
         """Advance every world by one decision of the policy; see the class for the order.
 
         Args:
-            action: Shape ``(nworld, action_dim)``, float32.
+            action: Shape ``(nworld, action_dim)``, float32 or float64.
 
         Returns:
             ``obs``: by group, ``(nworld, dim)``, float32; of worlds that ended, the first of the

@@ -1,13 +1,12 @@
 """Sums over a gate's episodes, and their report."""
 
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from mjstack.config.session import search_path_args
+from mjstack.config.explain import assign, command
 from mjstack.episodes.failures import describe_sign
 from mjstack.episodes.record import FAILING, EpisodeRecord
 from mjstack.episodes.rollout import Episode
@@ -183,8 +182,9 @@ class EpisodeTally:
         look = ""
         if len(failed) and self.path is not None and self.replayed:
             gate = "" if self.path.name == FAILING else f"{self.gate}:"
-            run = shlex.join([*search_path_args(), "job=replay", f"run={self.path.parent}"])
-            look = f". To look at one: {run} world={gate}{self.names(failed[:1])[0]}"
+            world = assign("world", gate + self.names(failed[:1])[0])
+            look = command("job=replay", assign("run", self.path.parent), world)
+            look = f". To look at one: {look}"
         if "sign" in self.records[0].worlds and self.array("unreachable").any():
             unreachable = np.flatnonzero(self.array("unreachable"))
             broken = {"target out of reach": unreachable.tolist()} | broken

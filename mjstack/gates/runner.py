@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from mjstack.config.complete import typed
+from mjstack.config.explain import assign, command
 from mjstack.config.functions import resolve_func
 from mjstack.config.schema import Config
 from mjstack.distributed import Ranks, current_ranks
@@ -97,7 +98,9 @@ def run_guarded(run: Run, name: str, gate: Gate, spread: str = "") -> None:
         gone = isinstance(cause, RankError) and cause.gone
         over = cause if gone or (ranks.size > 1 and spread == "worlds") else None
         if over is not None and run.cfg.job.name == "gates" and run.folder is not None:
-            results[0].reason += f" To go on after the last finished seed: resume={run.folder}"
+            rest = [o for o in run.overrides if not o.startswith("resume=")]
+            resuming = command(*rest, assign("resume", run.folder))
+            results[0].reason += f" To go on after the last finished seed: {resuming}"
     seconds = time.perf_counter() - began
     for result in results:
         if result.status is not Status.skipped and not result.seconds:

@@ -79,7 +79,7 @@ def _plan_replay(cfg: Config) -> ReplayPlan:
     """
     for key, expected in (("run", "the folder of an earlier run"), ("world", "one of its worlds")):
         if getattr(cfg, key) is None:
-            fix = "Write job=replay run=outputs/<date>/<time> world=17"
+            fix = "Write mjstack job=replay run=outputs/DATE/TIME world=17"
             raise ConfigError(key, "null", f"{expected}, because job=replay plays one again", fix)
     resolve_backend(cfg)  # what this command line asks for must be there
     run = EarlierRun.read(str(cfg.run))

@@ -21,6 +21,7 @@ import torch
 from rich.markup import escape
 
 from mjstack.config import load_config
+from mjstack.config.explain import command
 from mjstack.config.fingerprint import config_content, config_hash, differences
 from mjstack.config.functions import find_object
 from mjstack.config.schema import Backend, Config
@@ -117,7 +118,9 @@ class CheckedJob:
         console = Console(highlight=False, soft_wrap=True)
         cfg = self.stage.cfg
         page = Page(
-            title=f"{cfg.robot.title}, {self.title}", motion=cfg.web.episode and not lacks_viser()
+            title=f"{cfg.robot.title}, {self.title}",
+            command=command(*overrides),
+            motion=cfg.web.episode and not lacks_viser(),
         )
         report = Report(
             folder=folder,

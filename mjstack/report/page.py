@@ -76,6 +76,7 @@ class Page:
 
     Attributes:
         title: Robot and task.
+        command: The command that runs it again.
         motion: Whether it shows worlds in motion.
         worlds: Episodes by gate.
         worlds3d: Worlds in motion, by the part of the run that played them.
@@ -85,6 +86,7 @@ class Page:
     """
 
     title: str = "mjstack run"
+    command: str = ""
     motion: bool = False
     worlds: dict[str, Worlds] = field(default_factory=dict)
     worlds3d: dict[str, list[World]] = field(default_factory=dict)

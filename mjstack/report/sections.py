@@ -77,7 +77,7 @@ def make_sections(report: Report, page: Page) -> list[Section]:
     text = f"Play it in 3-D: {page.episode} (red tables: failed worlds)"
     head: list[Part] = [
         ", ".join(str(facts[name]) for name in ("date", "device") if name in facts),
-        " ".join(report.overrides),
+        page.command,
         summarize(report.gates),
         Marked(text, link=page.episode) if page.episode else "",
         page.notes,
