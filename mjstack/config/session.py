@@ -34,6 +34,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from typing_extensions import override
 
 from mjstack.config.functions import find_object
+from mjstack.config.policy_observation import choose_observation
 from mjstack.errors import MjstackError
 from mjstack.files import check_regular
 
@@ -304,7 +305,6 @@ def _compose_once(loader: Any) -> None:
     def load_once(*, overrides: list[str], run_mode: RunMode, **options: Any) -> DictConfig:
         key = (*overrides, run_mode)
         if key not in composed:
-            from mjstack.config.task_terms import choose_observation  # it reads CONFIG_FOLDER
 
             def compose(overrides: list[str]) -> DictConfig:
                 files.clear()
