@@ -204,17 +204,21 @@ def test_a_part_of_a_view_is_its_memory_where_columns_lie_side_by_side() -> None
 
 
 def test_a_branch_knows_what_came_before_it_and_keeps_the_rest() -> None:
-    def value(name: str) -> torch.Tensor:
-        return shared(name, lambda: torch.zeros(1))
+    @shared
+    def value(env: object, name: str) -> torch.Tensor:
+        return torch.zeros(1)
+
+    env = object()
 
     def work() -> torch.Tensor:
-        before = value("before")
-        assert in_one_pass(lambda: value("before")) is before
-        first, second = (in_one_pass(lambda: value("within")) for _ in range(2))
+        before = value(env, "before")
+        assert in_one_pass(lambda: value(env, "before")) is before
+        assert value(object(), "before") is not before
+        first, second = (in_one_pass(lambda: value(env, "within")) for _ in range(2))
         assert first is not second
         return before
 
-    assert value("before") is not in_one_pass(work)
+    assert value(env, "before") is not in_one_pass(work)
 
 
 def test_an_interrupt_at_any_moment_leaves_no_values_behind() -> None:
@@ -222,8 +226,11 @@ def test_an_interrupt_at_any_moment_leaves_no_values_behind() -> None:
     it is new.
     """
 
-    def value() -> torch.Tensor:
-        return shared("a", lambda: torch.zeros(1))
+    @shared
+    def zero(env: object) -> torch.Tensor:
+        return torch.zeros(1)
+
+    value = functools.partial(zero, None)
 
     def work() -> torch.Tensor:
         value()
