@@ -193,7 +193,7 @@ BAD_VALUES = [
     (f"seed={1 << 32}", f"seed={1 << 32}"),
     ("gate.capacity.margin=inf", "gate.capacity.margin="),
     ("gate.success.rate=1.01", "gate.success.rate=1.01: expected a number from 0 to 1"),
-    ("gate.success.seeds=0", "gate.success.seeds=0: expected an integer of at least 1"),
+    ("gate.success.seeds=0", "gate.success.seeds=0: expected an integer from 1 to 100000"),
     ("gate.success.yaw_cell_deg=91", "gate.success.yaw_cell_deg"),
     ("gate.success.region=[-0.01,0.1]", "gate.success.region"),
 ]
@@ -281,7 +281,7 @@ BAD = [
     ),
     (["+nworld=4"], "An item is already at 'nworld'."),
     (["~nworld"], "~nworld: expected a term of"),
-    (["~gate.batch.seeds"], "~gate.batch.seeds: expected an integer of at least 1 [seeds]."),
+    (["~gate.batch.seeds"], "~gate.batch.seeds: expected an integer from 1 to 100000 [seeds]."),
 ]
 
 

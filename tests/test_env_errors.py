@@ -335,7 +335,7 @@ OUT_OF_RANGE: list[tuple[str, type[MjstackError], str]] = [
     (
         "action=ee_delta action.arm.params.iterations=0",
         ConfigError,
-        "=0: expected an integer of at",
+        "=0: expected an integer from 1 to",
     ),
     ("termination.joint_limit.params.margin=-0.1", ConfigError, "=-0.1: expected a number of at"),
     ("reward.progress.params.scale=abc", ConfigError, "=abc: expected a number"),

@@ -23,7 +23,7 @@ from omegaconf.errors import ConfigKeyError
 from mjstack.config import session
 from mjstack.config.fields import accepted, find_field
 from mjstack.config.schema import JOB_SCHEMAS, Config, GateCfg
-from mjstack.errors import MjstackError, UnknownName, first_line, suggest
+from mjstack.errors import MjstackError, UnknownName, first_line, shorten, suggest
 
 COMMANDS = ("demo", "doctor", "list", "new")  # first words of a command line
 LISTS = ("cameras", "experiment")  # groups of which several may be chosen
@@ -66,8 +66,8 @@ def parse(override: str) -> Override:
             problem = f"override {override!r} cannot be read: expected key=value, or a command"
             raise MjstackError(f"{problem}. {suggest(override, COMMANDS)}") from error
         raise MjstackError(
-            f"override {override!r} cannot be read: expected key=value without spaces around the"
-            " sign, such as nworld=64. A value with a bracket, a quote, a letter beyond ASCII or"
+            f"override {shorten(override, 60)!r} cannot be read: expected key=value without spaces"
+            " around the sign. A value with a bracket, a quote, a letter beyond ASCII or"
             " one of = , : ; # & ! < > ^ ~ ` needs double quotes inside of single ones:"
             " 'policy=\"run (1)\"', or in a list 'job.against=[\"policy=DIR\"]'."
         ) from error

@@ -27,6 +27,7 @@ from mjstack.errors import ConfigError
 
 MOST_WORLDS = (1 << 31) - 1  # Warp counts them with 32 bits
 MOST_SEEDS = 1 << 32  # seeds are 32-bit
+MOST_COUNT = 1_000_000  # steps or episodes, one after the other
 _SPEC = "mjstack"  # key of a field's metadata
 _NOUNS = {int: "an integer", float: "a number", bool: "true or false", str: "text"}
 _PLURALS = {int: "integers", float: "numbers", str: "names"}
@@ -81,11 +82,13 @@ class Range:
         return noun + (f" [{self.unit}]" if self.unit else "")
 
 
-# Annotations of a term's parameters, which its manager checks
+# Annotations of a term's parameters, which its manager checks. A stranger's policy or run may set
+# one, so that each integer has an upper end.
 Positive = Annotated[float, Range(gt=0.0)]
 NotNegative = Annotated[float, Range(ge=0.0)]
 Fraction = Annotated[float, Range(ge=0.0, le=1.0)]
-Count = Annotated[int, Range(ge=1)]
+Count = Annotated[int, Range(ge=1, le=MOST_COUNT)]
+Repeats = Annotated[int, Range(ge=1, le=1000)]  # of a computation that nothing interrupts
 
 
 def spec(default: Any = MISSING, **limits: Any) -> Any:

@@ -1,8 +1,8 @@
 """Composes `conf/` into the dataclasses of `schema`."""
 
-import json
 import os
 import re
+import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,7 +24,7 @@ from mjstack.config.fingerprint import POLICY_FILE, policy_folder
 from mjstack.config.schema import JOB_SCHEMAS, TRAINER_SCHEMAS, Backend, Config
 from mjstack.config.task_terms import complete_terms
 from mjstack.errors import ConfigError, MjstackError
-from mjstack.files import read_inside, reading
+from mjstack.files import read_json, reading
 
 _schema = OmegaConf.structured(Config)
 _schema.gate._set_flag("struct", False)  # gates of the search path are added to it
@@ -56,6 +56,14 @@ def _by_device(cuda: Any, cpu: Any, *, _root_: DictConfig) -> Any:
 def _is_native(root: DictConfig) -> bool:
     return root.sim.backend == Backend.native
 
+
+# The functions that a replay calls: where a run's configuration names them, and of which kind.
+_REPLAYED = {
+    "controller.action.": "action term",
+    "gate.success.reset.": "reset term",
+    "reset.": "reset term",
+    "task.check.": "check",
+}
 
 # Overrides by the key where a choice of a group goes, such as gate.success.reset=jitter
 _CHOICE = re.compile(r"^(?:gate\.\w+\.|job\.)(reset|observation)=(?!null$)[\w,]+$")
@@ -137,10 +145,10 @@ def _policy_choices(overrides: Sequence[str]) -> list[str]:
     if not isinstance(folder, str):
         return []
     try:
-        facts = json.loads(read_inside(policy_folder(folder) / POLICY_FILE))
+        facts = read_json(policy_folder(folder) / POLICY_FILE)
         trained = {group: [facts["config"][group]["name"]] for group in ("robot", "task")}
         trained["cameras"] = list(facts["observation"].get("images", {}))
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+    except Exception:  # it may hold anything
         return []
     choices = session.list_choices()
     return [
@@ -224,16 +232,24 @@ def load_saved(path: Path) -> Config:
         merged = cast(DictConfig, OmegaConf.merge(_schema, plain))
         if missing := sorted(OmegaConf.missing_keys(merged)):
             raise MjstackError(f"{missing[0]} is missing, expected every key of this version.")
-        session.check_replayed(merged, path)
+        for key, name in session.list_items(merged):
+            for place, kind in _REPLAYED.items():
+                if key.startswith(place) and key.endswith(".func"):
+                    session.check_term(key.removesuffix(".func"), str(name), kind, path)
         try:
             cfg = to_config(merged)
         except ConfigError as error:
             if not error.key.endswith(".file"):
                 raise
             raise MjstackError(f"{error} {session.add_folder(path)}") from error
-        session.check_beside("robot.file", cfg.robot.file)
-        for name, thing in cfg.scene.objects.items():
-            session.check_beside(f"scene.objects.{name}.file", thing.file)
+        files = {"robot.file": cfg.robot.file}
+        files |= {f"scene.objects.{k}.file": thing.file for k, thing in cfg.scene.objects.items()}
+        folders = [folder.parent for folder in session.config_folders()]
+        for key, file in files.items():
+            if file is not None and not any(map(Path(file).is_relative_to, folders)):
+                flags = shlex.join(session.search_path_args([Path(file).parent]))
+                problem = f"{key}={file}: expected a file beside a folder of the search path"
+                raise MjstackError(problem, f"If you trust it, add {flags}")
     return cfg
 
 

@@ -19,7 +19,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import yaml  # type: ignore[import-untyped]
 from hydra import initialize_config_dir
 from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra.core.config_search_path import ConfigSearchPath
@@ -36,7 +35,7 @@ from typing_extensions import override
 from mjstack.config.functions import find_object
 from mjstack.config.policy_observation import choose_observation
 from mjstack.errors import MjstackError
-from mjstack.files import check_regular
+from mjstack.files import yaml_text
 
 _PACKAGE_FOLDER = Path(__file__).parents[1]
 # In a checkout the configuration lies beside the package, in a wheel inside of it.
@@ -49,13 +48,6 @@ CONFIG_NAME = "config"
 ENTRY_POINTS = "mjstack.configs"
 PROVIDER = "mjstack.search_path"  # of added entries, in a run's .hydra/hydra.yaml
 _FILE = "file://"
-# The functions that a replay calls: where a run's configuration names them, and of which kind.
-_REPLAYED = {
-    "controller.action.": "action term",
-    "gate.success.reset.": "reset term",
-    "reset.": "reset term",
-    "task.check.": "check",
-}
 
 # An override that adds an entry to a mapping by names, of which the schema knows the type
 _ENTRY = re.compile(
@@ -106,7 +98,7 @@ def add_folder(saved: Path) -> str:
     except Exception:  # the file may be missing, or hold anything
         folders = []
     flag = shlex.join(search_path_args(folders)) or "--config-dir DIR"
-    return f"If you trust the folder that the run had used, add {flag}."
+    return f"If you trust the folder that it had used, add {flag}."
 
 
 def lacking_folders(sources: Iterable[Any]) -> list[Path]:
@@ -119,15 +111,9 @@ def read_yaml(path: Path) -> Any:
     """Read YAML of a run's folder, which may be a stranger's: interpolations stay text.
 
     Raises:
-        Exception: It cannot be read, or has aliases: a few stand for any number of values.
+        Exception: It cannot be read, as of `yaml_text`.
     """
-    check_regular(path)
-    text = path.read_text()
-    # libyaml, where PyYAML has it: the other parser takes minutes for brackets nested very deep.
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, Loader=loader)):
-        raise yaml.YAMLError("an alias")
-    return OmegaConf.to_container(OmegaConf.create(text))
+    return OmegaConf.to_container(OmegaConf.create(yaml_text(path)))
 
 
 def config_folders() -> list[Path]:
@@ -141,19 +127,6 @@ def config_folders() -> list[Path]:
 def _registered() -> list[str]:
     """Configuration modules that installed packages register."""
     return [point.value for point in entry_points(group=ENTRY_POINTS)]
-
-
-def check_replayed(cfg: DictConfig, saved: Path) -> None:
-    """`check_term` for every function that a replay of a run calls.
-
-    Args:
-        cfg: The configuration of an earlier run.
-        saved: Its file.
-    """
-    for key, name in list_items(cfg):
-        for place, kind in _REPLAYED.items():
-            if key.startswith(place) and key.endswith(".func"):
-                check_term(key.removesuffix(".func"), str(name), kind, saved)
 
 
 def check_term(label: str, dotted: str, kind: str, saved: Path) -> None:
@@ -179,8 +152,8 @@ def check_term(label: str, dotted: str, kind: str, saved: Path) -> None:
         if getattr(func, "term_kind", "") == kind or in_search_path(home, saved):
             return
     raise MjstackError(
-        f"{label}.func={dotted}: expected one of the {kind}s of mjstack, of a package registered"
-        f" under {ENTRY_POINTS}, or beside a folder of the search path. {add_folder(saved)}"
+        f"{label}.func={dotted}: expected one of the {kind}s of mjstack, a registered package or"
+        f" the search path. {add_folder(saved)}"
     )
 
 
@@ -211,20 +184,6 @@ def in_search_path(dotted: str, saved: Path) -> bool:
         )
         for place in places
     )
-
-
-def check_beside(key: str, file: str | None) -> None:
-    """Check that an MJCF file, if a saved run names one, lies beside a folder of the search path.
-
-    Raises:
-        MjstackError: It lies elsewhere.
-    """
-    folders = [folder.parent for folder in config_folders()]
-    if file is not None and not any(map(Path(file).is_relative_to, folders)):
-        raise MjstackError(
-            f"{key}={file}: expected a file beside a folder of the search path. If you trust"
-            f" it, add {shlex.join(search_path_args([Path(file).parent]))}."
-        )
 
 
 def list_items(node: object, prefix: str = "") -> Iterator[tuple[str, object]]:

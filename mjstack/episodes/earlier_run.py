@@ -1,6 +1,5 @@
 """The folder of an earlier run: its configuration, report and records, and its starts file."""
 
-import json
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -15,7 +14,7 @@ from mjstack.config.schema import Config, TermCfg
 from mjstack.config.session import read_yaml
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.errors import FolderError, MjstackError
-from mjstack.files import made_by, reading, write_atomic
+from mjstack.files import made_by, read_json, reading, write_atomic
 
 REPORT = "report.json"
 COPY = "starts_played.npz"
@@ -61,10 +60,9 @@ class EarlierRun:
         try:
             cfg = load_saved(saved)
         except MjstackError as error:
-            problem = f".hydra/config.yaml{made_by(folder)} is no configuration of this mjstack"
-            raise FolderError(f"{key}={name}: {problem}: {error}") from error
+            raise FolderError(f"{key}={name}{made_by(folder)}: {error}") from error
         with reading(report, "Name another folder"):
-            provenance = dict(json.loads(report.read_text())["provenance"])
+            provenance = dict(read_json(report, "provenance"))
             provenance["versions"] = dict(provenance["versions"])
         return cls(folder=folder, cfg=cfg, provenance=provenance)
 

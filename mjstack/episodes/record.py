@@ -129,9 +129,9 @@ class EpisodeRecord:
             arrays.pop("sign_names", None)
             record = cls(
                 **{n: arrays.pop(n).item() for n in _FACTS},
-                **{n: arrays.pop(n).tolist() for n in _NAMES if n in arrays},
+                **{n: _items(arrays.pop(n)) for n in _NAMES if n in arrays},
                 worlds=arrays,
-                ranks=dict(zip(*(rank.tolist() for rank in ranks), strict=True)),
+                ranks=dict(zip(*map(_items, ranks), strict=True)),
             )
             record._check()
         return record
@@ -194,6 +194,11 @@ class EpisodeRecord:
             "retries": row["retries"],
             "unreachable": int(row["unreachable"]),
         }
+
+
+def _items(array: np.ndarray) -> Any:
+    """The items of a flat array, in Python's types."""
+    return [item.item() for item in array]
 
 
 def starts_name(seed: int | str) -> str:

@@ -21,7 +21,7 @@ from mjstack.episodes.rollout import Episode, require_episode
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
 from mjstack.episodes.tally import rate_cells
-from mjstack.errors import ConfigError, DeviceError, FolderError
+from mjstack.errors import ConfigError, DeviceError, FolderError, shorten
 from mjstack.files import to_csv, write_atomic, write_npz
 from mjstack.gates.runner import run_guarded
 from mjstack.gates.success import success_config
@@ -219,7 +219,7 @@ def _changes(recorded: dict, current: dict) -> list[str]:
         for facts in (recorded, current)
     )
     lines = [
-        f"{name} was {before[name]} in that run and is {value} now"
+        f"{name} was {shorten(str(before[name]), 100)} in that run and is {value} now"
         for name, value in now.items()
         if name in before and before[name] != value
     ]

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from mjstack.config.fields import Count, NotNegative
+from mjstack.config.fields import NotNegative, Repeats
 from mjstack.config.functions import offered
 from mjstack.errors import ParameterError
 from mjstack.managers.view import EnvView, offers, random_uniform, uses_fields, zero_rows
@@ -121,7 +121,7 @@ class RandomizeObjects:
         xy: Sequence[NotNegative],
         yaw: NotNegative = math.pi,
         gap: NotNegative = GAP,
-        candidates: Count = 16,
+        candidates: Repeats = 16,
     ) -> None:
         """Check that the region has room.
 

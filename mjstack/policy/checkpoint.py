@@ -7,7 +7,7 @@ policy that was there before.
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from hashlib import sha256
@@ -25,7 +25,7 @@ from mjstack.config.fingerprint import POLICY_FILE, config_content, policy_folde
 from mjstack.config.schema import Config, ObservationGroupCfg, ObservationTermCfg, TermCfg
 from mjstack.config.session import check_term
 from mjstack.errors import FolderError
-from mjstack.files import read_inside, reading, write_atomic
+from mjstack.files import read_inside, read_json, reading, write_atomic
 from mjstack.policy.network import PolicyNetwork, Vision
 from mjstack.version import __version__
 
@@ -37,8 +37,8 @@ _NAME_ANOTHER = ", or ".join(
 )
 _FLOATS = (torch.float32, torch.float16)  # of weights in a file
 # A stranger's files may ask for more than this.
+_MOST_WEIGHTS = 2**28  # bytes
 _MOST_COUNT = 1_000_000
-_MOST_LAYERS = 100
 _MOST_TERMS = 100
 _MOST_PIXELS = 4096  # along a side
 _MOST_STEPS = 1000  # control steps between two queries
@@ -206,12 +206,18 @@ def load_policy(folder: Path) -> Policy:
             in the search path.
     """
     folder = policy_folder(folder)
+    with suppress(FolderError):
+        return _load_policy(folder)
+    return _load_policy(folder)  # a training may have saved the next one meanwhile
+
+
+def _load_policy(folder: Path) -> Policy:
     path = folder / POLICY_FILE
     if not path.is_file():
         reason = f"has no {POLICY_FILE}, expected the folder of a policy"
         raise FolderError(f"policy={folder}: {reason}", _NAME_ANOTHER)
     with reading(path, _NAME_ANOTHER):
-        facts = json.loads(read_inside(path))
+        facts = read_json(path)
         if facts["format"] != FORMAT:
             of = " of version 0.1" if facts["format"] in (3, 4) else ""
             raise FolderError(
@@ -224,22 +230,17 @@ def load_policy(folder: Path) -> Policy:
         if not re.fullmatch("[0-9a-f]{64}", digest):
             raise ValueError("weights_sha256 is no SHA-256")
     weights = folder / _weights_name(digest)
-    try:
-        with reading(weights, "Copy the whole folder again, or train the policy again"):
-            numbers = sum(value.numel() for value in policy.network.state_dict().values())
-            content = read_inside(weights, 4 * numbers + 2**20)  # and names
-            if sha256(content).hexdigest() != digest:
-                raise ValueError(f"its content is not that of {POLICY_FILE}")
-            tensors = load(content)
-            for name, value in tensors.items():
-                if value.dtype not in _FLOATS or not bool(value.isfinite().all()):
-                    raise ValueError(f"{name} has other values than finite ones in float32")
-            policy.network.load_state_dict(tensors, assign=True)
-            policy.network.float()
-    except FolderError:
-        if digest in path.read_text():
-            raise
-        return load_policy(folder)  # a training has saved the next one since
+    with reading(weights, "Copy the whole folder again, or train the policy again"):
+        numbers = sum(value.numel() for value in policy.network.state_dict().values())
+        content = read_inside(weights, min(4 * numbers, _MOST_WEIGHTS) + 2**20)  # and names
+        if sha256(content).hexdigest() != digest:
+            raise ValueError(f"its content is not that of {POLICY_FILE}")
+        tensors = load(content)
+        for name, value in tensors.items():
+            if value.dtype not in _FLOATS or not bool(value.isfinite().all()):
+                raise ValueError(f"{name} has other values than finite ones in float32")
+        policy.network.load_state_dict(tensors, assign=True)
+        policy.network.float()
     policy.network.requires_grad_(False)
     return policy
 
@@ -259,7 +260,7 @@ def _from_facts(facts: Facts, path: Path) -> Policy:
             sum(widths.values()),
             _whole("action.width", action["width"]),
             _whole("action.chunk", action["chunk"]),
-            _layers("network.hidden", facts["network"]["hidden"], least=0),
+            [_whole("network.hidden", width) for width in facts["network"]["hidden"]],
             vision,
         )
     policy = Policy(
@@ -292,15 +293,9 @@ def _read_vision(facts: Facts) -> Vision:
     side = partial(_whole, "observation.images", most=_MOST_PIXELS)
     return Vision(
         sizes={name: (side(height), side(width)) for name, (height, width) in images.items()},
-        channels=_layers("network.channels", network["channels"], least=1),
+        channels=[_whole("network.channels", width) for width in network["channels"]],
         features=_whole("network.features", network["features"]),
     )
-
-
-def _layers(name: str, widths: Sequence[object], least: int) -> list[int]:
-    if not least <= len(widths) <= _MOST_LAYERS:
-        raise ValueError(f"{name} has {len(widths)} layers, expected {least} to {_MOST_LAYERS}")
-    return [_whole(name, width) for width in widths]
 
 
 def _whole(name: str, value: object, least: int = 1, most: int = _MOST_COUNT) -> int:

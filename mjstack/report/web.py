@@ -8,6 +8,7 @@ import io
 import logging
 import math
 import os
+import re
 import secrets
 import socket
 from collections.abc import Callable, Mapping, Sequence
@@ -29,7 +30,8 @@ from mjstack.report.page import MOST_WORLDS, World
 EPISODE = "episode.html"
 _LENGTH = 4.0 / 2**15  # m, to which positions are rounded
 _TURN = 1.0 / 2**12  # of quaternions
-_LOOPBACK = ("127.0.0.1", "::1", "localhost")
+_LOOPBACK = ("127.0.0.1", "::1", "[::1]", "localhost")
+_PORT = re.compile(r":\d+$")
 _MESSAGE = 2**16  # bytes, the largest of a browser
 _MARGIN = 0.12  # m between worlds
 _UNSEEN = ("site_", "cam_", "light_", "mat_")  # beginnings of model fields that it does not show
@@ -279,18 +281,18 @@ def _answer(
     """Answer a request of a browser, HTTP or the start of a websocket.
 
     The page's address has the token. Its answer makes it a cookie, which the page's websocket
-    brings; a page of another site cannot send it (SameSite=Strict), nor can a script read it. On
-    this machine alone (``local``) another port is the same site, so that Origin and Host count too.
+    brings; a page of another site cannot send it (SameSite=Strict), nor can a script read it.
+    Another port of this host is the same site, so that Origin has to be Host. On this machine alone
+    (``local``) Host counts too: another name may lead here.
     """
-    headers = request.headers
-    host = headers.get("Host", "")
+    hosts = request.headers.get_all("Host")
     cookie = f"mjstack-{token}=1"
+    cookies = "; ".join(request.headers.get_all("Cookie")).split("; ")
     fresh = token in parse_qs(urlsplit(request.path).query).get("token", [])
-    known = cookie in (text.strip() for text in headers.get("Cookie", "").split(";"))
-    refused = not (fresh or known)
-    if local:
-        origin = headers.get("Origin", f"http://{host}")  # a browser sends that of a websocket
-        refused |= urlsplit(f"//{host}").hostname not in _LOOPBACK or origin != f"http://{host}"
+    origins = request.headers.get_all("Origin")  # a browser sends that of a websocket
+    refused = not (fresh or cookie in cookies) or len(hosts) != 1
+    refused |= any(origin != f"http://{host}" for origin in origins for host in hosts)
+    refused |= local and not all(_PORT.sub("", host) in _LOOPBACK for host in hosts)
     if refused:
         text = "Open the whole address that the run has printed, with its token.\n"
         return connection.respond(403, text)

@@ -49,13 +49,13 @@ class BoxCheck(EpisodeCheck):
         """The place of each in the box."""
         force: float = spec(unit="N", gt=0.0)
         """A jaw, or a support, that presses with more than this touches."""
-        grasp_steps: int = spec(unit="steps", ge=1)
+        grasp_steps: int = spec(unit="steps", ge=1, le=1_000_000)
         """Consecutive steps, while closing, in which both jaws press."""
         lift_height: float = spec(unit="m", gt=0.0)
         """Height of the lowest corner above the table."""
-        lift_steps: int = spec(unit="steps", ge=1)
+        lift_steps: int = spec(unit="steps", ge=1, le=1_000_000)
         """Consecutive steps with both jaws pressing and no support touched."""
-        carry_steps: int = spec(unit="steps", ge=1)
+        carry_steps: int = spec(unit="steps", ge=1, le=1_000_000)
         """Least number of such steps in a row of a carry."""
         carry_distance: float = spec(unit="m", gt=0.0)
         """Horizontal distance from where those steps began."""
@@ -68,7 +68,7 @@ class BoxCheck(EpisodeCheck):
         """How far a corner may be beyond the inside of the box."""
         rest_speed: float = spec(unit="m/s", gt=0.0)
         """Speed of the fastest corner."""
-        window: int = spec(unit="steps", ge=1)
+        window: int = spec(unit="steps", ge=1, le=1000)
         """Last steps without contact to a jaw, in which an object must be inside and slow."""
         jaw_clearance: float = spec(unit="m", gt=0.0)
         """Lowest jaw geometry above the box's rim at the end."""

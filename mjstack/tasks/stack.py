@@ -42,13 +42,13 @@ class StackCheck(EpisodeCheck):
         """Phase in which carrying counts, if the driver has phases."""
         airborne_height: float = spec(unit="m", ge=0.0)
         """Height of its lowest point above the table from which the object is in the air."""
-        lift_steps: int = spec(unit="steps", ge=1)
+        lift_steps: int = spec(unit="steps", ge=1, le=1_000_000)
         """Consecutive steps in the air that make a lift."""
-        carry_steps: int = spec(unit="steps", ge=1)
+        carry_steps: int = spec(unit="steps", ge=1, le=1_000_000)
         """Least number of consecutive steps in the air of a carry."""
         carry_distance: float = spec(unit="m", gt=0.0)
         """Horizontal distance from where those steps began."""
-        window: int = spec(unit="steps", ge=2)
+        window: int = spec(unit="steps", ge=2, le=1000)
         """Last steps of the episode, in which everything below must hold."""
         xy_err: float = spec(unit="m", gt=0.0)
         """Largest horizontal distance of the centres."""

@@ -180,7 +180,7 @@ class PpoJobCfg(TrainJobCfg):
     """Time budget of a call; the next one goes on. null: unlimited."""
     save_every: int = spec(unit="iterations", ge=1)
     """Iterations between two saved policies."""
-    expert_worlds: int = spec(unit="worlds", ge=1)
+    expert_worlds: int = spec(unit="worlds", ge=1, le=4096)
     """reset=expert_states: worlds in which the expert plays at the beginning."""
     horizon: int = spec(unit="decisions", ge=1)
     """Decisions of every world per iteration."""

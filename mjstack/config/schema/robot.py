@@ -37,13 +37,13 @@ class PlacementsCfg:
     """How far above an object's centre it is held."""
     home: list[float] | None = spec(None, unit="rad, m")
     """Joint values at which this scene's task begins, where ``robot.home`` would collide."""
-    nconmax: int = spec(128, ge=1)
+    nconmax: int = spec(128, ge=1, le=100_000)
     """Contacts per world while a driver does the task."""
-    njmax: int = spec(300, ge=1)
+    njmax: int = spec(300, ge=1, le=100_000)
     """Constraint rows per world while a driver does the task."""
-    env_nconmax: int = spec(128, ge=1)
+    env_nconmax: int = spec(128, ge=1, le=100_000)
     """Contacts per world under random actions."""
-    env_njmax: int = spec(768, ge=1)
+    env_njmax: int = spec(768, ge=1, le=100_000)
     """Constraint rows per world under random actions."""
 
 
