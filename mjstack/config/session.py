@@ -48,6 +48,7 @@ PROVIDER = "mjstack.search_path"  # of added entries, in a run's .hydra/hydra.ya
 _FILE = "file://"
 # The functions that a replay calls: where a run's configuration names them, and of which kind.
 _REPLAYED = {
+    "controller.func": "driver",
     "controller.action.": "action term",
     "gate.success.reset.": "reset term",
     "reset.": "reset term",

@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from mjstack.config.schema import CameraCfg, Config
+from mjstack.drivers.assets import Assets
 from mjstack.drivers.driver import Driver, require_actions
 from mjstack.envs.env import Env
 from mjstack.errors import ArgumentError, FolderError, TermError
@@ -71,6 +73,22 @@ class PolicyDriver(Driver):
     Attributes:
         query_images: These images.
     """
+
+    plays_policy = True
+    noun = "policy"
+
+    @classmethod
+    @override
+    def build(cls, env: Env, cfg: Config, assets: Assets) -> Driver:
+        if assets.lerobot_policy:
+            return LerobotDriver.with_params(cfg, env, assets.lerobot_policy, cfg)
+        return cls.with_params(cfg, env, assets.policy, cfg.scene.cameras)
+
+    @classmethod
+    @override
+    def check(cls, env: Env, cfg: Config, assets: Assets) -> None:
+        """Build it, which compares the policy with the worlds; nothing is drawn."""
+        cls.build(env, cfg, assets)
 
     def __init__(
         self, env: Env, policy: Policy, cameras: Mapping[str, CameraCfg] | None = None
