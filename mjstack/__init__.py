@@ -23,8 +23,9 @@ if TYPE_CHECKING:
     from mjstack.envs import Env, make_env
     from mjstack.errors import MjstackError
     from mjstack.jobs.runner import verify
+    from mjstack.policy import load_policy
 
-__all__ = ["Config", "Env", "MjstackError", "load_config", "make_env", "verify"]
+__all__ = ["Config", "Env", "MjstackError", "load_config", "load_policy", "make_env", "verify"]
 __version__ = "0.2.0"
 
 _HOMES = {
@@ -33,6 +34,7 @@ _HOMES = {
     "Env": "mjstack.envs",
     "make_env": "mjstack.envs",
     "MjstackError": "mjstack.errors",
+    "load_policy": "mjstack.policy",
     "verify": "mjstack.jobs.runner",
 }
 
@@ -45,3 +47,7 @@ if not TYPE_CHECKING:  # a type checker would take any name for one of these
         if find_spec(f"mjstack.{name}"):
             return import_module(f"mjstack.{name}")
         raise AttributeError(f"module 'mjstack' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -163,7 +163,7 @@ def test_a_sweep_and_a_replay(lean: Path, tmp_path: Path) -> None:
     with pytest.raises(MjstackError) as caught:
         load_saved(saved)
     assert "reset.lean.func=lean.lean: expected one of the reset terms" in str(caught.value)
-    assert f"--config-dir {lean}" in str(caught.value)
+    assert f"config_dir='{lean}'" in str(caught.value)
     with search_path([lean]):
         assert load_saved(saved).reset["lean"].func == "lean.lean"
     saved.write_text(saved.read_text().replace("lean.lean", "shutil.rmtree"))

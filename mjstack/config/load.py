@@ -86,9 +86,20 @@ def load_config(
     Raises:
         MjstackError: An override does not fit; the message says which and what would.
     """
+    with configured(overrides, config_dir) as cfg:
+        return cfg
+
+
+@contextmanager
+def configured(overrides: Sequence[str], config_dir: str | os.PathLike | None) -> Iterator[Config]:
+    """The configuration of `load_config`, whose search path goes on inside: a policy that is loaded
+    there may name functions beside it.
+    """
     folders = [] if config_dir is None else [config_dir]
-    with extended_search_path(overrides, folders) as composed, session.hydra_session():
-        return to_config(compose(composed))
+    with extended_search_path(overrides, folders) as composed:
+        with session.hydra_session():
+            cfg = to_config(compose(composed))
+        yield cfg
 
 
 @contextmanager

@@ -62,6 +62,7 @@ _ENTRY = re.compile(
 )
 
 _added: ContextVar[tuple[Path, ...]] = ContextVar("search path", default=())
+_on_command_line: ContextVar[bool] = ContextVar("command line", default=False)
 
 
 @contextmanager
@@ -84,6 +85,23 @@ def search_path(entries: Sequence[str | os.PathLike]) -> Iterator[None]:
         yield
     finally:
         _added.reset(token)
+
+
+@contextmanager
+def command_line() -> Iterator[None]:
+    """Let advice inside be that for a command line, not for Python."""
+    token = _on_command_line.set(True)
+    try:
+        yield
+    finally:
+        _on_command_line.reset(token)
+
+
+def folder_advice(folders: Sequence[Path] = ()) -> str:
+    """The words that add folders to the search path where they are needed; any folder if none."""
+    if _on_command_line.get():
+        return shlex.join(search_path_args(folders)) or "--config-dir DIR"
+    return " and ".join(f"config_dir='{folder}'" for folder in folders) or "config_dir=DIR"
 
 
 def search_path_args(folders: Sequence[Path] | None = None) -> list[str]:
@@ -109,8 +127,8 @@ def add_folder(saved: Path) -> str:
         folders = lacking_folders(sources)
     except Exception:  # the file may be missing, or hold anything
         folders = []
-    flag = shlex.join(search_path_args(folders)) or "--config-dir DIR"
-    return f"If you trust the folder that the run had used, add {flag}."
+    advice = folder_advice(folders)
+    return f"If you trust the folder that the run had used, add {advice}."
 
 
 def lacking_folders(sources: Iterable[Any]) -> list[Path]:
@@ -227,7 +245,7 @@ def check_beside(key: str, file: str | None) -> None:
     if file is not None and not any(map(Path(file).is_relative_to, folders)):
         raise MjstackError(
             f"{key}={file}: expected a file beside a folder of the search path. If you trust"
-            f" it, add {shlex.join(search_path_args([Path(file).parent]))}."
+            f" it, add {folder_advice([Path(file).parent])}."
         )
 
 

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -56,7 +55,7 @@ class Assets:
         if self.cfg.policy is None:
             expected = "the folder of a trained policy, which controller=policy plays"
             raise ConfigError("policy", None, expected)
-        return load_policy(Path(self.cfg.policy))
+        return load_policy(self.cfg.policy)
 
     @cached_property
     def lerobot_policy(self) -> tuple[Any, Any, Any] | None:
