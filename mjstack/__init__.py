@@ -18,6 +18,8 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
+from mjstack.adapters.ids import Registrar
+
 if TYPE_CHECKING:
     from mjstack.config import Config, load_config
     from mjstack.envs import Env, make_env
@@ -51,3 +53,6 @@ if not TYPE_CHECKING:  # a type checker would take any name for one of these
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
+
+
+Registrar().install()

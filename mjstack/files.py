@@ -20,6 +20,13 @@ import numpy as np
 import mjstack
 from mjstack.errors import FolderError, MjstackError, first_line
 
+_PACKAGE = Path(__file__).parent
+# In a checkout the configuration lies beside the package, in a wheel inside of it.
+CONFIG_FOLDER = next(
+    folder
+    for folder in (_PACKAGE.parent / "conf", _PACKAGE / "conf")
+    if (folder / "config.yaml").is_file()
+)
 _MOST_TEXT = 2**26  # bytes of JSON or YAML
 _MOST_BYTES = 2**32  # of any other file, and of the arrays in one
 _KEY = "hydra.run.dir (job=collect, job=train: job.folder)"

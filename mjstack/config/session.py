@@ -33,15 +33,8 @@ from typing_extensions import override
 
 from mjstack.config.functions import find_object
 from mjstack.errors import MjstackError
-from mjstack.files import check_regular
+from mjstack.files import CONFIG_FOLDER, check_regular
 
-_PACKAGE_FOLDER = Path(__file__).parents[1]
-# In a checkout the configuration lies beside the package, in a wheel inside of it.
-CONFIG_FOLDER = next(
-    folder
-    for folder in (_PACKAGE_FOLDER.parent / "conf", _PACKAGE_FOLDER / "conf")
-    if (folder / "config.yaml").is_file()
-)
 CONFIG_NAME = "config"
 ENTRY_POINTS = "mjstack.configs"
 PROVIDER = "mjstack.search_path"  # of added entries, in a run's .hydra/hydra.yaml

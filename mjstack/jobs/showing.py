@@ -2,7 +2,6 @@
 
 import os
 import secrets
-import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from importlib import import_module
@@ -109,19 +108,9 @@ def find_viewers(stage: Stage) -> list[Observer]:
     """
     if stage.cfg.view != "true":
         return []
-    import mujoco.viewer
-
-    model = stage.assets.visual_model
-    data = mujoco.MjData(model)
-    handle = mujoco.viewer.launch_passive(model, data)
+    window = picture.Window(stage.assets.visual_model, stage.cfg.timing.step_dt)
 
     def show(step: int, sim: Simulation) -> None:
-        if not handle.is_running():
-            return
-        began = time.perf_counter()
-        data.qpos[:] = sim.qpos[0].cpu().numpy()
-        mujoco.mj_forward(model, data)
-        handle.sync()
-        time.sleep(max(0.0, stage.cfg.timing.step_dt - (time.perf_counter() - began)))
+        window.show(sim.qpos[0].cpu().numpy())
 
     return [Hook(show)]
