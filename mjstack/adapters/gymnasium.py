@@ -28,63 +28,11 @@ try:
 except ImportError as error:
     raise MissingExtra("mjstack.adapters.gymnasium", str(error.name), "train") from error
 
-__all__ = ["GymnasiumEnv", "GymnasiumVectorEnv", "make_single", "make_vector", "register_env"]
+__all__ = ["GymnasiumEnv", "GymnasiumVectorEnv", "make", "register_env"]
 Observation = ndarray | dict[str, ndarray]
 Info = dict[str, Any]
+State = tuple[torch.Tensor, Info]
 _MODES = ("rgb_array", "human")  # of rendering
-State = tuple[torch.Tensor, dict[str, torch.Tensor]]  # positions, and model fields by name
-
-
-class _Screen:
-    """Shows the states of an environment as ``render_mode`` says; None shows none."""
-
-    def __init__(self, env: Env, mode: str | None, cameras: Mapping[str, CameraCfg] | None) -> None:
-        self._env = env
-        self._mode = mode
-        self._cameras = dict(cameras or env.cfg.scene.cameras)
-        self._renderer: StateRenderer | None = None
-        self._window: Window | None = None
-        if mode not in (None, *_MODES):
-            raise ArgumentError("render_mode", repr(mode), f"None, or one of {', '.join(_MODES)}")
-        if mode == "rgb_array" and not self._cameras:
-            fix = "Build the environment with cameras=front"
-            raise ArgumentError("render_mode", repr(mode), "a scene with a camera", fix)
-        if mode == "human" and not opens_windows():
-            display = os.environ.get("DISPLAY", "not set")
-            expected = f"a display that opens windows (DISPLAY={display})"
-            raise ArgumentError("render_mode", repr(mode), expected, "Use rgb_array")
-
-    def state(self) -> State:
-        """What there is to see now."""
-        sim = self._env.sim
-        return sim.qpos.clone(), {name: field.clone() for name, field in sim.fields.items()}
-
-    def show(self, qpos: torch.Tensor, fields: dict[str, torch.Tensor]) -> tuple[ndarray, ...]:
-        """Images by the first camera, a world each ``(height, width, 3)``, uint8. A window shows
-        the first world; there are no images then.
-        """
-        env = self._env
-        if self._mode is None:
-            fix = "Give it to gymnasium.make"
-            raise ArgumentError("render_mode", None, f"one of {', '.join(_MODES)}", fix)
-        if self._mode == "human":
-            dt = env.cfg.timing.decision_dt
-            self._window = self._window or Window(env.sim.model, dt)
-            self._window.show(qpos[0].cpu().numpy())
-            return ()
-        if self._renderer is None:
-            scene = env.cfg.scene
-            film = with_outputs(self._cameras, ["rgb"], list(self._cameras)[:1])
-            cfg = replace(env.cfg, scene=replace(scene, cameras=film))
-            self._renderer = StateRenderer(env.sim.model, cfg, env.nworld, fields=[*fields])
-        (images,) = self._renderer.draw(qpos, fields).values()
-        return tuple(images.to("cpu", copy=True).numpy())
-
-    def close(self) -> None:
-        """Close what has been opened."""
-        for opened in (self._renderer, self._window):
-            if opened is not None:
-                opened.close()
 
 
 class GymnasiumVectorEnv(VectorEnv):
@@ -137,10 +85,20 @@ class GymnasiumVectorEnv(VectorEnv):
         self.group = group
         self.num_envs = env.nworld
         self.render_mode = render_mode
-        self.screen = _Screen(env, render_mode, cameras)
+        self._film = [*(cameras or env.cfg.scene.cameras).items()][:1]
+        self._renderer: StateRenderer | None = None
+        self._window: Window | None = None
+        modes = _MODES[: 1 + opens_windows()]
+        if render_mode not in (None, *modes):
+            display = os.environ.get("DISPLAY", "not set")
+            expected = f"None, or one of {', '.join(modes)} on this display (DISPLAY={display})"
+            raise ArgumentError("render_mode", repr(render_mode), expected)
+        if render_mode == "rgb_array" and not self._film:
+            fix = "Build the environment with cameras=front"
+            raise ArgumentError("render_mode", repr(render_mode), "a scene with a camera", fix)
         self.metadata = {
             "autoreset_mode": AutoresetMode.SAME_STEP,
-            "render_modes": _MODES[: 1 + opens_windows()],
+            "render_modes": modes,
             "render_fps": round(1.0 / env.cfg.timing.decision_dt),
         }
         boxes: dict[str, spaces.Space] = {
@@ -220,16 +178,39 @@ class GymnasiumVectorEnv(VectorEnv):
 
     def render(self) -> tuple[ndarray, ...] | None:
         """Images of all worlds, or None; see the class."""
-        return self.screen.show(*self.screen.state()) or None
+        return self.draw(*self.state())
+
+    def state(self) -> State:
+        """Positions of all worlds, and the model fields that differ between them, now."""
+        sim = self.inner.sim
+        return sim.qpos.clone(), {name: field.clone() for name, field in sim.fields.items()}
+
+    def draw(self, qpos: torch.Tensor, fields: Info) -> tuple[ndarray, ...] | None:
+        """Images of states as of `state`, as of `render`."""
+        env = self.inner
+        if self.render_mode is None:
+            fix = "Give it to gymnasium.make"
+            raise ArgumentError("render_mode", None, f"one of {', '.join(_MODES)}", fix)
+        if self.render_mode == "human":
+            self._window = self._window or Window(env.sim.model, env.cfg.timing.decision_dt)
+            self._window.show(qpos[0].cpu().numpy())
+            return None
+        if self._renderer is None:
+            cameras = with_outputs(dict(self._film), ["rgb"])
+            cfg = replace(env.cfg, scene=replace(env.cfg.scene, cameras=cameras))
+            self._renderer = StateRenderer(env.sim.model, cfg, env.nworld, fields=[*fields])
+        (images,) = self._renderer.draw(qpos, fields).values()
+        return tuple(images.to("cpu", copy=True).numpy())
 
     def _show(self) -> None:
         if self.render_mode == "human":
             self.render()
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Give the simulation's threads and buffers back."""
-        self.screen.close()
-        self.inner.close()
+        """Give the simulation's threads and buffers back, and close the viewer."""
+        for opened in (self._renderer, self._window, self.inner):
+            if opened is not None:
+                opened.close()
 
 
 class GymnasiumEnv(gymnasium.Env):
@@ -259,10 +240,9 @@ class GymnasiumEnv(gymnasium.Env):
         self._worlds = GymnasiumVectorEnv(env, **options)
         self.group = self._worlds.group
         self.render_mode = self._worlds.render_mode
-        self._screen = self._worlds.screen
-        self._seen = self._screen.state()
-        modes = {"render_modes", "render_fps"}
-        self.metadata = {key: self._worlds.metadata[key] for key in modes}
+        self.metadata = dict(self._worlds.metadata)
+        del self.metadata["autoreset_mode"]
+        self._seen = self._worlds.state()
         self.observation_space = self._worlds.single_observation_space
         self.action_space = self._worlds.single_action_space
         # What the next episode has shown first: it starts in the step that ends one
@@ -289,7 +269,7 @@ class GymnasiumEnv(gymnasium.Env):
         if seed is not None or first is None:
             first, _ = self._worlds.reset(seed=seed)
         self._first = None
-        self._seen = self._screen.state()
+        self._seen = self._worlds.state()
         super().reset(seed=seed)
         return _row(first, 0), {}
 
@@ -317,13 +297,13 @@ class GymnasiumEnv(gymnasium.Env):
             self._first = obs
             seen = infos["final_obs"][0]
         elif self.render_mode is not None:
-            self._seen = self._screen.state()
+            self._seen = self._worlds.state()
         info = {"success": bool(infos["success"])}
         return seen, float(reward[0]), bool(terminated), bool(truncated), info
 
     def render(self) -> ndarray | None:
         """An image ``(height, width, 3)``, uint8, or None; see the class."""
-        images = self._screen.show(*self._seen)
+        images = self._worlds.draw(*self._seen)
         return images[0] if images else None
 
     def close(self) -> None:
@@ -332,15 +312,15 @@ class GymnasiumEnv(gymnasium.Env):
 
 
 @offers(metadata={"render_modes": _MODES})
-def make_vector(
-    num_envs: int = 1,
+def make(
+    num_envs: int | None = None,
     *,
     choices: Sequence[str] = (),
     overrides: Sequence[str] = (),
     config_dir: str | os.PathLike | None = None,
     **options: Any,
-) -> GymnasiumVectorEnv:
-    """The environment of ``gymnasium.make_vec``.
+) -> GymnasiumVectorEnv | GymnasiumEnv:
+    """The environment of ``gymnasium.make`` or, with a number of worlds, of ``make_vec``.
 
     Args:
         num_envs: Number of worlds.
@@ -353,35 +333,13 @@ def make_vector(
     Raises:
         MjstackError: An override or an option cannot be used.
     """
-    return GymnasiumVectorEnv(**_build(num_envs, choices, overrides, config_dir, options))
-
-
-@offers(metadata={"render_modes": _MODES})
-def make_single(
-    *,
-    choices: Sequence[str] = (),
-    overrides: Sequence[str] = (),
-    config_dir: str | os.PathLike | None = None,
-    **options: Any,
-) -> GymnasiumEnv:
-    """The environment of ``gymnasium.make``; arguments as of `make_vector`."""
-    return GymnasiumEnv(**_build(1, choices, overrides, config_dir, options))
-
-
-def _build(
-    nworld: int,
-    choices: Sequence[str],
-    overrides: Sequence[str],
-    config_dir: str | os.PathLike | None,
-    options: Info,
-) -> Info:
-    """Arguments of an environment's constructor, its worlds built."""
-    words = [*choices, *overrides, f"nworld={nworld}"]
+    words = [*choices, *overrides, f"nworld={1 if num_envs is None else num_envs}"]
     cfg = filmed = load_config(words, config_dir=config_dir)
     if options.get("render_mode") and not cfg.scene.cameras:
         filmed = load_config([*words, "cameras=front"], config_dir=config_dir)
     env = build_env(cfg, model=build_model(filmed))  # with what pictures need
-    return {"env": env, "cameras": filmed.scene.cameras, **options}
+    kind = GymnasiumEnv if num_envs is None else GymnasiumVectorEnv
+    return kind(env, cameras=filmed.scene.cameras, **options)
 
 
 def _numpy(obs: dict[str, torch.Tensor], group: str | None) -> Observation:

@@ -10,7 +10,7 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any
 
-_MODULE = "mjstack.adapters.gymnasium"
+_MAKER = "mjstack.adapters.gymnasium:make"
 
 
 def register_env(
@@ -28,8 +28,7 @@ def register_env(
     kwargs: dict[str, Any] = {"choices": list(overrides)}
     if config_dir is not None:  # relative to the folder of this call
         kwargs["config_dir"] = os.path.abspath(config_dir)
-    single, vector = f"{_MODULE}:make_single", f"{_MODULE}:make_vector"
-    register(id, entry_point=single, vector_entry_point=vector, kwargs=kwargs)
+    register(id, entry_point=_MAKER, vector_entry_point=_MAKER, kwargs=kwargs)
 
 
 def register_tasks() -> None:
