@@ -7,14 +7,10 @@ import math
 import numpy as np
 import torch
 from torch import Tensor
-from typing_extensions import override
 
-from mjstack.config.schema import Config
-from mjstack.drivers.assets import Assets
 from mjstack.drivers.feedback import STAY, FeedbackDriver, measure_planar
 from mjstack.drivers.open_loop import OpenLoopPlanner, smoothstep
 from mjstack.envs import Env
-from mjstack.kinematics.batched_ik import build_chain
 from mjstack.managers.view import EnvView
 from mjstack.math import atan2, norm
 from mjstack.mdp.geometry import jaw_forces, objects_in_hand, robot
@@ -45,11 +41,6 @@ class ClosedLoopDriver(FeedbackDriver):
 
     phased = True
     measures = True  # objects, in phases that say so
-
-    @classmethod
-    @override
-    def check(cls, env: Env, cfg: Config, assets: Assets) -> None:
-        build_chain(assets.model, cfg.robot)
 
     def __init__(self, env: EnvView, nominal: np.ndarray) -> None:
         """Allocate for the environment's worlds; see `FeedbackDriver`."""

@@ -1,24 +1,80 @@
-"""Drivers give the actions of every world, step by step, and the phase of each world."""
+"""Drivers give the actions of every world, step by step, and the phase of each world. Scene, plan
+and policy, of which they are made.
+"""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
+import mujoco
 import torch
 from torch import Tensor
 from typing_extensions import override
 
 from mjstack.config.functions import resolve_func
 from mjstack.config.schema import Config, TermCfg
-from mjstack.drivers.assets import Assets
-from mjstack.drivers.open_loop import JointTrajectory
+from mjstack.drivers.open_loop import JointTrajectory, OpenLoopPlanner
 from mjstack.envs import Env
-from mjstack.errors import ArgumentError, TermError
+from mjstack.errors import ArgumentError, ConfigError, TermError
 from mjstack.managers.term import blamed, check_params
 from mjstack.math import describe_tensor
 from mjstack.mdp.geometry import source_xy
+from mjstack.policy import Policy, load_policy
+from mjstack.policy.lerobot import PREFIX, load_lerobot
+from mjstack.scene import SceneIndex, build_model
 from mjstack.scene.phases import Phase
+from mjstack.sim import resolve_backend
+
+
+@dataclass(eq=False)
+class Assets:
+    """Scene, plan and policy, each built once when it is first needed.
+
+    Attributes:
+        cfg: The configuration of scene, robot and phases.
+    """
+
+    cfg: Config
+
+    @cached_property
+    def model(self) -> mujoco.MjModel:
+        """The scene for physics."""
+        return build_model(self.cfg)
+
+    @cached_property
+    def visual_model(self) -> mujoco.MjModel:
+        """The same scene with everything that only pictures need."""
+        return build_model(self.cfg, visuals=True)
+
+    @cached_property
+    def index(self) -> SceneIndex:
+        """Addresses in the model."""
+        return SceneIndex(self.model, self.cfg.robot, self.cfg.scene)
+
+    @cached_property
+    def planner(self) -> OpenLoopPlanner:
+        """The planner, its nominal plan made."""
+        return OpenLoopPlanner(self.cfg)
+
+    @cached_property
+    def policy(self) -> Policy:
+        """The policy of ``controller=policy``.
+
+        Raises:
+            MjstackError: There is none, or it cannot be read.
+        """
+        if self.cfg.policy is None:
+            expected = "the folder of a trained policy, which controller=policy plays"
+            raise ConfigError("policy", None, expected)
+        return load_policy(self.cfg.policy)
+
+    @cached_property
+    def lerobot_policy(self) -> tuple[Any, Any, Any] | None:
+        """That of ``policy=lerobot:FOLDER``, as of `load_lerobot`; None if the policy is ours."""
+        name = self.cfg.policy or ""
+        return load_lerobot(name, resolve_backend(self.cfg)[1]) if name.startswith(PREFIX) else None
 
 
 class Driver(ABC):
@@ -87,29 +143,6 @@ class Driver(ABC):
         check_params("controller", cls, cfg.controller.params, len(args))
         return cls(*args, **cfg.controller.params)
 
-    @classmethod
-    def check(cls, env: Env, cfg: Config, assets: Assets) -> None:
-        """Raise for what it cannot drive, before anything is written. Arguments as of `build`; the
-        worlds are native ones, which are not used afterwards.
-
-        Raises:
-            TermError: Its first actions cannot be used, or one of its attributes.
-        """
-        with blamed("controller"):
-            driver = cls.build(env, cfg, assets)
-            if bool(driver.phases) != cls.phased:
-                expected = "phases if, and only if, its class has phased=True"
-                raise ArgumentError("phases", driver.phases or "none", expected)
-            steps = driver.phases[-1].stop if cls.phased else cfg.task.episode_steps
-            if driver.steps != steps:
-                raise ArgumentError("steps", driver.steps, f"{steps}, those of the episode")
-            for name in ("phase", "error", "retries"):
-                value = getattr(driver, name)
-                if not isinstance(value, Tensor) or value.shape != (env.nworld,):
-                    expected = f"shape ({env.nworld},), a number for each world"
-                    raise ArgumentError(name, describe_tensor(value), expected)
-            env.action_manager.process(driver.command())
-
 
 # Drivers that jobs choose, by the name of their controller
 _CHOSEN = {
@@ -135,6 +168,31 @@ def find_driver(cfg: Config) -> type[Driver]:
         problem = f"func={cfg.controller.func}: expected a class with {', '.join(lacking)}()"
         raise TermError("controller", problem)
     return driver
+
+
+def check_driver(env: Env, cfg: Config, assets: Assets) -> None:
+    """Build the configured driver and take its first actions; a policy, whose widths are compared,
+    is not asked. Arguments as of `Driver.build`; the worlds are not used afterwards.
+
+    Raises:
+        TermError: Its actions cannot be used, or one of its attributes.
+    """
+    with blamed("controller"):
+        driver = find_driver(cfg).build(env, cfg, assets)
+        if driver.plays_policy:
+            return
+        if bool(driver.phases) != driver.phased:
+            expected = "phases if, and only if, its class has phased=True"
+            raise ArgumentError("phases", driver.phases or "none", expected)
+        steps = driver.phases[-1].stop if driver.phased else cfg.task.episode_steps
+        if driver.steps != steps:
+            raise ArgumentError("steps", driver.steps, f"{steps}, those of the episode")
+        for name in ("phase", "error", "retries"):
+            value = getattr(driver, name)
+            if not isinstance(value, Tensor) or value.shape != (env.nworld,):
+                expected = f"shape ({env.nworld},), a number for each world"
+                raise ArgumentError(name, describe_tensor(value), expected)
+        env.action_manager.process(driver.command())
 
 
 def require_actions(cfg: Config, terms: Mapping[str, TermCfg], expected: str) -> None:
@@ -191,8 +249,3 @@ class OpenLoopDriver(Driver):
         trajectory = assets.planner.plan(sources, names=env.world.tolist())
         trajectory = trajectory.to(env.device, env.sim.ctrl.dtype)
         return cls.with_params(cfg, trajectory, assets.planner.phases)
-
-    @classmethod
-    @override
-    def check(cls, env: Env, cfg: Config, assets: Assets) -> None:
-        """Leave it to the planner, whose nominal plan reaches every target."""

@@ -13,8 +13,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from mjstack.config.schema import Config
-from mjstack.drivers.assets import Assets
-from mjstack.drivers.driver import Driver, require_actions
+from mjstack.drivers.driver import Assets, Driver, require_actions
 from mjstack.envs import Env
 from mjstack.errors import ArgumentError
 from mjstack.kinematics.batched_ik import BatchedIk

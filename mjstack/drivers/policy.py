@@ -13,8 +13,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from mjstack.config.schema import CameraCfg, Config
-from mjstack.drivers.assets import Assets
-from mjstack.drivers.driver import Driver, require_actions
+from mjstack.drivers.driver import Assets, Driver, require_actions
 from mjstack.envs.env import Env
 from mjstack.errors import ArgumentError, FolderError, TermError
 from mjstack.managers.observation import ObservationManager
@@ -83,12 +82,6 @@ class PolicyDriver(Driver):
         if assets.lerobot_policy:
             return LerobotDriver.with_params(cfg, env, assets.lerobot_policy, cfg)
         return cls.with_params(cfg, env, assets.policy, cfg.scene.cameras)
-
-    @classmethod
-    @override
-    def check(cls, env: Env, cfg: Config, assets: Assets) -> None:
-        """Build it, which compares the policy with the worlds; nothing is drawn."""
-        cls.build(env, cfg, assets)
 
     def __init__(
         self, env: Env, policy: Policy, cameras: Mapping[str, CameraCfg] | None = None

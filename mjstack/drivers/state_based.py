@@ -10,11 +10,8 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from mjstack.config.schema import Config
-from mjstack.drivers.assets import Assets
 from mjstack.drivers.feedback import STAY, FeedbackDriver, State, servo_lag
 from mjstack.drivers.roles import Role, find_roles
-from mjstack.envs import Env
 from mjstack.managers.view import EnvView
 from mjstack.math import atan2, norm, quat_to_matrix
 from mjstack.mdp.geometry import pose_w, robot
@@ -100,12 +97,6 @@ class StateBasedDriver(FeedbackDriver):
     """
 
     stateless = True
-
-    @classmethod
-    @override
-    def check(cls, env: Env, cfg: Config, assets: Assets) -> None:
-        if cfg.task.check is not None:
-            cls.build(env, cfg, assets)
 
     def __init__(self, env: EnvView, nominal: np.ndarray) -> None:
         """Allocate for the environment's worlds; arguments as of `FeedbackDriver`.

@@ -12,8 +12,7 @@ import mujoco
 
 from mjstack.config.schema import Backend, Config, TermCfg
 from mjstack.distributed import Ranks, current_ranks
-from mjstack.drivers.assets import Assets
-from mjstack.drivers.driver import Driver, find_driver
+from mjstack.drivers.driver import Assets, Driver, find_driver
 from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.envs import Env, build_env, driven_config
 from mjstack.envs.buffers import Advance, MeasuringWorlds, measured_sizes

@@ -8,7 +8,7 @@ import torch
 
 from mjstack.config.fingerprint import config_content, differences
 from mjstack.config.schema import Backend, Config
-from mjstack.drivers.driver import find_driver
+from mjstack.drivers.driver import check_driver
 from mjstack.envs import driven_config
 from mjstack.episodes.earlier_run import EarlierRun
 from mjstack.episodes.record import STEMS
@@ -99,13 +99,16 @@ def check_task(stage: Stage) -> None:
             raise ConfigError("task.episode_steps", cfg.task.episode_steps, expected)
         if cfg.controller.approach_gain > 0.0:
             turn_sign(stage.model, cfg.robot)
-    judged = find_driver(success_config(cfg)) if "success" in cfg.gates else driver
     keys = {} if stage.policy else {"action": "controller.action"}
-    # Two worlds, so that a driver that answers for one is seen
+    # Two worlds show a driver that answers for one.
     with renamed_keys(keys), stage.native_env(stage.driven({}), nworld=2) as env:
-        env.reset()
-        for kind in dict.fromkeys((driver, judged)):
-            kind.check(env, cfg, stage.assets)
+        if cfg.task.check is not None or not driver.needs_phases:
+            env.reset()
+            check_driver(env, cfg, stage.assets)
+    if "success" in cfg.gates and driver.planned:  # the closed-loop expert plays
+        from mjstack.kinematics.batched_ik import build_chain  # loads Warp
+
+        build_chain(stage.model, cfg.robot)
 
 
 def check_cameras(stage: Stage) -> None:
