@@ -393,7 +393,8 @@ import sys
 {imports}
 assert "torch" not in sys.modules
 ids = sorted(id for id in gymnasium.registry if id.startswith("mjstack/"))
-names = [f"{{task}}-{{robot}}" for task in ("box", "reach", "stack") for robot in ("rebot", "so101")]
+arms = ("rebot", "so101")
+names = [f"{{task}}-{{arm}}" for task in ("box", "reach", "stack") for arm in arms]
 tasks = [f"mjstack/{{name}}-v0" for name in names]
 assert {named} or ids == tasks, ids
 env = gymnasium.make("{prefix}mjstack/reach-rebot-v0", overrides=["sim=native"])

@@ -5,7 +5,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from environments import Patch, refusal
+from compositions import refusal
+from environments import Patch
 
 import mjstack
 from mjstack.cli import run
