@@ -16,8 +16,8 @@ _GRIPPER = re.compile("grip|finger|jaw|thumb|left|right", re.IGNORECASE)
 
 
 def write_new(args: Sequence[str]) -> list[Path]:
-    """Write the files of ``task``, ``driver`` or ``action NAME``, or of ``robot NAME FILE.xml``, into a
-    new folder NAME.
+    """Write the files of ``task``, ``driver`` or ``action NAME``, or of ``robot NAME FILE.xml``,
+    into a new folder NAME.
 
     Raises:
         MjstackError: The arguments are others, NAME exists, or MuJoCo cannot compile the file.
