@@ -139,7 +139,7 @@ def test_its_worlds_are_replayed_on_the_users_search_path_alone(conf: Path) -> N
 REFUSED = {
     "NoDriver": "func=holding.NoDriver: expected a subclass of mjstack.drivers.driver.Driver",
     "NoCommand": "func=holding.NoCommand: expected a class with command()",
-    "Missing": "'Missing' does not exist. Available: Bare",
+    "Missing": "'Missing' does not exist.",
     "Narrow": "of shape (2, 5) on cpu, expected a float32 tensor of shape (2, 6)",
     "OneWorld": "of shape (1, 6) on cpu, expected a float32 tensor of shape (2, 6)",
     "NotFinite": "in world 0, expected finite numbers",

@@ -61,9 +61,9 @@ def test_a_robot_is_read_from_its_file(here: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("new", "new : expected 'task NAME' or 'robot NAME FILE.xml'"),
-        ("new task", "new task: expected 'task NAME'"),
-        ("new robot arm", "new robot arm: expected 'task NAME' or 'robot NAME FILE.xml'"),
+        ("new", "new : expected task, driver or action NAME, or robot NAME FILE.xml"),
+        ("new task", "new task: expected task, driver or action NAME"),
+        ("new robot arm", "new robot arm: expected task, driver or action NAME, or robot"),
         ("new task Lift", "new task Lift: expected small letters, digits and _"),
         ("new task stack", "and no folder, task or Python module of that name. Choose another"),
         ("new task json", "Python module of that name"),
