@@ -88,14 +88,14 @@ class GymnasiumVectorEnv(VectorEnv):
         self._film = [*(cameras or env.cfg.scene.cameras).items()][:1]
         self._renderer: StateRenderer | None = None
         self._window: Window | None = None
-        modes = _MODES[: 1 + opens_windows()]
+        if render_mode == "rgb_array" and not self._film:
+            fix = "Build the environment with cameras=front"
+            raise ArgumentError("render_mode", repr(render_mode), "a scene with a camera", fix)
+        modes = _MODES[not self._film : 1 + opens_windows()]
         if render_mode not in (None, *modes):
             display = os.environ.get("DISPLAY", "not set")
             expected = f"None, or one of {', '.join(modes)} on this display (DISPLAY={display})"
             raise ArgumentError("render_mode", repr(render_mode), expected)
-        if render_mode == "rgb_array" and not self._film:
-            fix = "Build the environment with cameras=front"
-            raise ArgumentError("render_mode", repr(render_mode), "a scene with a camera", fix)
         self.metadata = {
             "autoreset_mode": AutoresetMode.SAME_STEP,
             "render_modes": modes,
@@ -339,7 +339,9 @@ def make(
         filmed = load_config([*words, "cameras=front"], config_dir=config_dir)
     env = build_env(cfg, model=build_model(filmed))  # with what pictures need
     kind = GymnasiumEnv if num_envs is None else GymnasiumVectorEnv
-    return kind(env, cameras=filmed.scene.cameras, **options)
+    made = kind(env, cameras=filmed.scene.cameras, **options)
+    made.metadata["render_modes"] = _MODES[: 1 + opens_windows()]  # a camera is added for one
+    return made
 
 
 def _numpy(obs: dict[str, torch.Tensor], group: str | None) -> Observation:
