@@ -29,6 +29,7 @@ from mjstack.config.help import help_text, key_help, list_text
 from mjstack.config.load import compose, extended_search_path, to_config
 from mjstack.config.session import (
     CONFIG_NAME,
+    command_line,
     hydra_session,
     lacking_folders,
     list_items,
@@ -66,7 +67,7 @@ def run(args: list[str]) -> int:
             print(f"mjstack {__version__}")
             return 0
         flags = _parse(args)
-        with extended_search_path(flags.overrides, flags.config_dir) as overrides:
+        with command_line(), extended_search_path(flags.overrides, flags.config_dir) as overrides:
             return _dispatch(flags, overrides)
     except KeyboardInterrupt:  # the job has said so
         return EXIT_CODE

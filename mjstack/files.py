@@ -25,6 +25,13 @@ import yaml  # type: ignore[import-untyped]
 from mjstack.errors import FolderError, MjstackError, first_line
 from mjstack.version import __version__
 
+_PACKAGE = Path(__file__).parent
+# In a checkout the configuration lies beside the package, in a wheel inside of it.
+CONFIG_FOLDER = next(
+    folder
+    for folder in (_PACKAGE.parent / "conf", _PACKAGE / "conf")
+    if (folder / "config.yaml").is_file()
+)
 # Bytes of a file, and of what an npz file unpacks to
 _MOST = {".json": 2**22, ".yaml": 2**20, ".npz": 2**29, ".safetensors": 2**30}
 _MOST_BYTES = 2**32  # of any other

@@ -7,6 +7,7 @@ from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 import pytest
+import torch
 from doc_blocks import ROOT
 from environments import Capture, Patch, Refused
 
@@ -127,9 +128,9 @@ def test_a_robot_from_a_pipe_is_refused(here: Path, refused: Refused) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("new", "new : expected 'task NAME' or 'robot NAME FILE.xml'"),
-        ("new task", "new task: expected 'task NAME'"),
-        ("new robot arm", "new robot arm: expected 'task NAME' or 'robot NAME FILE.xml'"),
+        ("new", "new : expected task, driver or action NAME, or robot NAME FILE.xml"),
+        ("new task", "new task: expected task, driver or action NAME"),
+        ("new robot arm", "new robot arm: expected task, driver or action NAME, or robot"),
         ("new task Lift", "new task Lift: expected small letters, digits and _"),
         ("new task stack", "and no folder, task or Python module of that name. Choose another"),
         ("new task json", "Python module of that name"),
@@ -143,3 +144,21 @@ def test_a_name_that_is_taken_is_refused(
     words: str, message: str, here: Path, refused: Refused
 ) -> None:
     assert message in refused(*words.split())
+
+
+def test_a_driver_and_an_action_play_as_they_are_written(here: Path) -> None:
+    assert run(["new", "driver", "fresh_driver"]) == 0
+    overrides = ["task=reach", "sim=native", "nworld=2", "task.check.distance=10.0"]
+    played = [*overrides, "controller=fresh_driver", "gates=[batch]"]
+    result = mjstack.verify(played, config_dir=Path("fresh_driver/conf"))
+    assert result.status == "pass", result.messages
+    assert run(["new", "action", "fresh_action"]) == 0
+    env = mjstack.make_env([*overrides, "action=fresh_action"], config_dir="fresh_action/conf")
+    env.reset(seed=0)
+    before = env.sim.ctrl.clone()
+    env.step(torch.ones(2, env.action_manager.action_dim))
+    change = (env.sim.ctrl - before)[:, : env.index.n_arm]
+    torch.testing.assert_close(change, torch.full_like(change, 0.05))
+    env.close()
+    for args in (["driver"], ["driver", "a", "b"], ["gate", "x"], ["action", "ee_delta"]):
+        assert run(["new", *args]) == 2

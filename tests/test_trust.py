@@ -118,7 +118,7 @@ def test_a_replay_runs_no_command_of_its_folder(key: str, stranger: Path) -> Non
     if key in USED:
         found = refused(lambda: replay(stranger))
         assert f"{key}.func=pydoc.pipepager: expected one of the" in found
-        assert found.endswith("add --config-dir DIR.")
+        assert found.endswith("add config_dir=DIR.")
     else:
         replay(stranger)
     assert not Path("PWNED").exists()
@@ -167,8 +167,8 @@ def test_a_run_names_terms_alone(name: str, term: str, stranger: Path) -> None:
 
 
 def test_each_kind_of_term_is_listed(tmp_path: Path) -> None:
-    """A policy names observation and action terms, a run action and reset terms and checks: those
-    of the list, and nothing else of mjstack.
+    """A policy names observation and action terms, a run action and reset terms, checks and
+    drivers: those of the list, and nothing else of mjstack.
     """
     listed = set((ROOT / "tests" / "data" / "may_be_named.txt").read_text().splitlines())
     named = set()
@@ -178,7 +178,7 @@ def test_each_kind_of_term_is_listed(tmp_path: Path) -> None:
         for name, value in vars(importlib.import_module(module.name)).items():
             if getattr(value, "__module__", "") != module.name:
                 continue
-            for kind in ("observation term", "action term", "reset term", "check"):
+            for kind in ("observation term", "action term", "reset term", "check", "driver"):
                 with suppress(MjstackError):
                     check_term("", f"{module.name}.{name}", kind, tmp_path / "policy.json")
                     named.add(f"{kind}: {module.name}.{name}")
@@ -201,7 +201,7 @@ def test_a_gate_declares_itself(capsys: Capture) -> None:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("key", ["reset.evil", "controller.action.arm", "task.check"])
+@pytest.mark.parametrize("key", ["reset.evil", "controller.action.arm", "controller", "task.check"])
 @pytest.mark.parametrize("given", ["", "conf", "beside"])
 def test_no_module_of_the_folder_is_imported(
     key: str, given: str, stranger: Path, monkeypatch: Patch
@@ -213,7 +213,8 @@ def test_no_module_of_the_folder_is_imported(
     sys.path.insert(0, str(Path.cwd()))
     monkeypatch.delitem(sys.modules, "beside", raising=False)
     # The second is the user's own module, whose import runs nothing, with another's function.
-    edit(stranger, key, {"func": "beside.rmtree" if given == "beside" else "stranger.payload.X"})
+    func = "beside.rmtree" if given == "beside" else "stranger.payload.X"
+    edit(stranger, *((f"{key}.func", func) if key == "controller" else (key, {"func": func})))
     with search_path(["conf"] if given else []):
         found = refused(lambda: replay(stranger))
         assert not given or in_search_path("beside.X", stranger)
@@ -275,7 +276,7 @@ FOLLOWED = {
     "robot's name": ("robot.name", "../../x", "robot.name=../../x: expected a name that"),
     "absolute name": ("robot.menagerie_file", "/etc/passwd", "robot.menagerie_file=/etc/passwd"),
     "robot's file": ("robot.file", "{stranger}/arm.xml", "stranger/arm.xml: expected a fil"),
-    "relative file": ("robot.file", "stranger/arm.xml", "add --config-dir {stranger}."),
+    "relative file": ("robot.file", "stranger/arm.xml", "add config_dir='{stranger}'."),
 }
 
 
@@ -330,7 +331,7 @@ def test_only_regular_files_are_read(kind: str, stranger: Path) -> None:
             assert "it is no regular file" in refused(lambda: replay(stranger))
         else:
             edit(stranger, "task.check.func", "os.system")
-            assert "add --config-dir DIR." in refused(lambda: replay(stranger))
+            assert "add config_dir=DIR." in refused(lambda: replay(stranger))
     state = swap(stranger / "training.safetensors")
     assert "it is no regular file" in refused(lambda: read_state(state))
     starts = swap(stranger / "starts.npz")
@@ -635,7 +636,7 @@ DAMAGE = {
     "versions": (write("report.json", b'{"provenance": {"versions": 3}}'), "json: cannot be read"),
     "deep configuration": (write(CONFIG, DEEP), "config.yaml: cannot be read (ValueError"),
     "bytes": (write(CONFIG, bytes(range(256))), "config.yaml: cannot be read"),
-    "hydra": (damage_hydra, "add --config-dir DIR."),
+    "hydra": (damage_hydra, "add config_dir=DIR."),
 }
 
 

@@ -120,7 +120,8 @@ def explain(error: Exception, overrides: Sequence[str] = ()) -> MjstackError:
         choices = error.options or session.list_choices().get(group, [])
         problem: MjstackError = UnknownName(f"{group}={name}:", name, choices)
         if not session.config_folders() and not group.startswith("hydra/"):
-            problem = MjstackError(f"{problem} A choice of your own needs --config-dir DIR.")
+            advice = f"A choice of your own needs {session.folder_advice()}."
+            problem = MjstackError(f"{problem} {advice}")
     else:
         problem = _explain(error, overrides)
     inside = re.match(r"In '([^']+)': ", str(error))

@@ -2,7 +2,6 @@
 
 import os
 import re
-import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -59,6 +58,7 @@ def _is_native(root: DictConfig) -> bool:
 
 # The functions that a replay calls: where a run's configuration names them, and of which kind.
 _REPLAYED = {
+    "controller.func": "driver",
     "controller.action.": "action term",
     "gate.success.reset.": "reset term",
     "reset.": "reset term",
@@ -95,9 +95,20 @@ def load_config(
     Raises:
         MjstackError: An override does not fit; the message says which and what would.
     """
+    with configured(overrides, config_dir) as cfg:
+        return cfg
+
+
+@contextmanager
+def configured(overrides: Sequence[str], config_dir: str | os.PathLike | None) -> Iterator[Config]:
+    """The configuration of `load_config`, whose search path goes on inside: a policy that is loaded
+    there may name functions beside it.
+    """
     folders = [] if config_dir is None else [config_dir]
-    with extended_search_path(overrides, folders) as composed, session.hydra_session():
-        return to_config(compose(composed))
+    with extended_search_path(overrides, folders) as composed:
+        with session.hydra_session():
+            cfg = to_config(compose(composed))
+        yield cfg
 
 
 @contextmanager
@@ -247,9 +258,9 @@ def load_saved(path: Path) -> Config:
         folders = [folder.parent for folder in session.config_folders()]
         for key, file in files.items():
             if file is not None and not any(map(Path(file).is_relative_to, folders)):
-                flags = shlex.join(session.search_path_args([Path(file).parent]))
+                advice = session.folder_advice([Path(file).parent])
                 problem = f"{key}={file}: expected a file beside a folder of the search path"
-                raise MjstackError(problem, f"If you trust it, add {flags}")
+                raise MjstackError(problem, f"If you trust it, add {advice}")
     return cfg
 
 

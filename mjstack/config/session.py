@@ -35,15 +35,8 @@ from typing_extensions import override
 from mjstack.config.functions import find_object
 from mjstack.config.policy_observation import choose_observation
 from mjstack.errors import MjstackError
-from mjstack.files import yaml_text
+from mjstack.files import CONFIG_FOLDER, yaml_text
 
-_PACKAGE_FOLDER = Path(__file__).parents[1]
-# In a checkout the configuration lies beside the package, in a wheel inside of it.
-CONFIG_FOLDER = next(
-    folder
-    for folder in (_PACKAGE_FOLDER.parent / "conf", _PACKAGE_FOLDER / "conf")
-    if (folder / "config.yaml").is_file()
-)
 CONFIG_NAME = "config"
 ENTRY_POINTS = "mjstack.configs"
 PROVIDER = "mjstack.search_path"  # of added entries, in a run's .hydra/hydra.yaml
@@ -56,6 +49,7 @@ _ENTRY = re.compile(
 )
 
 _added: ContextVar[tuple[Path, ...]] = ContextVar("search path", default=())
+_on_command_line: ContextVar[bool] = ContextVar("command line", default=False)
 
 
 @contextmanager
@@ -80,6 +74,23 @@ def search_path(entries: Sequence[str | os.PathLike]) -> Iterator[None]:
         _added.reset(token)
 
 
+@contextmanager
+def command_line() -> Iterator[None]:
+    """Let advice inside be that for a command line, not for Python."""
+    token = _on_command_line.set(True)
+    try:
+        yield
+    finally:
+        _on_command_line.reset(token)
+
+
+def folder_advice(folders: Sequence[Path] = ()) -> str:
+    """The words that add folders to the search path where they are needed; any folder if none."""
+    if _on_command_line.get():
+        return shlex.join(search_path_args(folders)) or "--config-dir DIR"
+    return " and ".join(f"config_dir='{folder}'" for folder in folders) or "config_dir=DIR"
+
+
 def search_path_args(folders: Sequence[Path] | None = None) -> list[str]:
     """Arguments of a command that adds folders; those of the current search path if None."""
     folders = _added.get() if folders is None else folders
@@ -97,8 +108,8 @@ def add_folder(saved: Path) -> str:
         folders = lacking_folders(sources)
     except Exception:  # the file may be missing, or hold anything
         folders = []
-    flag = shlex.join(search_path_args(folders)) or "--config-dir DIR"
-    return f"If you trust the folder that it had used, add {flag}."
+    advice = folder_advice(folders)
+    return f"If you trust the folder that it had used, add {advice}."
 
 
 def lacking_folders(sources: Iterable[Any]) -> list[Path]:

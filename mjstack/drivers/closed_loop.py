@@ -39,6 +39,9 @@ class ClosedLoopDriver(FeedbackDriver):
     ``retries`` are those of the current episode.
     """
 
+    phased = True
+    measures = True  # objects, in phases that say so
+
     def __init__(self, env: EnvView, nominal: np.ndarray) -> None:
         """Allocate for the environment's worlds; see `FeedbackDriver`."""
         super().__init__(env, nominal, clock=True)

@@ -10,8 +10,11 @@ import mujoco
 import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import override
 
-from mjstack.drivers.driver import Driver, require_actions
+from mjstack.config.schema import Config
+from mjstack.drivers.driver import Assets, Driver, require_actions
+from mjstack.envs import Env
 from mjstack.errors import ArgumentError
 from mjstack.kinematics.batched_ik import BatchedIk
 from mjstack.managers.view import EnvView
@@ -148,6 +151,14 @@ def _places(phases: Sequence[Phase]) -> list[int]:
 
 class FeedbackDriver(Driver):
     """Base class of drivers that give joint targets from where the objects of every world are."""
+
+    needs_phases = True
+    noun = "expert"
+
+    @classmethod
+    @override
+    def build(cls, env: Env, cfg: Config, assets: Assets) -> Driver:
+        return cls.with_params(cfg, env, assets.planner.nominal)
 
     def __init__(self, env: EnvView, nominal: np.ndarray, *, clock: bool) -> None:
         """Allocate for the environment's worlds.

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from mjstack.config.schema import CameraCfg, Config
-from mjstack.drivers.driver import Driver, require_actions
+from mjstack.drivers.driver import Assets, Driver, require_actions
 from mjstack.envs.env import Env
 from mjstack.errors import ArgumentError, FolderError, TermError
 from mjstack.managers.observation import ObservationManager
@@ -71,6 +72,16 @@ class PolicyDriver(Driver):
     Attributes:
         query_images: These images.
     """
+
+    plays_policy = True
+    noun = "policy"
+
+    @classmethod
+    @override
+    def build(cls, env: Env, cfg: Config, assets: Assets) -> Driver:
+        if assets.lerobot_policy:
+            return LerobotDriver.with_params(cfg, env, assets.lerobot_policy, cfg)
+        return cls.with_params(cfg, env, assets.policy, cfg.scene.cameras)
 
     def __init__(
         self, env: Env, policy: Policy, cameras: Mapping[str, CameraCfg] | None = None

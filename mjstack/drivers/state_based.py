@@ -96,6 +96,8 @@ class StateBasedDriver(FeedbackDriver):
             ``(nworld,)``, int64.
     """
 
+    stateless = True
+
     def __init__(self, env: EnvView, nominal: np.ndarray) -> None:
         """Allocate for the environment's worlds; arguments as of `FeedbackDriver`.
 

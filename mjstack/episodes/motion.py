@@ -11,7 +11,6 @@ from torch import Tensor
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.recorder import Channels, Read, Recorder
-from mjstack.episodes.rollout import POLICY
 from mjstack.episodes.stage import Stage
 from mjstack.files import read_npz, reading, write_npz
 from mjstack.mdp.geometry import place_xy
@@ -88,10 +87,8 @@ def draw_seen(
         Images by camera, each ``(frames, height, width, 3)``, uint8, which change where the policy
         was queried. None of a driver that sees no images, or of LeRobot's.
     """
-    if stage.cfg.controller.name != POLICY or stage.assets.lerobot_policy:
-        return {}
-    policy = stage.assets.policy
-    if not policy.network.vision.sizes:
+    policy = stage.policy
+    if policy is None or not policy.network.vision.sizes:
         return {}
     looks = {name: values[world : world + 1] for name, values in sim.fields.items()}
     queried = np.arange(len(qpos)) * stride // policy.execute * policy.execute // stride

@@ -10,21 +10,16 @@ import torch
 from typing_extensions import override
 
 from mjstack.config.schema import Config, TermCfg
-from mjstack.drivers.driver import Driver
+from mjstack.drivers.driver import Driver, find_driver
 from mjstack.envs import Env
 from mjstack.envs.buffers import Advance
 from mjstack.errors import ConfigError
+from mjstack.managers.term import current_term
 from mjstack.mdp.geometry import place_xy, pose_w
 from mjstack.sim import Simulation
 from mjstack.sim.graph import StepGraph
 from mjstack.tasks.check import CheckResult, make_check
 
-# Controllers with feedback; any other name plays a plan.
-CLOSED_LOOP = "closed_loop"
-STATE_BASED = "state_based"
-POLICY = "policy"
-FEEDBACK = (CLOSED_LOOP, STATE_BASED, POLICY)
-PHASELESS = (STATE_BASED, POLICY)
 Reset = dict[str, TermCfg]
 
 
@@ -102,6 +97,7 @@ def rollout(
 
     # A step, and its graph
     def work() -> None:
+        current_term.label = "controller"
         env.action_manager.process(driver.command())
         env.advance()
         for observer in observers:
@@ -310,7 +306,7 @@ class Hook(Observer):
 
 def lacks_episode(cfg: Config) -> str:
     """Why no driver can play a judged episode of the task; empty if one can."""
-    if not cfg.controller.phases and cfg.controller.name != POLICY:
+    if not cfg.controller.phases and find_driver(cfg).needs_phases:
         return f"task {cfg.task.name} has no phases: no open- or closed-loop driver"
     if cfg.task.check is None:
         return f"task {cfg.task.name} has no check"

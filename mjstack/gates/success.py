@@ -15,10 +15,10 @@ from typing_extensions import override
 from mjstack.config.check import places_objects, reads_starts_file, with_region
 from mjstack.config.schema import Config, SuccessGateCfg
 from mjstack.distributed import Ranks
-from mjstack.drivers.driver import Driver
+from mjstack.drivers.driver import Driver, find_driver, with_controller
 from mjstack.envs import Env
 from mjstack.episodes.record import REGIONS, starts_name
-from mjstack.episodes.rollout import CLOSED_LOOP, FEEDBACK, POLICY, Observer
+from mjstack.episodes.rollout import Observer
 from mjstack.episodes.run import Run, needs_episode, spread
 from mjstack.episodes.seeds import play_seeds
 from mjstack.episodes.tally import rate_cells
@@ -40,14 +40,16 @@ _EDGE = 1e-9  # cells: a place this close below a cell's edge is on it
 
 
 def success_config(cfg: Config) -> Config:
-    """The configuration under which the gate plays: its controller, and how its worlds start."""
+    """The configuration under which the gate plays: how its worlds start, and its controller, the
+    closed-loop expert in the place of a plan.
+    """
     t = cfg.gate.success
     reset = dict(cfg.reset if reads_starts_file(cfg.reset) else t.reset)
     region = t.region
     if region is not None:
         reset = with_region(reset, lambda xy: list(region))
-    name = cfg.controller.name if cfg.controller.name in FEEDBACK else CLOSED_LOOP
-    return replace(cfg, reset=reset, controller=replace(cfg.controller, name=name))
+    cfg = with_controller(cfg, "closed_loop") if find_driver(cfg).planned else cfg
+    return replace(cfg, reset=reset)
 
 
 @spread
@@ -60,7 +62,8 @@ def run_success(run: Run) -> list[GateResult]:
     cfg = success_run.cfg
     t = cfg.gate.success
     unwritten: list[str] = []
-    goals = [Goal(success_run.stage.ranks)] if cfg.controller.name == POLICY else []
+    counts = not success_run.stage.driver_class.needs_phases
+    goals = [Goal(success_run.stage.ranks)] if counts else []
     tally = play_seeds(
         success_run,
         "success",

@@ -3,15 +3,14 @@ MuJoCo; or the policy as a folder of LeRobot's.
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import mujoco
 
 from mjstack.config.schema import Config
+from mjstack.drivers.driver import with_controller
 from mjstack.envs import driven_config
-from mjstack.episodes.rollout import POLICY as DRIVER
 from mjstack.episodes.stage import Stage
 from mjstack.errors import FolderError
 from mjstack.files import write_atomic
@@ -35,7 +34,7 @@ def check_export(cfg: Config) -> CheckedJob:
     """Raise for what cannot be exported, before anything is written."""
     if cfg.job.format == "onnx":
         require_onnx()
-    stage = Stage(replace(cfg, controller=replace(cfg.controller, name=DRIVER)))
+    stage = Stage(with_controller(cfg, "policy"))
     check_task(stage)
     return CheckedJob(
         stage=stage,

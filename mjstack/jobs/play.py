@@ -10,10 +10,11 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import Config, PlayJobCfg
+from mjstack.drivers.driver import find_driver, with_controller
 from mjstack.episodes.motion import draw_seen, world_fields
 from mjstack.episodes.recorder import WorldRecorder
 from mjstack.episodes.replay import simulate_alone
-from mjstack.episodes.rollout import POLICY, play_episode, rollout
+from mjstack.episodes.rollout import play_episode, rollout
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError
@@ -34,11 +35,12 @@ _MOST = 64  # worlds of a video
 def check_play(cfg: Config) -> CheckedJob:
     """Raise for what cannot be shown, before anything is written."""
     if cfg.policy is not None:
-        cfg = replace(cfg, controller=replace(cfg.controller, name=POLICY))
+        cfg = with_controller(cfg, "policy")
     cfg = replace(cfg, video=cfg.video or cfg.view == "false")
     if cfg.video and cfg.nworld > _MOST:
         raise ConfigError("nworld", cfg.nworld, f"at most {_MOST} worlds, as a video has room for")
-    if not cfg.controller.phases and cfg.controller.name != POLICY:
+    driver = find_driver(cfg)
+    if not cfg.controller.phases and driver.needs_phases:
         expected = "a task with phases, which the expert follows"
         raise ConfigError("task", cfg.task.name, expected, "Name a policy: policy=FOLDER")
     job: PlayJobCfg = cfg.job
@@ -51,10 +53,9 @@ def check_play(cfg: Config) -> CheckedJob:
     check_showing(cfg, f".{job.format}")
     if cfg.video and job.camera is None:  # cameras have been checked with the task
         require_offscreen(stage.model)
-    driver = "a policy" if cfg.controller.name == POLICY else "the expert"
     return CheckedJob(
         stage=stage,
-        title=f"task {cfg.task.name}, {cfg.nworld} worlds with {driver}",
+        title=f"task {cfg.task.name}, {cfg.nworld} worlds with the {driver.noun}",
         work=lambda run, folder: run_guarded(run, NAME, play_worlds),
     )
 

@@ -20,10 +20,10 @@ import numpy as np
 import torch
 from rich.markup import escape
 
-from mjstack.config import load_config
 from mjstack.config.explain import command
 from mjstack.config.fingerprint import config_content, config_hash, differences
 from mjstack.config.functions import find_object
+from mjstack.config.load import configured
 from mjstack.config.schema import Backend, Config
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.run import Run
@@ -327,10 +327,11 @@ def verify(
     Raises:
         MjstackError: An override cannot be used, or this machine cannot do what is asked for.
     """
-    checked = check_job(load_config(overrides, config_dir=config_dir))
     report = Report(folder=Path())
-    run = Run(checked.stage, record=report.gates.append)
-    with tempfile.TemporaryDirectory() as folder:  # a file of starts is copied before it is read
+    # A file of starts is copied into a folder before it is read.
+    with configured(overrides, config_dir) as cfg, tempfile.TemporaryDirectory() as folder:
+        checked = check_job(cfg)
+        run = Run(checked.stage, record=report.gates.append)
         checked.work(run, Path(folder))
     report.conclude()
     gates = {gate.name: gate for gate in report.gates}

@@ -3,7 +3,6 @@
 import copy
 import os
 import secrets
-import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from importlib import import_module
@@ -128,21 +127,12 @@ def find_viewers(stage: Stage) -> list[Observer]:
     """
     if stage.cfg.view != "true":
         return []
-    import mujoco.viewer
-
     model = copy.copy(stage.assets.visual_model)
-    data = mujoco.MjData(model)
-    handle = mujoco.viewer.launch_passive(model, data)
+    window = picture.Window(model, stage.cfg.timing.step_dt)
 
     def show(step: int, sim: Simulation) -> None:
-        if not handle.is_running():
-            return
-        began = time.perf_counter()
         write_fields(model, *world_fields(stage, hook.env, [0]))
-        data.qpos[:] = sim.qpos[0].cpu().numpy()
-        mujoco.mj_forward(model, data)
-        handle.sync()
-        time.sleep(max(0.0, stage.cfg.timing.step_dt - (time.perf_counter() - began)))
+        window.show(sim.qpos[0].cpu().numpy())
 
     hook = Hook(show)
     return [hook]

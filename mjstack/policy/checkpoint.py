@@ -5,6 +5,7 @@ policy that was there before.
 """
 
 import json
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -23,7 +24,7 @@ from torch import Tensor
 from mjstack.config.complete import typed
 from mjstack.config.fingerprint import POLICY_FILE, config_content, policy_folder, shipped_policies
 from mjstack.config.schema import Config, ObservationGroupCfg, ObservationTermCfg, TermCfg
-from mjstack.config.session import check_term
+from mjstack.config.session import check_term, search_path
 from mjstack.errors import FolderError
 from mjstack.files import read_inside, read_json, reading, write_atomic
 from mjstack.policy.network import PolicyNetwork, Vision
@@ -197,21 +198,29 @@ def policy_facts(policy: Policy) -> Facts:
     }
 
 
-def load_policy(folder: Path) -> Policy:
+def load_policy(
+    folder: str | os.PathLike, *, config_dir: str | os.PathLike | None = None
+) -> Policy:
     """Read a policy's folder, which may be a stranger's, or a shipped policy by its name. Weights
     in float16 become float32.
+
+    Args:
+        folder: The folder, such as ``outputs/mine/last``.
+        config_dir: A folder as of `mjstack.make_env`: the policy may name terms beside it.
 
     Raises:
         FolderError: It is no policy, of another version, damaged, or names functions that are not
             in the search path.
     """
-    folder = policy_folder(folder)
-    with suppress(FolderError):
-        return _load_policy(folder)
-    return _load_policy(folder)  # a training may have saved the next one meanwhile
+    with search_path([] if config_dir is None else [config_dir]):
+        folder = policy_folder(Path(folder))
+        with suppress(FolderError):
+            return _load_policy(folder)
+        return _load_policy(folder)  # a training may have saved the next one meanwhile
 
 
 def _load_policy(folder: Path) -> Policy:
+    """The policy of a folder, on the current search path."""
     path = folder / POLICY_FILE
     if not path.is_file():
         reason = f"has no {POLICY_FILE}, expected the folder of a policy"

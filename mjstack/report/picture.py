@@ -3,6 +3,7 @@
 import copy
 import itertools
 import math
+import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -243,6 +244,33 @@ def opens_windows() -> bool:
 
     with warnings.catch_warnings(action="ignore"):
         return bool(glfw.init())
+
+
+class Window:
+    """MuJoCo's viewer of states in real time; what shows them goes on when it is closed."""
+
+    def __init__(self, model: mujoco.MjModel, step_dt: float) -> None:
+        """Open it for states of a model that are ``step_dt`` [s] apart."""
+        import mujoco.viewer
+
+        self._model = model
+        self._data = mujoco.MjData(model)
+        self._step_dt = step_dt
+        self._handle = mujoco.viewer.launch_passive(model, self._data)
+
+    def show(self, qpos: np.ndarray) -> None:
+        """Show a state, shape ``(nq,)``, until the next one is due."""
+        if not self._handle.is_running():
+            return
+        began = time.perf_counter()
+        self._data.qpos[:] = qpos
+        mujoco.mj_forward(self._model, self._data)
+        self._handle.sync()
+        time.sleep(max(0.0, self._step_dt - (time.perf_counter() - began)))
+
+    def close(self) -> None:
+        """Close it."""
+        self._handle.close()
 
 
 def save_trajectories(

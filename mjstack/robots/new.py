@@ -16,22 +16,25 @@ from mjstack.files import check_regular
 
 _MISSING = "fill_in"
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)  # hinges follow; others are not the robot's own
+_GROUPS = {"task": "task", "robot": "robot", "driver": "controller", "action": "action"}
 _GRIPPER = re.compile("grip|finger|jaw|thumb|left|right", re.IGNORECASE)
 
 
 def write_new(args: Sequence[str]) -> list[Path]:
-    """Write the files of ``task NAME`` or of ``robot NAME FILE.xml`` into a new folder NAME.
+    """Write the files of ``task``, ``driver`` or ``action NAME``, or of ``robot NAME FILE.xml``,
+    into a new folder NAME.
 
     Raises:
-        MjstackError: The arguments are others, NAME is exists, or MuJoCo cannot compile the file.
+        MjstackError: The arguments are others, NAME exists, or MuJoCo cannot compile the file.
     """
     kind, name = (*args, "", "")[:2]
-    if (kind, len(args)) not in (("task", 2), ("robot", 3)):
-        expected = "'task NAME' or 'robot NAME FILE.xml', such as mjstack new task lift"
+    if len(args) != (3 if kind == "robot" else 2) or kind not in _GROUPS:
+        expected = "task, driver or action NAME, or robot NAME FILE.xml, such as new task lift"
         raise MjstackError(f"new {' '.join(args)}: expected {expected}.")
     folder = Path(name)
     valid = re.fullmatch(r"[a-z][a-z0-9_]{0,63}", name)
-    if not valid or folder.exists() or name in list_choices()[kind] or find_spec(name) is not None:
+    taken = folder.exists() or name in list_choices()[_GROUPS[kind]]
+    if not valid or taken or find_spec(name) is not None:
         raise MjstackError(
             f"new {kind} {name}: expected small letters, digits and _, and no folder, {kind} or"
             " Python module of that name. Choose another name."

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -85,7 +84,7 @@ class MjstackEnv(EnvConfig):
         """Make one vector environment of all worlds, and describe its features."""
         cfg = self.compose()
         if self.policy is not None:
-            policy = load_policy(Path(self.policy))
+            policy = load_policy(self.policy, config_dir=self.config_dir)
             policy.check_fit(cfg)
             cfg = replace(cfg, observation={GROUP: policy.observation})
         worlds = LerobotVectorEnv(cfg, n_envs, self.cameras, self.units)
