@@ -2,10 +2,8 @@
 that a policy sees.
 """
 
-import json
 import time
 from collections.abc import Mapping, Sequence
-from operator import index
 from pathlib import Path
 
 import numpy as np
@@ -41,11 +39,10 @@ def check_dataset(stage: Stage, widths: Mapping[str, int]) -> range:
     """
     cfg = stage.cfg
     folder, info, places = _open(cfg, widths)
-    _task_number(cfg, folder)
-    lengths, seeds = _rows(folder, info)
-    reader.check_frames(folder, info, lengths)
+    stored = reader.read_dataset(folder, _features(places))
+    _task_number(cfg, stored)
     # The ranges of the first file: degrees, say, are far out of them
-    action = _read(reader.data_files(folder, info)[0], {_ACTION: places[_ACTION]}, info)[_ACTION]
+    action = _read(reader.data_files(folder, info)[0], places, info)[_ACTION]
     low, high = stage.index.ctrl_range.T
     worst = np.maximum(low - action, action - high).max(0)
     joint = int(worst.argmax())
@@ -56,6 +53,7 @@ def check_dataset(stage: Stage, widths: Mapping[str, int]) -> range:
             f" {values.max():g}, expected absolute joint targets within {low[joint]:g} to"
             f" {high[joint]:g} rad or m. Give a dataset with these units"
         )
+    seeds = [row["seed"] for row in stored.episodes if "seed" in row]
     return range(min(seeds), max(seeds) + 1) if seeds else range(0)
 
 
@@ -69,15 +67,14 @@ def read_demonstrations(stage: Stage, widths: dict[str, int]) -> Demonstrations:
     """
     began = time.perf_counter()
     folder, info, places = _open(stage.cfg, widths)
-    facts = [_EPISODE, _TASK, *({_SUCCESS} & info["features"].keys())]
-    places |= {name: [(name, 0)] for name in facts}
+    stored = reader.read_dataset(folder, _features(places))
     parts = [_read(path, places, info) for path in reader.data_files(folder, info)]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in places}
 
     # Episodes of the task that succeeded
     ends = np.flatnonzero(np.diff(columns[_EPISODE][:, 0], append=-1)) + 1
     starts = np.concatenate([[0], ends[:-1]])
-    usable = columns[_TASK][ends - 1, 0] == _task_number(stage.cfg, folder)
+    usable = columns[_TASK][ends - 1, 0] == _task_number(stage.cfg, stored)
     if _SUCCESS in columns:
         usable &= columns[_SUCCESS][ends - 1, 0] != 0.0
     ranks = stage.ranks
@@ -108,27 +105,6 @@ def read_demonstrations(stage: Stage, widths: dict[str, int]) -> Demonstrations:
     )
 
 
-def _read_info(folder: Path) -> Facts:
-    """The content of info.json of a LeRobotDataset v3."""
-    lerobot.require_pyarrow()
-    path = folder / lerobot.INFO
-    if not path.is_file():
-        problem = f"job.dataset={folder}: has no {lerobot.INFO}, expected a LeRobotDataset v3"
-        raise FolderError(problem, "Give the folder dataset of job=collect")
-    with reader.readable(path):
-        info = json.loads(path.read_text(encoding="utf-8"))
-        version = str(info["codebase_version"])
-        if not version.startswith("v3"):
-            problem = f"job.dataset={folder}: is a LeRobotDataset {version}, expected v3.0"
-            raise FolderError(problem, "Convert it with LeRobot")
-        reader.check_types(info, written_here="mjstack" in info)
-        if info["total_episodes"] < 1:
-            raise ValueError("it has no episodes")
-        for feature in info["features"].values():
-            feature["names"] = _names(feature.get("names"))
-    return info
-
-
 def _open(cfg: Config, widths: Mapping[str, int]) -> tuple[Path, Facts, dict[str, list[Place]]]:
     """The folder of the job's dataset, its info.json, and where the numbers of the observation and
     of the action are.
@@ -138,7 +114,12 @@ def _open(cfg: Config, widths: Mapping[str, int]) -> tuple[Path, Facts, dict[str
     """
     job: CloneJobCfg = cfg.job
     folder = Path(str(job.dataset))
-    info = _read_info(folder)
+    info = reader.read_info(folder)
+    with reader.readable(folder / lerobot.INFO):
+        if not info["total_episodes"]:
+            raise ValueError("it has no episodes")
+        for feature in info["features"].values():
+            feature["names"] = _names(feature.get("names"))
     expected = {"robot_type": cfg.robot.name, "fps": round(cfg.task.control_hz)}
     for key, value in expected.items():
         if (recorded := info.get(key)) != value:
@@ -176,6 +157,8 @@ def _open(cfg: Config, widths: Mapping[str, int]) -> tuple[Path, Facts, dict[str
         "observation": locate([name, *beside], numbers),
         _ACTION: locate([_ACTION], [f"{joint}.pos" for joint in cfg.robot.joints]),
     }
+    alone = {_EPISODE, _TASK, _SUCCESS} & info["features"].keys()
+    places |= {name: [(name, 0)] for name in alone}
     return folder, info, places
 
 
@@ -188,50 +171,31 @@ def _names(value: object) -> list[object]:
     return value if isinstance(value, list) else []
 
 
-def _rows(folder: Path, info: Facts) -> tuple[list[int], list[int]]:
-    """Length of every episode, and its seed as far as the dataset has any."""
-    lengths: list[int] = []
-    seeds: list[int] = []
-    for path in reader.data_files(folder, info, lerobot.EPISODES):
-        with reader.readable(path):
-            columns = reader.read_table(path, ["length", "seed"]).to_pydict()  # if it has seeds
-            lengths += map(index, columns["length"])
-            seeds += map(index, columns.get("seed", ()))
-    return lengths, seeds
-
-
-def _task_number(cfg: Config, folder: Path) -> int:
-    """Number of the task in the dataset of a folder.
+def _task_number(cfg: Config, stored: reader.StoredDataset) -> int:
+    """Number of the task in a dataset.
 
     Raises:
         FolderError: The dataset does not have it.
     """
-    path = folder / lerobot.TASKS
-    with reader.readable(path):
-        table = reader.read_table(path)
-        names = table.column_names
-        text = "task" if "task" in names else next(n for n in names if n != "task_index")
-        numbers = map(index, table["task_index"].to_pylist())
-        tasks = dict(zip(table[text].to_pylist(), numbers, strict=True))
-    if cfg.task.instruction not in tasks:
-        there = f"{', '.join(map(repr, tasks)) or 'none'}, expected {cfg.task.instruction!r}"
-        problem = f"job.dataset={folder}: has the task {there}"
-        raise FolderError(problem, "Give another dataset, or set task")
-    return tasks[cfg.task.instruction]
+    if cfg.task.instruction not in stored.tasks:
+        tasks = ", ".join(map(repr, stored.tasks)) or "none"
+        problem = f"{stored.folder} has the task {tasks}, expected {cfg.task.instruction!r}"
+        raise FolderError(f"job.dataset={problem}", "Give another dataset, or set task")
+    return stored.tasks.index(cfg.task.instruction)
+
+
+def _features(places: Mapping[str, Sequence[Place]]) -> list[str]:
+    """The features in which numbers are."""
+    return sorted({feature for numbers in places.values() for feature, _ in numbers})
 
 
 def _read(path: Path, columns: Mapping[str, Sequence[Place]], info: Facts) -> dict[str, np.ndarray]:
     """Numbers of a data file by name, each shape ``(frames, numbers)``; every row of a feature has
     its shape in info.json.
     """
-    features = sorted({feature for places in columns.values() for feature, _ in places})
     with reader.readable(path):
-        read = reader.read_columns(path, info, features)
-        values = {name: column.astype(float) for name, column in read.items()}
-        arrays = {
-            name: np.stack([values[feature][:, number] for feature, number in places], axis=1)
+        read = reader.read_columns(path, info, _features(columns))
+        return {
+            name: np.stack([read[feature][:, number] for feature, number in places], axis=1)
             for name, places in columns.items()
         }
-        if not all(np.isfinite(array).all() for array in arrays.values()):
-            raise ValueError("numbers that are not finite")
-        return arrays
