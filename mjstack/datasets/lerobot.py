@@ -14,7 +14,7 @@ changed once they count.
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -135,6 +135,33 @@ def make_info(
             "provenance": list(provenance),
         },
     }
+
+
+def episode_columns(
+    videos: Iterable[str], fps: float, shard: int, number: int, first: int, start: int, end: int
+) -> dict[str, Any]:
+    """Columns of an episode's row that say where it is.
+
+    Args:
+        videos: Names of the videos.
+        fps: Frames per second.
+        shard: The shard.
+        number: The episode.
+        first: Number of the first frame of the shard.
+        start: Number of the first frame of the episode.
+        end: One more than that of its last one.
+    """
+    columns = {
+        "episode_index": number,
+        "length": end - start,
+        "dataset_from_index": start,
+        "dataset_to_index": end,
+    }
+    folders = [f"videos/{name}" for name in videos]
+    for name, value in shard_indices(shard).items():
+        columns |= {f"{files}/{name}": value for files in ("data", "meta/episodes", *folders)}
+    times = {"from_timestamp": (start - first) / fps, "to_timestamp": (end - first) / fps}
+    return columns | {f"{files}/{name}": time for files in folders for name, time in times.items()}
 
 
 def is_foreign(info: Mapping[str, Any]) -> bool:

@@ -80,24 +80,12 @@ def read_table(path: Path, widths: Mapping[str, int]) -> Any:
             raise ValueError(f"{name} has other values than numbers and texts")
     table = open_file(path, read_dictionary=list(texts.values())).read(columns=list(widths))
     for name in texts:
-        column = flat(table[name])
+        column = table[name].combine_chunks()
+        while hasattr(column, "flatten"):
+            column = column.flatten()
         longest = max(map(len, filter(None, column.dictionary.to_pylist())), default=0)
         check_size(rows * longest // 8, disk)
     return table
-
-
-def flat(column: Any) -> Any:
-    """All values of a column, one after the other; lists in it are of equal lengths.
-
-    Raises:
-        ValueError: They are not.
-    """
-    column = column.combine_chunks()
-    while hasattr(column, "flatten"):
-        if len(column.value_lengths().unique()) > 1:  # a null has none
-            raise ValueError("lists of unequal lengths")
-        column = column.flatten()
-    return column
 
 
 def read_numbers(path: Path, widths: Mapping[str, int]) -> dict[str, np.ndarray]:
@@ -113,11 +101,12 @@ def read_numbers(path: Path, widths: Mapping[str, int]) -> dict[str, np.ndarray]
     table = read_table(path, widths)
     columns = {}
     for name, width in widths.items():
-        try:
-            column = flat(table[name])
-        except ValueError:
-            column = ()
-        if len(column) != len(table) * width or column.null_count:
+        column = table[name].combine_chunks()
+        even = True
+        while even and hasattr(column, "flatten"):
+            even = len(column.value_lengths().unique()) < 2  # a null has none
+            column = column.flatten()
+        if not even or len(column) != len(table) * width or column.null_count:
             raise ValueError(f"rows of {name} without {width} numbers")
         values = column.to_numpy(zero_copy_only=False)
         if values.dtype.kind not in "biuf":

@@ -131,27 +131,15 @@ class PartWriter:
             pixels = count_pixels(episode.images[name][sampled])
             statistics[name] = by_name(image_statistics(pixels), len(sampled), video=True)
             self.part.pixels[name] = self.part.pixels.get(name, 0) + pixels
-        before = sum(row["length"] for row in self.part.rows)  # frames before it in the videos
-        times = {
-            "from_timestamp": before / self._spec.fps,
-            "to_timestamp": (before + length) / self._spec.fps,
-        }
-        place = lerobot.shard_indices(0)  # the commit knows it
-        self.part.rows.append(
+        rows = self.part.rows
+        first = rows[0]["dataset_from_index"] if rows else start
+        rows.append(
             {
-                "episode_index": number,
+                **lerobot.episode_columns(
+                    self._spec.videos, self._spec.fps, 0, number, first, start, start + length
+                ),
                 "tasks": [episode.task],
-                "length": length,
-                **{f"data/{name}": index for name, index in place.items()},
-                "dataset_from_index": start,
-                "dataset_to_index": start + length,
-                **{
-                    f"videos/{name}/{key}": value
-                    for name in self._spec.videos
-                    for key, value in (place | times).items()
-                },
                 **facts,
-                **{f"meta/episodes/{name}": index for name, index in place.items()},
                 **{
                     f"stats/{name}/{kind}": values
                     for name, kinds in statistics.items()

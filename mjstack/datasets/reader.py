@@ -288,13 +288,9 @@ def _check_row(
     frame is ``start``, in a shard whose first frame is ``first``.
     """
     end = start + row["length"]
-    videos = [f"videos/{name}" for name in videos_of(info)]
-    expected = {"episode_index": number, "dataset_from_index": start, "dataset_to_index": end}
-    for name, value in lerobot.shard_indices(shard).items():
-        expected |= {f"{files}/{name}": value for files in ("data", "meta/episodes", *videos)}
-    for video in videos:
-        expected[f"{video}/from_timestamp"] = (start - first) / info["fps"]
-        expected[f"{video}/to_timestamp"] = (end - first) / info["fps"]
+    expected = lerobot.episode_columns(
+        videos_of(info), info["fps"], shard, number, first, start, end
+    )
     for name, value in expected.items():
         if row[name] != value:
             raise ValueError(f"row {number}: {name} is {row[name]!r:.60}, expected {value}")
