@@ -1,10 +1,7 @@
 """Opening a dataset: to read it, or to go on with it."""
 
-import json
 import math
-import re
-from collections.abc import Iterable, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from mjstack.config.fingerprint import differences
-from mjstack.datasets import lerobot, parquet
+from mjstack.datasets import lerobot, parquet, tables
 from mjstack.datasets.lerobot import STATISTICS, is_foreign, videos_of
-from mjstack.datasets.spec import INDICES, OWN_VALUES, VALUE_DTYPES, DatasetSpec
+from mjstack.datasets.spec import INDICES, DatasetSpec
 from mjstack.datasets.statistics import count_pixels, sampled_frames
-from mjstack.datasets.video import check_video, decode
+from mjstack.datasets.video import decode
 from mjstack.errors import FolderError, require_names
-from mjstack.files import reading, refuse_links
+from mjstack.files import refuse_links
 
 _FIX = "Restore its files, or give another folder"
 _SLACK = 1e-4  # s: LeRobot lets no timestamp be off further
@@ -62,7 +59,7 @@ class StoredDataset:
         place = {key: row[f"videos/{name}/{key}"] for key in ("chunk_index", "file_index")}
         path = self.folder / lerobot.VIDEO.format(video_key=name, **place)
         start = row[f"videos/{name}/from_timestamp"]
-        with readable(path):
+        with tables.readable(path):
             return decode(path, videos[name], start, row["length"], self.info["fps"])
 
     def frames(self, name: str) -> np.ndarray:
@@ -83,9 +80,9 @@ class StoredDataset:
         require_names("feature", [name], features.keys() - videos_of(self.info).keys())
         shape = features[name]["shape"]
         columns = [np.empty((0, math.prod(shape)), features[name]["dtype"])]
-        for path in data_files(self.folder, self.info):
-            with readable(path):
-                columns.append(read_columns(path, self.info, [name])[name])
+        for path in tables.data_files(self.folder, self.info):
+            with tables.readable(path):
+                columns.append(tables.read_columns(path, self.info, [name])[name])
         return np.concatenate(columns).reshape(-1, *shape)
 
     def pixels(self, shard: int) -> dict[str, np.ndarray]:
@@ -96,8 +93,8 @@ class StoredDataset:
             FolderError: A file is missing or damaged.
         """
         path = lerobot.shard_path(self.folder, lerobot.EPISODES, shard)
-        with readable(path):
-            if counts := _read_pixels(path, self.info):
+        with tables.readable(path):
+            if counts := tables.read_pixels(path, self.info):
                 return counts
         counts = {name: np.zeros((3, 256), np.int64) for name in videos_of(self.info)}
         for number, row in enumerate(self.episodes):
@@ -120,15 +117,17 @@ def read_dataset(folder: Path | str, used: Iterable[str] = ()) -> StoredDataset:
         FolderError: There is none, or a file is missing, damaged or too large for what it holds.
     """
     folder = Path(folder)
-    info = read_info(folder)
+    info = tables.read_info(folder)
     columns = {*INDICES, *used} if is_foreign(info) else info["features"].keys() - videos_of(info)
     require_names("feature", columns, info["features"])
     _check_sizes(folder, info, columns)
     stored = StoredDataset(
         folder=folder,
         info=info,
-        tasks=_read_tasks(folder, info),
-        episodes=_read_lengths(folder, info) if is_foreign(info) else _read_rows(folder, info),
+        tasks=tables.read_tasks(folder, info),
+        episodes=tables.read_lengths(folder, info)
+        if is_foreign(info)
+        else tables.read_rows(folder, info),
     )
     _check_frames(stored, columns)
     return stored
@@ -159,7 +158,7 @@ def read_begun(folder: Path, spec: DatasetSpec) -> StoredDataset | None:
                 expected = "expected a dataset or an empty folder. Give another"
                 raise FolderError(f"{folder} has {name} and no {lerobot.INFO}, {expected}")
         return None
-    info = read_info(folder)
+    info = tables.read_info(folder)
     if is_foreign(info):
         raise FolderError(f"{folder} was not written by mjstack", "Give another folder")
     if changes := differences(_identity(info), _identity(lerobot.make_info(spec))):
@@ -175,27 +174,6 @@ def _identity(info: dict[str, Any]) -> dict[str, Any]:
     return block | {key: info[key] for key in keys}
 
 
-def read_info(folder: Path) -> dict[str, Any]:
-    """The content of info.json.
-
-    Raises:
-        FolderError: It is missing, damaged, or of another version of LeRobot's.
-    """
-    lerobot.require_pyarrow()
-    path = folder / lerobot.INFO
-    if not path.is_file():
-        problem = f"{folder} has no {lerobot.INFO}, expected a LeRobotDataset v3"
-        raise FolderError(problem, "Give the folder dataset of job=collect")
-    with readable(path):
-        info = json.loads(path.read_text(encoding="utf-8"))
-        version = str(info["codebase_version"])
-        if not version.startswith("v3"):
-            problem = f"{folder} is a LeRobotDataset {version:.20}, expected v3.0"
-            raise FolderError(problem, "Convert it with LeRobot")
-        lerobot.check_info(info)
-    return info
-
-
 def _check_sizes(folder: Path, info: dict[str, Any], columns: Iterable[str]) -> None:
     """Check how many rows the files have and what they unpack to, before any is unpacked."""
     width = sum(math.prod(info["features"][name]["shape"]) for name in columns)
@@ -205,8 +183,8 @@ def _check_sizes(folder: Path, info: dict[str, Any], columns: Iterable[str]) -> 
         (lerobot.DATA, width),
     ):
         rows = disk = 0
-        for path in data_files(folder, info, files):
-            with readable(path):
+        for path in tables.data_files(folder, info, files):
+            with tables.readable(path):
                 rows += parquet.count_rows(path)
                 disk += path.stat().st_size
                 parquet.check_size(rows * numbers, disk)
@@ -217,102 +195,6 @@ def _check_sizes(folder: Path, info: dict[str, Any], columns: Iterable[str]) -> 
             f"{folder} has {found[0]} rows of episodes and {found[1]} frames, expected {total[0]}"
             f" episodes and {total[1]} frames as {lerobot.INFO} says. {_FIX}"
         )
-
-
-def _read_tasks(folder: Path, info: dict[str, Any]) -> list[str]:
-    """Texts of the tasks that count, by index."""
-    path = folder / lerobot.TASKS
-    if not info.get("total_tasks", 1):
-        return []
-    with readable(path):
-        names = parquet.open_file(path).schema_arrow.names
-        text = "task" if "task" in names else next(n for n in names if n != "task_index")
-        table = parquet.read_table(path, {text: 1, "task_index": 1})
-        count = len(table) if is_foreign(info) else info["total_tasks"]
-        columns = (table[name].to_pylist() for name in ("task_index", text))
-        tasks = sorted(zip(*columns, strict=True))[:count]
-        if [number for number, _ in tasks] != list(range(count)):
-            raise ValueError(f"task_index does not count from 0 to {count - 1}")
-        if not all(isinstance(task, str) for _, task in tasks):
-            raise ValueError("a task is no text")
-    return [task for _, task in tasks]
-
-
-def _read_lengths(folder: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
-    """Length and seed of every episode of a foreign dataset."""
-    rows: list[dict[str, Any]] = []
-    for path in data_files(folder, info, lerobot.EPISODES):
-        with readable(path):
-            names = {"length", "seed"}.intersection(parquet.open_file(path).schema_arrow.names)
-            columns = parquet.read_numbers(path, dict.fromkeys({"length", *names}, 1))
-            if any(values.dtype.kind not in "iu" for values in columns.values()):
-                raise ValueError("a length or a seed is no whole number")
-            lists = [values[:, 0].tolist() for values in columns.values()]
-            rows += [dict(zip(columns, row, strict=True)) for row in zip(*lists, strict=True)]
-    return rows
-
-
-def _read_rows(folder: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
-    """Rows of every episode."""
-    rows: list[dict[str, Any]] = []
-    videos = videos_of(info)
-    widths: dict[str, int] = {}
-    for name, feature in info["features"].items():
-        width = 3 if name in videos else math.prod(feature["shape"])
-        widths |= {f"stats/{name}/{kind}": width for kind in STATISTICS}
-        widths[f"stats/{name}/count"] = 1
-    for shard, path in enumerate(data_files(folder, info, lerobot.EPISODES)):
-        with readable(path):
-            names = parquet.open_file(path).schema_arrow.names
-            names = [name for name in names if not name.startswith("stats/")]
-            first = start = rows[-1]["dataset_to_index"] if rows else 0
-            for row in parquet.read_table(path, dict.fromkeys(names, 1)).to_pylist():
-                _check_row(info, row, shard, len(rows), start, first)
-                start = row["dataset_to_index"]
-                rows.append(row)
-            statistics = parquet.read_numbers(path, widths)
-            if not all(np.isfinite(values).all() for values in statistics.values()):
-                raise ValueError("statistics that are not finite")
-            _read_pixels(path, info)
-        for video in videos:
-            path = lerobot.shard_path(folder, lerobot.VIDEO, shard, video)
-            with readable(path):
-                check_video(path)
-    return rows
-
-
-def _check_row(
-    info: Mapping[str, Any], row: dict[str, Any], shard: int, number: int, start: int, first: int
-) -> None:
-    """Raise an error of any kind where a row is not that of an episode of this number, whose first
-    frame is ``start``, in a shard whose first frame is ``first``.
-    """
-    end = start + row["length"]
-    expected = lerobot.episode_columns(
-        videos_of(info), info["fps"], shard, number, first, start, end
-    )
-    for name, value in expected.items():
-        if row[name] != value:
-            raise ValueError(f"row {number}: {name} is {row[name]!r:.60}, expected {value}")
-    for name, dtype in {**OWN_VALUES, **info["mjstack"]["values"]}.items():
-        if type(row[name]) is not VALUE_DTYPES[dtype][1]:
-            raise ValueError(f"row {number}: {name} is {row[name]!r:.60}, expected {dtype}")
-    if row["length"] < 1 or min(row["seed"], row["world"]) < 0 or len(row["tasks"]) != 1:
-        raise ValueError(f"row {number} has no frames, no task, or a negative seed or world")
-
-
-def _read_pixels(path: Path, info: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Counts of the pixels of a shard's videos, as far as its writer has left them.
-
-    Raises:
-        Exception: There are others.
-    """
-    text = (parquet.open_file(path).schema_arrow.metadata or {}).get(lerobot.PIXELS, b"{}")
-    pixels = {name: np.array(counts, np.int64) for name, counts in json.loads(text).items()}
-    for name, counts in pixels.items():
-        if name not in videos_of(info) or counts.shape != (3, 256) or not (counts >= 0).all():
-            raise ValueError(f"counts of the pixels of {name}")
-    return pixels
 
 
 def _check_frames(stored: StoredDataset, names: Iterable[str]) -> None:
@@ -339,9 +221,9 @@ def _check_frames(stored: StoredDataset, names: Iterable[str]) -> None:
         task_numbers = [numbers.get(row["tasks"][0], -1) for row in stored.episodes]
         expected["task_index"] = np.repeat(task_numbers, lengths)
     start = 0
-    for path in data_files(stored.folder, info):
-        with readable(path):
-            columns = read_columns(path, info, names)
+    for path in tables.data_files(stored.folder, info):
+        with tables.readable(path):
+            columns = tables.read_columns(path, info, names)
             stop = start + len(columns["index"])
             for name, values in expected.items():
                 found, values = columns[name][:, 0], values[start:stop]
@@ -358,34 +240,6 @@ def _check_frames(stored: StoredDataset, names: Iterable[str]) -> None:
             start = stop
 
 
-def data_files(folder: Path, info: dict[str, Any], files: str = lerobot.DATA) -> list[Path]:
-    """The data files that count, or those of episodes (`lerobot.EPISODES`), in order. If some are
-    missing, the first of them is among these.
-    """
-    there = sorted(folder.glob(re.sub(r"{.*?}", "*", files)))
-    if is_foreign(info):
-        return there
-    shards = min(info["mjstack"]["shards"], len(there) + 1)
-    return [lerobot.shard_path(folder, files, shard) for shard in range(shards)]
-
-
-def read_columns(path: Path, info: dict[str, Any], names: Iterable[str]) -> dict[str, np.ndarray]:
-    """Columns of a data file, each shape ``(frames, numbers)``.
-
-    Raises:
-        Exception: It cannot be read; a number is missing or not finite; or mjstack wrote it and the
-            type is another than info.json says.
-    """
-    features = info["features"]
-    columns = parquet.read_numbers(path, {n: math.prod(features[n]["shape"]) for n in names})
-    for name, values in columns.items():
-        if not is_foreign(info) and values.dtype != features[name]["dtype"]:
-            raise ValueError(f"{name} is {values.dtype}, expected {features[name]['dtype']}")
-        if not np.isfinite(values).all():
-            raise ValueError(f"{name} has numbers that are not finite")
-    return columns
-
-
 def uncommitted(folder: Path, shards: int) -> list[Path]:
     """Files that an interrupted writer left: shards from this number on, and hidden ones."""
     counted = {lerobot.FILE.format(**lerobot.shard_indices(shard)) for shard in range(shards)}
@@ -399,8 +253,3 @@ def uncommitted(folder: Path, shards: int) -> list[Path]:
     patterns += [f"meta/.{Path(name).name}.*" for name in totals]
     paths = [path for pattern in patterns for path in folder.glob(pattern)]
     return [path for path in paths if f"{path.parent.name}/{path.stem}" not in counted]
-
-
-def readable(path: Path) -> AbstractContextManager[None]:
-    """Raise a `FolderError` for whatever goes wrong with a file inside."""
-    return reading(path, "Restore it, or give another folder")

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from mjstack.datasets import lerobot, reader
+from mjstack.datasets import lerobot, reader, tables
 from mjstack.datasets.part import Part, PartWriter
 from mjstack.datasets.spec import DatasetSpec, EpisodeData, typed_episode
 from mjstack.datasets.statistics import (
@@ -208,8 +208,8 @@ class DatasetWriter:
         """Count a shard, by its frames, its episodes' rows and the pixels of its videos."""
         path = lerobot.shard_path(self.folder, lerobot.DATA, shard)
         columns = lerobot.columns_of(self.spec)
-        with reader.readable(path):
-            frames = reader.read_columns(path, lerobot.make_info(self.spec), columns)
+        with tables.readable(path):
+            frames = tables.read_columns(path, lerobot.make_info(self.spec), columns)
         for name, (_, dim) in columns.items():
             self._statistics.setdefault(name, RunningStatistics(dim)).add(frames[name])
         for name, counts in pixels.items():
@@ -257,7 +257,7 @@ class DatasetWriter:
             if self._part is not None:
                 self._part.abandon()
                 self._part = None
-            info = reader.read_info(self.folder)
+            info = tables.read_info(self.folder)
             del self.committed[info["total_episodes"] :]
             self.frames = info["total_frames"]
             for path in reader.uncommitted(self.folder, info["mjstack"]["shards"]):

@@ -18,8 +18,9 @@ from mjstack.config.functions import offered
 from mjstack.config.schema import CollectJobCfg, Config, ObservationTermCfg
 from mjstack.datasets import DatasetSpec, Feature, Video
 from mjstack.datasets.lerobot import INFO
-from mjstack.datasets.reader import read_begun, read_info, readable
+from mjstack.datasets.reader import read_begun
 from mjstack.datasets.spec import term_columns
+from mjstack.datasets.tables import read_info, readable
 from mjstack.datasets.video import check_encoder
 from mjstack.envs import Env, demonstration_config
 from mjstack.episodes.stage import Stage
