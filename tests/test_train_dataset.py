@@ -139,15 +139,20 @@ def shuffle(table: pa.Table) -> pa.Table:
 
 
 SHAPES = "rows of action without 6 numbers"
-ORDER = "3 episodes, out of order, expected 3 episodes and 450 frames"
 DAMAGES: dict[str, tuple[Callable[[pa.Table], pa.Table], str]] = {
     "a null row and a double one": (reshape_rows({7: None, 8: 12}), SHAPES),
     "rows of 5 and 7": (reshape_rows({100: 5, 200: 7}), SHAPES),
-    "the end is missing": (lambda table: table.slice(0, 413), "413 frames of 3 episodes, ex"),
-    "an episode is missing": (lambda table: table.slice(150), "300 frames of 2 episodes, ex"),
-    "shuffled": (shuffle, ORDER),
-    "two steps swapped": (swap(20, 21), ORDER),
-    "episodes mixed": (swap(149, 150), ORDER),
+    "the end is missing": (
+        lambda table: table.slice(0, 413),
+        "3 rows of episodes and 413 frames, ex",
+    ),
+    "an episode is missing": (
+        lambda table: table.slice(150),
+        "3 rows of episodes and 300 frames, ex",
+    ),
+    "shuffled": (shuffle, "_index of frame 0 is "),
+    "two steps swapped": (swap(20, 21), "frame_index of frame 20 is 21, expected 20"),
+    "episodes mixed": (swap(149, 150), "episode_index of frame 149 is 1, expected 0"),
 }
 
 
@@ -173,7 +178,7 @@ def test_a_file_that_is_there_twice_is_refused(dataset: Path, tmp_path: Path) ->
             assert len(read(folder).ends) == 3
         else:
             line = refusal_of([f"job.dataset={folder}"])
-            assert "has 3 rows of episodes and 900 frames of 3 episodes, expected 3 epis" in line
+            assert "has 3 rows of episodes and 900 frames, expected 3 episodes and 450 fr" in line
 
 
 def test_without_a_success_all_episodes_count(dataset: Path, tmp_path: Path) -> None:
@@ -265,12 +270,32 @@ def test_a_dataset_that_does_not_fit_is_one_line(name: str, dataset: Path, tmp_p
 
 ROWS = "meta/episodes/chunk-000/file-000.parquet"
 COLUMNS: dict[str, tuple[str, str, list[Any], str]] = {
-    "seeds null": (ROWS, "seed", [None, 0, 0], f"{ROWS}: cannot be read (TypeError"),
-    "seeds in words": (ROWS, "seed", ["0", "0", "0"], f"{ROWS}: cannot be read (TypeError"),
-    "lengths": (ROWS, "length", [149, 151, 150], "as long as its row says"),
-    "a negative length": (ROWS, "length", [-1, 301, 150], "as long as its row says"),
+    "seeds null": (
+        ROWS,
+        "seed",
+        [None, 0, 0],
+        f"{ROWS}: cannot be read (ValueError: row 0: seed is None",
+    ),
+    "seeds in words": (
+        ROWS,
+        "seed",
+        ["0", "0", "0"],
+        f"{ROWS}: cannot be read (ValueError: row 0: seed is '0'",
+    ),
+    "lengths": (ROWS, "length", [149, 151, 150], "row 0: dataset_to_index is 150, expected 149"),
+    "a negative length": (
+        ROWS,
+        "length",
+        [-1, 301, 150],
+        "row 0: dataset_to_index is 150, expected -1",
+    ),
     "no length": (ROWS, "length", [None, 150, 150], f"{ROWS}: cannot be read (TypeError"),
-    "task": ("meta/tasks.parquet", "task_index", [None], "tasks.parquet: cannot be read (TypeEr"),
+    "task": (
+        "meta/tasks.parquet",
+        "task_index",
+        [None],
+        "tasks.parquet: cannot be read (ValueError: task_index",
+    ),
 }
 
 

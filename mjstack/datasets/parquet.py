@@ -3,7 +3,7 @@ footer, and is checked before anything is unpacked.
 """
 
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +27,9 @@ def open_file(path: Path, **options: Any) -> Any:
     """
     with open(path, "rb") as file:
         file.seek(max(0, file.seek(0, os.SEEK_END) - 8))
-        footer = int.from_bytes(file.read(4), "little")
-    if footer > _MOST_FOOTER:
+        end = file.read()
+    footer = int.from_bytes(end[:4], "little")
+    if end[4:] == b"PAR1" and footer > _MOST_FOOTER:
         raise ValueError(f"its footer has {footer} bytes, more than {_MOST_FOOTER}")
     return lerobot.require_pyarrow()[1].ParquetFile(path, **options)
 
@@ -37,6 +38,14 @@ def count_rows(path: Path) -> int:
     """Rows of a file, as its footer has them; raises as `open_file` does."""
     metadata = open_file(path).metadata
     return sum(metadata.row_group(group).num_rows for group in range(metadata.num_row_groups))
+
+
+def check_names(path: Path, names: Collection[str]) -> None:
+    """Raise an error if a file has other columns, or raise as `open_file` does."""
+    found = open_file(path).schema_arrow.names
+    if sorted(found) != sorted(names):
+        others = sorted({*found} ^ {*names}) or ["a second one of a name"]
+        raise ValueError(f"its columns are not those expected: {others[0]:.60}")
 
 
 def check_size(values: int, disk: int) -> None:

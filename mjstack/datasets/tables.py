@@ -63,6 +63,8 @@ def read_columns(path: Path, info: dict[str, Any], names: Iterable[str]) -> dict
             type is another than info.json says.
     """
     features = info["features"]
+    if not is_foreign(info):
+        parquet.check_names(path, features.keys() - videos_of(info).keys())
     columns = parquet.read_numbers(path, {n: math.prod(features[n]["shape"]) for n in names})
     for name, values in columns.items():
         if not is_foreign(info) and values.dtype != features[name]["dtype"]:
@@ -114,10 +116,11 @@ def read_rows(folder: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
         width = 3 if name in videos else math.prod(feature["shape"])
         widths |= {f"stats/{name}/{kind}": width for kind in STATISTICS}
         widths[f"stats/{name}/count"] = 1
+    names = {"tasks", *OWN_VALUES, *info["mjstack"]["values"]}
+    names |= lerobot.episode_columns(videos, 1.0, 0, 0, 0, 0, 0).keys()
     for shard, path in enumerate(data_files(folder, info, lerobot.EPISODES)):
         with readable(path):
-            names = parquet.open_file(path).schema_arrow.names
-            names = [name for name in names if not name.startswith("stats/")]
+            parquet.check_names(path, names | widths.keys())
             first = start = rows[-1]["dataset_to_index"] if rows else 0
             for row in parquet.read_table(path, dict.fromkeys(names, 1)).to_pylist():
                 _check_row(info, row, shard, len(rows), start, first)
