@@ -513,7 +513,8 @@ def test_another_configuration_is_refused(tmp_path: Path) -> None:
     assert contents(tmp_path) == before
 
 
-FOREIGN = '{"codebase_version": "v3.0", "fps": 30, "features": {}, "total_episodes": 0, "total_frames": 0}'
+COUNTS = {"total_episodes": 0, "total_frames": 0}
+FOREIGN = json.dumps({"codebase_version": "v3.0", "fps": 30, "features": {}, **COUNTS})
 
 
 def test_other_folders_are_left_alone(tmp_path: Path) -> None:
@@ -729,7 +730,7 @@ DAMAGE: dict[str, tuple[str, Any, str]] = {
     "column": (
         DATA,
         lambda table: table.append_column("x", table["index"]),
-        "not those expected: x",
+        "those expected: x",
     ),
     "row column": (ROWS, lambda table: table.append_column("x", table["seed"]), "expected: x"),
     "place": (ROWS, set_column("data/file_index", 7), "data/file_index is 7, expected 0"),
@@ -848,7 +849,7 @@ def test_row_groups_without_end_are_not_opened(tmp_path: Path) -> None:
     with pq.ParquetWriter(tmp_path / DATA, table.schema) as writer:
         for _ in range(32_000):
             writer.write_table(table.slice(0, 1))
-    with pytest.raises(FolderError, match="its footer has .* bytes, more than"):
+    with pytest.raises(FolderError, match=r"its footer has .* bytes, more than"):
         read_dataset(tmp_path)
 
 
@@ -871,8 +872,10 @@ def put(kind: str, path: Path) -> None:
 @pytest.mark.parametrize("kind", ["link", "pipe", "other"])
 @pytest.mark.parametrize(
     "name",
-    ["meta", "data", "data/chunk-000", "meta/episodes", STATS, INFO, lerobot.TASKS, DATA, ROWS]
-    + ["data/chunk-000/.file-rank0000-0.parquet.part", "meta/.info.json.x"],
+    [
+        *("meta", "data", "data/chunk-000", "meta/episodes", STATS, INFO, lerobot.TASKS, DATA),
+        *(ROWS, "data/chunk-000/.file-rank0000-0.parquet.part", "meta/.info.json.x"),
+    ],
 )
 def test_a_writer_writes_files_and_nothing_else(name: str, kind: str, tmp_path: Path) -> None:
     folder = tmp_path / "dataset"
