@@ -206,6 +206,11 @@ def videos_of(info: Mapping[str, Any]) -> dict[str, Video]:
     }
 
 
+def numeric_columns(info: Mapping[str, Any]) -> list[str]:
+    """The columns of info.json but for the videos."""
+    return [name for name, feature in info["features"].items() if feature["dtype"] != "video"]
+
+
 def to_json(data: Mapping[str, Any]) -> str:
     """Text of a JSON file."""
     return json.dumps(data, indent=4, ensure_ascii=False, allow_nan=False) + "\n"

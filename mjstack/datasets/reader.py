@@ -10,7 +10,7 @@ import numpy as np
 
 from mjstack.config.fingerprint import differences
 from mjstack.datasets import lerobot, parquet, tables
-from mjstack.datasets.lerobot import STATISTICS, is_foreign, videos_of
+from mjstack.datasets.lerobot import STATISTICS, is_foreign, numeric_columns, videos_of
 from mjstack.datasets.spec import INDICES, DatasetSpec
 from mjstack.datasets.statistics import count_pixels, sampled_frames
 from mjstack.datasets.video import decode
@@ -56,8 +56,7 @@ class StoredDataset:
         videos = videos_of(self.info)
         require_names("video", [name], videos)
         row = self.episodes[episode]
-        place = {key: row[f"videos/{name}/{key}"] for key in ("chunk_index", "file_index")}
-        path = self.folder / lerobot.VIDEO.format(video_key=name, **place)
+        path = lerobot.shard_path(self.folder, lerobot.VIDEO, lerobot.shard_of(row), name)
         start = row[f"videos/{name}/from_timestamp"]
         with tables.readable(path):
             return decode(path, videos[name], start, row["length"], self.info["fps"])
@@ -77,7 +76,7 @@ class StoredDataset:
             FolderError: A file is missing or damaged.
         """
         features = self.info["features"]
-        require_names("feature", [name], features.keys() - videos_of(self.info).keys())
+        require_names("feature", [name], numeric_columns(self.info))
         shape = features[name]["shape"]
         columns = [np.empty((0, math.prod(shape)), features[name]["dtype"])]
         for path in tables.data_files(self.folder, self.info):
@@ -118,17 +117,12 @@ def read_dataset(folder: Path | str, used: Iterable[str] = ()) -> StoredDataset:
     """
     folder = Path(folder)
     info = tables.read_info(folder)
-    columns = {*INDICES, *used} if is_foreign(info) else info["features"].keys() - videos_of(info)
+    columns = [*INDICES, *used] if is_foreign(info) else numeric_columns(info)
     require_names("feature", columns, info["features"])
     _check_sizes(folder, info, columns)
-    stored = StoredDataset(
-        folder=folder,
-        info=info,
-        tasks=tables.read_tasks(folder, info),
-        episodes=tables.read_lengths(folder, info)
-        if is_foreign(info)
-        else tables.read_rows(folder, info),
-    )
+    tasks = tables.read_tasks(folder, info)
+    rows = (tables.read_lengths if is_foreign(info) else tables.read_rows)(folder, info)
+    stored = StoredDataset(folder=folder, info=info, tasks=tasks, episodes=rows)
     _check_frames(stored, columns)
     return stored
 

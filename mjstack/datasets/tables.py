@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mjstack.datasets import lerobot, parquet
-from mjstack.datasets.lerobot import STATISTICS, is_foreign, videos_of
+from mjstack.datasets.lerobot import STATISTICS, is_foreign, numeric_columns, videos_of
 from mjstack.datasets.spec import OWN_VALUES, VALUE_DTYPES
 from mjstack.datasets.video import check_video
 from mjstack.errors import FolderError
@@ -64,7 +64,7 @@ def read_columns(path: Path, info: dict[str, Any], names: Iterable[str]) -> dict
     """
     features = info["features"]
     if not is_foreign(info):
-        parquet.check_names(path, features.keys() - videos_of(info).keys())
+        parquet.check_names(path, numeric_columns(info))
     columns = parquet.read_numbers(path, {n: math.prod(features[n]["shape"]) for n in names})
     for name, values in columns.items():
         if not is_foreign(info) and values.dtype != features[name]["dtype"]:
@@ -98,12 +98,10 @@ def read_lengths(folder: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for path in data_files(folder, info, lerobot.EPISODES):
         with readable(path):
-            names = {"length", "seed"}.intersection(parquet.open_file(path).schema_arrow.names)
-            columns = parquet.read_numbers(path, dict.fromkeys({"length", *names}, 1))
-            if any(values.dtype.kind not in "iu" for values in columns.values()):
+            names = {"length", *({"seed"} & {*parquet.open_file(path).schema_arrow.names})}
+            rows += parquet.read_table(path, dict.fromkeys(names, 1)).to_pylist()
+            if not all(type(value) is int for row in rows for value in row.values()):
                 raise ValueError("a length or a seed is no whole number")
-            lists = [values[:, 0].tolist() for values in columns.values()]
-            rows += [dict(zip(columns, row, strict=True)) for row in zip(*lists, strict=True)]
     return rows
 
 
