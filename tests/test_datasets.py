@@ -721,7 +721,11 @@ DAMAGE: dict[str, tuple[str, Any, str]] = {
     "late": (DATA, change_column("timestamp", lambda t: t + 2e-3), "timestamp of frame 0 is 0.002"),
     "no time": (DATA, change_column("timestamp", lambda t: t * np.nan), "not finite"),
     "backwards": (DATA, change_column("index", lambda i: i[::-1]), "index of frame 0 is 68, ex"),
-    "least": (DATA, change_column("index", lambda i: 0 * i + -(2**63)), "index of frame 0 is -9223"),
+    "least": (
+        DATA,
+        change_column("index", lambda i: 0 * i + -(2**63)),
+        "index of frame 0 is -9223",
+    ),
     "far task": (DATA, change_column("task_index", lambda i: i + 10**9), "0 is 1000000000, exp"),
     "null": (DATA, set_column("observation.state", None), "rows of observation.state without 3"),
     "null count": (DATA, set_column("count", None), "rows of count without 1 numbers"),

@@ -42,10 +42,10 @@ def count_rows(path: Path) -> int:
 
 def check_names(path: Path, names: Collection[str]) -> None:
     """Raise an error if a file has other columns, or raise as `open_file` does."""
-    found = open_file(path).schema_arrow.names
-    if sorted(found) != sorted(names):
-        others = sorted({*found} ^ {*names}) or ["a second one of a name"]
-        raise ValueError(f"its columns are not those expected: {others[0]:.60}")
+    columns = open_file(path).schema_arrow.names
+    if sorted(columns) != sorted(names):
+        difference = sorted({*columns} ^ {*names}) or ["a second one of a name"]
+        raise ValueError(f"its columns are not those expected: {difference[0]:.60}")
 
 
 def check_size(values: int, disk: int) -> None:

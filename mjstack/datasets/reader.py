@@ -171,7 +171,7 @@ def _identity(info: dict[str, Any]) -> dict[str, Any]:
 def _check_sizes(folder: Path, info: dict[str, Any], columns: Iterable[str]) -> None:
     """Check how many rows the files have and what they unpack to, before any is unpacked."""
     width = sum(math.prod(info["features"][name]["shape"]) for name in columns)
-    found = []
+    counts = []
     for files, numbers in (
         (lerobot.EPISODES, 2 if is_foreign(info) else width * len(STATISTICS)),
         (lerobot.DATA, width),
@@ -182,11 +182,11 @@ def _check_sizes(folder: Path, info: dict[str, Any], columns: Iterable[str]) -> 
                 rows += parquet.count_rows(path)
                 disk += path.stat().st_size
                 parquet.check_size(rows * numbers, disk)
-        found.append(rows)
+        counts.append(rows)
     total = [info["total_episodes"], info["total_frames"]]
-    if found != total:
+    if counts != total:
         raise FolderError(
-            f"{folder} has {found[0]} rows of episodes and {found[1]} frames, expected {total[0]}"
+            f"{folder} has {counts[0]} rows of episodes and {counts[1]} frames, expected {total[0]}"
             f" episodes and {total[1]} frames as {lerobot.INFO} says. {_FIX}"
         )
 
@@ -220,13 +220,13 @@ def _check_frames(stored: StoredDataset, names: Iterable[str]) -> None:
             columns = tables.read_columns(path, info, names)
             stop = start + len(columns["index"])
             for name, values in expected.items():
-                found, values = columns[name][:, 0], values[start:stop]
-                wrong = found != values
+                column, values = columns[name][:, 0], values[start:stop]
+                differs = column != values
                 if name == "timestamp":
-                    wrong = np.abs(found - values) > _SLACK + np.spacing(values)
-                if wrong.any():
-                    k = int(wrong.argmax())
-                    problem = f"{name} of frame {start + k} is {found[k]}, expected {values[k]}"
+                    differs = np.abs(column - values) > _SLACK + np.spacing(values)
+                if differs.any():
+                    k = int(differs.argmax())
+                    problem = f"{name} of frame {start + k} is {column[k]}, expected {values[k]}"
                     raise ValueError(problem)
             task = columns["task_index"]
             if not ((task >= 0) & (task < len(tasks))).all():

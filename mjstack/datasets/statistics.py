@@ -64,11 +64,11 @@ def _quantile_bins(counts: np.ndarray) -> np.ndarray:
     NumPy does; ``counts`` are the values in each bin, shape ``(dim, bins)``.
     """
     ranks = np.outer(counts.sum(1) - 1, [*QUANTILES.values()])
-    below, above = (
+    lower, upper = (
         [np.searchsorted(*row, side="right") for row in zip(counts.cumsum(1), rank, strict=True)]
         for rank in (np.floor(ranks), np.ceil(ranks))
     )
-    return (below + (ranks - np.floor(ranks)) * np.subtract(above, below)).T
+    return (lower + (ranks - np.floor(ranks)) * np.subtract(upper, lower)).T
 
 
 class RunningStatistics:
@@ -101,11 +101,12 @@ class RunningStatistics:
         half = np.maximum(high / 2 - low / 2, np.spacing(np.maximum(np.abs(low), np.abs(high))))
         width = np.ldexp(2.0 / _BINS, np.frexp(np.maximum(half, 1e-290))[1])
         origin = np.floor(low / width)
-        before, self._bins = self._bins, np.zeros_like(self._bins)
+        earlier = self._bins
+        self._bins = np.zeros_like(earlier)
         for k, bins in enumerate(self._bins):
-            full = np.flatnonzero(before[k])
+            full = np.flatnonzero(earlier[k])
             moved = np.floor((self._origin[k] + full) * (self._width[k] / width[k])) - origin[k]
-            np.add.at(bins, moved.astype(int), before[k, full])
+            np.add.at(bins, moved.astype(int), earlier[k, full])
             added = np.floor(frames[:, k] / width[k]) - origin[k]
             bins += np.bincount(added.astype(int), minlength=_BINS + 1)
         self._range, self._width, self._origin = np.stack([low, high]), width, origin

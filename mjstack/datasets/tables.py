@@ -27,10 +27,10 @@ def data_files(folder: Path, info: dict[str, Any], files: str = lerobot.DATA) ->
     """The data files that count, or those of episodes (`lerobot.EPISODES`), in order. If some are
     missing, the first of them is among these.
     """
-    there = sorted(folder.glob(re.sub(r"{.*?}", "*", files)))
+    paths = sorted(folder.glob(re.sub(r"{.*?}", "*", files)))
     if is_foreign(info):
-        return there
-    shards = min(info["mjstack"]["shards"], len(there) + 1)
+        return paths
+    shards = min(info["mjstack"]["shards"], len(paths) + 1)
     return [lerobot.shard_path(folder, files, shard) for shard in range(shards)]
 
 
