@@ -291,6 +291,9 @@ def test_tasks_keep_their_indices(tmp_path: Path) -> None:
     with DatasetWriter(tmp_path, SPEC) as writer:
         writer.add([episode(2, task="reach"), episode(3, task="box")])
     assert read_dataset(tmp_path).tasks == ["stack", "box", "reach"]
+    path = tmp_path / lerobot.TASKS
+    pq.write_table(pq.read_table(path).take([2, 0, 1]), path, row_group_size=1)
+    assert read_dataset(tmp_path).tasks == ["stack", "box", "reach"]
     table = pq.read_table(tmp_path / "data")
     rows = {row["episode_index"]: row["task_index"] for row in table.to_pylist()}
     assert rows == {0: 0, 1: 1, 2: 2, 3: 1}

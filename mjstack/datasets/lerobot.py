@@ -140,16 +140,8 @@ def make_info(
 def episode_columns(
     videos: Iterable[str], fps: float, shard: int, number: int, first: int, start: int, end: int
 ) -> dict[str, Any]:
-    """Columns of an episode's row that say where it is.
-
-    Args:
-        videos: Names of the videos.
-        fps: Frames per second.
-        shard: The shard.
-        number: The episode.
-        first: Number of the first frame of the shard.
-        start: Number of the first frame of the episode.
-        end: One more than that of its last one.
+    """Columns of the row of an episode that say where it is: in a shard whose first frame is
+    ``first``, from frame ``start`` to before ``end``.
     """
     columns = {
         "episode_index": number,

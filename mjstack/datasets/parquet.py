@@ -83,7 +83,7 @@ def read_table(path: Path, widths: Mapping[str, int]) -> Any:
             raise ValueError(f"rows of {name} without {widths[name]} numbers")
         if leaf.physical_type == "BYTE_ARRAY":
             texts[name] = leaf.path
-            if not _ENCODINGS.issuperset(*(chunk.encodings for chunk in chunks)):
+            if not all(_ENCODINGS.issuperset(chunk.encodings) for chunk in chunks):
                 raise ValueError(f"texts of {name} in another encoding than a plain one")
         elif leaf.physical_type not in _NUMBERS:
             raise ValueError(f"{name} has other values than numbers and texts")

@@ -156,14 +156,16 @@ def _check_row(
 
 
 def read_pixels(path: Path, info: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Counts of the pixels of a shard's videos, as far as its writer has left them.
+    """Counts of the pixels of a shard's videos; empty if its writer left none.
 
     Raises:
-        Exception: There are others.
+        Exception: They are damaged.
     """
-    text = (parquet.open_file(path).schema_arrow.metadata or {}).get(lerobot.PIXELS, b"{}")
-    pixels = {name: np.array(counts, np.int64) for name, counts in json.loads(text).items()}
+    text = (parquet.open_file(path).schema_arrow.metadata or {}).get(lerobot.PIXELS)
+    if text is None:
+        return {}
+    pixels = {name: np.array(json.loads(text)[name], np.int64) for name in videos_of(info)}
     for name, counts in pixels.items():
-        if name not in videos_of(info) or counts.shape != (3, 256) or not (counts >= 0).all():
-            raise ValueError(f"counts of the pixels of {name}")
+        if counts.shape != (3, 256) or counts.min() < 0 or counts.sum(1).min() < 1:
+            raise ValueError(f"the counts of the pixels of {name} are damaged")
     return pixels
