@@ -1,5 +1,7 @@
 """Statistics of an episode's frames and of all frames, by the names that LeRobot has for them."""
 
+import math
+
 import numpy as np
 import torch
 
@@ -89,27 +91,28 @@ class RunningStatistics:
 
     def add(self, frames: np.ndarray) -> None:
         """Add frames, shape ``(frames, dim)``."""
-        frames = frames.astype(float)
-        count = self.count + len(frames)
-        shift = frames.mean(0) - self._mean
-        self._squares += len(frames) * (frames.var(0) + shift**2 * self.count / count)
-        self._mean += shift * len(frames) / count
-        self.count = count
-        low = np.minimum(self._range[0], frames.min(0))
-        high = np.maximum(self._range[1], frames.max(0))
+        for k, column in enumerate(frames.T):
+            self._add(k, column.astype(float))
+        self.count += len(frames)
+
+    def _add(self, k: int, values: np.ndarray) -> None:
+        """Add values of a number."""
+        count = self.count + len(values)
+        shift = values.mean() - self._mean[k]
+        self._squares[k] += len(values) * (values.var() + shift**2 * self.count / count)
+        self._mean[k] += shift * len(values) / count
+        low = min(self._range[0, k], values.min())
+        high = max(self._range[1, k], values.max())
         # No narrower than what float64 tells apart
-        half = np.maximum(high / 2 - low / 2, np.spacing(np.maximum(np.abs(low), np.abs(high))))
-        width = np.ldexp(2.0 / _BINS, np.frexp(np.maximum(half, 1e-290))[1])
+        half = max(high / 2 - low / 2, np.spacing(max(abs(low), abs(high))), 1e-290)
+        width = math.ldexp(2.0 / _BINS, math.frexp(half)[1])
         origin = np.floor(low / width)
-        earlier = self._bins
-        self._bins = np.zeros_like(earlier)
-        for k, bins in enumerate(self._bins):
-            full = np.flatnonzero(earlier[k])
-            moved = np.floor((self._origin[k] + full) * (self._width[k] / width[k])) - origin[k]
-            np.add.at(bins, moved.astype(int), earlier[k, full])
-            added = np.floor(frames[:, k] / width[k]) - origin[k]
-            bins += np.bincount(added.astype(int), minlength=_BINS + 1)
-        self._range, self._width, self._origin = np.stack([low, high]), width, origin
+        full = np.flatnonzero(self._bins[k])
+        moved = np.floor((self._origin[k] + full) * (self._width[k] / width)) - origin
+        bins = np.bincount((np.floor(values / width) - origin).astype(int), minlength=_BINS + 1)
+        np.add.at(bins, moved.astype(int), self._bins[k, full])
+        self._bins[k] = bins
+        self._range[:, k], self._width[k], self._origin[k] = (low, high), width, origin
 
     def statistics(self) -> np.ndarray:
         """As `frame_statistics` has them, but each quantile up to a bin lower: at most 1/8192 of
