@@ -155,7 +155,7 @@ DAMAGES: dict[str, tuple[Callable[[pa.Table], pa.Table], str]] = {
         lambda table: table.slice(150),
         "3 rows of episodes and 300 frames",
     ),
-    "shuffled": (shuffle, "_index of frame 0 is "),
+    "shuffled": (shuffle, "episode_index of frame 2 is 1, expected 0"),
     "two steps swapped": (swap(20, 21), "frame_index of frame 20 is 21, expected 20"),
     "episodes mixed": (swap(149, 150), "episode_index of frame 149 is 1, expected 0"),
 }
