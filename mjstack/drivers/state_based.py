@@ -12,7 +12,7 @@ from typing_extensions import override
 
 from mjstack.drivers.feedback import STAY, FeedbackDriver, State, servo_lag
 from mjstack.drivers.roles import Role, find_roles
-from mjstack.managers.view import EnvView
+from mjstack.managers.view import EnvView, offers
 from mjstack.math import atan2, norm, quat_to_matrix
 from mjstack.mdp.geometry import pose_w, robot
 from mjstack.tasks.check import make_check
@@ -74,6 +74,7 @@ class _Due(NamedTuple):
     beside: Tensor
 
 
+@offers("driver")
 class StateBasedDriver(FeedbackDriver):
     """Joint targets that are a function of the simulation's state: no clock, no memory.
 
