@@ -85,8 +85,7 @@ def altered_stage(task: str, robot: str, nworld: int) -> Stage:
     folder = EXAMPLES / task / "conf"
     start = [f"task={task}", f"robot={robot}", "sim=native", f"nworld={nworld}"]
     phases = load_config(start, config_dir=folder).controller.phases
-    brief = STEPS * 0.02 / len(phases)
-    seconds = [f"controller.phases.{name}.seconds={brief}" for name in phases]
+    seconds = [f"controller.phases.{name}.seconds=0.2" for name in phases]
     cfg = load_config([*start, *seconds, f"task.episode_steps={STEPS}"], config_dir=folder)
     return Stage(cfg)
 
