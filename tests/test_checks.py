@@ -259,7 +259,7 @@ def test_a_check_may_be_about_no_object(least: float, broken: list[str]) -> None
 @pytest.mark.parametrize(
     ("wrong", "text"),
     [
-        ("shape", r"task.check.func: placed returned a torch.bool tensor of shape \(2,\)"),
+        ("shape", r"task.check.func: placed: a torch.bool tensor of shape \(2,\)"),
         ("rests", "self.objects names none"),
     ],
 )

@@ -77,7 +77,7 @@ PATHS: dict[str, dict[str, str] | None] = {
     },
     "tasks/placed.py": {"HeldSuccess": "__call__ _holds reset"},
     "tasks/stack.py": {
-        "StackCheck": "placed placed_of on_top on_table goals",
+        "StackCheck": "placed placed_of on_top goals",
         "StackSuccess": "_look _replace_oldest __call__",
     },
     "tasks/box.py": {

@@ -92,10 +92,10 @@ class BoxCheck(EpisodeCheck):
                 f"settled_steps_{name}_min": (f"settled_steps_{name}", "min"),
             }
 
-        def rests(step: Step) -> tuple[Tensor, ...]:
-            return step.untouched, self.placed(step), step.corner_speed < t.rest_speed
-
-        self.resting = AllOf(("untouched", "inside", "rest_speed"), rests)
+        self.resting = AllOf(
+            ("untouched", "inside", "rest_speed"),
+            lambda step: (step.untouched, self.placed(step), step.corner_speed < t.rest_speed),
+        )
         hold = parts.in_hand(*self.objects)
         grasp = parts.Streak(
             *("GRASP", "{object} not grasped", self.objects, hold, t.grasp_steps),
@@ -213,11 +213,9 @@ class BoxCheck(EpisodeCheck):
 
     @override
     def trace(self, step: Step) -> dict[str, Tensor]:
+        slots = self.slots.items()
         return {
-            **{
-                f"slot_err_{name}_m": parts.away(step, name, slot)
-                for name, slot in self.slots.items()
-            },
+            **{f"slot_err_{name}_m": parts.away(step, name, slot) for name, slot in slots},
             "beyond_m": self.outside(step).amax((1, 2)),
             "corner_speed_m_per_s": step.corner_speed.amax(1),
         }

@@ -250,10 +250,10 @@ class Step:
         faces = {"box": "xyz", "cylinder": "z"}
         require_names(f"axis of {shape} {name}", [axis], [*"xyz", *["face"] * (shape in faces)])
         axis = faces[shape] if axis == "face" else axis
-        up = self.turn[:, self.view.number(name), 2]  # of each axis
-        up = up.abs() if either_end else up
-        up = up.sort(-1).values if axis == "xyz" else up.roll("zyx".index(axis), -1)
-        return atan2(norm(up[:, :2]), up[:, 2]).rad2deg()
+        cosines = self.turn[:, self.view.number(name), 2]  # of each axis
+        cosines = cosines.abs() if either_end or axis == "xyz" else cosines
+        ordered = cosines.sort(-1).values if axis == "xyz" else cosines.roll("zyx".index(axis), -1)
+        return atan2(norm(ordered[:, :2]), ordered[:, 2]).rad2deg()
 
     @step_value
     def in_hand(self) -> Tensor:
@@ -276,10 +276,9 @@ class Step:
         """Whether anything but a jaw presses on each object, shape ``(nworld, objects)``, bool;
         needs ``scene.support_sensors``.
         """
-        scene = self.view.env.cfg.scene
-        if not scene.support_sensors:
+        if not self.view.env.cfg.scene.support_sensors:
             expected = "true: the check asks what an object rests on"
-            raise ConfigError("scene.support_sensors", scene.support_sensors, expected)
+            raise ConfigError("scene.support_sensors", False, expected)
         return self._sensed(self.view.supports).any(-1)
 
     def judged(self, key: slice) -> Tensor:
@@ -297,8 +296,9 @@ class Step:
 
     def _of_each(self, values: list[Tensor]) -> Tensor:
         if not values:
-            problem = "task.check: a rule reads where objects are, but self.objects names none"
-            raise MjstackError(problem, "Name them in build")
+            raise MjstackError(
+                "task.check: a rule asks how objects are, but self.objects names none"
+            )
         return torch.stack(values, dim=1).float()
 
     def _sensed(self, columns: Columns) -> Tensor:
