@@ -333,10 +333,10 @@ class AllOf:
             holds = torch.stack(torch.broadcast_tensors(*holds), dim=-1)
         return holds if holds.dim() == 2 else holds.all(1)
 
-    def __and__(self, more: "AllOf") -> "AllOf":
+    def __and__(self, condition: "AllOf") -> "AllOf":
         """A condition of the parts of both, each for all its objects, shape ``(nworld,)``, bool."""
 
         def parts(step: Step) -> Tensor:
-            return torch.cat((self.apart(step), more.apart(step)), dim=-1)
+            return torch.cat((self.apart(step), condition.apart(step)), dim=-1)
 
-        return AllOf((*self.names, *more.names), parts)
+        return AllOf((*self.names, *condition.names), parts)
