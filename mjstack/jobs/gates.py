@@ -121,9 +121,9 @@ def _try_check(stage: Stage) -> None:
         check.update()
         check.result()
         placed = check.placed(check.view(env).step())
-        wanted = describe_tensor(torch.zeros((env.nworld, len(check.objects) or 1)) > 0)
-        if (found := describe_tensor(placed)) != wanted:
-            raise MjstackError(f"placed: {found}, expected {wanted}, of two worlds")
+        expected = describe_tensor(torch.zeros((env.nworld, len(check.objects) or 1)) > 0)
+        if (actual := describe_tensor(placed)) != expected:
+            raise MjstackError(f"placed: {actual}, expected {expected}, of two worlds")
 
 
 def check_cameras(stage: Stage) -> None:
