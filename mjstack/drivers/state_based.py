@@ -119,7 +119,7 @@ class StateBasedDriver(FeedbackDriver):
         things = list(cfg.scene.objects)
         judged = self._check.objects
         tensor = self._tensor
-        columns = [judged.index(r.name) if r.name in judged else len(judged) for r in moved]
+        columns = [1 + judged.index(r.name) if r.name in judged else 0 for r in moved]
         self._judged = tensor(columns)
         self._moved = tensor(things.index(r.name) for r in moved)
         self._grasps = tensor(r.way == "grasp" for r in moved)
@@ -252,7 +252,7 @@ class StateBasedDriver(FeedbackDriver):
             grasped[:, k] = between[:, k] & (state.opening <= _SHUT)
         placed = self._check.placed(self._view.step())
         unknown = torch.zeros_like(placed[:, :1])  # of an object that the check does not judge
-        placed = torch.cat((placed, unknown), dim=1).index_select(1, self._judged)
+        placed = torch.cat((unknown, placed), dim=1).index_select(1, self._judged)
         places = [self._point(state, row[Role.place].expand(len(pos))) for row in self._roles]
         offset = pos - (torch.stack(places, dim=1) - offsets)
         across = norm(offset[..., :2])
