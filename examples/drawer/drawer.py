@@ -72,14 +72,15 @@ class DrawerCheck(EpisodeCheck):
 
     def build(self) -> list[Rule]:
         """The rules, in the order of their bits."""
+        self.objects = ["cube"]
         t = self.t
-        steps = self.cfg.task.episode_steps
-
-        def on_rail(step: Step) -> torch.Tensor:
-            return (opening(step.view.env) <= t.stop)[:, None]
+        whole = self.cfg.task.episode_steps
 
         def still(step: Step) -> torch.Tensor:
             return (speed(step.view.env).abs() <= t.speed)[:, None]
+
+        def on_rail(step: Step) -> torch.Tensor:
+            return (opening(step.view.env) <= t.stop)[:, None]
 
         def alone(step: Step) -> torch.Tensor:
             return (force(step.view.env, "cabinet") == 0.0)[:, None]
@@ -88,15 +89,25 @@ class DrawerCheck(EpisodeCheck):
             InWindow("OPEN", "drawer not open", self.is_open, t.window, measure=self.trace),
             InWindow("STILL", "drawer moving", still, t.window),
             InWindow("LET_GO", "handle not let go of", self.let_go, t.window),
-            InWindow("ON_RAIL", "drawer pulled to its stop", on_rail, steps),
-            InWindow("ALONE", "cabinet touched", alone, steps),
+            InWindow("INSIDE", "cube not in the drawer", self.inside, t.window),
+            InWindow("ON_RAIL", "drawer pulled to its stop", on_rail, whole),
+            InWindow("ALONE", "cabinet touched", alone, whole),
         ]
 
     def is_open(self, step: Step) -> torch.Tensor:
+        """Whether the drawer is open, shape ``(nworld, 1)``."""
         return (opening(step.view.env) >= self.t.open)[:, None]
 
     def let_go(self, step: Step) -> torch.Tensor:
+        """Whether nothing touches the handle, shape ``(nworld, 1)``."""
         return (force(step.view.env, "handle") == 0.0)[:, None]
+
+    def inside(self, step: Step) -> torch.Tensor:
+        """Whether the cube is between the drawer's walls, shape ``(nworld, 3)``."""
+        env = step.view.env
+        middle = env.sim.site_xpos[:, env.sim.model.site("inside").id]
+        half = step.view.constant(*env.sim.model.site("inside").size)
+        return (step.center("cube") - middle).abs() <= half
 
     def placed(self, step: Step) -> torch.Tensor:
         """Whether the drawer is open and let go of, shape ``(nworld, 1)``."""
