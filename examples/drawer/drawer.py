@@ -47,9 +47,10 @@ def near(env: EnvView, *, scale: float) -> torch.Tensor:
     return 1.0 - torch.tanh(torch.linalg.vector_norm(to_handle(env), dim=1) / scale)
 
 
-def progress(env: EnvView, *, open: float) -> torch.Tensor:
-    """Reward for how far the drawer is open, as a fraction of ``open`` [m], from 0 to 1."""
-    return (opening(env) / open).clamp(0.0, 1.0)
+def progress(env: EnvView, *, open: float, stop: float) -> torch.Tensor:
+    """Reward for how far the drawer is open, as a fraction of ``open`` [m]; 0 from ``stop`` on."""
+    at = opening(env)
+    return (at / open).clamp(0.0, 1.0) * (at <= stop)
 
 
 def force(env: EnvView, name: str) -> torch.Tensor:
