@@ -219,9 +219,7 @@ def _compare_ends(run: Run, end: np.ndarray, result: GateResult) -> tuple[list[s
             quats = [torch.from_numpy(q[model.jnt_qposadr[number] :][3:7]) for q in ends]
             apart["rotation_deg"] = math.degrees(turn_between(thing.shape, *quats))
         result.metrics |= {f"final.{name}.{key}": value for key, value in apart.items()}
-        values = [
-            (1e3 * v, "mm") if key == "position_m" else (v, "deg") for key, v in apart.items()
-        ]
+        values = [(v, "deg") if "deg" in key else (1e3 * v, "mm") for key, v in apart.items()]
         text = f"{name} ends {' and '.join(f'{v:.2f} {unit}' for v, unit in values)} from native's"
         share = float(np.max([v / max(allowed[key], 1e-30) for key, v in apart.items()]))
         problems += [] if share <= 1.0 else [text]
