@@ -18,6 +18,8 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
+from mjstack.version import __version__ as __version__
+
 if TYPE_CHECKING:
     from mjstack.config import Config, load_config
     from mjstack.envs import Env, make_env
@@ -25,7 +27,6 @@ if TYPE_CHECKING:
     from mjstack.jobs.runner import verify
 
 __all__ = ["Config", "Env", "MjstackError", "load_config", "make_env", "verify"]
-__version__ = "0.2.0"
 
 _HOMES = {
     "Config": "mjstack.config",

@@ -23,7 +23,6 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-import mjstack
 from mjstack.cli_sweep import check_jobs, claim_sweep, expand, hydra_path, print_sweep
 from mjstack.config.explain import own_overrides
 from mjstack.config.help import help_text, key_help, list_text
@@ -42,6 +41,7 @@ from mjstack.interrupt import EXIT_CODE, begin_job
 from mjstack.process import is_rank
 from mjstack.report.record import Report, Status
 from mjstack.report.table import Console
+from mjstack.version import __version__
 
 if TYPE_CHECKING:
     from mjstack.jobs import CheckedJob
@@ -63,7 +63,7 @@ def run(args: list[str]) -> int:
     _assisting = False
     try:
         if "--version" in args:
-            print(f"mjstack {mjstack.__version__}")
+            print(f"mjstack {__version__}")
             return 0
         flags = _parse(args)
         with extended_search_path(flags.overrides, flags.config_dir) as overrides:

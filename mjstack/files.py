@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-import mjstack
 from mjstack.errors import FolderError, MjstackError, first_line
+from mjstack.version import __version__
 
 _MOST_TEXT = 2**26  # bytes of JSON or YAML
 _MOST_BYTES = 2**32  # of any other file, and of the arrays in one
@@ -258,7 +258,7 @@ def made_by(folder: Path) -> str:
         with suppress(OSError, ValueError, LookupError, TypeError, RecursionError):
             check_regular(report)
             version = json.loads(report.read_text())["provenance"]["versions"]["mjstack"]
-            return "" if version == mjstack.__version__ else f" of mjstack {str(version)[:40]}"
+            return "" if version == __version__ else f" of mjstack {str(version)[:40]}"
     return ""
 
 

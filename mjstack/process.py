@@ -32,9 +32,10 @@ def available_cores() -> int:
     return max(1, (cores or 1) // int(os.environ.get("LOCAL_WORLD_SIZE", 1)))
 
 
-def own_command(args: Sequence[str], module: str = "mjstack.__main__") -> list[str]:
-    """The command that starts this mjstack, or ``main`` of one of its modules, in a process."""
-    return [sys.executable, "-P", "-c", f"{_START} from {module} import main; main()", *args]
+def own_command(args: Sequence[str]) -> list[str]:
+    """The command that starts this mjstack in a process."""
+    start = f"{_START} from mjstack.__main__ import main; main()"
+    return [sys.executable, "-P", "-c", start, *args]
 
 
 class Child(subprocess.Popen[bytes]):

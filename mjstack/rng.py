@@ -7,7 +7,9 @@ of 2048 draws, and no draw depends on which other worlds reset.
 """
 
 import operator
+from contextlib import suppress
 from functools import lru_cache
+from typing import SupportsIndex
 
 import numpy as np
 import torch
@@ -86,8 +88,8 @@ def uniform(
     return torch.from_numpy(out.reshape(-1, 4 * blocks)[:, :size]).to(world.device)
 
 
-def check_seed(seed: int, *, masked: bool) -> int:
-    """The seed as a Python integer.
+def check_seed(seed: SupportsIndex, *, masked: bool = False) -> int:
+    """The seed, which may be NumPy's or torch's, as a Python integer.
 
     Raises:
         ArgumentError: It is no 32-bit integer, or a mask is given beside it.
@@ -95,7 +97,8 @@ def check_seed(seed: int, *, masked: bool) -> int:
     if masked:
         expected = "no mask beside it, because a seed starts every world anew"
         raise ArgumentError("seed", str(seed), expected, "Leave one out")
-    number = operator.index(seed) if hasattr(seed, "__index__") else -1
-    if isinstance(seed, bool) or not 0 <= number < 1 << 32:
-        raise ArgumentError("seed", repr(seed), "an integer from 0 to 4294967295")
-    return number
+    kind = str(getattr(seed, "dtype", type(seed).__name__))
+    with suppress(TypeError):  # no integer
+        if "bool" not in kind and 0 <= (number := operator.index(seed)) < 1 << 32:
+            return number
+    raise ArgumentError("seed", repr(seed), "an integer from 0 to 4294967295")

@@ -176,7 +176,7 @@ def test_vector_wrappers_of_gymnasium_work(make: Make) -> None:
 
 
 WRONG = [
-    ({"action": np.zeros((3, 2))}, r"action: found shape \(3, 2\), expected a float32 array"),
+    ({"action": np.zeros((3, 2))}, r"action: found shape \(3, 2\), expected an array of numbers"),
     ({"action": np.zeros(6)}, r"action: found shape \(6,\), expected"),
     ({"action": "up"}, r"action: found str, expected"),
     ({"action": np.full((3, 6), np.nan)}, r"found \[nan.* in world 0, expected finite numbers"),
@@ -203,6 +203,37 @@ def test_vector_wrong_actions_and_resets(
     env.reset()
     with pytest.raises(MjstackError, match=message):
         env.step(arguments["action"]) if "action" in arguments else env.reset(**arguments)
+
+
+SEEDS = [3, np.int64(3), np.uint8(3), np.array(3), torch.tensor(3)]
+
+
+@pytest.mark.parametrize("seed", SEEDS, ids=lambda seed: type(seed).__name__)
+@pytest.mark.parametrize("adapter", [GymnasiumVectorEnv, GymnasiumEnv])
+def test_seeds_of_other_types(make: Make, adapter: Any, seed: Any) -> None:
+    """As the environment itself takes them."""
+    env = adapter(make(nworld=1))
+    expected, _ = env.inner.reset(seed=3)
+    obs, _ = env.reset(seed=seed)
+    np.testing.assert_array_equal(obs, expected["policy"].numpy().reshape(obs.shape))
+    assert env.np_random_seed == 3
+
+
+WRONG_SEEDS = [True, np.True_, torch.tensor(True), 3.0, np.float64(3.0), "3", [3], np.array([3, 4])]
+WRONG_SEEDS += [-1, np.int64(-1), 1 << 32]
+
+
+@pytest.mark.parametrize("seed", WRONG_SEEDS, ids=repr)
+@pytest.mark.parametrize("adapter", [GymnasiumVectorEnv, GymnasiumEnv])
+def test_a_wrong_seed_resets_no_world(make: Make, adapter: Any, seed: Any) -> None:
+    env = adapter(make(nworld=1))
+    env.reset(seed=5)
+    before = env.inner.sim.qpos.clone()
+    for reset in (env.reset, env.inner.reset):
+        with pytest.raises(ArgumentError, match=r"seed: found .*an integer from 0 to 4294967295"):
+            reset(seed=seed)
+    assert torch.equal(env.inner.sim.qpos, before)
+    assert env.inner.seed == env.np_random_seed == 5
 
 
 # Gymnasium, one world

@@ -15,8 +15,7 @@ COPIES = {"tensor", "as_tensor", "from_numpy", "masked_select", "unique", "argwh
 CASTS = {"bool", "int", "float"}
 # The code that runs within a step, by file and class, "" for functions; None for all of a file.
 PATHS: dict[str, dict[str, str] | None] = {
-    "envs/env.py": {"Env": "advance _step_physics _evaluate _reset_ended"},
-    "envs/starts.py": {"Starts": "begin start"},
+    "envs/env.py": {"Env": "advance _step_physics _evaluate _reset_ended _begin _start"},
     "envs/command_delay.py": {"CommandDelay": "late reset"},
     "envs/faults.py": {"FaultLatch": "record record_reward"},
     "envs/outputs.py": {
@@ -108,7 +107,6 @@ PATHS: dict[str, dict[str, str] | None] = {
     "policy/network.py": {"PolicyNetwork": "normalized forward"},
     "episodes/failures.py": {"FailureMonitor": "update", "": "_of"},
     "kinematics/batched_ik.py": {"BatchedIk": "solve forward _launch _copy_in"},
-    "scene/index.py": {"Columns": "read write write_masked"},
     "sim/mjwarp.py": {"MjwarpSimulation": "step reset kinematics _decimation _pose _place"},
     "sim/usage.py": {"Usage": "count clear"},
     "sim/fused/constraints.py": {"": "collision solve"},
@@ -116,7 +114,7 @@ PATHS: dict[str, dict[str, str] | None] = {
     "sim/fused/step.py": {"": "rearranged_step"},
     "sim/graph.py": {"": "side_by_side where_any"},
     "sim/draws.py": {"": "draw_uniform"},
-    "sim/simulation.py": {"Simulation": "part"},
+    "sim/simulation.py": {"Columns": "read write write_masked", "Simulation": "part"},
     "math.py": None,
 }
 

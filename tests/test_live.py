@@ -142,9 +142,9 @@ def test_worlds_pause_step_and_are_chosen(
         wait_until(lambda: view._numbers == [4, 1])
         time.sleep(0.2)
         places, _ = Shapes(stage.assets.visual_model).poses(env.sim.qpos[[4, 1]].double().numpy())
-        for body, handle in view._view._handles:
+        for shape, handle in view._view._handles:
             held = np.asarray(handle.batched_positions)
-            assert np.allclose(held[:, 2], places[:, body, 2], atol=1e-4)
+            assert np.allclose(held[:, 2], places[:, shape.pose, 2], atol=1e-4)
         view._worlds.value = "99"
         line = "Worlds: '99' names none, expected numbers from 0 to 4"
         wait_until(lambda: line in view._status.value)

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from compositions import load_config
 from doc_blocks import ROOT, write_files
 
 import mjstack
@@ -19,6 +20,7 @@ from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
 from mjstack.gates.parity import (
     _compare_ends,
+    compare_options,
     compare_states,
     differences,
     end_state,
@@ -26,6 +28,7 @@ from mjstack.gates.parity import (
 )
 from mjstack.math import quat_mul
 from mjstack.report.record import GateResult, Status
+from mjstack.scene import build_model
 from mjstack.sim import make_simulation
 
 SCENES = {"box": "stack", "cylinder": "lift", "box in the jaws": "peg"}
@@ -193,3 +196,17 @@ def test_ends_of_all_joints_but_the_robots_are_compared(
     assert farthest is None or lines == [f"{text} from native's" for text in farthest]
     assert not any("arm" in name for name in result.metrics)
     assert {"final.drawer.position_m", "final.lid.rotation_deg"} <= result.metrics.keys()
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
+def test_the_cone_reaches_both_backends(cone: str) -> None:
+    cfg = load_config([f"solver.cone={cone}"])
+    model = build_model(cfg)
+    native, mjwarp = (
+        make_simulation(model, cfg, 1, backend=kind, device="cpu")
+        for kind in (Backend.native, Backend.mjwarp)
+    )
+    configured, compiled, uploaded, equal = compare_options(cfg, native, mjwarp)["cone"]
+    assert configured == compiled == uploaded == f"mjCONE_{cone.upper()}"
+    assert equal

@@ -233,3 +233,29 @@ def test_only_modules_beside_the_folder_are_trusted(lean: Path, monkeypatch: Pat
         assert in_search_path("lean.height", Path("config.yaml"))
         for name in ("os.system", "sys.exit", "shutil.rmtree", "nowhere.at_all"):
             assert not in_search_path(name, Path("config.yaml")), name
+
+
+MARK = "\ufeff"
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_a_byte_order_mark_hides_nothing(end: str, tmp_path: Path, capsys: Capture) -> None:
+    """In any file of the search path: the header, defaults, and the comment that ``list`` shows."""
+    glob = "# @package _global_"
+    files = {
+        "experiment/marked.yaml": f"{glob}|defaults:|  - override /task: leaning|nworld: 7|",
+        "task/leaning.yaml": f"{glob}|# It leans|defaults:|  - stack|task:|  name: leaning|",
+        "robot/ours.yaml": "defaults:|  - so101|title: Ours|",
+        "gate/upright.yaml": "# @package gate.upright|func: mjstack.gates.batch.run_batch|",
+        "task/plain.yaml": "# It has no header|name: plain|",
+    }
+    for name, text in files.items():
+        path = tmp_path / "conf" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes((MARK + text.replace("|", end)).encode())
+    cfg = load_config(["experiment=marked", "robot=ours"], config_dir=tmp_path / "conf")
+    assert (cfg.nworld, cfg.task.name, cfg.robot.title) == (7, "leaning", "Ours")
+    assert run(["--config-dir", str(tmp_path / "conf"), "list", "tasks"]) == 0
+    out = capsys.readouterr().out
+    assert "leaning      It leans" in out
+    assert "plain        It has no header" in out

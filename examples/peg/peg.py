@@ -36,8 +36,10 @@ class PegCheck(EpisodeCheck):
         """The rules, in the order of their bits."""
         self.objects = ["peg"]
         w = self.t.window
+        in_hole = InWindow("IN_HOLE", "peg not in the hole", self.placed, w, measure=self.trace)
+        in_hole.limits[0]["off_m"] = (0.0, self.t.within)
         return [
-            InWindow("IN_HOLE", "peg not in the hole", self.placed, w, measure=self.trace),
+            in_hole,
             InWindow("BOTTOM", "peg not at the bottom", on_table("peg", gap=0.002), w),
             InWindow("RELEASED", "peg not released", released("peg", open_fraction=0.8), w),
             AtRest(w, speed=0.05, position=0.005, rotation_deg=3.0),

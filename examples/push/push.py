@@ -37,9 +37,13 @@ class PushCheck(EpisodeCheck):
         """The rules, in the order of their bits."""
         self.objects = ["puck"]
         flat = on_table("puck", gap=self.t.lift)
+        at_goal = InWindow(
+            "AT_GOAL", "puck not at goal", self.placed, self.t.window, measure=self.trace
+        )
+        at_goal.limits[0]["distance_m"] = (0.0, self.t.within)
         return [
             InWindow("FLAT", "puck left the table", flat, self.cfg.task.episode_steps),
-            InWindow("AT_GOAL", "puck not at goal", self.placed, self.t.window, measure=self.trace),
+            at_goal,
             InWindow("LEFT_ALONE", "puck touched", lambda step: step.untouched, self.t.window),
             AtRest(self.t.window, speed=0.05, position=0.005, rotation_deg=3.0),
         ]

@@ -8,6 +8,7 @@ from numpy import ndarray
 
 from mjstack.envs import Env
 from mjstack.errors import ArgumentError, ConfigError, MissingExtra, require_names
+from mjstack.rng import check_seed
 
 try:
     import gymnasium
@@ -95,8 +96,9 @@ class GymnasiumVectorEnv(VectorEnv):
         require_names("reset option", rest, ("reset_mask",))
         if mask is not None:
             mask = torch.as_tensor(mask, device=self.inner.device)
+        if seed is not None:  # before any world is reset; Gymnasium takes Python's integers alone
+            seed = check_seed(seed, masked=mask is not None)
         obs, _ = self.inner.reset(seed=seed, mask=mask)
-        # After the environment, whose message about a wrong seed says more.
         super().reset(seed=seed)
         return _numpy(obs, self.group), {}
 
@@ -104,7 +106,7 @@ class GymnasiumVectorEnv(VectorEnv):
         """Advance every world by one control interval.
 
         Args:
-            actions: Shape ``(num_envs, action_dim)``, float32.
+            actions: Shape ``(num_envs, action_dim)``, numbers.
 
         Returns:
             Observations ``(num_envs, dim)``, float32; rewards ``(num_envs,)``, float32;
@@ -181,14 +183,14 @@ class GymnasiumEnv(gymnasium.Env):
         if seed is not None or first is None:
             first, _ = self._worlds.reset(seed=seed)
         self._first = None
-        super().reset(seed=seed)
+        super().reset(seed=None if seed is None else check_seed(seed))
         return _row(first, 0), {}
 
     def step(self, action: ndarray) -> tuple[Observation, float, bool, bool, Info]:
         """Advance the world by one control interval.
 
         Args:
-            action: Shape ``(action_dim,)``, float32.
+            action: Shape ``(action_dim,)``, numbers.
 
         Returns:
             The observation ``(dim,)``, float32, the reward, whether the episode terminated, whether
@@ -234,7 +236,7 @@ def _row(obs: Observation, world: int) -> Observation:
 
 
 def _array(action: Any, space: spaces.Space) -> ndarray:
-    expected = f"a float32 array of shape {space.shape}"
+    expected = f"an array of numbers of shape {space.shape}"
     try:
         array = np.asarray(action, np.float32)
     except (TypeError, ValueError) as error:

@@ -89,7 +89,7 @@ class RslRlVecEnv(VecEnv):
         """Advance every world by one decision; worlds that end are reset in the same step.
 
         Args:
-            actions: Shape ``(num_envs, num_actions)``, float32.
+            actions: Shape ``(num_envs, num_actions)``, float32 or float64.
 
         Returns:
             ``observations``: every group, each ``(num_envs, dim)``, float32.

@@ -51,6 +51,7 @@ def complete(cfg: schema.Config) -> None:
         if hasattr(parent, last):  # not every job has observations
             setattr(parent, last, _typed_all(key, getattr(parent, last), kind))
     robot = cfg.robot
+    check_fields("robot", robot)
     robot.title = robot.title or robot.name
     robot.start = robot.start or list(robot.home)
     robot.ik_joints = robot.ik_joints or [n for n in robot.arm_joints if n not in robot.locked]

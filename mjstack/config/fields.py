@@ -43,6 +43,8 @@ class Range:
         ge: Values are at least this.
         le: Values are at most this.
         length: Number of items of a list.
+        vectors: Whether a mapping, of type ``dict[str, Any]``, holds lists of numbers. With their
+            type OmegaConf would refuse whole ones.
         choices: The only values.
         finite: Whether infinity is refused; NaN always is.
     """
@@ -52,6 +54,7 @@ class Range:
     ge: float | None = None
     le: float | None = None
     length: int | None = None
+    vectors: bool = False
     choices: tuple[object, ...] = ()
     finite: bool = True
 
@@ -148,6 +151,10 @@ def _check(path: str, value: object, owner: type, item: Field, *, inside: bool =
         check_fields(path, value)
     elif isinstance(value, Mapping):
         for name, part in value.items():
+            if limits.vectors:
+                if not isinstance(part, list) or {*map(type, part)} - {int, float}:
+                    raise ConfigError(f"{path}.{name}", part, accepted(owner, item, inside=True))
+                part[:] = map(float, part)
             _check(f"{path}.{name}", part, owner, item, inside=True)
     elif isinstance(value, list | tuple):
         if limits.length not in (None, len(value)) or not all(map(limits.holds, value)):
@@ -161,9 +168,9 @@ def accepted(owner: type, item: Field, *, inside: bool = False) -> str:
     [s]``.
     """
     hint = _hints(owner)[item.name]
-    kind, holders = _kind(hint)
-    holders = holders[inside:]
     limits = field_range(item)
+    kind, holders = _kind(dict[str, list[float]] if limits.vectors else hint)
+    holders = holders[inside:]
     if limits.choices or isinstance(kind, EnumMeta):
         choices = limits.choices or kind.__members__
         words = f"{'some' if holders else 'one'} of {', '.join(map(str, choices))}"

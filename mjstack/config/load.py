@@ -3,7 +3,7 @@
 import json
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
@@ -156,14 +156,14 @@ def compose(overrides: Sequence[str], run_mode: RunMode = RunMode.RUN) -> DictCo
     """
     if run_mode is RunMode.RUN:
         check_overrides(overrides)
-    loader = GlobalHydra.instance().config_loader()
+    loader: Any = GlobalHydra.instance().config_loader()
     try:
         cfg = loader.load_configuration(
             config_name=session.CONFIG_NAME, overrides=list(overrides), run_mode=run_mode
         )
         if run_mode is RunMode.RUN:
             check_added(session.without_hydra(cfg), overrides)
-            _drop_inherited(cfg, overrides)
+            _drop_inherited(cfg, loader.files[id(cfg)], overrides)
             complete_terms(cfg, overrides)
     except (HydraException, OmegaConfBaseException, AssertionError, TypeError, ValueError) as error:
         raise explain(error, overrides) from error
@@ -172,40 +172,41 @@ def compose(overrides: Sequence[str], run_mode: RunMode = RunMode.RUN) -> DictCo
     return cfg
 
 
-def _drop_inherited(cfg: DictConfig, overrides: Sequence[str]) -> None:
-    """Leave a term whose ``func`` an override swaps with the parameters that overrides give it:
-    those of the other function are not its own.
+def _drop_inherited(
+    cfg: DictConfig, files: Sequence[Mapping[str, object]], overrides: Sequence[str]
+) -> None:
+    """Leave a term, and the check, whose ``func`` a file or an override swaps with the parameters
+    that are given with the new one or after it: those of the other function are not its own.
+    ``files`` are the keys and values of each, in the order of composition.
     """
-    if not any("func" in override for override in overrides):
-        return
-    values = {o.key_or_group: o.value() for o in map(parse, own_overrides(overrides))}
-    # Other keys of a job or a gate are no parameters of its function.
-    terms = {
-        key: key.removesuffix(".func")
-        for key, value in values.items()
-        if (key.endswith(".func") or (isinstance(value, dict) and "func" in value))
-        and not re.match(r"job\.|gate\.(?!.*\.reset\.)", key)
-    }
-    rest = [o for o in overrides if o.lstrip("+").partition("=")[0] not in terms]
-    before = (
-        GlobalHydra.instance()
-        .config_loader()
-        .load_configuration(config_name=session.CONFIG_NAME, overrides=rest, run_mode=RunMode.RUN)
-    )
-    for term in terms.values():
-        old = OmegaConf.select(before, f"{term}.func")
-        if old is None or old == OmegaConf.select(cfg, f"{term}.func"):
+    typed: dict[str, object] = {}
+    for override in map(parse, own_overrides(overrides)):
+        value: Any = None if override.is_delete() else override.value()
+        typed |= {override.key_or_group: value}
+        typed |= dict(session.list_items(value, f"{override.key_or_group}."))
+    functions: dict[str, object] = {}  # by the mapping of their parameters
+    params: dict[str, set[str]] = {}
+    swapped = set()
+    for source in (*files, typed):
+        for key, value in source.items():
+            term, _, name = key.rpartition(".")
+            section = term if term == "task.check" else f"{term}.params"
+            if name == "func" and functions.setdefault(section, value) != value:
+                functions[section] = value
+                params[section] = {"func"}
+                swapped.add(section)
+        for key in source:
+            section, _, name = key.rpartition(".")
+            params.setdefault(section, set()).add(name)
+    for section in swapped:
+        parent, _, name = section.rpartition(".")
+        owner = OmegaConf.select(cfg, parent)
+        if not isinstance(owner, DictConfig) or name not in owner:
             continue
-        section = term if term == "task.check" else f"{term}.params"
-        changes = OmegaConf.create()
-        for key, value in values.items():
-            if f"{key}.".startswith(f"{term}."):
-                OmegaConf.update(changes, key, value)
-        params = {"func", *(OmegaConf.select(changes, section) or ())}
-        node = OmegaConf.select(cfg, section) or {}
-        with open_dict(cfg):
-            for name in node.keys() - params:
-                del node[name]
+        if isinstance(owner[name], DictConfig) and not OmegaConf.is_interpolation(owner, name):
+            with open_dict(cfg):
+                for key in owner[name].keys() - params[section]:
+                    del owner[name][key]
 
 
 def load_saved(path: Path) -> Config:

@@ -11,7 +11,7 @@ import os
 import re
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from importlib.metadata import entry_points
@@ -21,11 +21,13 @@ from typing import Any
 
 import yaml  # type: ignore[import-untyped]
 from hydra import initialize_config_dir
+from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.plugins import Plugins
 from hydra.core.singleton import Singleton
+from hydra.plugins.config_source import ConfigResult
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
@@ -89,12 +91,6 @@ def search_path_args(folders: Sequence[Path] | None = None) -> list[str]:
     """Arguments of a command that adds folders; those of the current search path if None."""
     folders = _added.get() if folders is None else folders
     return [arg for folder in folders for arg in ("--config-dir", str(folder))]
-
-
-def quoted(path: Path) -> str:
-    """A path as a value of an override."""
-    text = str(path).replace("\\", "\\\\").replace("'", "\\'")
-    return f"'{text}'"
 
 
 def add_folder(saved: Path) -> str:
@@ -249,6 +245,7 @@ def hydra_session() -> Iterator[Any]:
     GlobalHydra.instance().clear()
     try:
         Plugins.instance().register(_Folders)
+        Plugins.instance().register(_Folder)
         # All gates of the search path are composed, as mjstack's are.
         added = [
             n for n in list_choices()["gate"] if not (CONFIG_FOLDER / f"gate/{n}.yaml").exists()
@@ -257,11 +254,28 @@ def hydra_session() -> Iterator[Any]:
         ConfigStore.instance().store("added_gates", {"defaults": defaults}, provider="mjstack")
         initialize_config_dir(str(CONFIG_FOLDER), "run", version_base="1.3")
         hydra: Any = GlobalHydra.instance().hydra
-        loader = hydra.config_loader
-        loader.load_configuration = _once(loader.load_configuration)
+        _compose_once(hydra.config_loader)
         yield hydra
     finally:
         Singleton.set_state(outer)
+
+
+class _Folder(FileConfigSource):
+    """A folder of the search path. A file may begin with a byte order mark, which would hide its
+    header from Hydra.
+    """
+
+    @staticmethod
+    @override
+    def scheme() -> str:
+        return "mjstack"
+
+    @override
+    def load_config(self, config_path: str) -> ConfigResult:
+        result = super().load_config(config_path)
+        path = Path(self.path, self._normalize_file_name(config_path))
+        result.header = self._get_header_dict(path.read_text("utf-8-sig"))
+        return result
 
 
 class _Folders(SearchPathPlugin):
@@ -270,12 +284,22 @@ class _Folders(SearchPathPlugin):
     @override
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         for folder in config_folders():
-            search_path.append(PROVIDER, f"{_FILE}{folder}")
+            search_path.append(PROVIDER, f"{_Folder.scheme()}://{folder}")
 
 
-def _once(load: Callable[..., DictConfig]) -> Callable[..., DictConfig]:
-    """Return the composition of an earlier call with the same overrides."""
+def _compose_once(loader: Any) -> None:
+    """Let a loader of Hydra return the composition of an earlier call with the same overrides, and
+    keep in ``loader.files``, by the composition's id, the keys and values of each file behind it.
+    """
+    load, load_file = loader.load_configuration, loader._load_single_config
     composed: dict[tuple, DictConfig] = {}
+    files: list[dict[str, object]] = []
+    loader.files = {}
+
+    def load_one_file(default: Any, repo: Any) -> ConfigResult:
+        result = load_file(default, repo)
+        files.append(dict(list_items(result.config)))
+        return result
 
     def load_once(*, overrides: list[str], run_mode: RunMode, **options: Any) -> DictConfig:
         key = (*overrides, run_mode)
@@ -283,12 +307,15 @@ def _once(load: Callable[..., DictConfig]) -> Callable[..., DictConfig]:
             from mjstack.config.task_terms import choose_observation  # it reads CONFIG_FOLDER
 
             def compose(overrides: list[str]) -> DictConfig:
+                files.clear()
                 return load(overrides=_add_entries(overrides), run_mode=run_mode, **options)
 
             composed[key] = compose(choose_observation(overrides, compose))
+            loader.files[id(composed[key])] = files.copy()
         return composed[key]
 
-    return load_once
+    loader._load_single_config = load_one_file
+    loader.load_configuration = load_once
 
 
 def _add_entries(overrides: Sequence[str]) -> list[str]:

@@ -1,5 +1,6 @@
 """Worlds in motion, for the run's 3-D page: recorded on the device, failing ones first."""
 
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -13,6 +14,8 @@ from mjstack.episodes.recorder import Channels, Read, Recorder
 from mjstack.episodes.rollout import POLICY
 from mjstack.episodes.stage import Stage
 from mjstack.files import read_npz, reading, write_npz
+from mjstack.mdp.geometry import place_xy
+from mjstack.report.geometry import Fields, is_visible, match_geoms
 from mjstack.report.page import MOST_WORLDS, Page, World, frame_stride
 from mjstack.report.write import safely_write
 from mjstack.sim import Simulation
@@ -38,6 +41,34 @@ def motion_recorder(step_dt: float) -> Recorder:
         return range(0, steps + 1, stride)
 
     return Recorder(Channels(bind, ends))
+
+
+def world_fields(stage: Stage, env: Env, worlds: Sequence[int]) -> list[Fields]:
+    """Model fields of some worlds that pictures show, with the drawn places, those of the model
+    with visuals.
+    """
+    sim = env.sim
+    places = env.cfg.scene.places.items()
+    centers = {name: place_xy(env, name) for name, place in places if any(place.random_xy)}
+    fields = {name: values for name, values in sim.fields.items() if is_visible(name)}
+    if not centers and not fields:
+        return [{}] * len(worlds)
+    visual = stage.assets.visual_model
+    geoms = match_geoms(sim.model, visual)
+    rows = {}
+    for name, values in fields.items():
+        array = values[list(worlds)].cpu().numpy()
+        nominal = np.repeat(getattr(visual, name)[None], len(worlds), 0)
+        if name.startswith("geom_"):  # physics has fewer of them
+            nominal[:, geoms] = array
+        elif array.shape == nominal.shape:  # physics may have no light
+            nominal[:] = array
+        rows[name] = nominal
+    for name, xy in centers.items():
+        nominal = np.repeat(visual.geom_pos[None], len(worlds), 0)
+        disc = visual.geom(f"place/{name}").id
+        rows.setdefault("geom_pos", nominal)[:, disc, :2] = xy[list(worlds)].cpu().numpy()
+    return [{name: values[row] for name, values in rows.items()} for row in range(len(worlds))]
 
 
 def draw_seen(
@@ -81,7 +112,7 @@ def show_batch(
     path: Path,
     gate: str,
     qpos: Tensor,
-    sim: Simulation,
+    env: Env,
     failed: np.ndarray,
 ) -> None:
     """Add a gate's worlds to the page, failing ones first. A file keeps them for a resumed run.
@@ -92,21 +123,25 @@ def show_batch(
         path: The file.
         gate: The gate's name.
         qpos: Positions that `motion_recorder` has recorded of the configured seed.
-        sim: The worlds that have played it.
+        env: The worlds that have played it.
         failed: Bits of the task's rules, shape ``(nworld,)``.
     """
     rules = stage.check.rules
     chosen = np.argsort(failed[: qpos.shape[1]] == 0, kind="stable")[:MOST_WORLDS].tolist()
     motions = qpos[:, chosen].float().swapaxes(0, 1).cpu().numpy()
+    fields = world_fields(stage, env, chosen)
     moving: list[World] = []
     stride = frame_stride(stage.cfg.timing.step_dt)
-    for world, motion in zip(chosen, motions, strict=True):
+    for world, motion, values in zip(chosen, motions, fields, strict=True):
         problem = rules.describe(failed[world])
         label = f"{world}: {problem}" if problem else str(world)
-        seen = draw_seen(stage, motion, sim, world, stride) if len(moving) < MOST_SEEN else {}
-        moving.append(World(label=label, qpos=motion, failed=bool(problem), images=seen))
+        seen = draw_seen(stage, motion, env.sim, world, stride) if len(moving) < MOST_SEEN else {}
+        moving.append(
+            World(label=label, qpos=motion, failed=bool(problem), images=seen, fields=values)
+        )
     page.worlds3d[gate] = moving
     arrays = {name: [getattr(world, name) for world in moving] for name in _PARTS}
+    arrays |= {name: [values[name] for values in fields] for name in fields[0]}
     if problem := safely_write(path, write_npz, arrays, stops=False):
         stage.progress.print_line(problem)
 
@@ -120,7 +155,13 @@ def restore_batch(page: Page, path: Path, gate: str) -> None:
     if path.exists():
         with reading(path, "Remove it"):
             arrays = read_npz(path)
+            parts = zip(*(arrays.pop(name) for name in _PARTS), strict=True)
             page.worlds3d[gate] = [
-                World(label=str(label), failed=bool(failed), qpos=qpos)
-                for label, failed, qpos in zip(*(arrays[name] for name in _PARTS), strict=True)
+                World(
+                    label=str(label),
+                    failed=bool(failed),
+                    qpos=qpos,
+                    fields={n: rows[number] for n, rows in arrays.items() if is_visible(n)},
+                )
+                for number, (label, failed, qpos) in enumerate(parts)
             ]

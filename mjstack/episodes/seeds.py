@@ -119,7 +119,7 @@ def _play(
                     tally.details.append(problem)
             if path is not None and record.seed == seeds[0]:
                 qpos = motion.rows.pop("qpos")
-                show_batch(run.stage, run.page, path, tally.gate, qpos, sim, record.failed)
+                show_batch(run.stage, run.page, path, tally.gate, qpos, batch.env, record.failed)
             _count(run, tally, record)
     except Exception as error:
         check_interrupt()
@@ -175,13 +175,27 @@ def _worlds(tally: EpisodeTally, run: Run) -> Worlds:
         broken=[rules.broken(failed) for failed in bits[plotted].tolist()],
         rules=rules.texts,
         values={name: values[plotted] for name, values in tally.values.items()},
+        limits=tally.check.limits,
     )
-    start = tally.array("start_qpos")[plotted]
+    # What the check judges, and what else differs
     moving = run.page.worlds3d.get(tally.gate, [])
-    for name, (at, _) in run.stage.index.objects.items():
-        xy = slice(at, at + 2)
-        ways = [(world.label, world.failed, world.qpos[:, xy]) for world in moving]
-        worlds.maps.append(Map(title=name, xy=start[:, xy], table=table, ways=ways))
+    objects = run.stage.index.objects
+    judged = tally.check.objects
+    starts = tally.places
+    marks = {name: place.xy for name, place in scene.places.items()}
+    marks |= {name: at for name, at in run.stage.index.fixed.items() if name in judged}
+    marks = {name: at[:2] for name, at in marks.items() if name not in starts}
+    for name, places in starts.items():
+        if name in objects and name not in judged:
+            worlds.unjudged.append(name)
+            continue
+        ways = []
+        if name in objects:
+            xy = slice(objects[name][0], objects[name][0] + 2)
+            ways = [(world.label, world.failed, world.qpos[:, xy]) for world in moving]
+        worlds.maps.append(
+            Map(title=name, xy=places[plotted, :2], table=table, ways=ways, marks=marks)
+        )
     return worlds
 
 
@@ -189,6 +203,7 @@ def _record(stage: Stage, batch: Batch, monitor: FailureMonitor | None) -> Episo
     """The record of this rank's worlds."""
     sim = batch.env.sim
     episode = batch.episode
+    places = episode.places
     place = f"rank {stage.ranks.rank}: {socket.gethostname()}, {sim.device}"
     return EpisodeRecord(
         seed=batch.plan.seed,
@@ -202,9 +217,10 @@ def _record(stage: Stage, batch: Batch, monitor: FailureMonitor | None) -> Episo
             "measured.waypoint_error_m": episode.waypoint_error,
             "measured.peak_contacts": sim.peak_contacts.cpu().numpy().copy(),
             "measured.peak_constraint_rows": sim.peak_constraints.cpu().numpy().copy(),
+            **({"start_places": np.stack([*places.values()], 1)} if places else {}),
             **(circumstances(episode, monitor) if monitor else {}),
         },
-        object_names=list(stage.index.objects) if monitor else [],
+        object_names=list(places),
         phase_names=[phase.name for phase in monitor.driver.phases] if monitor else [],
         seconds=episode.timing.seconds,
         steps=int(sim.step_count.sum()),

@@ -69,13 +69,14 @@ def run_success(run: Run) -> list[GateResult]:
         signs=True,
         observers=lambda seed: [_StartsWriter(success_run, seed, unwritten), *goals],
     )
-    starts = tally.array("start_places")
+    places = tally.places
+    starts = np.stack([*places.values()], axis=1)
     retries = tally.array("retries")
     succeeded = tally.array("failed") == 0
     retried = int((retries > 0).sum())
     retried_succeeded = int(((retries > 0) & succeeded).sum())
-    regions = find_regions(t, starts, succeeded, tally.records[0].object_names)
-    distinct = len(np.unique(np.round(starts, 6).reshape(len(starts), -1), axis=0))
+    regions = find_regions(t, starts, succeeded, list(places))
+    distinct = len(np.unique(np.round(np.nan_to_num(starts), 6).reshape(len(starts), -1), axis=0))
     lost = sum(goal.lost for goal in goals)
     doubts = find_doubts(distinct, tally.episodes, tally.successes, lost, t.rate)
     tally.details = unwritten + doubts + tally.details
@@ -201,8 +202,8 @@ def find_regions(
 
     Args:
         cfg: The configuration of the gate, with their widths and the least number of episodes.
-        places: x and y [m] and rotation about z [rad] of each object at the start, shape ``(n,
-            objects, 3)``.
+        places: x and y [m] and rotation about z [rad] of each object at the start, NaN for a place,
+            shape ``(n, objects, 3)``.
         succeeded: Whether each episode was, shape ``(n,)``, bool.
         objects: Names of the objects.
     """
@@ -213,7 +214,7 @@ def find_regions(
         yaw = radial_yaw_deg(places[:, number])
         keys = np.floor(np.column_stack((places[:, number, :2], yaw)) / widths + _EDGE)
         keys[keys[:, 2] * cfg.yaw_cell_deg >= 90.0, 2] = 0.0  # on the edge of 90, which is 0
-        for axes in ([0, 1], [2], [0, 1, 2]):
+        for axes in ([0, 1],) if np.isnan(yaw).any() else ([0, 1], [2], [0, 1, 2]):
             cells, which = np.unique(keys[:, axes], axis=0, return_inverse=True)
             for row, key in enumerate(cells):
                 outcomes = succeeded[which.ravel() == row]

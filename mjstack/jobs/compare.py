@@ -16,7 +16,7 @@ from mjstack.config.fingerprint import config_content, differences
 from mjstack.config.load import load_config
 from mjstack.config.schema import Backend, Config
 from mjstack.episodes.batches import BatchPlan, play_batches
-from mjstack.episodes.motion import motion_recorder
+from mjstack.episodes.motion import motion_recorder, world_fields
 from mjstack.episodes.replay import simulate_alone
 from mjstack.episodes.rollout import require_episode
 from mjstack.episodes.run import Run
@@ -201,10 +201,14 @@ def _replay(sides: Sides, rows: Sequence[Mapping[str, Any]]) -> list[World]:
             seed = batch.plan.seed
             motions = batch.rows["qpos"].float().swapaxes(0, 1).cpu().numpy()
             bits = batch.episode.failed.tolist()
-            for world, qpos, failed in zip(batch.plan.worlds, motions, bits, strict=True):
+            fields = world_fields(stage, batch.env, range(len(bits)))
+            episodes = zip(batch.plan.worlds, motions, bits, fields, strict=True)
+            for world, qpos, failed, values in episodes:
                 problem = stage.check.rules.describe(failed)
                 label = f"{seed}:{world} {name} {problem}".rstrip()
-                moving[seed, world, name] = World(label=label, qpos=qpos, failed=failed > 0)
+                moving[seed, world, name] = World(
+                    label=label, qpos=qpos, failed=failed > 0, fields=values
+                )
     return [moving[key] for key in sorted(moving)]
 
 

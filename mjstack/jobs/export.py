@@ -9,7 +9,6 @@ from typing import Any
 
 import mujoco
 
-import mjstack
 from mjstack.config.schema import Config
 from mjstack.envs import driven_config
 from mjstack.episodes.rollout import POLICY as DRIVER
@@ -25,6 +24,7 @@ from mjstack.policy.checkpoint import policy_facts
 from mjstack.policy.lerobot import lerobot_files
 from mjstack.policy.onnx import require_onnx, to_onnx
 from mjstack.report.record import GateResult, Status
+from mjstack.version import __version__
 
 NAME = "export"
 POLICY = "policy.onnx"
@@ -92,7 +92,7 @@ def export_facts(stage: Stage) -> dict[str, Any]:
     network = policy.network
     return policy_facts(policy) | {
         "versions": policy.versions,
-        "exported_with": {"mjstack": mjstack.__version__, "mujoco": mujoco.__version__},
+        "exported_with": {"mjstack": __version__, "mujoco": mujoco.__version__},
         "columns": {"names": columns.names, "units": columns.units},
         "normalization": {
             name: network.get_buffer(name).tolist() for name, _ in network.named_buffers()

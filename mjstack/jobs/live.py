@@ -4,7 +4,6 @@ import re
 import time
 from collections import deque
 from collections.abc import Mapping
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,10 +12,10 @@ from typing_extensions import override
 
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
+from mjstack.episodes.motion import world_fields
 from mjstack.episodes.rollout import Observer
 from mjstack.episodes.stage import Stage
 from mjstack.interrupt import check_interrupt
-from mjstack.report.geometry import Shapes
 from mjstack.report.page import MOST_WORLDS, World
 from mjstack.report.web import Stage as SceneView
 from mjstack.sim import StateRenderer
@@ -55,6 +54,7 @@ class LiveView(Observer):
         self._view: SceneView | None = None
         self._nworld = 0
         self._numbers = [0]  # of the worlds in the picture
+        self._fields: list[bytes] = []  # of these worlds
         self._part = ""
         self._choice = ("", 0)  # of the last picture: worlds and plotted world
         self._steps = 0  # that a click lets the run make
@@ -159,13 +159,18 @@ class LiveView(Observer):
         elif numbers != self._numbers:
             self._numbers = numbers
             self._view = None
+        fields = world_fields(self._stage, env, self._numbers)
+        content = [values.tobytes() for world in fields for values in world.values()]
+        if content != self._fields:  # an episode may draw them anew
+            self._fields = content
+            self._view = None
         index = torch.tensor(self._numbers, device=env.device)
         qpos = env.sim.qpos[index].double().cpu().numpy()
         if self._view is None:
             self._server.scene.reset()
-            places = zip(env.world[index].tolist(), qpos[:, None], strict=True)
-            worlds = [World(label=str(number), qpos=frames) for number, frames in places]
-            self._view = SceneView(self._server, self._shapes, worlds)
+            rows = zip(env.world[index].tolist(), qpos[:, None], fields, strict=True)
+            worlds = [World(label=str(n), qpos=frames, fields=values) for n, frames, values in rows]
+            self._view = SceneView(self._server, self._stage.assets.visual_model, worlds)
         self._view.update(np.nan_to_num(qpos))
         world = min(max(0, int(plotted)), env.nworld - 1)
         terms, lines = self._values(world)
@@ -184,11 +189,6 @@ class LiveView(Observer):
         title = f"{self._part}, step {step:,}, {env.nworld:,} worlds"
         lines_shown = [title, f"world {world}: {terms}", *problem]
         self._status.value = "\n".join(line[: 2 * _TEXT] for line in lines_shown)
-
-    @cached_property
-    def _shapes(self) -> Shapes:
-        """Geometry of the scene."""
-        return Shapes(self._stage.assets.visual_model)
 
     def _values(self, world: int) -> tuple[str, dict[str, dict[str, float]]]:
         """A world's state in words, and the lines of the plots by title."""

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import Config, PlayJobCfg
-from mjstack.episodes.motion import draw_seen
+from mjstack.episodes.motion import draw_seen, world_fields
 from mjstack.episodes.recorder import WorldRecorder
 from mjstack.episodes.replay import simulate_alone
 from mjstack.episodes.rollout import POLICY, play_episode, rollout
@@ -21,6 +21,7 @@ from mjstack.gates.runner import run_guarded
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import VIEWS, CheckedJob, Job
 from mjstack.jobs.showing import check_showing
+from mjstack.report.geometry import Fields
 from mjstack.report.gl import require_offscreen
 from mjstack.report.picture import save_video
 from mjstack.report.record import GateResult, Status
@@ -69,6 +70,7 @@ def play_worlds(run: Run) -> list[GateResult]:
     positions = []
     seen = []
     fields = []
+    scenes: list[Fields] = []
     details = []
     succeeded = 0
     with closing(simulate_alone(stage, *stage.backend)) as sim:
@@ -90,8 +92,9 @@ def play_worlds(run: Run) -> list[GateResult]:
             positions.append(recorder.qpos)
             if cfg.video and job.camera is None:
                 seen.append(draw_seen(stage, recorder.qpos, sim))
+            scenes += world_fields(stage, env, [0])
             fields.append({name: value.clone() for name, value in sim.fields.items()})
-            run.show_world(f"{NAME}_{world}", str(world), recorder.qpos, status, sim)
+            run.show_world(f"{NAME}_{world}", str(world), recorder.qpos, status, env)
             details.append(f"world {world}: {outcome}")
             run.print_line(details[-1])
     result = GateResult(
@@ -103,7 +106,7 @@ def play_worlds(run: Run) -> list[GateResult]:
         details=details,
     )
     if cfg.video:
-        _save(run, np.stack(positions), fields, seen, result)
+        _save(run, np.stack(positions), fields, scenes, seen, result)
     return [result]
 
 
@@ -111,6 +114,7 @@ def _save(
     run: Run,
     qpos: np.ndarray,
     fields: Sequence[Mapping[str, torch.Tensor]],
+    scenes: Sequence[Fields],
     seen: Sequence[Mapping[str, np.ndarray]],
     result: GateResult,
 ) -> None:
@@ -129,7 +133,7 @@ def _save(
             save_video, path, model, qpos, step_dt, advance, fps=job.fps, width=job.width
         )
         if job.camera is None:
-            save(seen=seen)
+            save(seen=seen, fields=scenes)
             return
         looks = {field: torch.cat([world[field] for world in fields]) for field in fields[0]}
         name = f"images.{job.camera}"

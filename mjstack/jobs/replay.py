@@ -79,7 +79,7 @@ def _plan_replay(cfg: Config) -> ReplayPlan:
     """
     for key, expected in (("run", "the folder of an earlier run"), ("world", "one of its worlds")):
         if getattr(cfg, key) is None:
-            fix = "Write job=replay run=outputs/<date>/<time> world=17"
+            fix = "Write mjstack job=replay run=outputs/DATE/TIME world=17"
             raise ConfigError(key, "null", f"{expected}, because job=replay plays one again", fix)
     resolve_backend(cfg)  # what this command line asks for must be there
     run = EarlierRun.read(str(cfg.run))
@@ -248,7 +248,8 @@ def _replay(
         qpos = trace.arrays["qpos"]
         status, reason, metrics, beyond = run.judge_one(episode)
         title = f"world {plan.world} of seed {plan.seed}, replayed ({backend})" if first else ""
-        run.show_world(f"replay_{backend}", f"{plan.world}, {backend}", qpos, status, sim, title)
+        label = f"{plan.world}, {backend}"
+        run.show_world(f"replay_{backend}", label, qpos, status, trace.env, title)
     agrees, comparison = _compare(plan, number, episode, qpos[-1], changes, run)
     lines += [_first_sign(monitor, episode) for monitor in monitors]
     for line in lines:

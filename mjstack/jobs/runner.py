@@ -21,6 +21,7 @@ import torch
 from rich.markup import escape
 
 from mjstack.config import load_config
+from mjstack.config.explain import command
 from mjstack.config.fingerprint import config_content, config_hash, differences
 from mjstack.config.functions import find_object
 from mjstack.config.schema import Backend, Config
@@ -117,7 +118,9 @@ class CheckedJob:
         console = Console(highlight=False, soft_wrap=True)
         cfg = self.stage.cfg
         page = Page(
-            title=f"{cfg.robot.title}, {self.title}", motion=cfg.web.episode and not lacks_viser()
+            title=f"{cfg.robot.title}, {self.title}",
+            command=command(*overrides),
+            motion=cfg.web.episode and not lacks_viser(),
         )
         report = Report(
             folder=folder,
@@ -185,8 +188,8 @@ class CheckedJob:
             self.work(run, folder)
         report.conclude()
         write_formats(report, page)
-        showing.draw_episode(self.stage, folder, run.artifacts.pictured, run.draw)
-        page.note = showing.save_page(self.stage, folder, page)
+        showing.draw_episode(self.stage, folder, run.artifacts.pictured, page, run.draw)
+        showing.save_page(self.stage, folder, page)
 
     def _load(self, *, warp: bool) -> None:
         """Load MuJoCo Warp, if asked to, and have the collector, which gates call often, pass over

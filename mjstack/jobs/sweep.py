@@ -15,8 +15,9 @@ import torch
 
 from mjstack.config import spec
 from mjstack.config.complete import typed
-from mjstack.config.session import quoted, search_path_args
-from mjstack.errors import ConfigError, FolderError
+from mjstack.config.explain import assign
+from mjstack.config.session import search_path_args
+from mjstack.errors import ConfigError, FolderError, first_line
 from mjstack.files import check_unused, lock, move_aside, refuse_links, write_atomic
 from mjstack.interrupt import interrupted
 from mjstack.process import POLL, Child, stop_all
@@ -153,11 +154,13 @@ class Queueing:
                 raise ConfigError("hydra.launcher.jobs", count, f"at most {gpus}, a GPU for each")
             visible = os.environ.get("CUDA_VISIBLE_DEVICES") or ",".join(map(str, range(gpus)))
             # Below the home: in a shared folder, others could hold a lock for ever.
-            locks = Path.home() / ".cache/mjstack/gpus" / socket.gethostname()
+            locks = Path("~/.cache/mjstack/gpus", socket.gethostname())
             try:
+                locks = locks.expanduser()
                 locks.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                problem = f"{locks}: {error.strerror}, expected a folder for the GPUs' locks"
+            except (OSError, RuntimeError) as error:  # the other one: there is no home folder
+                reason = getattr(error, "strerror", None) or first_line(error)
+                problem = f"{locks}: {reason}, expected a folder for the GPUs' locks"
                 raise FolderError(problem, "Set HOME to a folder of yours") from error
             return [
                 Slot(f"GPU {name}", {"CUDA_VISIBLE_DEVICES": name}, lock=locks / name)
@@ -305,7 +308,7 @@ class _Queue:
                     return False
                 locks.enter_context(gpu)
             key = "resume" if job.set_aside() else "hydra.run.dir"
-            args = [*job.overrides, f"{key}={quoted(job.folder)}", *search_path_args()]
+            args = [*job.overrides, assign(key, job.folder), *search_path_args()]
             logged = log.tell()
             child = Child(args, log, env=slot.env, cores=slot.cores)
             self.running[slot] = _Running(job, child, logged, locks.pop_all())

@@ -11,7 +11,7 @@ from mjstack.managers.action import ActionTerm
 from mjstack.managers.view import EnvView
 from mjstack.math import atan2, norm
 from mjstack.mdp.geometry import Pose, robot
-from mjstack.scene.index import Columns
+from mjstack.sim.simulation import Columns
 
 _TILT_STEP = 0.03  # rad: how far `EndEffectorDelta` tilts the gripper in a step at most
 

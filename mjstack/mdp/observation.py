@@ -39,14 +39,11 @@ def joint_vel(env: EnvView) -> Tensor:
 
 
 @_in_metres
+@shared
 def grasp_point_pos(env: EnvView) -> Tensor:
     """Midpoint between the jaws [m], world frame, shape ``(nworld, 3)``. Not to be written into."""
-
-    def compute() -> Tensor:
-        first, second = (env.sim.part("site_xpos", site) for site in env.index.grasp_sites)
-        return 0.5 * (first + second)
-
-    return shared((id(env), grasp_point_pos), compute)
+    first, second = (env.sim.part("site_xpos", site) for site in env.index.grasp_sites)
+    return 0.5 * (first + second)
 
 
 @_in_metres

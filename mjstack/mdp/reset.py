@@ -15,7 +15,8 @@ from mjstack.math import quat_from_yaw, quat_mul
 from mjstack.mdp.geometry import Pose, robot, write_robot
 from mjstack.mdp.starts.placement import GAP, Placement, may_meet, require_reach
 from mjstack.mdp.starts.randomization import Elements, Randomized, bounds
-from mjstack.scene.index import Columns, joint_limits
+from mjstack.scene.index import joint_limits
+from mjstack.sim.simulation import Columns
 
 
 @offers("reset term")

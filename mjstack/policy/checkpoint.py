@@ -20,7 +20,6 @@ from safetensors import safe_open
 from safetensors.torch import load, save
 from torch import Tensor
 
-import mjstack
 from mjstack.config.complete import typed
 from mjstack.config.fingerprint import POLICY_FILE, config_content, policy_folder, shipped_policies
 from mjstack.config.schema import Config, ObservationGroupCfg, ObservationTermCfg, TermCfg
@@ -28,6 +27,7 @@ from mjstack.config.session import check_term
 from mjstack.errors import FolderError
 from mjstack.files import read_inside, reading, write_atomic
 from mjstack.policy.network import PolicyNetwork, Vision
+from mjstack.version import __version__
 
 Facts = dict[str, Any]
 """Values in JSON's types, by name."""
@@ -147,7 +147,8 @@ def save_policy(folder: Path, policy: Policy) -> None:
     digest = sha256(weights).hexdigest()
     facts = {
         **policy_facts(policy),
-        "versions": {module.__name__: module.__version__ for module in (mjstack, mujoco, torch)},
+        "versions": {"mjstack": __version__}
+        | {module.__name__: module.__version__ for module in (mujoco, torch)},
         "weights_sha256": digest,
         "config": policy.config,
     }
@@ -215,7 +216,7 @@ def load_policy(folder: Path) -> Policy:
             of = " of version 0.1" if facts["format"] in (3, 4) else ""
             raise FolderError(
                 f"policy={folder}: has format {facts['format']}{of}, expected {FORMAT}, which"
-                f" mjstack {mjstack.__version__} reads",
+                f" mjstack {__version__} reads",
                 "Use the mjstack that wrote it, or train it again",
             )
         policy = _from_facts(facts, path)

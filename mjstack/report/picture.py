@@ -1,5 +1,6 @@
 """Pictures of a run: the final scene, the objects' way there, and a video."""
 
+import copy
 import itertools
 import math
 import warnings
@@ -16,6 +17,7 @@ from PIL import Image
 
 from mjstack.errors import MissingExtra
 from mjstack.interrupt import check_interrupt
+from mjstack.report.geometry import Fields, write_fields
 from mjstack.report.gl import open_renderer
 from mjstack.report.page import frame_stride
 
@@ -58,13 +60,19 @@ def outline(centre: Sequence[float], half: Sequence[float], **style: Any) -> Any
 
 
 def _render(
-    model: mujoco.MjModel, states: np.ndarray, width: int, height: int
+    model: mujoco.MjModel,
+    states: np.ndarray,
+    width: int,
+    height: int,
+    fields: Sequence[Fields] = ({},),
 ) -> Iterator[np.ndarray]:
-    """Draw states offscreen, shape ``(n, nq)``: images of shape ``(height, width, 3)``, uint8.
+    """Draw states offscreen, shape ``(n, nq)``, of worlds with these model fields in turn: images
+    of shape ``(height, width, 3)``, uint8.
 
     Raises:
         MjstackError: This machine cannot draw offscreen.
     """
+    model = copy.copy(model)
     data = mujoco.MjData(model)
     renderer = open_renderer(model, height, width)
     x, _, z = model.geom_pos[model.geom("table").id].tolist()
@@ -75,8 +83,9 @@ def _render(
     camera.azimuth = 140.0
     camera.elevation = -24.0
     with renderer:
-        for state in states:
+        for state, values in zip(states, itertools.cycle(fields), strict=False):
             check_interrupt()
+            write_fields(model, values)
             data.qpos[:] = state
             mujoco.mj_forward(model, data)
             renderer.update_scene(data, camera)
@@ -104,6 +113,7 @@ def save_video(
     width: int | None = None,
     draw: Draw | None = None,
     seen: Sequence[Mapping[str, np.ndarray]] = (),
+    fields: Sequence[Fields] = ({},),
 ) -> None:
     """Write a video of episodes in real time, side by side: an mp4, or a GIF or WebP that loops, by
     the file's ending.
@@ -120,6 +130,7 @@ def save_video(
             3)``, uint8. By default the scene is seen from the side.
         seen: Images of each world by camera, each ``(steps, height, width, 3)``, that stand in its
             corner.
+        fields: Model fields of each world, for the scene as seen from the side.
 
     Raises:
         MjstackError: This machine cannot draw offscreen, or lacks what writes the format.
@@ -133,7 +144,7 @@ def save_video(
 
     images: Iterator[np.ndarray]
     if draw is None:
-        images = _render(model, states.reshape(-1, nq), wide, 3 * wide // 4)
+        images = _render(model, states.reshape(-1, nq), wide, 3 * wide // 4, fields)
     else:
         images = (image for frame in states for image in draw(frame))
     if seen:
@@ -239,7 +250,7 @@ def save_trajectories(
     positions: np.ndarray,
     objects: Mapping[str, tuple[Sequence[float], Sequence[float]]],
     fixed: np.ndarray,
-    places: Mapping[str, tuple[Sequence[float], Sequence[float]]],
+    places: Mapping[str, Sequence[Sequence[float]]],
     title: str,
 ) -> None:
     """Plot the objects' way among what does not move.
@@ -250,7 +261,7 @@ def save_trajectories(
         objects: Half sizes [m] and colour of each object by name.
         fixed: Corners of the boxes that hold fixed things [m], shape ``(n, 8, 3)``, in the order of
             their signs.
-        places: Position and half-widths of the region [m] of each place by name.
+        places: Position of each place by name, and middle and half-widths of its region [m].
         title: The picture's.
     """
     with figure(path, title, 3, figsize=(13, 4)) as (_, (side, above, height)):
@@ -259,10 +270,10 @@ def save_trajectories(
                 for face in box[_FACES][..., [1, row]]:
                     axes.fill(*face.T, color="0.75", zorder=0)
         for name, place in places.items():
-            at, half = 1e3 * np.fliplr(place)
+            at, middle, half = 1e3 * np.fliplr(place)
             above.plot(*at, "x", color="0.3")
             above.annotate(name, at, color="0.3")
-            above.add_patch(outline(at, half, linestyle=":"))
+            above.add_patch(outline(middle, half, linestyle=":"))
         for number, (name, (half, color)) in enumerate(objects.items()):
             mm = 1e3 * positions[:, number]
             for axes, row in ((side, 2), (above, 0)):

@@ -23,7 +23,7 @@ import numpy as np
 
 from mjstack.errors import ConfigError, MissingExtra, MjstackError
 from mjstack.interrupt import check_interrupt
-from mjstack.report.geometry import Shapes
+from mjstack.report.geometry import Shape, Shapes
 from mjstack.report.page import MOST_WORLDS, World
 
 EPISODE = "episode.html"
@@ -32,6 +32,7 @@ _TURN = 1.0 / 2**12  # of quaternions
 _LOOPBACK = ("127.0.0.1", "::1", "localhost")
 _MESSAGE = 2**16  # bytes, the largest of a browser
 _MARGIN = 0.12  # m between worlds
+_UNSEEN = ("site_", "cam_", "light_", "mat_")  # beginnings of model fields that it does not show
 _FAILED = np.array([0.86, 0.35, 0.32])
 _IMAGE = 0.16  # m, height of what a driver saw
 _UPRIGHT = (0.5, -0.5, -0.5, 0.5)  # it faces the viewer
@@ -47,37 +48,40 @@ def lacks_viser() -> str:
 class Stage:
     """Worlds side by side in a viser server's scene."""
 
-    def __init__(self, server: Any, shapes: Shapes, worlds: Sequence[World]) -> None:
+    def __init__(self, server: Any, model: mujoco.MjModel, worlds: Sequence[World]) -> None:
         """Add the worlds, in the model's own state.
 
         Args:
             server: A ``viser.ViserServer``.
-            shapes: The geometry of each world.
-            worlds: Their texts, and their images, which stand behind the table. In those that
-                failed, what does not move is red.
+            model: The scene with its visuals.
+            worlds: Their model fields, texts, and images, which stand behind the table. In those
+                that failed, the table and what stands still in all worlds alike are red.
         """
-        self._shapes = shapes
-        count = len(worlds)
-        low, high = shapes.box
-        self._offsets = _grid(count, high[:2] - low[:2] + _MARGIN)
-        self._handles: list[tuple[int, Any]] = []
-        places, turns = self._round(*shapes.poses(np.repeat(shapes.model.qpos0[None], count, 0)))
+        self._shapes = shapes = Shapes(model, [world.fields for world in worlds])
+        low, high = shapes.box()
+        self._offsets = _grid(len(worlds), high[:2] - low[:2] + _MARGIN)
+        self._handles: list[tuple[Shape, Any]] = []
+        places, turns = self._round(*shapes.poses(shapes.rest))
         self._last = (places, turns)
-        for number, (body, rgba, (vertices, faces)) in enumerate(shapes.meshes):
-            colors = [_FAILED if world.failed and not body else rgba[:3] for world in worlds]
+        failed = np.array([world.failed for world in worlds])
+        for number, shape in enumerate(shapes.meshes):
+            rgba = shape.rgba.copy()
+            rgba[failed[shape.worlds] & shape.table, :3] = _FAILED
+            alpha = rgba[:, 3]
             handle = server.scene.add_batched_meshes_simple(
                 f"/{number}",
-                vertices.astype(np.float32),
-                faces,
-                turns[:, body],
-                places[:, body],
-                batched_colors=np.round(255.0 * np.array(colors)).astype(np.uint8),
-                opacity=None if rgba[3] == 1.0 else rgba[3],
+                shape.mesh[0].astype(np.float32),
+                shape.mesh[1],
+                turns[shape.worlds, shape.pose],
+                places[shape.worlds, shape.pose],
+                batched_colors=np.round(255.0 * rgba[:, :3]).astype(np.uint8),
+                batched_opacities=None if np.ptp(alpha) == 0.0 else alpha / alpha.max(),
+                opacity=None if alpha.min() == 1.0 else float(alpha.max()),
                 flat_shading=True,
-                cast_shadow=body > 0,
+                cast_shadow=shape.pose > 0,
                 lod="off",
             )
-            self._handles.append((body, handle))
+            self._handles.append((shape, handle))
 
         # Texts, images, the floor, and where one looks from
         self._images: list[tuple[np.ndarray, Any]] = []
@@ -106,8 +110,10 @@ class Stage:
                 )
                 left += wide + 0.02
                 self._images.append((images, handle))
-        span = np.ptp(self._offsets, 0) + (high - low)[:2]
-        centre = np.array([*self._offsets.mean(0) + 0.5 * (low + high)[:2], 0.0])
+        size = (high - low)[:2]
+        span = np.ptp(self._offsets, 0) + size
+        middle = 0.5 * (low + high)[:2]
+        centre = np.array([*self._offsets.mean(0) + middle, 0.0])
         server.scene.add_grid(
             "/floor",
             width=float(span[0] + 2.0),
@@ -116,7 +122,6 @@ class Stage:
             section_size=1.0,
             position=[centre[0], centre[1], low[2] - 1e-3],
         )
-        reach = 0.3 + 0.56 * float(np.linalg.norm(span))
         server.scene.set_up_direction("+z")
         server.scene.configure_environment_map(None)
         server.scene.configure_default_lights(False)
@@ -124,6 +129,10 @@ class Stage:
         server.scene.add_light_directional(
             "/sun", position=centre + np.array([1.0, -1.5, 3.0]), intensity=1.6, cast_shadow=True
         )
+        if failed.any():  # one looks at the first of these
+            centre[:2] = self._offsets[failed.argmax()] + middle
+            span = size
+        reach = 0.3 + 0.56 * float(np.linalg.norm(span))
         server.initial_camera.position = centre + reach * np.array([0.75, -0.45, 0.6])
         server.initial_camera.look_at = centre + reach * np.array([0.1, -0.06, 0.0])
 
@@ -137,11 +146,12 @@ class Stage:
                 handle.image = image
         places, turns = self._round(*self._shapes.poses(qpos))
         old_places, old_turns = self._last
-        for body, handle in self._handles:
-            if not np.array_equal(old_places[:, body], places[:, body]):
-                handle.batched_positions = places[:, body]
-            if not np.array_equal(old_turns[:, body], turns[:, body]):
-                handle.batched_wxyzs = turns[:, body]
+        for shape, handle in self._handles:
+            at = (shape.worlds, shape.pose)
+            if not np.array_equal(old_places[at], places[at]):
+                handle.batched_positions = places[at]
+            if not np.array_equal(old_turns[at], turns[at]):
+                handle.batched_wxyzs = turns[at]
         self._last = (places, turns)
 
     def _round(self, places: np.ndarray, turns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -160,6 +170,20 @@ def choose_worlds(parts: Mapping[str, Sequence[World]]) -> list[World]:
     return [*(world for part in batches for world in part[: share - share % 2]), *alone]
 
 
+def not_shown(model: mujoco.MjModel, worlds: Sequence[World]) -> list[str]:
+    """What differs from world to world and a page does not show, in a line; none if there is
+    nothing.
+    """
+    fields = {
+        name
+        for world in worlds
+        for name, values in world.fields.items()
+        if name.startswith(_UNSEEN) and not np.allclose(values, getattr(model, name))
+    }
+    names = [*sorted(fields - {"mat_rgba"}), *Shapes(model, [w.fields for w in worlds]).missing]
+    return [f"{EPISODE} does not show how worlds differ in {', '.join(names)}"] * bool(names)
+
+
 def save_episode(
     path: Path, model: mujoco.MjModel, worlds: Sequence[World], frame_dt: float
 ) -> None:
@@ -176,7 +200,7 @@ def save_episode(
     """
     server = start_server("127.0.0.1", 0)
     try:
-        stage = Stage(server, Shapes(model), worlds)
+        stage = Stage(server, model, worlds)
         qpos = np.stack([_fill(world, worlds) for world in worlds], axis=1)
         stage.update(qpos[0])
         scene = server.get_scene_serializer()

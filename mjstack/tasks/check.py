@@ -40,9 +40,8 @@ from mjstack.errors import ConfigError, TermError, require_names
 from mjstack.managers.view import EnvView
 from mjstack.math import not_finite
 from mjstack.mdp.geometry import LOADED
-from mjstack.scene.index import Columns
 from mjstack.scene.phases import Phase
-from mjstack.sim.simulation import LOST_PHYSICS
+from mjstack.sim.simulation import LOST_PHYSICS, Columns
 from mjstack.tasks.view import PhaseNames, Step, TaskView
 
 _EVERY_TASK = {
@@ -319,6 +318,11 @@ class EpisodeCheck(ABC):
             if words and len(limits) > 1:
                 broken[name] = f" ({', '.join(words)})"
         return broken, beyond
+
+    @property
+    def limits(self) -> dict[str, tuple[float, float]]:
+        """The least and the largest of each measured value for which its rule holds, by name."""
+        return dict(chain(*(limits.items() for r in self._rules for limits in r.limits)))
 
     @abstractmethod
     def placed(self, step: Step) -> Tensor:

@@ -12,8 +12,8 @@ from typing_extensions import override
 from mjstack.config.fields import spec
 from mjstack.managers.term import branches
 from mjstack.managers.view import EnvView
-from mjstack.scene.index import Columns
 from mjstack.sim.graph import where_any
+from mjstack.sim.simulation import Columns
 from mjstack.tasks import parts
 from mjstack.tasks.check import EpisodeCheck, Rule
 from mjstack.tasks.placed import HeldSuccess

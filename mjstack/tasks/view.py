@@ -18,8 +18,8 @@ from mjstack.managers.view import EnvView
 from mjstack.math import lowest_point, norm, quat_to_matrix
 from mjstack.mdp.geometry import LOADED, gripper_opening, pose_w
 from mjstack.mdp.observation import object_velocity
-from mjstack.scene.index import Columns
 from mjstack.scene.phases import Phase
+from mjstack.sim.simulation import Columns
 
 PhaseNames = Sequence[Sequence[str]]
 """For each object, names of phases."""

@@ -160,7 +160,8 @@ class CloneJobCfg(TrainJobCfg):
     save_every: int = spec(unit="batches", ge=1)
     """Batches between two saved policies."""
     input_noise: float = spec(ge=0.0)
-    """Noise on the observations that training sees, in multiples of their terms' ``noise``."""
+    """Noise on the observations that training sees, in multiples of their terms' ``noise``, or of
+    2 % of their standard deviation where a term has none."""
     weight_decay: float = spec(ge=0.0)
     """Of AdamW."""
     vision: VisionCfg = field(default_factory=VisionCfg)
