@@ -60,7 +60,7 @@ def force(env: EnvView, name: str) -> torch.Tensor:
 
 
 class DrawerCheck(EpisodeCheck):
-    """The drawer is open, at rest and let go of, with the cube in it; the cabinet was left alone."""
+    """The drawer is open, at rest and let go of, the cube in it; the cabinet was left alone."""
 
     @dataclass(kw_only=True, slots=True)
     class Thresholds:
