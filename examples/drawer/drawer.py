@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 
 from mjstack.config.fields import spec
-from mjstack.managers import EnvView, repeatable, uses_fields
+from mjstack.managers import EnvView, uses_fields
 from mjstack.mdp.geometry import place_xy
 from mjstack.mdp.observation import grasp_point_pos
 from mjstack.tasks.check import EpisodeCheck, Rule
@@ -13,7 +13,6 @@ from mjstack.tasks.parts import InWindow
 from mjstack.tasks.view import Step
 
 
-@repeatable
 @uses_fields("body_pos")
 def move_cabinet(env: EnvView, mask: torch.Tensor) -> None:
     """Put the cabinet where the episode's handle is, and move the cube in it along."""
