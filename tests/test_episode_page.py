@@ -23,13 +23,15 @@ import mjstack.report.web as web
 from mjstack.cli import run
 from mjstack.config.load import load_config
 from mjstack.config.schema import TermCfg
-from mjstack.episodes.motion import motion_recorder, restore_batch, show_batch
+from mjstack.episodes.motion import load_worlds, motion_recorder
 from mjstack.episodes.rollout import Hook
+from mjstack.episodes.run import Run
+from mjstack.episodes.seeds import _show as show_worlds
 from mjstack.episodes.stage import Stage
 from mjstack.managers import EnvView, random_uniform, uses_fields
 from mjstack.math import quat_to_matrix
 from mjstack.report.geometry import Shapes, with_fields
-from mjstack.report.page import Page, World, frame_stride
+from mjstack.report.page import World, frame_stride
 from mjstack.report.web import choose_worlds, not_shown, save_episode
 
 PRIMITIVES = """
@@ -227,16 +229,13 @@ def test_a_page_shows_the_model_fields_of_each_world(tmp_path: Path) -> None:
     stage = Stage(replace(cfg, reset=dict(cfg.reset) | terms))
     sim = stage.batch_simulation(3)
     env = stage.start(sim, stage.cfg.reset)
-    page = Page()
     failed = np.array([0, stage.check.rules["STACKED"], 0], np.int32)
-    show_batch(stage, page, tmp_path / "m.npz", "batch", sim.qpos[None], env, failed)
-    restored = Page()
-    restore_batch(restored, tmp_path / "m.npz", "batch")
+    played = Run(stage)
+    show_worlds(played, "batch", tmp_path / "m.npz", sim.qpos[None], env, failed)
     visual = stage.assets.visual_model
     assert visual.ngeom > sim.model.ngeom  # so that numbers of geoms differ
     table_size = 2.0 * np.array(stage.cfg.scene.table_half[:2])
-    for shown in (page, restored):
-        worlds = shown.worlds3d["batch"]
+    for worlds in (played.page.worlds3d["batch"], load_worlds(tmp_path / "m.npz")):
         save_episode(tmp_path / "episode.html", visual, worlds, 0.04)
         placed = placed_meshes(tmp_path / "episode.html")
         tables = [

@@ -34,6 +34,7 @@ from mjstack.episodes.rollout import rollout
 from mjstack.errors import FolderError, MjstackError
 from mjstack.jobs.gates import check_machine
 from mjstack.policy import load_policy, save_policy
+from mjstack.report.page import World
 
 SHORT = one_second_episode()
 
@@ -457,9 +458,9 @@ def test_a_policy_that_succeeds_is_timed_and_shown(tmp_path: Path, monkeypatch: 
     """The episode has a figure, and the video shows the policy's world of *baseline*."""
     shown: list[np.ndarray] = []
 
-    def save(path: Path, model: mujoco.MjModel, qpos: np.ndarray, step_dt: float) -> None:
+    def save(path: Path, model: mujoco.MjModel, worlds: list[World], step_dt: float) -> None:
         path.touch()
-        shown.append(qpos)
+        shown.append(np.stack([world.qpos for world in worlds]))
 
     monkeypatch.setattr(showing.picture, "save_video", save)
     policy = hold_above_red(tmp_path / "policy")

@@ -6,19 +6,8 @@ from functools import partial
 
 import numpy as np
 
-from mjstack.bench.timing import (
-    NO_METER,
-    WARM_UP,
-    EnergyMeter,
-    EnergyObserver,
-    Measurement,
-    describe_lost,
-    lost_worlds,
-    settled,
-    steps_that_fit,
-    time_budget,
-    timed,
-)
+from mjstack.bench import timing
+from mjstack.bench.timing import EnergyMeter, Measurement
 from mjstack.config.schema import Backend
 from mjstack.episodes.rollout import Episode, State, restore, rollout, snapshot
 from mjstack.episodes.stage import Stage
@@ -40,7 +29,7 @@ def measure_physics(stage: Stage, sim: Simulation, carry: State | None = None) -
     decimation = stage.cfg.timing.decimation
     state = carry_start(stage, sim, carry)
     restore(sim, state)
-    lost = lost_worlds(sim)
+    lost = timing.lost_worlds(sim)
     carried = stage.phase(t.from_phase).carried
     full = sim.nworld
     if carried >= 0:  # both jaws press on the phase's object
@@ -56,16 +45,17 @@ def measure_physics(stage: Stage, sim: Simulation, carry: State | None = None) -
         for _ in range(count):
             sim.step(decimation)
 
-    seconds = [timed(sim, partial(play, 1)) for _ in range(WARM_UP)][-1]
-    steps = steps_that_fit(t.steps, time_budget(stage.cfg, sim), t.repetitions * seconds)
+    seconds = [timing.timed(sim, partial(play, 1)) for _ in range(timing.WARM_UP)][-1]
+    budget = timing.time_budget(stage.cfg, sim)
+    steps = timing.steps_that_fit(t.steps, budget, t.repetitions * seconds)
     meter = EnergyMeter(str(sim.device))
     times: list[float] = []
     for repetition in range(t.repetitions):
         restore(sim, state)
-        times.append(timed(sim, partial(play, steps), meter))
-        lost |= lost_worlds(sim, steps * decimation)
+        times.append(timing.timed(sim, partial(play, steps), meter))
+        lost |= timing.lost_worlds(sim, steps * decimation)
         stage.progress.advance("physics, repetitions", repetition + 1, t.repetitions)
-        if settled(stage.cfg, times):
+        if timing.settled(stage.cfg, times):
             break
 
     # The result
@@ -76,7 +66,7 @@ def measure_physics(stage: Stage, sim: Simulation, carry: State | None = None) -
         "peak_contacts_per_world": int(sim.peak_contacts.max()),
         "peak_constraint_rows_per_world": int(sim.peak_constraints.max()),
     }
-    out.problem = describe_lost(lost) or out.problem
+    out.problem = timing.describe_lost(lost) or out.problem
     out.headline = (
         f"{out.median('world_steps_per_s'):,.0f} world-steps/s,"
         f" {out.median('ms_per_batched_step'):.3g} ms per step of {sim.nworld} worlds"
@@ -108,11 +98,7 @@ def carry_start(stage: Stage, sim: Simulation, state: State | None) -> State:
 
 
 def measure_episode(
-    stage: Stage,
-    sim: Simulation,
-    before: Episode | None = None,
-    *,
-    step_seconds: float = 0.0,
+    stage: Stage, sim: Simulation, before: Episode | None = None, *, step_seconds: float = 0.0
 ) -> Measurement:
     """Measure whole episodes with their check.
 
@@ -120,15 +106,12 @@ def measure_episode(
     worlds lasts minutes, so it is played only as often as the time allows, and not at all where
     even one would not fit.
 
-    Args:
-        stage: Scene and planner.
-        sim: The worlds.
-        before: The episode of gate *batch*, if it was timed.
-        step_seconds: About how long a control step takes [s].
+    ``before`` is the episode of gate *batch*, if it was timed, and ``step_seconds`` about how long
+    a control step takes [s].
     """
     cfg = stage.cfg
     t = cfg.gate.throughput
-    seconds = time_budget(cfg, sim)
+    seconds = timing.time_budget(cfg, sim)
     out = Measurement(name="episode")
     steps = stage.episode_steps
     # The repetitions, and about how long one takes
@@ -142,10 +125,10 @@ def measure_episode(
         if time.perf_counter() - began + estimate > seconds:
             break
         repetition_began = time.perf_counter()
-        played.append(stage.play(sim, cfg.reset, [EnergyObserver(meter)]))
+        played.append(stage.play(sim, cfg.reset, [timing.EnergyObserver(meter)]))
         estimate = time.perf_counter() - repetition_began
         stage.progress.advance("episode, repetitions", number + 1, rounds)
-        if settled(cfg, [episode.timing.seconds for episode in played]):
+        if timing.settled(cfg, [episode.timing.seconds for episode in played]):
             break
     if not played:
         key = "max_seconds" if sim.device.type == "cuda" else "cpu_max_seconds"
@@ -158,14 +141,14 @@ def measure_episode(
     # The result
     failed = np.flatnonzero(np.any([episode.failed for episode in played], axis=0)).tolist()
     timings = [episode.timing for episode in played]
-    times = [timing.seconds for timing in timings]
+    times = [spent.seconds for spent in timings]
     out.samples = {"seconds": times}
     out.facts = {
         "of_the_batch_gate": int(played[0] is before),
         "succeeded": sim.nworld - len(failed),
     }
-    used = meter if played[-1] is not before else NO_METER
-    captured = all(timing.captured for timing in timings)
+    used = meter if played[-1] is not before else timing.NO_METER
+    captured = all(spent.captured for spent in timings)
     out.add_repetitions(sim, cfg, times, steps, used, *timings, captured=captured)
     out.headline = f"{statistics.median(times):.3g} s"
     if failed:

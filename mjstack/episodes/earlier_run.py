@@ -101,14 +101,8 @@ class EarlierRun:
 
 
 def archive_starts(cfg: Config, folder: Path) -> Config:
-    """Copy the starts file that worlds start from, byte for byte, for the run and its replays.
-
-    Args:
-        cfg: The run's configuration.
-        folder: The run's folder.
-
-    Returns:
-        The configuration with the copy as the file of its terms.
+    """Copy the starts file that worlds start from into a run's folder, byte for byte, for the run
+    and its replays, and return the configuration with the copy as the file of its terms.
 
     Raises:
         OSError: The file cannot be read, or the copy cannot be written.
@@ -135,13 +129,11 @@ def archived_starts(cfg: Config, folder: Path) -> Config:
         )
 
     def swap(reset: Mapping[str, TermCfg]) -> dict[str, TermCfg]:
-        params = {"path": str(copy)}
-        return {
-            key: replace(term, params=term.params | params)
-            if term.params.get("path") == path
-            else term
-            for key, term in reset.items()
-        }
+        terms = dict(reset)
+        for key, term in reset.items():
+            if term.params.get("path") == path:
+                terms[key] = replace(term, params=term.params | {"path": str(copy)})
+        return terms
 
     success = replace(cfg.gate.success, reset=swap(cfg.gate.success.reset))
     return replace(cfg, reset=swap(cfg.reset), gate=replace(cfg.gate, success=success))

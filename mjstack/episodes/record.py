@@ -112,11 +112,6 @@ class EpisodeRecord:
         """Read the record of a gate's seed in a run's folder; None if the gate did not get there,
         or there is no folder.
 
-        Args:
-            folder: The folder.
-            seed: The seed.
-            gate: The gate.
-
         Raises:
             FolderError: The file cannot be read.
         """

@@ -109,12 +109,11 @@ class EpisodeTally:
     def write_failing(self) -> None:
         """Write the table of failing episodes, if any. A full disk takes no result back."""
         rows = []
-        stop = 0
-        everywhere = self.places
-        for record in self.records:
-            first, stop = stop, stop + len(record.failed)
-            places = {name: values[first:stop] for name, values in everywhere.items()}
-            rows += record.failing_rows(self.check.rules, places)
+        places = self.places
+        for number, record in enumerate(self.records):
+            share = slice(number * len(record.failed), (number + 1) * len(record.failed))
+            starts = {name: values[share] for name, values in places.items()}
+            rows += record.failing_rows(self.check.rules, starts)
         if rows and self.path is not None:
             problem = safely_write(self.path, Path.write_text, to_csv(rows), stops=False)
             has = f"{self.path.name} has every failing episode with what was measured"

@@ -79,7 +79,7 @@ def _compare(run: Run, mjwarp: Simulation) -> GateResult:
     apart, ends = _compare_ends(run, world.qpos[-1], result)
     problems += apart
     if cfg.scene.cameras:
-        problems += compare_images(run.stage, run.nominal.world.qpos, run.folder, run.draw, result)
+        problems += compare_images(run, result)
 
     headline = run.stage.check.headline(judged)
     run.print_line(f"{cfg.task.name} check: {headline} ({mjwarp.description})")

@@ -63,13 +63,8 @@ def run_gates(run: Run, folder: Path) -> None:
 
 def run_guarded(run: Run, name: str, gate: Gate, spread: str = "") -> None:
     """Run one gate, or other work that judges like one, and record its results. If it raises it has
-    failed, with the error as its reason.
-
-    Args:
-        run: The run.
-        name: The gate's name.
-        gate: Its function.
-        spread: How ranks share its work, as the marks of gates say; by default as it is marked.
+    failed, with the error as its reason. ``spread`` is how ranks share its work, as the marks of
+    gates say; by default as it is marked.
 
     Raises:
         Exception: It failed in a rank whose part the others need, or a rank has gone: the run is

@@ -42,11 +42,8 @@ class LiveView(Observer):
     """
 
     def __init__(self, server: Any, stage: Stage) -> None:
-        """Add the controls to a server.
-
-        Args:
-            server: Of `report.web.start_server`.
-            stage: The scene. Its cameras are rendered here where the environment does not.
+        """Add the controls to a server of `report.web.start_server`. The stage's cameras are
+        rendered here where the environment does not.
         """
         self._server = server
         self._stage = stage
@@ -54,7 +51,7 @@ class LiveView(Observer):
         self._view: SceneView | None = None
         self._nworld = 0
         self._numbers = [0]  # of the worlds in the picture
-        self._fields: list[bytes] = []  # of these worlds
+        self._content: tuple[list[int], list[bytes]] = ([], [])  # these worlds and their fields
         self._part = ""
         self._choice = ("", 0)  # of the last picture: worlds and plotted world
         self._steps = 0  # that a click lets the run make
@@ -156,13 +153,11 @@ class LiveView(Observer):
         if not numbers:
             expected = f"numbers from 0 to {env.nworld - 1}, such as 0-15, 20"
             problem.append(f"Worlds: {text!r} names none, expected {expected}")
-        elif numbers != self._numbers:
-            self._numbers = numbers
-            self._view = None
+        self._numbers = numbers or self._numbers
         fields = world_fields(self._stage, env, self._numbers)
         content = [values.tobytes() for world in fields for values in world.values()]
-        if content != self._fields:  # an episode may draw them anew
-            self._fields = content
+        if self._content != (self._numbers, content):  # an episode may draw its fields anew
+            self._content = (self._numbers, content)
             self._view = None
         index = torch.tensor(self._numbers, device=env.device)
         qpos = env.sim.qpos[index].double().cpu().numpy()

@@ -6,7 +6,6 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from mjstack.config.schema import Config, PlayJobCfg
@@ -22,8 +21,8 @@ from mjstack.gates.runner import run_guarded
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import VIEWS, CheckedJob, Job
 from mjstack.jobs.showing import check_showing
-from mjstack.report.geometry import Fields
 from mjstack.report.gl import require_offscreen
+from mjstack.report.page import World
 from mjstack.report.picture import save_video
 from mjstack.report.record import GateResult, Status
 from mjstack.report.write import safely_write
@@ -68,10 +67,8 @@ def play_worlds(run: Run) -> list[GateResult]:
     cfg = stage.cfg
     advance = stage.progress.advance
     job: PlayJobCfg = cfg.job
-    positions = []
-    seen = []
-    fields = []
-    scenes: list[Fields] = []
+    worlds: list[World] = []
+    looks = []
     details = []
     succeeded = 0
     with closing(simulate_alone(stage, *stage.backend)) as sim:
@@ -90,12 +87,12 @@ def play_worlds(run: Run) -> list[GateResult]:
                 status, outcome, metrics, _ = run.judge_one(episode)
                 succeeded += status is Status.passed
                 outcome = outcome or f"succeeded, {stage.check.headline(metrics)}"
-            positions.append(recorder.qpos)
-            if cfg.video and job.camera is None:
-                seen.append(draw_seen(stage, recorder.qpos, sim))
-            scenes += world_fields(stage, env, [0])
-            fields.append({name: value.clone() for name, value in sim.fields.items()})
-            run.show_world(f"{NAME}_{world}", str(world), recorder.qpos, status, env)
+            qpos = recorder.qpos
+            seen = draw_seen(stage, qpos, sim) if cfg.video and job.camera is None else {}
+            (fields,) = world_fields(stage, env, [0])
+            worlds.append(World(label=str(world), qpos=qpos, images=seen, fields=fields))
+            looks.append({name: value.clone() for name, value in sim.fields.items()})
+            run.show_world(f"{NAME}_{world}", str(world), qpos, status, env)
             details.append(f"world {world}: {outcome}")
             run.print_line(details[-1])
     result = GateResult(
@@ -107,19 +104,19 @@ def play_worlds(run: Run) -> list[GateResult]:
         details=details,
     )
     if cfg.video:
-        _save(run, np.stack(positions), fields, scenes, seen, result)
+        _save(run, worlds, looks, result)
     return [result]
 
 
 def _save(
     run: Run,
-    qpos: np.ndarray,
+    worlds: Sequence[World],
     fields: Sequence[Mapping[str, torch.Tensor]],
-    scenes: Sequence[Fields],
-    seen: Sequence[Mapping[str, np.ndarray]],
     result: GateResult,
 ) -> None:
-    """Write the video; without one there is nothing to look at, and the job fails."""
+    """Write the video of worlds with these model fields; without one there is nothing to look at,
+    and the job fails.
+    """
     assert run.folder is not None
     stage = run.stage
     job: PlayJobCfg = stage.cfg.job
@@ -128,17 +125,14 @@ def _save(
     def write(path: Path) -> None:
         """Write it as seen from the side, or by a camera with each world in its own looks."""
         model = stage.assets.visual_model
-        step_dt = stage.cfg.timing.step_dt
-        advance = stage.progress.advance
-        save = partial(
-            save_video, path, model, qpos, step_dt, advance, fps=job.fps, width=job.width
-        )
+        scene = (model, worlds, stage.cfg.timing.step_dt, stage.progress.advance)
+        save = partial(save_video, path, *scene, fps=job.fps, width=job.width)
         if job.camera is None:
-            save(seen=seen, fields=scenes)
+            save()
             return
         looks = {field: torch.cat([world[field] for world in fields]) for field in fields[0]}
         name = f"images.{job.camera}"
-        with closing(stage.color_renderer(len(qpos), list(looks), [job.camera])) as renderer:
+        with closing(stage.color_renderer(len(worlds), list(looks), [job.camera])) as renderer:
             save(draw=lambda q: renderer.draw(torch.from_numpy(q), looks)[name].cpu().numpy())
 
     if problem := safely_write(path, write):

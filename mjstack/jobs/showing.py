@@ -79,7 +79,7 @@ def draw_episode(
         page.notes.append("trajectories.png is not drawn: no object has moved")
     if cfg.video:
         path = folder / "episode.mp4"
-        problem = safely_write(path, picture.save_video, model, qpos[None], cfg.timing.step_dt)
+        problem = safely_write(path, picture.save_video, model, [pictured], cfg.timing.step_dt)
         stage.progress.print_line(problem or f"video: {path}")
 
 

@@ -42,14 +42,9 @@ def update_summary(folder: Path, master: DictConfig, reports: Mapping[int, Repor
 def write_summary(
     folder: Path, sweep: SweepCfg, reports: Mapping[int, Report], *, draw: bool = False
 ) -> tuple[Table, str]:
-    """Write summary.csv and summary.md into the folder of a sweep, and summary.png if it is drawn.
-
-    Args:
-        folder: The folder.
-        sweep: What is shown.
-        reports: Reports of jobs that have ended, by their numbers. Those of the jobs in the
-            folder's list are read if they are not here.
-        draw: Whether the picture is drawn anew.
+    """Write summary.csv and summary.md into the folder of a sweep, and summary.png if it is drawn
+    anew. ``reports`` are those of jobs that have ended, by their numbers; of other jobs in the
+    folder's list they are read.
 
     Returns:
         The table, its results without details, and why there is no picture; empty if there is one,

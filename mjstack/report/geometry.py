@@ -105,11 +105,8 @@ class Shapes:
     """
 
     def __init__(self, model: mujoco.MjModel, worlds: Sequence[Fields] = ({},)) -> None:
-        """Read the geoms that MuJoCo shows by default.
-
-        Args:
-            model: The model, with its visuals.
-            worlds: Fields of each world that are not those of the model.
+        """Read the geoms of a model with visuals that MuJoCo shows by default. ``worlds`` are the
+        fields of each world that are not those of the model.
         """
         from trimesh.util import append_faces  # comes with viser
 
@@ -170,11 +167,8 @@ class Shapes:
         )
 
     def poses(self, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Poses of the bodies and geoms in a state.
-
-        Args:
-            qpos: Positions of the worlds, or any number of states of a single one, shape ``(n,
-                nq)``.
+        """Poses of the bodies and geoms in a state of each world, or in any number of states of a
+        single one, shape ``(n, nq)``.
 
         Returns:
             Positions [m], shape ``(n, poses, 3)``, and quaternions (w, x, y, z), of shape ``(n,

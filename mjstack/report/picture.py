@@ -20,7 +20,7 @@ from mjstack.errors import MissingExtra
 from mjstack.interrupt import check_interrupt
 from mjstack.report.geometry import Fields, write_fields
 from mjstack.report.gl import open_renderer
-from mjstack.report.page import frame_stride
+from mjstack.report.page import World, frame_stride
 
 _FACES = [[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]]
 """Corners of a box in the order of their signs, by its faces."""
@@ -106,15 +106,13 @@ def save_scene(path: Path, model: mujoco.MjModel, qpos: np.ndarray) -> None:
 def save_video(
     path: Path,
     model: mujoco.MjModel,
-    qpos: np.ndarray,
+    worlds: Sequence[World],
     step_dt: float,
     advance: Callable[[str, int, int], None] = lambda what, done, total: None,
     *,
     fps: float = 25.0,
     width: int | None = None,
     draw: Draw | None = None,
-    seen: Sequence[Mapping[str, np.ndarray]] = (),
-    fields: Sequence[Fields] = ({},),
 ) -> None:
     """Write a video of episodes in real time, side by side: an mp4, or a GIF or WebP that loops, by
     the file's ending.
@@ -122,44 +120,43 @@ def save_video(
     Args:
         path: The file.
         model: The scene.
-        qpos: States at the ends of steps, shape ``(worlds, steps, nq)``.
-        step_dt: Time between two of them [s].
+        worlds: The worlds with positions, and perhaps images that stand in their corners, at the
+            ends of equally many steps.
+        step_dt: Time of a step [s].
         advance: Reports progress.
         fps: Frames per second [Hz], as near as whole steps allow.
         width: Of the video [pixels]; 640 by default with one world, 960 with several.
         draw: Draws a state of every world, shape ``(worlds, nq)``, as images ``(height, width,
             3)``, uint8. By default the scene is seen from the side.
-        seen: Images of each world by camera, each ``(steps, height, width, 3)``, that stand in its
-            corner.
-        fields: Model fields of each world, for the scene as seen from the side.
 
     Raises:
         MjstackError: This machine cannot draw offscreen, or lacks what writes the format.
     """
     write = require_video(path.suffix)
     skip = frame_stride(step_dt, fps)
-    states = qpos[:, ::skip].swapaxes(0, 1)
-    count, worlds, nq = states.shape
-    columns = math.ceil(math.sqrt(worlds))
-    wide = (width or (640 if worlds == 1 else 960)) // columns
+    states = np.stack([world.qpos[::skip] for world in worlds], 1)
+    count, nworld, nq = states.shape
+    columns = math.ceil(math.sqrt(nworld))
+    wide = (width or (640 if nworld == 1 else 960)) // columns
 
     images: Iterator[np.ndarray]
     if draw is None:
+        fields = [world.fields for world in worlds]
         images = _render(model, states.reshape(-1, nq), wide, 3 * wide // 4, fields)
     else:
         images = (image for frame in states for image in draw(frame))
-    if seen:
+    if any(world.images for world in worlds):
         corners = (
-            [rows[number * skip] for rows in cameras.values()]
+            [rows[number * skip] for rows in world.images.values()]
             for number in range(count)
-            for cameras in seen
+            for world in worlds
         )
         images = map(_with_corner, images, corners)
 
     def frames() -> Iterator[Image.Image]:
         for done in range(1, count + 1):
             check_interrupt()
-            yield _side_by_side(list(itertools.islice(images, worlds)), columns, wide)
+            yield _side_by_side(list(itertools.islice(images, nworld)), columns, wide)
             advance("pictures of the video", done, count)
 
     write(path, frames(), count, step_dt * skip)

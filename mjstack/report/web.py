@@ -51,13 +51,10 @@ class Stage:
     """Worlds side by side in a viser server's scene."""
 
     def __init__(self, server: Any, model: mujoco.MjModel, worlds: Sequence[World]) -> None:
-        """Add the worlds, in the model's own state.
+        """Add the worlds to a ``viser.ViserServer``, in the state of their model with visuals.
 
-        Args:
-            server: A ``viser.ViserServer``.
-            model: The scene with its visuals.
-            worlds: Their model fields, texts, and images, which stand behind the table. In those
-                that failed, the table and what stands still in all worlds alike are red.
+        Images stand behind the table. In worlds that failed, the table and what stands still in
+        all worlds alike are red.
         """
         self._shapes = shapes = Shapes(model, [world.fields for world in worlds])
         low, high = shapes.box()
@@ -189,13 +186,8 @@ def not_shown(model: mujoco.MjModel, worlds: Sequence[World]) -> list[str]:
 def save_episode(
     path: Path, model: mujoco.MjModel, worlds: Sequence[World], frame_dt: float
 ) -> None:
-    """Write worlds in motion as one HTML file, which plays without a server.
-
-    Args:
-        path: The file.
-        model: The scene with its visuals.
-        worlds: They stand side by side; one that ends earlier stays.
-        frame_dt: Time between two frames [s].
+    """Write worlds in motion, side by side, as one HTML file, which plays without a server. A world
+    that ends earlier stays. ``model`` has visuals, ``frame_dt`` is the time between frames [s].
 
     Raises:
         OSError: The file cannot be written.
