@@ -87,8 +87,10 @@ def check_task(stage: Stage) -> None:
     """Raise if the task cannot be played as configured, on this machine."""
     cfg = stage.cfg
     resolve_backend(cfg)
+    keys = {} if stage.policy else {"action": "controller.action"}
     if cfg.task.check is not None:
-        _try_check(stage)
+        with renamed_keys(keys):
+            _try_check(stage)
     check_env(stage, cfg)
     check_cameras(stage)
     driver = stage.driver_class
@@ -101,7 +103,6 @@ def check_task(stage: Stage) -> None:
             raise ConfigError("task.episode_steps", cfg.task.episode_steps, expected)
         if cfg.controller.approach_gain > 0.0:
             turn_sign(stage.model, cfg.robot)
-    keys = {} if stage.policy else {"action": "controller.action"}
     # Two worlds show a driver that answers for one.
     with renamed_keys(keys), stage.native_env(stage.driven({}), nworld=2) as env:
         if cfg.task.check is not None or not driver.needs_phases:

@@ -33,8 +33,8 @@ def write_new(args: Sequence[str]) -> list[Path]:
         raise MjstackError(f"new {' '.join(args)}: expected {expected}.")
     folder = Path(name)
     valid = re.fullmatch(r"[a-z][a-z0-9_]{0,63}", name)
-    exists = folder.exists() or name in list_choices()[_GROUPS[kind]]
-    if not valid or exists or find_spec(name) is not None:
+    choices = list_choices()[_GROUPS[kind]]
+    if not valid or folder.exists() or name in choices or find_spec(name) is not None:
         raise MjstackError(
             f"new {kind} {name}: expected small letters, digits and _, and no folder, {kind} or"
             " Python module of that name. Choose another name."

@@ -68,7 +68,7 @@ class BoxCheck(EpisodeCheck):
         """How far a corner may be beyond the inside of the box."""
         rest_speed: float = spec(unit="m/s", gt=0.0)
         """Speed of the fastest corner."""
-        window: int = spec(unit="steps", ge=1, le=1000)
+        window: int = spec(unit="steps", ge=1, le=10_000)
         """Last steps without contact to a jaw, in which an object must be inside and slow."""
         jaw_clearance: float = spec(unit="m", gt=0.0)
         """Lowest jaw geometry above the box's rim at the end."""

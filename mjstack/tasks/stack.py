@@ -48,7 +48,7 @@ class StackCheck(EpisodeCheck):
         """Least number of consecutive steps in the air of a carry."""
         carry_distance: float = spec(unit="m", gt=0.0)
         """Horizontal distance from where those steps began."""
-        window: int = spec(unit="steps", ge=2, le=1000)
+        window: int = spec(unit="steps", ge=2, le=10_000)
         """Last steps of the episode, in which everything below must hold."""
         xy_err: float = spec(unit="m", gt=0.0)
         """Largest horizontal distance of the centres."""
