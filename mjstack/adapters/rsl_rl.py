@@ -75,11 +75,7 @@ class RslRlVecEnv(VecEnv):
         self.env.episode_step.copy_(value - value % self.env.cfg.timing.policy_decimation)
 
     def get_observations(self) -> TensorDict:
-        """The current observations.
-
-        Returns:
-            Every group, each ``(num_envs, dim)``, float32.
-        """
+        """The current observations: every group, each ``(num_envs, dim)``, float32."""
         groups = self.env.observation_manager.groups
         return self._tensordict({name: group.clone() for name, group in groups.items()})
 

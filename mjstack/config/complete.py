@@ -73,10 +73,8 @@ def _typed_all(key: str, nodes: dict[str, Any], kind: type) -> dict[str, Any]:
 
 
 def typed(key: str, node: Any, kind: type) -> Any:
-    """A mapping of a composed configuration, at a dotted key, as a dataclass.
-
-    Raises:
-        MjstackError: A key is unknown or missing, or its field does not accept a value.
+    """A mapping of a composed configuration, at a dotted key, as a dataclass; a MjstackError if a
+    key is unknown or missing, or its field does not accept a value.
     """
     items = {field.name: field for field in fields(kind)}
     if not isinstance(node, dict):

@@ -92,12 +92,8 @@ Repeats = Annotated[int, Range(ge=1, le=1000)]  # of a computation that nothing 
 
 
 def spec(default: Any = MISSING, **limits: Any) -> Any:
-    """Declare a configuration field with its unit and range.
-
-    Args:
-        default: Its value where the YAML has none, of a list or mapping a copy; without one, the
-            YAML must have it.
-        limits: Attributes of its `Range`.
+    """Declare a configuration field with the attributes of its `Range`. Its default is its value
+    where the YAML has none, of a list or mapping a copy; without one, the YAML must have it.
     """
     metadata = {_SPEC: Range(**limits)}
     if isinstance(default, list | dict):
@@ -127,11 +123,8 @@ def find_field(owner: type, key: str) -> tuple[type, Field] | None:
 
 
 def check_fields(key: str, value: Any) -> None:
-    """Hold every number, list and choice below a key against its field's range.
-
-    Args:
-        key: Dotted configuration key of the value, empty for the whole configuration.
-        value: A dataclass. Dataclasses in its fields, lists and mappings are checked too.
+    """Hold every number, list and choice in a dataclass against its field's range, also those in
+    dataclasses, lists and mappings in it. Its dotted key is empty for the whole configuration.
 
     Raises:
         ConfigError: The first value that its field does not accept, or a ``NAME_min`` above its

@@ -16,13 +16,8 @@ from mjstack.errors import MissingExtra, TermError, first_line, suggest
 def resolve_func(
     label: str, path: str, *, first: str = "env", base: type | None = None
 ) -> Callable[..., Any]:
-    """Find a function or class by its dotted name, and check that it declares itself.
-
-    Args:
-        label: Dotted configuration key, for errors.
-        path: The dotted name.
-        first: Name of its first parameter.
-        base: The class that it must be a subclass of, instead.
+    """Find a function or class by its dotted name, and check that it declares itself: by the name
+    of its first parameter, or instead by its base class. The label is its configuration key.
 
     Raises:
         TermError: There is no such module, or nothing of that name in it that is meant to be called

@@ -43,17 +43,13 @@ def _control_steps(seconds: float | None, *, _root_: DictConfig) -> int:
 def _by_device(cuda: Any, cpu: Any, *, _root_: DictConfig) -> Any:
     """The value for the device of the run, which ``${by_device:CUDA,CPU}`` stands for."""
     device = _root_.sim.device
-    if _is_native(_root_):
+    if _root_.sim.backend == Backend.native:
         device = "cpu"
     elif device == "auto":
         from torch.cuda import is_available  # takes a second
 
         device = "cuda" if is_available() else "cpu"
     return cuda if device.startswith("cuda") else cpu
-
-
-def _is_native(root: DictConfig) -> bool:
-    return root.sim.backend == Backend.native
 
 
 # The functions that a replay calls: where a run's configuration names them, and of which kind.
@@ -72,7 +68,7 @@ _CHOICE = re.compile(r"^(?:gate\.\w+\.|job\.)(reset|observation)=(?!null$)[\w,]+
 _RESOLVERS: dict[str, Callable] = {
     "steps": _control_steps,
     "by_device": _by_device,
-    "if_native": lambda native, mjwarp, *, _root_: native if _is_native(_root_) else mjwarp,
+    "if_native": lambda a, b, *, _root_: a if _root_.sim.backend == Backend.native else b,
     "at_most": lambda value, limit, small, large: small if value <= limit else large,
 }
 for _name, _function in _RESOLVERS.items():

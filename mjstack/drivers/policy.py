@@ -86,12 +86,9 @@ class PolicyDriver(Driver):
     def __init__(
         self, env: Env, policy: Policy, cameras: Mapping[str, CameraCfg] | None = None
     ) -> None:
-        """Build the policy's observation and allocate for the environment's worlds.
-
-        Args:
-            env: The environment, its worlds started; its action terms must be the policy's.
-            policy: The policy.
-            cameras: The scene's cameras, if the environment's configuration does not have them.
+        """Build the policy's observation and allocate for the environment's worlds, which have
+        started; its action terms must be the policy's. ``cameras`` are the scene's, if its
+        configuration does not have them.
 
         Raises:
             MjstackError: The policy was trained for something else, or the environment takes other

@@ -40,11 +40,7 @@ class ObjectRoles(NamedTuple):
 
 
 def find_roles(cfg: Config, phases: Sequence[Phase]) -> list[ObjectRoles]:
-    """The objects that the phases move, in the order in which they do.
-
-    Args:
-        cfg: The configuration.
-        phases: Its phases.
+    """The objects that a configuration's phases move, in the order in which they do.
 
     Raises:
         ConfigError: They do nothing that a state tells, or commands are late: a state does not

@@ -99,11 +99,8 @@ class StateBasedDriver(FeedbackDriver):
     stateless = True
 
     def __init__(self, env: EnvView, nominal: np.ndarray) -> None:
-        """Allocate for the environment's worlds; arguments as of `FeedbackDriver`.
-
-        Raises:
-            MjstackError: As of `FeedbackDriver`, the task has no check, or its phases do nothing
-                that a state tells, see `find_roles`.
+        """Allocate for the environment's worlds; arguments and errors as of `FeedbackDriver`. It is
+        also an error if the task has no check, or as of `find_roles`.
         """
         super().__init__(env, nominal, clock=False)
         cfg = env.cfg
@@ -118,8 +115,7 @@ class StateBasedDriver(FeedbackDriver):
         things = list(cfg.scene.objects)
         judged = self._check.objects
         tensor = self._tensor
-        columns = [judged.index(r.name) if r.name in judged else len(judged) for r in moved]
-        self._judged = tensor(columns)
+        self._judged = tensor([*judged, r.name].index(r.name) for r in moved)
         self._moved = tensor(things.index(r.name) for r in moved)
         self._grasps = tensor(r.way == "grasp" for r in moved)
         self._pushed = [k for k, r in enumerate(moved) if r.way == "push"]
@@ -134,10 +130,9 @@ class StateBasedDriver(FeedbackDriver):
         self._has_faces = tensor(thing.has_faces for thing in cfg.scene.objects.values())
 
         # Heights of targets: over an object that is not carried, wherever it is, or over the table
-        objects = {*range(len(things))}
         self._above = tensor(target.above for _, target in self._aimed)
         self._follows = tensor(
-            phase.spec.level != "table" and target.source in objects - {phase.carried}
+            phase.spec.level != "table" and phase.carried != target.source < len(things)
             for phase, target in self._aimed
         )
         self._off_center = tensor(_OFF_CENTER)

@@ -50,10 +50,8 @@ def write_new(args: Sequence[str]) -> list[Path]:
 
 
 def _read_robot(file: Path, folder: Path) -> dict[str, str]:
-    """What an MJCF file tells about a robot, as YAML has it.
-
-    Raises:
-        MjstackError: It cannot be read, has too few joints, or a name that YAML cannot have.
+    """Joints, jaws and sites of an MJCF file, as YAML has them; a MjstackError if it cannot be
+    read, has too few joints, or a name that YAML cannot have.
     """
     try:
         check_regular(file)
