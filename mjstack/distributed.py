@@ -105,10 +105,8 @@ class Ranks:
         return self.in_all(first)[0]
 
     def in_all(self, work: Callable[[], T]) -> list[T]:
-        """The results of work that every rank does, by rank. If it fails in one, it fails in all.
-
-        Raises:
-            RankError: It failed in another rank. One error in all of them is rank 0's.
+        """The results of work that every rank does, by rank. If it fails in one, it fails in all,
+        in the others by a RankError. One error in all of them is rank 0's.
         """
         if self.size == 1:
             return [work()]

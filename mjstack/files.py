@@ -64,11 +64,8 @@ def reading(path: Path, fix: str) -> Iterator[None]:
 
 def check_regular(path: Path, most: int = _MOST_BYTES) -> None:
     """Check, before anything reads it, that a file ends, and after how many bytes at most: a
-    stranger's may be a pipe or a device.
-
-    Raises:
-        OSError: There is no such file.
-        ValueError: It is no regular file, or has more bytes; far fewer are enough for text.
+    stranger's may be a pipe or a device. An OSError if there is none, a ValueError if it is no
+    regular file, or has more bytes; far fewer are enough for text.
     """
     status = path.stat()
     if not stat.S_ISREG(status.st_mode):
@@ -101,11 +98,8 @@ def read_json(path: Path, *keys: str) -> Any:
 
 
 def yaml_text(path: Path) -> str:
-    """The text of a YAML file. Nothing is built of it.
-
-    Raises:
-        Exception: It cannot be read, has too many values or a very long one, or has aliases: a few
-            stand for any number of values.
+    """The text of a YAML file; nothing is built of it. Any exception if it cannot be read, has too
+    many values or a very long one, or has aliases: a few stand for any number of values.
     """
     check_regular(path)
     text = path.read_text()
@@ -141,10 +135,7 @@ def write_atomic(path: Path, content: str | bytes) -> None:
     """Write a file beside its place and move it there.
 
     A full disk or a kill leaves the old file. Files that are written one after the other outlast a
-    power cut in this order.
-
-    Raises:
-        OSError: The file cannot be written.
+    power cut in this order. An OSError if it cannot be written.
     """
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
@@ -307,11 +298,8 @@ def made_by(folder: Path) -> str:
 
 def lock_folder(folder: Path, *, shared: bool = False) -> int:
     """A descriptor that keeps other writers out until it is closed, also by the end of the process;
-    or, if it is shared, those that would have the folder alone.
-
-    Raises:
-        FolderError: Another writer has the folder.
-        OSError: The folder cannot be opened.
+    or, if it is shared, those that would have the folder alone. A FolderError if another writer
+    has it, an OSError if it cannot be opened.
     """
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     if not lock(handle, shared=shared):

@@ -74,9 +74,8 @@ class GymnasiumVectorEnv(VectorEnv):
         if not those of its configuration.
 
         Raises:
-            ArgumentError: This machine has no display, or the scene no camera.
-            UnknownName: There is no such observation group.
-            ConfigError: With images, a camera does not draw the ends of episodes.
+            MjstackError: This machine has no display, the scene no camera, the environment no such
+                group, or, with images, a camera does not draw the ends of episodes.
         """
         self.inner = env
         self.group = group
@@ -254,10 +253,8 @@ class GymnasiumEnv(gymnasium.Env):
     def step(self, action: ndarray) -> tuple[Observation, float, bool, bool, Info]:
         """Advance the world by one control interval, as `GymnasiumVectorEnv.step` does, by an
         action ``(action_dim,)``: observation ``(dim,)``, float32, reward, whether the episode
-        terminated, whether it was truncated, and the info, see the class.
-
-        Raises:
-            MjstackError: As there, or the episode has ended.
+        terminated, whether it was truncated, and the info, see the class. A MjstackError as there,
+        or if the episode has ended.
         """
         if self._first is not None:
             value = "step() after the end of an episode"

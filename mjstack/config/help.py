@@ -100,13 +100,13 @@ def list_groups() -> dict[str, tuple[list[str], str]]:
     }
 
 
-def list_keys(value: object, name: str = "", *, named: bool = True) -> Iterator[Key]:
+def list_keys(value: Any, name: str = "", *, named: bool = True) -> Iterator[Key]:
     """Keys of a configuration at and below one of its parts, whose dotted key is ``name``.
 
     With ``named``, entries that users name, such as terms, are listed each. Otherwise the first one
     stands for all, as NAME and without values.
     """
-    docs = field_docs(type(value))
+    docs = field_docs(value.__class__)
     for item in fields(value) if is_dataclass(value) else ():
         part = getattr(value, item.name)
         key = f"{name}.{item.name}".lstrip(".")

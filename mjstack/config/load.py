@@ -112,11 +112,8 @@ def extended_search_path(
     overrides: Sequence[str], folders: Sequence[str | os.PathLike]
 ) -> Iterator[list[str]]:
     """Add folders, and those of overrides of ``hydra.searchpath``, to the search path of every
-    composition inside.
-
-    Yields:
-        The other overrides, starts and observations that they choose by a key as choices of their
-        group, and what the policy that they name was trained for.
+    composition inside. Yields the other overrides, starts and observations that they choose by a
+    key as choices of their group, and what the policy that they name was trained for.
     """
     entries = list(map(str, folders))
     remaining = [o for o in overrides if not o.lstrip("+").startswith("hydra.searchpath=")]
@@ -226,11 +223,8 @@ def _drop_inherited(
 
 def load_saved(path: Path) -> Config:
     """The configuration that a run left in ``.hydra/config.yaml``, typed and checked as a new one
-    is.
-
-    Raises:
-        MjstackError: The file cannot be read, is no configuration of this version, or names
-            functions or a robot that are not in the search path.
+    is; a MjstackError if the file cannot be read, is no configuration of this version, or names
+    functions or a robot that are not in the search path.
     """
     with reading(path, "Name another folder"):
         plain = session.read_yaml(path)

@@ -132,11 +132,8 @@ def check_term(label: str, dotted: str, kind: str, saved: Path) -> None:
     """Check that the folder of a policy or of a run, which may be a stranger's, may name a function
     or class: one that declares itself as a kind of term in an installed package
     (`mjstack.managers.offers`), or any that was defined beside a folder of the search path. The
-    label is its configuration key, and ``saved`` the file that names it.
-
-    Raises:
-        MjstackError: It may not.
-        TermError: There is no such function.
+    label is its configuration key, and ``saved`` the file that names it. A MjstackError if it may
+    not, a TermError if there is no such function.
     """
     installed = {"mjstack", *(name.partition(".")[0] for name in _registered())}
     # A module runs when it is imported, and imports others' functions too.

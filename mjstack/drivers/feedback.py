@@ -158,10 +158,8 @@ class FeedbackDriver(Driver):
     def __init__(self, env: EnvView, nominal: np.ndarray, *, clock: bool) -> None:
         """Allocate for the worlds of an environment, whose action terms must take absolute joint
         commands. Redundant joints keep close to the nominal plan's commands at the end of each
-        phase, shape ``(phases, nu)``. With a clock worlds go through the phases one by one.
-
-        Raises:
-            MjstackError: The environment takes other actions, or worlds have moved on.
+        phase, shape ``(phases, nu)``. With a clock worlds go through the phases one by one. A
+        MjstackError if the environment takes other actions, or worlds have moved on.
         """
         cfg = env.cfg
         device = env.device

@@ -98,11 +98,8 @@ class OpenLoopPlanner:
     def plan(self, sources_xy: ndarray, names: Sequence[int] | None = None) -> JointTrajectory:
         """Plan one trajectory per world, which does not depend on the other worlds, from where each
         object and place is at the start [m], shape ``(nworld, sources, 2)``; see `source_names`.
-        The worlds are divided among threads. An error has their numbers; from 0 on if None.
-
-        Raises:
-            Unreachable: A target is out of reach; names the world (the first one), the phase and
-                the distance.
+        The worlds are divided among threads. A target out of reach is an Unreachable, with the
+        phase, the distance and the number of the first such world; from 0 on without ``names``.
         """
         for sources, plan in self._plans:
             if np.array_equal(sources, sources_xy):

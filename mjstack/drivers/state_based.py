@@ -138,10 +138,9 @@ class StateBasedDriver(FeedbackDriver):
         self._off_center = tensor(_OFF_CENTER)
 
         # The robot
-        names = cfg.robot.joints
         aligned = cfg.robot.roll_joint if self._aligns else None
         locked = cfg.robot.locked.items()
-        self._locked = [(names.index(name), value) for name, value in locked if name != aligned]
+        self._locked = [(cfg.robot.joints.index(k), v) for k, v in locked if k != aligned]
         tensors = robot(env)
         self._quarters = 0.5 * math.pi * torch.arange(4, device=device)[:, None]
         self._grip_lead = _GRIP * (tensors.gripper_open - tensors.gripper_closed).abs().float()

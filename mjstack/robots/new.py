@@ -22,10 +22,8 @@ _GRIPPER = re.compile("grip|finger|jaw|thumb|left|right", re.IGNORECASE)
 
 def write_new(args: Sequence[str]) -> list[Path]:
     """Write the files of ``task``, ``driver`` or ``action NAME``, or of ``robot NAME FILE.xml``,
-    into a new folder NAME.
-
-    Raises:
-        MjstackError: The arguments are others, NAME exists, or MuJoCo cannot compile the file.
+    into a new folder NAME; a MjstackError if the arguments are others, NAME exists, or MuJoCo
+    cannot compile the file.
     """
     kind, name = (*args, "", "")[:2]
     if len(args) != (3 if kind == "robot" else 2) or kind not in _GROUPS:
@@ -33,8 +31,8 @@ def write_new(args: Sequence[str]) -> list[Path]:
         raise MjstackError(f"new {' '.join(args)}: expected {expected}.")
     folder = Path(name)
     valid = re.fullmatch(r"[a-z][a-z0-9_]{0,63}", name)
-    exists = folder.exists() or name in list_choices()[_GROUPS[kind]]
-    if not valid or exists or find_spec(name) is not None:
+    choices = list_choices()[_GROUPS[kind]]
+    if not valid or name in choices or folder.exists() or find_spec(name) is not None:
         raise MjstackError(
             f"new {kind} {name}: expected small letters, digits and _, and no folder, {kind} or"
             " Python module of that name. Choose another name."
