@@ -17,11 +17,11 @@ from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.envs import Env, build_env
 from mjstack.math import quat_to_matrix
 from mjstack.mdp.geometry import above_table
+from mjstack.mdp.observation import object_to_place
 from mjstack.scene import SceneIndex, build_model
 from mjstack.scene.index import lowest_height
 from mjstack.scene.phases import nominal_xy
 from mjstack.tasks.box import BoxSuccess
-from mjstack.tasks.box_terms import ToSlot
 from mjstack.tasks.check import make_check
 from mjstack.tasks.progress import Progress
 
@@ -212,10 +212,15 @@ def test_terms_know_the_box(robot: str) -> None:
     put(env, RED, places[RED], [1, 2])
     put(env, BLUE, places[BLUE], [2])
     put(env, RED, np.add(places[RED], [0.0, 0.0, 0.1]), [3])
-    np.testing.assert_allclose(ToSlot(env, object=RED)(env)[1:3], 0.0, atol=1e-6)
-    wanted = np.subtract(places[BLUE], env.sim.model.body(BLUE).pos)
-    np.testing.assert_allclose(ToSlot(env, object=BLUE)(env)[0], wanted, atol=1e-6)
     check = make_check(env.cfg)
+    floor = env.cfg.scene.box.floor
+    offsets = {
+        name: object_to_place(env, object=name, place=check.slots[name], height=floor)
+        for name in (RED, BLUE)
+    }
+    np.testing.assert_allclose(offsets[RED][1:3], 0.0, atol=1e-6)
+    wanted = np.subtract(places[BLUE], env.sim.model.body(BLUE).pos)
+    np.testing.assert_allclose(offsets[BLUE][0], wanted, atol=1e-6)
     placed = check.placed(check.view(env).step()).int().tolist()
     assert placed == [[0, 0], [1, 0], [1, 1], [0, 0]]
     progress = Progress(env)

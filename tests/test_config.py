@@ -329,6 +329,7 @@ def test_choices_by_key() -> None:
         ("reach", None, 3.0),
         pytest.param("push", "examples/push/conf", 8.0, marks=pytest.mark.full),
         pytest.param("tower", "examples/tower/conf", 25.0, marks=pytest.mark.full),
+        pytest.param("drawer", "examples/drawer/conf", 8.4, marks=pytest.mark.full),
     ],
 )
 def test_a_task_has_any_rate(task: str, folder: str | None, seconds: float) -> None:

@@ -38,13 +38,20 @@ import mjstack.cli  # before mujoco, which decides at its import how it draws
 import pytest
 import torch
 from fuzz_cases import CHOSEN, QUICK, Make, command_lines, damaged_folders, is_short, small_files
+from fuzz_datasets import damaged_datasets
 
 from mjstack.config.load import compose
 from mjstack.config.session import hydra_session
 
-COUNTS = {"commands": 60, "folders": 60, "small": 24}  # `make fuzz` tries 1,000, 500 and 72
+# `make fuzz` tries 1,000, 500, 200 and 72
+COUNTS = {"commands": 60, "folders": 60, "datasets": 12, "small": 24}
 REAL = 12  # folders that commands in a process of their own are given
-CASES = {"commands": command_lines, "folders": damaged_folders, "small": small_files}
+CASES = {
+    "commands": command_lines,
+    "folders": damaged_folders,
+    "datasets": damaged_datasets,
+    "small": small_files,
+}
 UNTOUCHED = ("policy", "run")  # what is only read
 PASSED = 77  # exit status of a child whose check has passed
 ENDS = {PASSED: "passed", 0: "shown, or run", 2: "one line"}
@@ -55,7 +62,7 @@ AT_ONCE = 3  # the process that forks works too
 
 @pytest.mark.full
 def test_a_check_passes_or_says_one_line() -> None:
-    """Both kinds in one process: loading all modules takes it as long as thirty cases."""
+    """All kinds in one process: loading all modules takes it as long as thirty cases."""
     done = subprocess.run([sys.executable, __file__], capture_output=True, text=True, timeout=1500)
     print(done.stdout[-20_000:])
     assert done.returncode == 0, done.stdout[-20_000:] + done.stderr[-3000:]
@@ -163,7 +170,7 @@ def judge_cases(kind: str, cases: Sequence[int]) -> int:
         draw = random.Random(kind)
         if kind == "small":
             pass
-        elif kind == "folders":
+        elif kind != "commands":
             judge(draw.sample(cases, min(REAL, len(cases))), run=True, real=True)
         else:
             tenth = min(counts["passed"] // 10 + 1, len(passed))

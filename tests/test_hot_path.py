@@ -63,28 +63,28 @@ PATHS: dict[str, dict[str, str] | None] = {
     "tasks/view.py": {
         "TaskView": "step clear",
         "Step": (
-            "pose pos center quat velocity turn height bounds speed corner_speed pressed in_hand "
-            "untouched narrowest supported judged _judged _sensed"
+            "pose pos center quat velocity turn height bounds speed corner_speed pressed tilt "
+            "in_hand untouched narrowest supported judged _judged _of_each _sensed"
         ),
+        "AllOf": "__call__ apart __and__",
     },
     "tasks/parts.py": {
-        "": "airborne in_hand on_top offset on_table released on_top_of",
+        "": "airborne in_hand on_top offset on_table upright in_zone released on_top_of",
         "Streak": "update _counts",
         "Carried InWindow AtRest": "update",
         "AtLeast": "holds unlocked",
     },
     "tasks/placed.py": {"HeldSuccess": "__call__ _holds reset"},
     "tasks/stack.py": {
-        "StackCheck": "placed placed_of on_top on_table goals",
+        "StackCheck": "placed placed_of on_top goals",
         "StackSuccess": "_look _replace_oldest __call__",
     },
     "tasks/box.py": {
-        "BoxCheck": "airborne resting outside over placed goals at_slot",
+        "BoxCheck": "airborne outside over placed goals at_slot",
         "_CarriedOver _Release _Settled _Order": "update",
         "_Drop": "update holds",
         "BoxSuccess": "__init__",
     },
-    "tasks/box_terms.py": {"ToSlot": "__call__"},
     "tasks/progress.py": {"Progress": "__call__ _placed _measure"},
     "tasks/reach.py": {"ReachCheck": "placed trace"},
     "drivers/open_loop.py": {"JointTrajectory": "command"},

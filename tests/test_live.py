@@ -142,7 +142,9 @@ def test_worlds_pause_step_and_are_chosen(
         view._worlds.value = "4, 1"
         wait_until(lambda: view._numbers == [4, 1])
         time.sleep(0.2)
-        places, _ = Shapes(stage.assets.visual_model).poses(env.sim.qpos[[4, 1]].double().numpy())
+        places, _ = Shapes(stage.assets.visual_model).poses(
+            env.sim.qpos[[4, 1]].double().cpu().numpy()
+        )
         for shape, handle in view._view._handles:
             held = np.asarray(handle.batched_positions)
             assert np.allclose(held[:, 2], places[:, shape.pose, 2], atol=1e-4)

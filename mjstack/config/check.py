@@ -111,6 +111,8 @@ def _robot(cfg: Config) -> Checks:
         path = Path(getattr(robot, key))
         wrong = path.is_absolute() or ".." in path.parts
         yield f"robot.{key}", wrong, "a name that does not lead out of a folder"
+    wrong = robot.file is not None and cfg.model.source == "menagerie"
+    yield "robot.file", wrong, "null, because model=menagerie has its own. Add model=builtin"
     names = (*robot.ik_joints, *robot.locked)
     require_names("robot.ik_joints, robot.locked: arm joint", names, robot.arm_joints)
     require_names("robot.roll_joint: arm joint", [robot.roll_joint], robot.arm_joints)

@@ -163,7 +163,7 @@ def help_text(cfg: Config, width: int) -> str:
         name: f"{words}: {', '.join(names)}" for name, (names, words) in list_groups().items()
     }
     keys = {key.name: f"{key.words} ({key.value})" for key in list_keys(cfg) if "." not in key.name}
-    for name in groups:
+    for name in (*groups, "unused_terms"):  # which mjstack fills in
         keys.pop(name, None)
     text = _TEXT.format(groups=_table(groups), keys=_table(keys))
     lines = []

@@ -11,7 +11,7 @@ from torch import Tensor
 from mjstack.drivers.feedback import STAY, FeedbackDriver, measure_planar
 from mjstack.drivers.open_loop import OpenLoopPlanner, smoothstep
 from mjstack.envs import Env
-from mjstack.managers.view import EnvView
+from mjstack.managers.view import EnvView, offers
 from mjstack.math import atan2, norm
 from mjstack.mdp.geometry import jaw_forces, objects_in_hand, robot
 from mjstack.tasks.check import make_check
@@ -23,6 +23,7 @@ _OFF = 0.03  # m: so far off the grasp point, a held object is made up for
 _DONE = 1e-3  # steps: a phase is over this much before its last step would be
 
 
+@offers("driver")
 class ClosedLoopDriver(FeedbackDriver):
     """Phase, time and targets of every world as tensors; targets from where its objects are.
 

@@ -19,6 +19,7 @@ from mjstack.drivers.open_loop import JointTrajectory, OpenLoopPlanner
 from mjstack.envs import Env
 from mjstack.errors import ArgumentError, ConfigError, TermError
 from mjstack.managers.term import blamed, check_params
+from mjstack.managers.view import offers
 from mjstack.math import describe_tensor
 from mjstack.mdp.geometry import source_xy
 from mjstack.policy import Policy, load_policy
@@ -99,7 +100,6 @@ class Driver(ABC):
         retries: Grasps that were tried again, shape ``(nworld,)``, int32.
     """
 
-    term_kind = "driver"  # as of `offers`
     needs_phases = False
     phased = False
     planned = False
@@ -199,6 +199,7 @@ def require_actions(cfg: Config, terms: Mapping[str, TermCfg], expected: str) ->
         raise ArgumentError("env", f"actions for {repeats} control steps", expected, fix)
 
 
+@offers("driver")
 class OpenLoopDriver(Driver):
     """Plays joint trajectories once, from the start that they were planned for: every world is in
     the same phase.

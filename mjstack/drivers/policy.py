@@ -16,6 +16,7 @@ from mjstack.config.schema import CameraCfg, Config
 from mjstack.drivers.driver import Assets, Driver, require_actions
 from mjstack.envs.env import Env
 from mjstack.errors import ArgumentError, FolderError, TermError
+from mjstack.managers import offers
 from mjstack.managers.observation import ObservationManager
 from mjstack.policy import Policy
 from mjstack.policy.lerobot import IMAGES, SEEN, STATE
@@ -55,6 +56,7 @@ class QueryImages:
             self._cameras.draw(self._buffers, dict.fromkeys(self.images, mask))
 
 
+@offers("driver")
 class PolicyDriver(Driver):
     """Actions of a policy for every world, for an environment with the policy's action terms.
 

@@ -12,7 +12,7 @@ from typing_extensions import override
 
 from mjstack.drivers.feedback import STAY, FeedbackDriver, State, servo_lag
 from mjstack.drivers.roles import Role, find_roles
-from mjstack.managers.view import EnvView
+from mjstack.managers.view import EnvView, offers
 from mjstack.math import atan2, norm, quat_to_matrix
 from mjstack.mdp.geometry import pose_w, robot
 from mjstack.tasks.check import make_check
@@ -74,6 +74,7 @@ class _Due(NamedTuple):
     beside: Tensor
 
 
+@offers("driver")
 class StateBasedDriver(FeedbackDriver):
     """Joint targets that are a function of the simulation's state: no clock, no memory.
 
@@ -115,7 +116,8 @@ class StateBasedDriver(FeedbackDriver):
         things = list(cfg.scene.objects)
         judged = self._check.objects
         tensor = self._tensor
-        self._judged = tensor([*judged, r.name].index(r.name) for r in moved)
+        columns = [1 + judged.index(r.name) if r.name in judged else 0 for r in moved]
+        self._judged = tensor(columns)
         self._moved = tensor(things.index(r.name) for r in moved)
         self._grasps = tensor(r.way == "grasp" for r in moved)
         self._pushed = [k for k, r in enumerate(moved) if r.way == "push"]
@@ -245,7 +247,7 @@ class StateBasedDriver(FeedbackDriver):
             grasped[:, k] = between[:, k] & (state.opening <= _SHUT)
         placed = self._check.placed(self._view.step())
         unknown = torch.zeros_like(placed[:, :1])  # of an object that the check does not judge
-        placed = torch.cat((placed, unknown), dim=1).index_select(1, self._judged)
+        placed = torch.cat((unknown, placed), dim=1).index_select(1, self._judged)
         places = [self._point(state, row[Role.place].expand(len(pos))) for row in self._roles]
         offset = pos - (torch.stack(places, dim=1) - offsets)
         across = norm(offset[..., :2])

@@ -139,4 +139,6 @@ class FailureMonitor(Observer):
 
 def _of(table: Tensor, column: Tensor) -> Tensor:
     """Each world's column, shape ``(nworld,)``; the first one where there is none (-1)."""
+    if not table.shape[1]:  # the task is about no object
+        return torch.zeros_like(column, dtype=torch.bool)
     return table.gather(1, column.clamp(min=0)[:, None])[:, 0]

@@ -13,13 +13,15 @@ from mjstack.envs import driven_config
 from mjstack.episodes.earlier_run import EarlierRun
 from mjstack.episodes.record import STEMS
 from mjstack.episodes.stage import Stage
-from mjstack.errors import ConfigError, FolderError, Unreachable, renamed_keys
+from mjstack.errors import ConfigError, FolderError, MjstackError, Unreachable, renamed_keys
 from mjstack.gates.images import load_images
 from mjstack.gates.runner import find_gates, run_gates
 from mjstack.gates.success import success_config
 from mjstack.jobs.runner import VIEWS, CheckedJob, Job, count_devices, run_provenance
 from mjstack.jobs.showing import check_showing
 from mjstack.managers.episode import required_fields
+from mjstack.managers.term import blamed
+from mjstack.math import describe_tensor
 from mjstack.report.gl import require_offscreen
 from mjstack.scene.index import turn_sign
 from mjstack.sim import resolve_backend
@@ -86,7 +88,7 @@ def check_task(stage: Stage) -> None:
     cfg = stage.cfg
     resolve_backend(cfg)
     if cfg.task.check is not None:
-        _ = stage.check  # reads its thresholds
+        _try_check(stage)
     check_env(stage, cfg)
     check_cameras(stage)
     driver = stage.driver_class
@@ -109,6 +111,19 @@ def check_task(stage: Stage) -> None:
         from mjstack.kinematics.batched_ik import build_chain  # loads Warp
 
         build_chain(stage.model, cfg.robot)
+
+
+def _try_check(stage: Stage) -> None:
+    """Raise if the task's check cannot judge a step of two worlds."""
+    check = stage.check
+    with stage.native_env(stage.driven({}), nworld=2) as env, blamed("task.check.func"):
+        check.start(env, 1)
+        check.update()
+        check.result()
+        placed = check.placed(check.view(env).step())
+        expected = describe_tensor(torch.zeros((env.nworld, len(check.objects) or 1)) > 0)
+        if (actual := describe_tensor(placed)) != expected:
+            raise MjstackError(f"placed: {actual}, expected {expected}, of two worlds")
 
 
 def check_cameras(stage: Stage) -> None:

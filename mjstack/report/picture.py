@@ -6,7 +6,7 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -240,10 +240,11 @@ def _write_loop(path: Path, frames: Iterator[Image.Image], count: int, dt: float
 
 def opens_windows() -> bool:
     """Whether MuJoCo's viewer can open one; where it cannot, it ends the process."""
-    import glfw
+    with warnings.catch_warnings(action="ignore"), suppress(ImportError):
+        import glfw
 
-    with warnings.catch_warnings(action="ignore"):
         return bool(glfw.init())
+    return False
 
 
 class Window:

@@ -109,16 +109,12 @@ class StackCheck(EpisodeCheck):
     @override
     def placed(self, step: Step) -> Tensor:
         """Whether the object is on the other one, and that one on the table."""
-        return torch.cat((self.on_top(step), self.on_table(step)), dim=1)
+        return torch.cat((self.on_top(step), self.supported(step)[:, None]), dim=1)
 
     @once_per_step
     def on_top(self, step: Step) -> Tensor:
         """Whether the object is on the other one, shape ``(nworld, 1)``, bool."""
         return self.stacked(step)[:, None]
-
-    def on_table(self, step: Step) -> Tensor:
-        """Whether the other one is on the table, shape ``(nworld, 1)``, bool."""
-        return self.supported(step)[:, None]
 
     @override
     def placed_of(self, step: Step, carried: Columns) -> Tensor:
@@ -157,7 +153,8 @@ class StackSuccess(HeldSuccess):
         check = StackCheck(env.cfg)
         view = check.view(env)
         # The host can mostly tell by the first. On CUDA a branch of a graph shares no value.
-        placed = [check.placed] if env.device.type == "cuda" else [check.on_top, check.on_table]
+        apart = [check.on_top, check.supported.apart]
+        placed = [check.placed] if env.device.type == "cuda" else apart
         super().__init__(env, view, [*placed, check.released], check.t.window)
         ring = (check.t.window, len(view.objects))
         # Where the oldest step is, in every world.
