@@ -89,11 +89,9 @@ def run(args: list[str]) -> int:
 def _dispatch(flags: Namespace, overrides: list[str]) -> int:
     """Do what the flags ask for, on the current search path."""
     demonstrates = overrides[:1] == ["demo"]
+    if demonstrates and any(override.startswith("experiment=") for override in overrides):
+        raise MjstackError("demo: expected no experiment=NAME, because it is one. Leave it out.")
     if demonstrates:
-        if any(override.startswith("experiment=") for override in overrides):
-            raise MjstackError(
-                "demo: expected no experiment=NAME, because it is one. Leave it out."
-            )
         overrides = ["experiment=demo", *overrides[1:]]
     with hydra_session() as hydra:
         if overrides[:1] == ["list"]:

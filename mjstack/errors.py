@@ -39,11 +39,8 @@ class MjstackError(Exception):
     exit_code = 2  # of a command line that could not begin
 
     def __init__(self, problem: str, fix: str = "") -> None:
-        """Build the message.
-
-        Args:
-            problem: A value or an event, and what was expected; with or without its full stop.
-            fix: What to do about it, a sentence without its full stop.
+        """Build the message from the problem, a value or an event and what was expected, with or
+        without its full stop, and the fix: what to do about it, a sentence without one.
         """
         stop = "" if problem.endswith((".", "?")) else "."
         super().__init__(shorten(f"{problem}{stop}{f' {fix}.' if fix else ''}"))
@@ -64,10 +61,8 @@ class KeyedError(MjstackError):
 
 @contextmanager
 def renamed_keys(keys: Mapping[str, str]) -> Iterator[None]:
-    """Let errors of what runs inside name the keys that the user has set.
-
-    Args:
-        keys: The key in the configuration, by the beginning of the one that an error names.
+    """Let errors of what runs inside name the keys that the user has set, by the beginnings of the
+    keys that they name.
     """
     try:
         yield

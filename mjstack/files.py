@@ -45,15 +45,9 @@ _KEY = "hydra.run.dir (job=collect, job=train: job.folder)"
 
 @contextmanager
 def reading(path: Path, fix: str) -> Iterator[None]:
-    """Raise one line for a file that is missing, damaged or none at all, as of `check_regular`: one
-    of a run's folder, which may be a stranger's, can hold anything.
-
-    Args:
-        path: The file that is read inside, or a folder of files.
-        fix: What to do about it, a sentence without its full stop.
-
-    Raises:
-        MjstackError: Something went wrong inside.
+    """Raise a `FolderError` of one line for a file, or one of a folder, that is read inside and is
+    missing, damaged or none at all, as of `check_regular`: one of a run's folder, which may be a
+    stranger's, can hold anything. ``fix`` is a sentence without its full stop.
     """
     try:
         for file in path.rglob("*") if path.is_dir() else [path]:
@@ -70,11 +64,8 @@ def reading(path: Path, fix: str) -> Iterator[None]:
 
 def check_regular(path: Path, most: int = _MOST_BYTES) -> None:
     """Check, before anything reads it, that a file ends, and after how many bytes at most: a
-    stranger's may be a pipe or a device.
-
-    Raises:
-        OSError: There is no such file.
-        ValueError: It is no regular file, or has more bytes; far fewer are enough for text.
+    stranger's may be a pipe or a device. An OSError if there is none, a ValueError if it is no
+    regular file, or has more bytes; far fewer are enough for text.
     """
     status = path.stat()
     if not stat.S_ISREG(status.st_mode):
@@ -97,10 +88,8 @@ def read_inside(path: Path, most: int = _MOST_BYTES) -> bytes:
 
 
 def read_json(path: Path, *keys: str) -> Any:
-    """The value below some keys of a JSON file of a folder.
-
-    Raises:
-        Exception: It cannot be read; `ValueError` if it has too many values.
+    """The value below some keys of a JSON file of a folder; any exception if it cannot be read, a
+    `ValueError` if it has too many values.
     """
     value = reduce(getitem, keys, json.loads(read_inside(path)))
     if sum(map(repr(value).count, ",:[{")) > _MOST_VALUES:
@@ -109,11 +98,8 @@ def read_json(path: Path, *keys: str) -> Any:
 
 
 def yaml_text(path: Path) -> str:
-    """The text of a YAML file. Nothing is built of it.
-
-    Raises:
-        Exception: It cannot be read, has too many values or a very long one, or has aliases: a few
-            stand for any number of values.
+    """The text of a YAML file; nothing is built of it. Any exception if it cannot be read, has too
+    many values or a very long one, or has aliases: a few stand for any number of values.
     """
     check_regular(path)
     text = path.read_text()
@@ -128,10 +114,8 @@ def yaml_text(path: Path) -> str:
 
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of an npz file by name. No object in it is built.
-
-    Raises:
-        Exception: It cannot be read; `ValueError` if it would be too large once unpacked.
+    """The arrays of an npz file by name; no object in it is built. Any exception if it cannot be
+    read, a `ValueError` if it would be too large once unpacked.
     """
     check_regular(path)
     content = path.read_bytes()
@@ -151,10 +135,7 @@ def write_atomic(path: Path, content: str | bytes) -> None:
     """Write a file beside its place and move it there.
 
     A full disk or a kill leaves the old file. Files that are written one after the other outlast a
-    power cut in this order.
-
-    Raises:
-        OSError: The file cannot be written.
+    power cut in this order. An OSError if it cannot be written.
     """
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
@@ -175,11 +156,7 @@ def write_atomic(path: Path, content: str | bytes) -> None:
 
 
 def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
-    """Write arrays as a compressed npz file in one step.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
+    """Write arrays as a compressed npz file in one step; an OSError if it cannot be written."""
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
     write_atomic(path, buffer.getvalue())
@@ -261,10 +238,7 @@ def _run_files(folder: Path) -> list[Path]:
 
 def move_aside(folder: Path) -> Path:
     """Move what a run has left in its folder to a new folder beside it, beside logs and Hydra's
-    files, which may be open.
-
-    Raises:
-        OSError: The folder cannot be made or a file cannot be moved.
+    files, which may be open; an OSError if it cannot be made or a file cannot be moved.
     """
     for number in itertools.count(1):
         aside = folder.with_name(f"{folder.name}-earlier-{number}")
@@ -324,11 +298,8 @@ def made_by(folder: Path) -> str:
 
 def lock_folder(folder: Path, *, shared: bool = False) -> int:
     """A descriptor that keeps other writers out until it is closed, also by the end of the process;
-    or, if it is shared, those that would have the folder alone.
-
-    Raises:
-        FolderError: Another writer has the folder.
-        OSError: The folder cannot be opened.
+    or, if it is shared, those that would have the folder alone. A FolderError if another writer
+    has it, an OSError if it cannot be opened.
     """
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     if not lock(handle, shared=shared):
@@ -352,11 +323,8 @@ def lock(handle: int, *, shared: bool = False) -> bool:
 
 
 def to_csv(rows: Sequence[Mapping[str, object]], columns: Sequence[str] = ()) -> str:
-    """Rows as CSV text; a value that is missing or None is an empty cell.
-
-    Args:
-        rows: Values by column.
-        columns: The first columns. Other keys of the rows follow, in order of appearance.
+    """Rows, values by column, as CSV text; a value that is missing or None is an empty cell. The
+    first columns may be given; other keys of the rows follow, in order of appearance.
     """
     columns = list(dict.fromkeys([*columns, *(name for row in rows for name in row)]))
     out = io.StringIO()

@@ -50,14 +50,9 @@ class Child(subprocess.Popen[bytes]):
         cores: Collection[int] = (),
         folder: Path | None = None,
     ) -> None:
-        """Start it.
-
-        Args:
-            args: Arguments of the command.
-            log: Gets its output.
-            env: Environment variables, besides those of this process.
-            cores: The cores that it may use; all if empty.
-            folder: Its working folder; by default that of this process.
+        """Start it with the command's arguments; the log gets its output. Environment variables add
+        to those of this process, it may use some cores, or all if there are none, and by default
+        works in the folder of this process.
         """
         self._began = time.monotonic()
         super().__init__(

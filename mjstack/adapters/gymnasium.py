@@ -32,7 +32,6 @@ except ImportError as error:
 __all__ = ["GymnasiumEnv", "GymnasiumVectorEnv", "make", "register_env"]
 Observation = ndarray | dict[str, ndarray]
 Info = dict[str, Any]
-State = tuple[torch.Tensor, Info]
 _MODES = ("rgb_array", "human")  # of rendering
 
 
@@ -59,6 +58,7 @@ class GymnasiumVectorEnv(VectorEnv):
         inner: The environment.
         group: The observation group that is returned, as one array; None for all and the images,
             in a dict.
+        seen: Positions and model fields of the state that `render` shows; None for the present one.
     """
 
     def __init__(
@@ -69,18 +69,13 @@ class GymnasiumVectorEnv(VectorEnv):
         render_mode: str | None = None,
         cameras: Mapping[str, CameraCfg] | None = None,
     ) -> None:
-        """Take over an environment, and close it when it is closed.
-
-        Args:
-            env: The environment.
-            group: See the class.
-            render_mode: ``rgb_array``, ``human`` or None.
-            cameras: Cameras to render by, if not those of its configuration.
+        """Take over an environment, and close it when it is closed. The group and the render mode,
+        ``rgb_array``, ``human`` or None, are as of the class; ``cameras`` are those to render by,
+        if not those of its configuration.
 
         Raises:
-            ArgumentError: This machine has no display, or the scene no camera.
-            UnknownName: There is no such observation group.
-            ConfigError: With images, a camera does not draw the ends of episodes.
+            MjstackError: This machine has no display, the scene no camera, the environment no such
+                group, or, with images, a camera does not draw the ends of episodes.
         """
         self.inner = env
         self.group = group
@@ -89,6 +84,7 @@ class GymnasiumVectorEnv(VectorEnv):
         self._film = [*(cameras or env.cfg.scene.cameras).items()][:1]
         self._renderer: StateRenderer | None = None
         self._window: Window | None = None
+        self.seen: tuple[torch.Tensor, Info] | None = None
         if render_mode == "rgb_array" and not self._film:
             fix = "Build the environment with cameras=front"
             raise ArgumentError("render_mode", repr(render_mode), "a scene with a camera", fix)
@@ -180,16 +176,8 @@ class GymnasiumVectorEnv(VectorEnv):
 
     def render(self) -> tuple[ndarray, ...] | None:
         """Images of all worlds, or None; see the class."""
-        return self.draw(*self.state())
-
-    def state(self) -> State:
-        """Positions of all worlds, and the model fields that differ between them, now."""
-        sim = self.inner.sim
-        return sim.qpos.clone(), {name: field.clone() for name, field in sim.fields.items()}
-
-    def draw(self, qpos: torch.Tensor, fields: Info) -> tuple[ndarray, ...] | None:
-        """Images of states as of `state`, as of `render`."""
         env = self.inner
+        qpos, fields = self.seen or (env.sim.qpos, env.sim.fields)
         if self.render_mode is None:
             fix = "Give it to gymnasium.make"
             raise ArgumentError("render_mode", None, f"one of {', '.join(_MODES)}", fix)
@@ -229,11 +217,8 @@ class GymnasiumEnv(gymnasium.Env):
     """
 
     def __init__(self, env: Env, **options: Any) -> None:
-        """Take over an environment of one world, and close it when it is closed. Options as of
-        `GymnasiumVectorEnv`.
-
-        Raises:
-            MjstackError: It has more worlds than one, or no such observation group.
+        """Take over an environment of one world, and close it when it is closed; options and errors
+        as of `GymnasiumVectorEnv`. More worlds are an ArgumentError.
         """
         if env.nworld != 1:
             fix = "Build it with nworld=1, or use GymnasiumVectorEnv"
@@ -244,7 +229,6 @@ class GymnasiumEnv(gymnasium.Env):
         self.render_mode = self._worlds.render_mode
         self.metadata = dict(self._worlds.metadata)
         del self.metadata["autoreset_mode"]
-        self._seen = self._worlds.state()
         self.observation_space = self._worlds.single_observation_space
         self.action_space = self._worlds.single_action_space
         # What the next episode has shown first: it starts in the step that ends one
@@ -253,59 +237,44 @@ class GymnasiumEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: Info | None = None
     ) -> tuple[Observation, Info]:
-        """Start a new episode.
-
-        Args:
-            seed: Starts with the first episode of this seed. Without one, the next episode under
-                the seed that is in use, at first the configured one.
-            options: None are known.
-
-        Returns:
-            The observation, ``(dim,)``, float32, and an empty dict.
-
-        Raises:
-            MjstackError: The seed or an option cannot be used.
+        """Start a new episode: the first one of a seed, or the next one as of
+        `GymnasiumVectorEnv.reset`. No options are known. Returns the observation, ``(dim,)``,
+        float32, and an empty dict.
         """
         require_names("reset option", options or (), ())
         first = self._first
+        self._worlds.seen = None
         if seed is not None or first is None:
             first, _ = self._worlds.reset(seed=seed)
         self._first = None
-        self._seen = self._worlds.state()
         super().reset(seed=None if seed is None else check_seed(seed))
         return _row(first, 0), {}
 
     def step(self, action: ndarray) -> tuple[Observation, float, bool, bool, Info]:
-        """Advance the world by one control interval.
-
-        Args:
-            action: Shape ``(action_dim,)``, numbers.
-
-        Returns:
-            The observation ``(dim,)``, float32, the reward, whether the episode terminated, whether
-            it was truncated, and the info, see the class.
-
-        Raises:
-            MjstackError: The action cannot be used, the episode has ended, or something went wrong
-                in the world.
+        """Advance the world by one control interval, as `GymnasiumVectorEnv.step` does, by an
+        action ``(action_dim,)``: observation ``(dim,)``, float32, reward, whether the episode
+        terminated, whether it was truncated, and the info, see the class. A MjstackError as there,
+        or if the episode has ended.
         """
         if self._first is not None:
             value = "step() after the end of an episode"
             raise ArgumentError("env", value, "reset() first", "Call env.reset()")
         actions = _array(action, self.action_space)[None]
+        sim = self.inner.sim
+        before = sim.qpos.clone(), {name: field.clone() for name, field in sim.fields.items()}
+        self._worlds.seen = None
         obs, reward, terminated, truncated, infos = self._worlds.step(actions)
         seen = _row(obs, 0)
         if "final_obs" in infos:
             self._first = obs
             seen = infos["final_obs"][0]
-        elif self.render_mode is not None:
-            self._seen = self._worlds.state()
+            self._worlds.seen = before
         info = {"success": bool(infos["success"])}
         return seen, float(reward[0]), bool(terminated), bool(truncated), info
 
     def render(self) -> ndarray | None:
         """An image ``(height, width, 3)``, uint8, or None; see the class."""
-        images = self._worlds.draw(*self._seen)
+        images = self._worlds.render()
         return images[0] if images else None
 
     def close(self) -> None:

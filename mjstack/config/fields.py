@@ -92,12 +92,8 @@ Repeats = Annotated[int, Range(ge=1, le=1000)]  # of a computation that nothing 
 
 
 def spec(default: Any = MISSING, **limits: Any) -> Any:
-    """Declare a configuration field with its unit and range.
-
-    Args:
-        default: Its value where the YAML has none, of a list or mapping a copy; without one, the
-            YAML must have it.
-        limits: Attributes of its `Range`.
+    """Declare a configuration field with the attributes of its `Range`. Its default is its value
+    where the YAML has none, of a list or mapping a copy; without one, the YAML must have it.
     """
     metadata = {_SPEC: Range(**limits)}
     if isinstance(default, list | dict):
@@ -127,15 +123,9 @@ def find_field(owner: type, key: str) -> tuple[type, Field] | None:
 
 
 def check_fields(key: str, value: Any) -> None:
-    """Hold every number, list and choice below a key against its field's range.
-
-    Args:
-        key: Dotted configuration key of the value, empty for the whole configuration.
-        value: A dataclass. Dataclasses in its fields, lists and mappings are checked too.
-
-    Raises:
-        ConfigError: The first value that its field does not accept, or a ``NAME_min`` above its
-            ``NAME_max``.
+    """Hold every number, list and choice in a dataclass against its field's range, also those in
+    dataclasses, lists and mappings in it. Its dotted key is empty for the whole configuration. A
+    ConfigError for the first value that is not accepted, or a ``NAME_min`` above its ``NAME_max``.
     """
     for item in fields(value):
         path = f"{key}.{item.name}" if key else item.name
@@ -189,23 +179,15 @@ def accepted(owner: type, item: Field, *, inside: bool = False) -> str:
     return limits.describe(words) + null
 
 
+@cache
 def field_docs(owner: type) -> dict[str, str]:
     """The docstring under each field of a dataclass and of those it derives from, by name."""
     docs: dict[str, str] = {}
-    for cls in reversed(owner.__mro__):
-        if is_dataclass(cls):
-            docs |= _own_docs(cls)
-    return docs
-
-
-@cache
-def _own_docs(cls: type) -> dict[str, str]:
-    (tree,) = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
-    body = tree.body if isinstance(tree, ast.ClassDef) else []
-    docs = {}
-    for node, after in pairwise(body):
-        if isinstance(node, ast.AnnAssign) and isinstance(after, ast.Expr):
-            docs[ast.unparse(node.target)] = " ".join(ast.literal_eval(after.value).split())
+    for cls in filter(is_dataclass, reversed(owner.__mro__)):
+        tree: Any = ast.parse(textwrap.dedent(inspect.getsource(cls)))
+        for node, after in pairwise(tree.body[0].body):
+            if isinstance(node, ast.AnnAssign) and isinstance(after, ast.Expr):
+                docs[ast.unparse(node.target)] = " ".join(ast.literal_eval(after.value).split())
     return docs
 
 

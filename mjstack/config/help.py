@@ -100,13 +100,13 @@ def list_groups() -> dict[str, tuple[list[str], str]]:
     }
 
 
-def list_keys(value: object, name: str = "", *, named: bool = True) -> Iterator[Key]:
+def list_keys(value: Any, name: str = "", *, named: bool = True) -> Iterator[Key]:
     """Keys of a configuration at and below one of its parts, whose dotted key is ``name``.
 
     With ``named``, entries that users name, such as terms, are listed each. Otherwise the first one
     stands for all, as NAME and without values.
     """
-    docs = field_docs(type(value))
+    docs = field_docs(value.__class__)
     for item in fields(value) if is_dataclass(value) else ():
         part = getattr(value, item.name)
         key = f"{name}.{item.name}".lstrip(".")
@@ -123,10 +123,8 @@ def list_keys(value: object, name: str = "", *, named: bool = True) -> Iterator[
 
 
 def key_help(cfg: Config, prefix: str, width: int) -> str:
-    """Keys of a configuration at and below a dotted one, with unit, range and meaning.
-
-    Raises:
-        UnknownName: There is no such key.
+    """Keys of a configuration at and below a dotted one, with unit, range and meaning; an
+    UnknownName if there are none.
     """
     nodes = {f"gate.{name}": (node, "config") for name, node in cfg.gate.added.items()}
     if cfg.task.check:
@@ -191,10 +189,7 @@ def _table(rows: Mapping[str, str]) -> str:
 
 def list_text(kinds: Sequence[str]) -> str:
     """What there is to choose from, of mjstack and of the search path, with a line each; of terms
-    alone also their parameters. Without kinds, all of them.
-
-    Raises:
-        UnknownName: There is no such kind.
+    alone also their parameters. Without kinds, all of them; an unknown one is an UnknownName.
     """
     require_names("list", kinds, _LISTED)
     lines = []

@@ -43,17 +43,13 @@ def _control_steps(seconds: float | None, *, _root_: DictConfig) -> int:
 def _by_device(cuda: Any, cpu: Any, *, _root_: DictConfig) -> Any:
     """The value for the device of the run, which ``${by_device:CUDA,CPU}`` stands for."""
     device = _root_.sim.device
-    if _is_native(_root_):
+    if _root_.sim.backend == Backend.native:
         device = "cpu"
     elif device == "auto":
         from torch.cuda import is_available  # takes a second
 
         device = "cuda" if is_available() else "cpu"
     return cuda if device.startswith("cuda") else cpu
-
-
-def _is_native(root: DictConfig) -> bool:
-    return root.sim.backend == Backend.native
 
 
 # The functions that a replay calls: where a run's configuration names them, and of which kind.
@@ -72,7 +68,7 @@ _CHOICE = re.compile(r"^(?:gate\.\w+\.|job\.)(reset|observation)=(?!null$)[\w,]+
 _RESOLVERS: dict[str, Callable] = {
     "steps": _control_steps,
     "by_device": _by_device,
-    "if_native": lambda native, mjwarp, *, _root_: native if _is_native(_root_) else mjwarp,
+    "if_native": lambda a, b, *, _root_: a if _root_.sim.backend == Backend.native else b,
     "at_most": lambda value, limit, small, large: small if value <= limit else large,
 }
 for _name, _function in _RESOLVERS.items():
@@ -116,11 +112,8 @@ def extended_search_path(
     overrides: Sequence[str], folders: Sequence[str | os.PathLike]
 ) -> Iterator[list[str]]:
     """Add folders, and those of overrides of ``hydra.searchpath``, to the search path of every
-    composition inside.
-
-    Yields:
-        The other overrides, starts and observations that they choose by a key as choices of their
-        group, and what the policy that they name was trained for.
+    composition inside. Yields the other overrides, starts and observations that they choose by a
+    key as choices of their group, and what the policy that they name was trained for.
     """
     entries = list(map(str, folders))
     remaining = [o for o in overrides if not o.lstrip("+").startswith("hydra.searchpath=")]
@@ -230,11 +223,8 @@ def _drop_inherited(
 
 def load_saved(path: Path) -> Config:
     """The configuration that a run left in ``.hydra/config.yaml``, typed and checked as a new one
-    is.
-
-    Raises:
-        MjstackError: The file cannot be read, is no configuration of this version, or names
-            functions or a robot that are not in the search path.
+    is; a MjstackError if the file cannot be read, is no configuration of this version, or names
+    functions or a robot that are not in the search path.
     """
     with reading(path, "Name another folder"):
         plain = session.read_yaml(path)

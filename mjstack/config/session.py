@@ -11,7 +11,7 @@ import os
 import re
 import shlex
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from importlib.metadata import entry_points
@@ -33,14 +33,14 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from typing_extensions import override
 
 from mjstack.config.functions import find_object
-from mjstack.config.policy_observation import choose_observation
 from mjstack.errors import MjstackError
 from mjstack.files import CONFIG_FOLDER, yaml_text
 
 CONFIG_NAME = "config"
+SEEN = "observation@job.observation="  # of a new policy
+TASK_SEEN = f"{SEEN}task"
 ENTRY_POINTS = "mjstack.configs"
 PROVIDER = "mjstack.search_path"  # of added entries, in a run's .hydra/hydra.yaml
-_FILE = "file://"
 
 # An override that adds an entry to a mapping by names, of which the schema knows the type
 _ENTRY = re.compile(
@@ -54,13 +54,8 @@ _on_command_line: ContextVar[bool] = ContextVar("command line", default=False)
 
 @contextmanager
 def search_path(entries: Sequence[str | os.PathLike]) -> Iterator[None]:
-    """Add folders to the search path of every composition inside.
-
-    Args:
-        entries: Folders, also as Hydra writes them: ``file://...``.
-
-    Raises:
-        MjstackError: There is no such folder, or it has a file of mjstack's name.
+    """Add folders, also as Hydra writes them, ``file://...``, to the search path of every
+    composition inside; a MjstackError if there is none, or it has a file of mjstack's name.
     """
     folders = [_checked_folder(str(entry)) for entry in entries]
     token = _added.set(tuple(dict.fromkeys((*_added.get(), *folders))))
@@ -98,18 +93,13 @@ def search_path_args(folders: Sequence[Path] | None = None) -> list[str]:
 
 
 def add_folder(saved: Path) -> str:
-    """The advice where the search path lacks a folder that a run had used.
-
-    Args:
-        saved: The run's ``config.yaml``.
-    """
+    """The advice where the search path lacks a folder that the run of a config.yaml had used."""
     try:
         sources = read_yaml(saved.with_name("hydra.yaml"))["hydra"]["runtime"]["config_sources"]
         folders = lacking_folders(sources)
     except Exception:  # the file may be missing, or hold anything
         folders = []
-    advice = folder_advice(folders)
-    return f"If you trust the folder that it had used, add {advice}."
+    return f"If you trust the folder that it had used, add {folder_advice(folders)}."
 
 
 def lacking_folders(sources: Iterable[Any]) -> list[Path]:
@@ -119,10 +109,8 @@ def lacking_folders(sources: Iterable[Any]) -> list[Path]:
 
 
 def read_yaml(path: Path) -> Any:
-    """Read YAML of a run's folder, which may be a stranger's: interpolations stay text.
-
-    Raises:
-        Exception: It cannot be read, as of `yaml_text`.
+    """Read YAML of a run's folder, which may be a stranger's: interpolations stay text. Any
+    exception says that it cannot be read, as of `yaml_text`.
     """
     return OmegaConf.to_container(OmegaConf.create(yaml_text(path)))
 
@@ -142,18 +130,10 @@ def _registered() -> list[str]:
 
 def check_term(label: str, dotted: str, kind: str, saved: Path) -> None:
     """Check that the folder of a policy or of a run, which may be a stranger's, may name a function
-    or class: one that declares itself in an installed package (`mjstack.managers.offers`), or any
-    that was defined beside a folder of the search path.
-
-    Args:
-        label: Dotted configuration key, for errors.
-        dotted: Its name.
-        kind: The kind of term that it is to be.
-        saved: The file that names it.
-
-    Raises:
-        MjstackError: It may not.
-        TermError: There is no such function.
+    or class: one that declares itself as a kind of term in an installed package
+    (`mjstack.managers.offers`), or any that was defined beside a folder of the search path. The
+    label is its configuration key, and ``saved`` the file that names it. A MjstackError if it may
+    not, a TermError if there is no such function.
     """
     installed = {"mjstack", *(name.partition(".")[0] for name in _registered())}
     # A module runs when it is imported, and imports others' functions too.
@@ -169,11 +149,8 @@ def check_term(label: str, dotted: str, kind: str, saved: Path) -> None:
 
 
 def in_search_path(dotted: str, saved: Path) -> bool:
-    """Whether a function or module lies beside a folder of the search path.
-
-    Args:
-        dotted: Its dotted name.
-        saved: The file that names it. No package that it lies in counts.
+    """Whether a function or module, by its dotted name, lies beside a folder of the search path. No
+    package counts in which the file lies that names it, ``saved``.
     """
     package = dotted.partition(".")[0]
     try:
@@ -280,7 +257,7 @@ def _compose_once(loader: Any) -> None:
                 files.clear()
                 return load(overrides=_add_entries(overrides), run_mode=run_mode, **options)
 
-            composed[key] = compose(choose_observation(overrides, compose))
+            composed[key] = compose(_choose_observation(overrides, compose))
             loader.files[id(composed[key])] = files.copy()
         return composed[key]
 
@@ -290,10 +267,8 @@ def _compose_once(loader: Any) -> None:
 
 def _add_entries(overrides: Sequence[str]) -> list[str]:
     """Let the next composition end with an empty entry of the right type for each object, place,
-    phase, camera or servo that a ``+`` adds: OmegaConf would take none from a command line.
-
-    Returns:
-        The overrides, which set such an entry's values over its defaults.
+    phase, camera or servo that a ``+`` adds: OmegaConf would take none from a command line. The
+    overrides come back, and set such an entry's values over its defaults.
     """
     entries = DictConfig({})
     out = []
@@ -304,6 +279,34 @@ def _add_entries(overrides: Sequence[str]) -> list[str]:
         out.append(f"++{text.lstrip('+')}" if entry else text)
     ConfigStore.instance().store("added_entries", entries, package="_global_", provider="mjstack")
     return out
+
+
+def _choose_observation(
+    overrides: list[str], compose: Callable[[list[str]], DictConfig]
+) -> list[str]:
+    """Let a new policy see the task's own observation: where the overrides say so, or where they
+    say nothing and the task writes all of its terms, without a choice of a file. The overrides come
+    back with that choice, whose terms are ready for the next composition.
+    """
+    chosen = [o for o in overrides if o.startswith(SEEN)]
+    trains = any(o.startswith(("job=train", "trainer=", "experiment=")) for o in overrides)
+    if TASK_SEEN not in chosen and (chosen or not trains):
+        return overrides
+    _store_observation({})
+    # An override of one of its terms fits only where the choice has been made.
+    cfg = compose([o for o in overrides if "job.observation" not in o])
+    choices = cfg.hydra.runtime.choices
+    alone = choices.get("observation") is None and bool(cfg.observation)
+    if not (chosen or (alone and choices.get(SEEN.rstrip("=")) == "state")):
+        return overrides
+    _store_observation(OmegaConf.to_container(cfg.observation))
+    return [*(o for o in overrides if o != TASK_SEEN), TASK_SEEN]
+
+
+def _store_observation(terms: Any) -> None:
+    """Set what ``conf/observation/task.yaml`` includes."""
+    node = OmegaConf.create(terms)
+    ConfigStore.instance().store("task_observation", node, provider="mjstack")
 
 
 def without_hydra(cfg: DictConfig) -> DictConfig:
@@ -326,7 +329,7 @@ def list_choices() -> dict[str, list[str]]:
 
 def _checked_folder(text: str) -> Path:
     """A folder with configuration files, absolute."""
-    folder = Path(text.removeprefix(_FILE)).absolute()
+    folder = Path(text.removeprefix("file://")).absolute()
     if not folder.is_dir():
         raise MjstackError(
             f"configuration folder {folder}: there is no such folder, expected one with YAML files"

@@ -10,9 +10,8 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from mjstack.config.policy_observation import TASK_SEEN
 from mjstack.config.schema import CloneJobCfg
-from mjstack.config.session import CONFIG_FOLDER
+from mjstack.config.session import CONFIG_FOLDER, TASK_SEEN
 
 Terms = dict[str, Any]
 
@@ -28,11 +27,8 @@ _LEFT_OUT = {
 
 def complete_terms(cfg: DictConfig, overrides: Sequence[str]) -> None:
     """Put the terms that are written over ``reset`` into its copies, and a line for each term that
-    does not act into ``unused_terms``, in place.
-
-    Args:
-        cfg: A composition, with Hydra's part.
-        overrides: Of the command line.
+    does not act into ``unused_terms``, in place. The composition, of the command line's overrides,
+    has Hydra's part.
     """
     chosen = any(o.startswith(f"reset@{_JUDGED}=") for o in overrides)
     with open_dict(cfg):
@@ -44,10 +40,8 @@ def complete_terms(cfg: DictConfig, overrides: Sequence[str]) -> None:
 
 
 def _complete_copy(cfg: DictConfig, key: str) -> Iterator[str]:
-    """Put the terms that are written over ``reset`` into a copy of it.
-
-    Yields:
-        A line for each that does not act in gate *success*, if that runs.
+    """Put the terms that are written over ``reset`` into a copy of it, and yield a line for each
+    that does not act in gate *success*, if that runs.
     """
     shipped = _shipped(cfg, "reset")
     copy = _terms(cfg, key)

@@ -50,19 +50,16 @@ class ClosedLoopDriver(FeedbackDriver):
         self._home_grip = robot(env).home[self._n_arm :].float()
 
         # Buffers
-        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-            return torch.zeros((env.nworld, *shape), dtype=dtype, device=env.device)
-
-        self._time = zeros()
-        self._rate = zeros()
-        # Whose grasp has been tried again
-        self._tried = zeros(len(self._cfg.scene.objects), dtype=torch.bool)
-        self._again = zeros(dtype=torch.bool)  # the phase was entered to try a grasp once more
+        self._time = torch.zeros_like(self.error)
+        self._rate = torch.zeros_like(self.error)
+        self._roll = torch.zeros_like(self.error)
+        # Whether the phase was entered to try a grasp once more, and whose has been tried again
+        self._again = torch.zeros_like(self.error, dtype=torch.bool)
+        self._tried = self._again[:, None].repeat(1, len(self._cfg.scene.objects))
         # Grasp point and gripper at both ends of the phase
-        self._from = zeros(3 + len(self._cfg.robot.gripper_joints))
+        self._from = self.error.new_zeros((env.nworld, 3 + len(self._cfg.robot.gripper_joints)))
         self._to = torch.zeros_like(self._from)
         self._at = torch.zeros_like(self._from)  # what the last command led to
-        self._roll = zeros()
 
     def command(self) -> Tensor:
         """Commands of the next step, shape ``(nworld, nu)``, float32. The controller's own memory:
@@ -243,14 +240,9 @@ def _put(buffer: Tensor, mask: Tensor, values: Tensor) -> None:
 
 
 def make_expert(env: Env) -> ClosedLoopDriver:
-    """Closed-loop driver of an environment: call ``command()`` once before every
-    ``env.step``.
-
-    Worlds may end and start anew whenever they like; each goes through its own phases from its own
-    reset on.
-
-    Args:
-        env: The environment, built with ``action=joint_absolute``.
+    """Closed-loop driver of an environment built with ``action=joint_absolute``: call ``command()``
+    once before every ``env.step``. Worlds may end and start anew whenever they like; each goes
+    through its own phases from its own reset on.
 
     Raises:
         ArgumentError: Its actions are not absolute joint commands, or its worlds have moved on

@@ -61,11 +61,7 @@ class Assets:
 
     @cached_property
     def policy(self) -> Policy:
-        """The policy of ``controller=policy``.
-
-        Raises:
-            MjstackError: There is none, or it cannot be read.
-        """
+        """The policy that ``policy`` names; a MjstackError if none can be read."""
         if self.cfg.policy is None:
             expected = "the folder of a trained policy, which controller=policy plays"
             raise ConfigError("policy", None, expected)
@@ -128,12 +124,9 @@ class Driver(ABC):
 
     @classmethod
     def build(cls, env: Env, cfg: Config, assets: Assets) -> "Driver":
-        """Make the driver of worlds that have started.
-
-        Args:
-            env: The environment. Its configuration has neither observations nor cameras.
-            cfg: The whole configuration.
-            assets: Plan and policy, made when they are asked for.
+        """Make the driver of worlds that have started, in an environment whose configuration has
+        neither observations nor cameras; ``cfg`` is the whole one. Plan and policy are made when
+        they are asked for.
         """
         return cls.with_params(cfg, env)
 
@@ -158,10 +151,8 @@ def with_controller(cfg: Config, name: str) -> Config:
 
 
 def find_driver(cfg: Config) -> type[Driver]:
-    """The class that ``controller.func`` names.
-
-    Raises:
-        TermError: There is no such driver, or it lacks a method.
+    """The class that ``controller.func`` names; a TermError if there is none, or it lacks a method
+    of `Driver`.
     """
     driver: Any = resolve_func("controller", cfg.controller.func, base=Driver)
     if lacking := sorted(driver.__abstractmethods__):
@@ -172,10 +163,8 @@ def find_driver(cfg: Config) -> type[Driver]:
 
 def check_driver(env: Env, cfg: Config, assets: Assets) -> None:
     """Build the configured driver and take its first actions; a policy, whose widths are compared,
-    is not asked. Arguments as of `Driver.build`; the worlds are not used afterwards.
-
-    Raises:
-        TermError: Its actions cannot be used, or one of its attributes.
+    is not asked. Arguments as of `Driver.build`; the worlds are not used afterwards. A TermError
+    if its actions cannot be used, or one of its attributes.
     """
     with blamed("controller"):
         driver = find_driver(cfg).build(env, cfg, assets)
@@ -196,15 +185,8 @@ def check_driver(env: Env, cfg: Config, assets: Assets) -> None:
 
 
 def require_actions(cfg: Config, terms: Mapping[str, TermCfg], expected: str) -> None:
-    """Check that an environment takes a driver's actions in every control step.
-
-    Args:
-        cfg: Its configuration.
-        terms: The driver's action terms.
-        expected: Words for such actions.
-
-    Raises:
-        ArgumentError: It has other action terms, or repeats an action.
+    """Check that an environment of a configuration takes a driver's actions, ``expected`` in words,
+    in every control step; other action terms or repeated actions are an ArgumentError.
     """
     if list(cfg.action.values()) != list(terms.values()):
         targets = terms == cfg.controller.action

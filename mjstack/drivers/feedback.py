@@ -62,10 +62,7 @@ class CarryTilt:
         self, env: EnvView, phases: Sequence[Phase], ik: BatchedIk, nominal: Tensor
     ) -> None:
         """Allocate for the worlds of a driver with these phases, solver and nominal commands, shape
-        ``(phases, nu)``, float32.
-
-        Raises:
-            ConfigError: The arm's first joint does not turn about the vertical.
+        ``(phases, nu)``, float32; a ConfigError if the arm's first joint is not vertical.
         """
         self._ik = ik
         self._nominal = nominal
@@ -81,7 +78,8 @@ class CarryTilt:
     def desired_approach(
         self, command: Tensor, phase: Tensor, there: Tensor, fresh: Tensor
     ) -> Tensor:
-        """Desired approach axis of the next step. Fixed shapes, no host read.
+        """Desired approach axis of the next step, unit vectors, shape ``(nworld, 3)``, float32.
+        Fixed shapes, no host read.
 
         Args:
             command: Joint positions at which the arm starts [rad, m], shape ``(nworld, nu)``,
@@ -90,9 +88,6 @@ class CarryTilt:
             there: Target of the phase ``place[phase]``, where the next object or the held one is
                 released [m], shape ``(nworld, 3)``.
             fresh: Worlds that start an episode, shape ``(nworld,)``, bool.
-
-        Returns:
-            Unit vectors, shape ``(nworld, 3)``, float32.
         """
         start = torch.where(fresh[:, None], self._nominal[self.place[phase]], self._there)
         self._there.copy_(self._there_ik.solve(start, there)[0])
@@ -161,16 +156,10 @@ class FeedbackDriver(Driver):
         return cls.with_params(cfg, env, assets.planner.nominal)
 
     def __init__(self, env: EnvView, nominal: np.ndarray, *, clock: bool) -> None:
-        """Allocate for the environment's worlds.
-
-        Args:
-            env: The environment; its action terms must take absolute joint commands.
-            nominal: Commands at the end of each phase of the nominal plan, which redundant joints
-                keep close to, shape ``(phases, nu)``.
-            clock: Whether worlds go through the phases one after the other.
-
-        Raises:
-            MjstackError: The environment takes other actions, or worlds have moved on.
+        """Allocate for the worlds of an environment, whose action terms must take absolute joint
+        commands. Redundant joints keep close to the nominal plan's commands at the end of each
+        phase, shape ``(phases, nu)``. With a clock worlds go through the phases one by one. A
+        MjstackError if the environment takes other actions, or worlds have moved on.
         """
         cfg = env.cfg
         device = env.device

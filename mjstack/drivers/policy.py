@@ -88,16 +88,10 @@ class PolicyDriver(Driver):
     def __init__(
         self, env: Env, policy: Policy, cameras: Mapping[str, CameraCfg] | None = None
     ) -> None:
-        """Build the policy's observation and allocate for the environment's worlds.
-
-        Args:
-            env: The environment, its worlds started; its action terms must be the policy's.
-            policy: The policy.
-            cameras: The scene's cameras, if the environment's configuration does not have them.
-
-        Raises:
-            MjstackError: The policy was trained for something else, or the environment takes other
-                actions.
+        """Build the policy's observation and allocate for the environment's worlds, which have
+        started; its action terms must be the policy's. ``cameras`` are the scene's, if its
+        configuration does not have them. A MjstackError if the policy was trained for something
+        else, or the environment takes other actions.
         """
         cfg = env.cfg
         require_actions(cfg, policy.action, "those that the policy was trained with")
@@ -226,12 +220,10 @@ class LerobotDriver(Driver):
         here = {name: part.shape[1:] for name, part in self._words.observe().items()}
         for name, shape in inputs.items():
             if here.get(name) not in (shape, (*shape[1:], *shape[:1])):  # images are (…, 3) here
-                there = f"{here.get(name, 'missing')}: expected the same"
-                problem = (
-                    f"policy={cfg.policy}: takes {name} of shape {shape}, and here it is {there}"
-                )
+                there = f"and here it is {here.get(name, 'missing')}: expected the same"
+                problem = f"policy={cfg.policy}: takes {name} of shape {shape}"
                 fix = "Set cameras, scene.cameras.NAME.size and observation as in its training"
-                raise FolderError(problem, fix)
+                raise FolderError(f"{problem}, {there}", fix)
         self._policy.reset()
 
     def command(self) -> Tensor:

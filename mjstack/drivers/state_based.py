@@ -100,11 +100,8 @@ class StateBasedDriver(FeedbackDriver):
     stateless = True
 
     def __init__(self, env: EnvView, nominal: np.ndarray) -> None:
-        """Allocate for the environment's worlds; arguments as of `FeedbackDriver`.
-
-        Raises:
-            MjstackError: As of `FeedbackDriver`, the task has no check, or its phases do nothing
-                that a state tells, see `find_roles`.
+        """Allocate for the environment's worlds; arguments and errors as of `FeedbackDriver`. It is
+        also an error if the task has no check, or as of `find_roles`.
         """
         super().__init__(env, nominal, clock=False)
         cfg = env.cfg
@@ -135,19 +132,17 @@ class StateBasedDriver(FeedbackDriver):
         self._has_faces = tensor(thing.has_faces for thing in cfg.scene.objects.values())
 
         # Heights of targets: over an object that is not carried, wherever it is, or over the table
-        objects = {*range(len(things))}
         self._above = tensor(target.above for _, target in self._aimed)
         self._follows = tensor(
-            phase.spec.level != "table" and target.source in objects - {phase.carried}
+            phase.spec.level != "table" and phase.carried != target.source < len(things)
             for phase, target in self._aimed
         )
         self._off_center = tensor(_OFF_CENTER)
 
         # The robot
-        names = cfg.robot.joints
         aligned = cfg.robot.roll_joint if self._aligns else None
         locked = cfg.robot.locked.items()
-        self._locked = [(names.index(name), value) for name, value in locked if name != aligned]
+        self._locked = [(cfg.robot.joints.index(k), v) for k, v in locked if k != aligned]
         tensors = robot(env)
         self._quarters = 0.5 * math.pi * torch.arange(4, device=device)[:, None]
         self._grip_lead = _GRIP * (tensors.gripper_open - tensors.gripper_closed).abs().float()

@@ -81,10 +81,7 @@ class Policy:
 
     def check_fit(self, cfg: Config) -> None:
         """Check that the policy was trained for the robot, task, objects, step and cameras of a
-        configuration.
-
-        Raises:
-            FolderError: It was trained for something else; names the first difference.
+        configuration; a FolderError names the first difference.
         """
         cameras = list(self.network.vision.sizes)
         trained = _requirements(self.config, cameras)
@@ -92,10 +89,7 @@ class Policy:
 
     def check_widths(self, widths: Mapping[str, int], action: int) -> None:
         """Check how many numbers an action and each term of its group have in the worlds that it
-        is to drive.
-
-        Raises:
-            FolderError: One has another number.
+        is to drive; another number is a FolderError.
         """
         self._compare({"action.width": self.network.width}, {"action.width": action})
         key = f"observation.{self.group}.terms.{{}}.width"
@@ -139,10 +133,8 @@ def _requirements(config: Facts, cameras: Sequence[str]) -> Facts:
 
 
 def save_policy(folder: Path, policy: Policy) -> None:
-    """Write a policy's folder; an earlier policy in it is replaced at once or not at all.
-
-    Raises:
-        FolderError: It cannot be written; an earlier policy is intact.
+    """Write a policy's folder; an earlier policy in it is replaced at once or not at all, such as
+    where a FolderError says that it cannot be written.
     """
     weights = save({k: v.contiguous() for k, v in policy.network.state_dict().items()})
     digest = sha256(weights).hexdigest()
@@ -341,10 +333,8 @@ def _writing(path: Path) -> Iterator[None]:
 
 
 def write_state(path: Path, tensors: Mapping[str, Tensor], facts: Facts) -> None:
-    """Write tensors and facts in JSON's types as one file, at once or not at all.
-
-    Raises:
-        FolderError: It cannot be written; an earlier file is intact.
+    """Write tensors and facts in JSON's types as one file, at once or not at all, such as where a
+    FolderError says that it cannot be written.
     """
     plain = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     with _writing(path):
@@ -352,10 +342,8 @@ def write_state(path: Path, tensors: Mapping[str, Tensor], facts: Facts) -> None
 
 
 def read_state(path: Path) -> tuple[dict[str, Tensor], Facts]:
-    """Tensors and facts of `write_state`.
-
-    Raises:
-        FolderError: The file cannot be read, or has numbers that are not finite.
+    """Tensors and facts of `write_state`; a FolderError if they cannot be read or a number of a
+    tensor is not finite.
     """
     with reading(path, "Remove it to train anew"), safe_open(path, "pt") as file:
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118

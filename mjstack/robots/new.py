@@ -22,10 +22,8 @@ _GRIPPER = re.compile("grip|finger|jaw|thumb|left|right", re.IGNORECASE)
 
 def write_new(args: Sequence[str]) -> list[Path]:
     """Write the files of ``task``, ``driver`` or ``action NAME``, or of ``robot NAME FILE.xml``,
-    into a new folder NAME.
-
-    Raises:
-        MjstackError: The arguments are others, NAME exists, or MuJoCo cannot compile the file.
+    into a new folder NAME; a MjstackError if the arguments are others, NAME exists, or MuJoCo
+    cannot compile the file.
     """
     kind, name = (*args, "", "")[:2]
     if len(args) != (3 if kind == "robot" else 2) or kind not in _GROUPS:
@@ -34,7 +32,7 @@ def write_new(args: Sequence[str]) -> list[Path]:
     folder = Path(name)
     valid = re.fullmatch(r"[a-z][a-z0-9_]{0,63}", name)
     choices = list_choices()[_GROUPS[kind]]
-    if not valid or folder.exists() or name in choices or find_spec(name) is not None:
+    if not valid or name in choices or folder.exists() or find_spec(name) is not None:
         raise MjstackError(
             f"new {kind} {name}: expected small letters, digits and _, and no folder, {kind} or"
             " Python module of that name. Choose another name."
@@ -50,10 +48,8 @@ def write_new(args: Sequence[str]) -> list[Path]:
 
 
 def _read_robot(file: Path, folder: Path) -> dict[str, str]:
-    """What an MJCF file tells about a robot, as YAML has it.
-
-    Raises:
-        MjstackError: It cannot be read, has too few joints, or a name that YAML cannot have.
+    """Joints, jaws and sites of an MJCF file, as YAML has them; a MjstackError if it cannot be
+    read, has too few joints, or a name that YAML cannot have.
     """
     try:
         check_regular(file)
