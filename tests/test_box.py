@@ -375,7 +375,7 @@ def test_a_bad_value_is_one_line(override: str, parts: list[str]) -> None:
         ("timing=default timing.decimation=11", ["task.control_hz=50"]),
         ("observation.policy.terms.red_to_slot.params.object=red_cub", ["red_to_slot", "red_cub"]),
         ("reward.progress.params.scale=0", ["reward.progress.params.scale=0", "above 0"]),
-        ("task=stack observation=box", ["box"]),
+        ("task=stack observation=box", ["red_to_slot", "place 'red_slot' does not exist"]),
     ],
 )
 def test_bad_input_is_one_line(overrides: str, parts: list[str]) -> None:

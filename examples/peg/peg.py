@@ -36,12 +36,10 @@ class PegCheck(EpisodeCheck):
         t = self.t
         self.over = in_zone("peg", "hole", low=[-t.within] * 2, high=[t.within] * 2)
         self.stands = on_table("peg", gap=t.gap) & upright("peg", tilt_deg=t.tilt_deg)
-        in_hole = InWindow(
-            "IN_HOLE", "peg not in the hole", self.over, t.window, measure=self.trace
-        )
-        in_hole.limits[0]["off_m"] = (0.0, t.within)
+        hole = InWindow("IN_HOLE", "peg not in the hole", self.over, t.window, measure=self.trace)
+        hole.limits[0]["off_m"] = (0.0, t.within)
         return [
-            in_hole,
+            hole,
             InWindow("BOTTOM", "peg does not stand at the bottom", self.stands, t.window),
             InWindow("RELEASED", "peg not released", released("peg", open_fraction=0.8), t.window),
             AtRest(t.window, speed=0.05, position=0.005, rotation_deg=3.0),

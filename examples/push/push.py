@@ -39,14 +39,13 @@ class PushCheck(EpisodeCheck):
         lies = down & flat("puck", tilt_deg=t.tilt_deg)
         slid = down & flat("puck", tilt_deg=t.tip_deg)
         there = at_place("puck", "goal", distance=t.within)
-        alone = released("puck", open_fraction=0.0)
         self.there = there & lies
         at_goal = InWindow("AT_GOAL", "puck not at goal", there, t.window, measure=self.trace)
         at_goal.limits[0]["distance_m"] = (0.0, t.within)
         return [
             InWindow("FLAT", "puck does not lie flat", lies, t.window),
             at_goal,
-            InWindow("LEFT_ALONE", "puck touched", alone, t.window),
+            InWindow("LEFT_ALONE", "puck touched", released("puck", open_fraction=0.0), t.window),
             AtRest(t.window, speed=0.05, position=0.005, rotation_deg=3.0),
             InWindow("SLID", "puck lifted or tipped over", slid, self.cfg.task.episode_steps),
         ]

@@ -291,6 +291,8 @@ def _read_vision(facts: Facts) -> Vision:
     if not images:
         return Vision()
     network = facts["network"]
+    if not network["channels"]:
+        raise ValueError("network.channels has 0 layers, expected at least 1")
     side = partial(_whole, "observation.images", most=_MOST_PIXELS)
     return Vision(
         sizes={name: (side(height), side(width)) for name, (height, width) in images.items()},
