@@ -18,14 +18,17 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
+from mjstack.adapters.ids import Registrar
+from mjstack.version import __version__ as __version__
+
 if TYPE_CHECKING:
     from mjstack.config import Config, load_config
     from mjstack.envs import Env, make_env
     from mjstack.errors import MjstackError
     from mjstack.jobs.runner import verify
+    from mjstack.policy import load_policy
 
-__all__ = ["Config", "Env", "MjstackError", "load_config", "make_env", "verify"]
-__version__ = "0.2.0"
+__all__ = ["Config", "Env", "MjstackError", "load_config", "load_policy", "make_env", "verify"]
 
 _HOMES = {
     "Config": "mjstack.config",
@@ -33,6 +36,7 @@ _HOMES = {
     "Env": "mjstack.envs",
     "make_env": "mjstack.envs",
     "MjstackError": "mjstack.errors",
+    "load_policy": "mjstack.policy",
     "verify": "mjstack.jobs.runner",
 }
 
@@ -45,3 +49,10 @@ if not TYPE_CHECKING:  # a type checker would take any name for one of these
         if find_spec(f"mjstack.{name}"):
             return import_module(f"mjstack.{name}")
         raise AttributeError(f"module 'mjstack' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+Registrar().install()

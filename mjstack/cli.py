@@ -23,13 +23,13 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-import mjstack
 from mjstack.cli_sweep import check_jobs, claim_sweep, expand, hydra_path, print_sweep
 from mjstack.config.explain import own_overrides
 from mjstack.config.help import help_text, key_help, list_text
 from mjstack.config.load import compose, extended_search_path, to_config
 from mjstack.config.session import (
     CONFIG_NAME,
+    command_line,
     hydra_session,
     lacking_folders,
     list_items,
@@ -42,6 +42,7 @@ from mjstack.interrupt import EXIT_CODE, begin_job
 from mjstack.process import is_rank
 from mjstack.report.record import Report, Status
 from mjstack.report.table import Console
+from mjstack.version import __version__
 
 if TYPE_CHECKING:
     from mjstack.jobs import CheckedJob
@@ -63,10 +64,10 @@ def run(args: list[str]) -> int:
     _assisting = False
     try:
         if "--version" in args:
-            print(f"mjstack {mjstack.__version__}")
+            print(f"mjstack {__version__}")
             return 0
         flags = _parse(args)
-        with extended_search_path(flags.overrides, flags.config_dir) as overrides:
+        with command_line(), extended_search_path(flags.overrides, flags.config_dir) as overrides:
             return _dispatch(flags, overrides)
     except KeyboardInterrupt:  # the job has said so
         return EXIT_CODE
@@ -88,11 +89,9 @@ def run(args: list[str]) -> int:
 def _dispatch(flags: Namespace, overrides: list[str]) -> int:
     """Do what the flags ask for, on the current search path."""
     demonstrates = overrides[:1] == ["demo"]
+    if demonstrates and any(override.startswith("experiment=") for override in overrides):
+        raise MjstackError("demo: expected no experiment=NAME, because it is one. Leave it out.")
     if demonstrates:
-        if any(override.startswith("experiment=") for override in overrides):
-            raise MjstackError(
-                "demo: expected no experiment=NAME, because it is one. Leave it out."
-            )
         overrides = ["experiment=demo", *overrides[1:]]
     with hydra_session() as hydra:
         if overrides[:1] == ["list"]:

@@ -8,10 +8,9 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from mjstack.config.explain import own_overrides, parse
+from mjstack.config.explain import assign, own_overrides, parse
 from mjstack.config.load import compose
 from mjstack.config.schema import SweepCfg
-from mjstack.config.session import quoted
 from mjstack.errors import ConfigError, MjstackError, is_out_of_memory
 from mjstack.files import claim_folder
 from mjstack.report.record import Report
@@ -42,7 +41,7 @@ def check_jobs(
     separate = not _launcher(master).endswith(".BasicLauncher")
     of_hydra = list(master.hydra.overrides.hydra)
     for job in jobs:
-        cfg = compose([*of_hydra, f"hydra.sweep.dir={quoted(folder)}", *job])
+        cfg = compose([*of_hydra, assign("hydra.sweep.dir", folder), *job])
         if cfg.devices is not None:
             fix = "Leave it out: with hydra/launcher=gpus each job has one GPU"
             raise ConfigError("devices", cfg.devices, "null with -m", fix)
@@ -74,7 +73,7 @@ def claim_sweep(master: DictConfig, jobs: Sequence[list[str]]) -> Iterator[Path]
     key = "hydra.sweep.dir"
     with claim_folder(folder, marker=marker, numbered=hourly, shared=queued, key=key) as claimed:
         master.hydra.sweep.dir = str(claimed)
-        master.hydra.overrides.hydra.append(f"hydra.sweep.dir={quoted(claimed)}")  # of its jobs
+        master.hydra.overrides.hydra.append(assign("hydra.sweep.dir", claimed))  # of its jobs
         add_jobs(claimed, number_jobs(claimed, jobs))
         yield claimed
 

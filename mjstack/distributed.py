@@ -76,10 +76,8 @@ class Ranks:
             gradient.copy_(part.view_as(gradient))
 
     def gather(self, value: T) -> list[T]:
-        """An object of every process, by rank; no tensor of it is on CUDA.
-
-        Raises:
-            RankError: Another rank has gone; says which, and why.
+        """An object of every process, by rank; no tensor of it is on CUDA. A RankError says which
+        other rank has gone, and why.
         """
         if self.size == 1:
             return [value]
@@ -100,19 +98,15 @@ class Ranks:
         return results[0]
 
     def from_first(self, work: Callable[[], T]) -> T:
-        """The result of work that rank 0 alone does, in every rank.
-
-        Raises:
-            RankError: It failed there, in the other ranks.
+        """The result of work that rank 0 alone does, in every rank; a RankError in the others if it
+        fails there.
         """
         first: Callable[[], Any] = work if self.writes else lambda: None
         return self.in_all(first)[0]
 
     def in_all(self, work: Callable[[], T]) -> list[T]:
-        """The results of work that every rank does, by rank. If it fails in one, it fails in all.
-
-        Raises:
-            RankError: It failed in another rank. One error in all of them is rank 0's.
+        """The results of work that every rank does, by rank. If it fails in one, it fails in all,
+        in the others by a RankError. One error in all of them is rank 0's.
         """
         if self.size == 1:
             return [work()]
@@ -202,10 +196,8 @@ def see_one_gpu() -> None:
 
 @contextmanager
 def joined() -> Iterator[Ranks]:
-    """Join the processes of the job that torchrun has started.
-
-    Raises:
-        MjstackError: Not all of them came, or the port is in use.
+    """Join the processes of the job that torchrun has started; a MjstackError if not all of them
+    come, or the port is in use.
     """
     global _current, _store
     see_one_gpu()
@@ -249,12 +241,8 @@ def joined() -> Iterator[Ranks]:
 
 
 def launch(args: Sequence[str], count: int) -> int:
-    """Run this command in ranks on this machine, by torch's elastic launch, and return its exit
-    status.
-
-    Args:
-        args: The command's arguments.
-        count: How many ranks.
+    """Run this command with its arguments in some ranks on this machine, by torch's elastic launch,
+    and return its exit status.
     """
     from torch.distributed.elastic.multiprocessing import SignalException
     from torch.distributed.elastic.multiprocessing.errors import ChildFailedError

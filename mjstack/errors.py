@@ -19,6 +19,8 @@ _OUT_OF_MEMORY = re.compile(
     r"|can't allocate memory|not enough memory",
     re.IGNORECASE,
 )
+_MOST_LETTERS = 290  # of a line, before which the command puts its name
+_MOST_NAMED = 7  # names of a list in it
 _LIBRARIES = (  # whose frames tell a user nothing
     *(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")),
     str(Path(__file__).parent),
@@ -37,14 +39,11 @@ class MjstackError(Exception):
     exit_code = 2  # of a command line that could not begin
 
     def __init__(self, problem: str, fix: str = "") -> None:
-        """Build the message.
-
-        Args:
-            problem: A value or an event, and what was expected; with or without its full stop.
-            fix: What to do about it, a sentence without its full stop.
+        """Build the message from the problem, a value or an event and what was expected, with or
+        without its full stop, and the fix: what to do about it, a sentence without one.
         """
         stop = "" if problem.endswith((".", "?")) else "."
-        super().__init__(f"{problem}{stop}{f' {fix}.' if fix else ''}")
+        super().__init__(shorten(f"{problem}{stop}{f' {fix}.' if fix else ''}"))
 
 
 class KeyedError(MjstackError):
@@ -53,19 +52,17 @@ class KeyedError(MjstackError):
     def __init__(self, key: str, problem: str, fix: str = "") -> None:
         super().__init__(f"{key}{problem}", fix)
         self.key = key
+        self._rest = (problem, fix)
 
     def move(self, key: str) -> None:
         """Name the key that the user has set instead."""
-        self.args = (key + str(self).removeprefix(self.key),)
-        self.key = key
+        KeyedError.__init__(self, key, *self._rest)
 
 
 @contextmanager
 def renamed_keys(keys: Mapping[str, str]) -> Iterator[None]:
-    """Let errors of what runs inside name the keys that the user has set.
-
-    Args:
-        keys: The key in the configuration, by the beginning of the one that an error names.
+    """Let errors of what runs inside name the keys that the user has set, by the beginnings of the
+    keys that they name.
     """
     try:
         yield
@@ -178,7 +175,7 @@ def describe_error(
 ) -> str:
     """An error in one line: kind, text, the line of the user's own code, where the traceback is."""
     if isinstance(error, MjstackError):
-        return " ".join(str(error).splitlines())  # a value in it may have several
+        return shorten(" ".join(str(error).splitlines()))  # a value in it may have several
     first = first_line(error)
     if is_out_of_memory(f"{type(error).__name__}: {error}"):
         smaller = "Run fewer worlds, or lower batch.nconmax, batch.njmax"
@@ -188,20 +185,32 @@ def describe_error(
         for frame in traceback.extract_tb(error.__traceback__)
         if not frame.filename.startswith(_LIBRARIES)
     ]
-    return f"{type(error).__name__}: {first} ({''.join(frames[-1:])}{traceback_at})"
+    return shorten(f"{type(error).__name__}: {first} ({''.join(frames[-1:])}{traceback_at})")
 
 
 def first_line(error: BaseException) -> str:
     """The first line of an error's text without its full stop; its type where it has no text."""
-    return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
+    return shorten((str(error).splitlines() or [type(error).__name__])[0].rstrip("."))
+
+
+def shorten(text: str, most: int = _MOST_LETTERS) -> str:
+    """A text that fits a line: of a longer one, long paths and words and then the rest lose their
+    middle. It begins with the key or the file, and ends with what to do.
+    """
+    if len(text) <= most:
+        return text
+    begin, end = text[: -(most // 2)], text[-(most // 2) :]
+    begin = re.sub(r"/\S{50,}|\S{100,}", lambda long: f"{long[0][:20]}...{long[0][-20:]}", begin)
+    return begin + end if len(begin + end) <= most else f"{begin[: most // 2 - 5]} ... {end}"
 
 
 def suggest(name: str, available: Iterable[str]) -> str:
-    """List the available names, the nearest match first if there is one."""
+    """List the available names, or the first of many, the nearest match first if there is one."""
     names = sorted(available)
-    nearest = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    nearest = difflib.get_close_matches(shorten(name), names[:1000], n=1, cutoff=0.5)
     hint = f"Did you mean '{nearest[0]}'? " if nearest else ""
-    return f"{hint}Available: {', '.join(names) or 'none'}."
+    more = f" and {len(names) - _MOST_NAMED} more" * (len(names) > _MOST_NAMED)
+    return f"{hint}Available: {', '.join(names[:_MOST_NAMED]) or 'none'}{more}."
 
 
 def name_worlds(

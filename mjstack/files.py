@@ -1,4 +1,7 @@
-"""Files that appear complete or not at all, folders of one run each, and rows as CSV."""
+"""Files that appear complete or not at all, folders of one run each, and rows as CSV.
+
+A file may be a stranger's. These are the bounds on what reading one takes, whatever its size is.
+"""
 
 import csv
 import fcntl
@@ -9,33 +12,42 @@ import os
 import shutil
 import stat
 import tempfile
-import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml  # type: ignore[import-untyped]
 
-import mjstack
 from mjstack.errors import FolderError, MjstackError, first_line
+from mjstack.version import __version__
 
-_MOST_TEXT = 2**26  # bytes of JSON or YAML
-_MOST_BYTES = 2**32  # of any other file, and of the arrays in one
+_PACKAGE = Path(__file__).parent
+# In a checkout the configuration lies beside the package, in a wheel inside of it.
+CONFIG_FOLDER = next(
+    folder
+    for folder in (_PACKAGE.parent / "conf", _PACKAGE / "conf")
+    if (folder / "config.yaml").is_file()
+)
+# Bytes of a file, and of what an npz file unpacks to
+_MOST = {".json": 2**22, ".yaml": 2**20, ".npz": 2**29, ".safetensors": 2**30}
+_MOST_BYTES = 2**32  # of any other
+_MOST_ARRAYS = 1000  # of an npz file
+_MOST_ROWS = 2**20  # of an array: of most files one for each world
+_MOST_VALUES = 5_000  # of a configuration, which has some 1,700
+_MOST_LETTERS = 3_000  # of a value, which Python can still write where it is a number
+_TOO_MANY = f"it has more than {_MOST_VALUES} values, or {_MOST_LETTERS} letters in one"
 _KEY = "hydra.run.dir (job=collect, job=train: job.folder)"
 
 
 @contextmanager
 def reading(path: Path, fix: str) -> Iterator[None]:
-    """Raise one line for a file that is missing, damaged or none at all, as of `check_regular`: one
-    of a run's folder, which may be a stranger's, can hold anything.
-
-    Args:
-        path: The file that is read inside, or a folder of files.
-        fix: What to do about it, a sentence without its full stop.
-
-    Raises:
-        MjstackError: Something went wrong inside.
+    """Raise a `FolderError` of one line for a file, or one of a folder, that is read inside and is
+    missing, damaged or none at all, as of `check_regular`: one of a run's folder, which may be a
+    stranger's, can hold anything. ``fix`` is a sentence without its full stop.
     """
     try:
         for file in path.rglob("*") if path.is_dir() else [path]:
@@ -46,53 +58,84 @@ def reading(path: Path, fix: str) -> Iterator[None]:
         raise
     except Exception as error:
         reason = getattr(error, "strerror", None) or f"{type(error).__name__}: {first_line(error)}"
-        raise FolderError(
-            f"{path}: cannot be read ({reason}), expected it as written", fix
-        ) from error
+        problem = f"{path}: cannot be read ({reason}), expected it as written"
+        raise FolderError(problem, fix) from error
 
 
 def check_regular(path: Path, most: int = _MOST_BYTES) -> None:
-    """Check, before anything reads it, that a file ends: a stranger's may be a pipe or a device.
-
-    Args:
-        path: The file.
-        most: Bytes that it may have.
-
-    Raises:
-        OSError: There is no such file.
-        ValueError: It is no regular file, or has more bytes; far fewer are enough for text.
+    """Check, before anything reads it, that a file ends, and after how many bytes at most: a
+    stranger's may be a pipe or a device. An OSError if there is none, a ValueError if it is no
+    regular file, or has more bytes; far fewer are enough for text.
     """
     status = path.stat()
     if not stat.S_ISREG(status.st_mode):
         raise ValueError("it is no regular file")
-    most = min(most, _MOST_TEXT if path.suffix in (".json", ".yaml") else _MOST_BYTES)
+    most = min(most, _MOST.get(path.suffix, _MOST_BYTES))
     if status.st_size > most:
         raise ValueError(f"it has {status.st_size} bytes, more than {most}")
+    if path.suffix == ".safetensors":  # the first bytes say how long the names of its tensors are
+        with path.open("rb") as file:
+            if int.from_bytes(file.read(8), "little") > _MOST[".json"]:
+                raise ValueError(f"its header has more than {_MOST['.json']} bytes")
+
+
+def read_inside(path: Path, most: int = _MOST_BYTES) -> bytes:
+    """The content of a file inside its folder, checked as by `check_regular`."""
+    if path.resolve().parent != path.parent.resolve():
+        raise ValueError("it is a link that leads out of the folder")
+    check_regular(path, most)
+    return path.read_bytes()
+
+
+def read_json(path: Path, *keys: str) -> Any:
+    """The value below some keys of a JSON file of a folder; any exception if it cannot be read, a
+    `ValueError` if it has too many values.
+    """
+    value = reduce(getitem, keys, json.loads(read_inside(path)))
+    if sum(map(repr(value).count, ",:[{")) > _MOST_VALUES:
+        raise ValueError(_TOO_MANY)
+    return value
+
+
+def yaml_text(path: Path) -> str:
+    """The text of a YAML file; nothing is built of it. Any exception if it cannot be read, has too
+    many values or a very long one, or has aliases: a few stand for any number of values.
+    """
+    check_regular(path)
+    text = path.read_text()
+    # libyaml, where PyYAML has it: the other parser takes minutes for brackets nested very deep.
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    for number, event in enumerate(yaml.parse(text, Loader=loader)):
+        if isinstance(event, yaml.AliasEvent):
+            raise yaml.YAMLError("an alias")
+        if number > _MOST_VALUES or len(getattr(event, "value", "")) > _MOST_LETTERS:
+            raise ValueError(_TOO_MANY)
+    return text
 
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of an npz file by name. No object in it is built.
-
-    Raises:
-        Exception: It cannot be read; `ValueError` if it would be too large once unpacked.
+    """The arrays of an npz file by name; no object in it is built. Any exception if it cannot be
+    read, a `ValueError` if it would be too large once unpacked.
     """
     check_regular(path)
-    with zipfile.ZipFile(path) as file:
-        size = sum(item.file_size for item in file.infolist())
-    if size > _MOST_BYTES:
-        raise ValueError(f"its arrays have {size} bytes, more than {_MOST_BYTES}")
-    with np.load(path) as arrays:
-        return dict(arrays)
+    content = path.read_bytes()
+    if content.count(b"PK\x01\x02") > _MOST_ARRAYS:  # once for each in its list
+        raise ValueError(f"it has more than {_MOST_ARRAYS} arrays")
+    with np.load(io.BytesIO(content)) as file:
+        size = sum(member.file_size for member in file.zip.infolist())
+        if size > _MOST[".npz"]:
+            raise ValueError(f"its arrays have {size} bytes, more than {_MOST['.npz']}")
+        arrays = {name: file[name] for name in dict.fromkeys(file.files)}  # one may come twice
+    if any(len(np.atleast_1d(array)) > _MOST_ROWS for array in arrays.values()):
+        raise ValueError(f"it has more than {_MOST_ROWS} rows")
+    return arrays
 
 
 def write_atomic(path: Path, content: str | bytes) -> None:
     """Write a file beside its place and move it there.
 
     A full disk or a kill leaves the old file. Files that are written one after the other outlast a
-    power cut in this order.
-
-    Raises:
-        OSError: The file cannot be written.
+    power cut in this order. An OSError if it cannot be written.
     """
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
@@ -113,11 +156,7 @@ def write_atomic(path: Path, content: str | bytes) -> None:
 
 
 def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
-    """Write arrays as a compressed npz file in one step.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
+    """Write arrays as a compressed npz file in one step; an OSError if it cannot be written."""
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
     write_atomic(path, buffer.getvalue())
@@ -199,10 +238,7 @@ def _run_files(folder: Path) -> list[Path]:
 
 def move_aside(folder: Path) -> Path:
     """Move what a run has left in its folder to a new folder beside it, beside logs and Hydra's
-    files, which may be open.
-
-    Raises:
-        OSError: The folder cannot be made or a file cannot be moved.
+    files, which may be open; an OSError if it cannot be made or a file cannot be moved.
     """
     for number in itertools.count(1):
         aside = folder.with_name(f"{folder.name}-earlier-{number}")
@@ -233,9 +269,8 @@ def check_unused(folder: Path, job: str = "", *, marker: str = "", key: str = _K
     used = _run_files(folder)
     if not used or (marker and (folder / marker).is_file()):
         return
-    with suppress(OSError, ValueError, KeyError, TypeError):
-        check_regular(folder / "report.json")
-        if job and json.loads((folder / "report.json").read_text())["resumes"] == job:
+    with suppress(Exception):  # it may hold anything
+        if job and read_json(folder / "report.json", "resumes") == job:
             return
     raise FolderError(
         f"{folder} has {used[0].name}{made_by(folder)}, expected a new or an empty folder, or one"
@@ -255,20 +290,16 @@ def made_by(folder: Path) -> str:
     is this one, or no report has it.
     """
     for report in (folder / "report.json", *sorted(folder.glob("*/report.json"))):
-        with suppress(OSError, ValueError, LookupError, TypeError, RecursionError):
-            check_regular(report)
-            version = json.loads(report.read_text())["provenance"]["versions"]["mjstack"]
-            return "" if version == mjstack.__version__ else f" of mjstack {str(version)[:40]}"
+        with suppress(Exception):  # it may hold anything
+            version = read_json(report, "provenance", "versions", "mjstack")
+            return "" if version == __version__ else f" of mjstack {str(version)[:40]}"
     return ""
 
 
 def lock_folder(folder: Path, *, shared: bool = False) -> int:
     """A descriptor that keeps other writers out until it is closed, also by the end of the process;
-    or, if it is shared, those that would have the folder alone.
-
-    Raises:
-        FolderError: Another writer has the folder.
-        OSError: The folder cannot be opened.
+    or, if it is shared, those that would have the folder alone. A FolderError if another writer
+    has it, an OSError if it cannot be opened.
     """
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     if not lock(handle, shared=shared):
@@ -292,11 +323,8 @@ def lock(handle: int, *, shared: bool = False) -> bool:
 
 
 def to_csv(rows: Sequence[Mapping[str, object]], columns: Sequence[str] = ()) -> str:
-    """Rows as CSV text; a value that is missing or None is an empty cell.
-
-    Args:
-        rows: Values by column.
-        columns: The first columns. Other keys of the rows follow, in order of appearance.
+    """Rows, values by column, as CSV text; a value that is missing or None is an empty cell. The
+    first columns may be given; other keys of the rows follow, in order of appearance.
     """
     columns = list(dict.fromkeys([*columns, *(name for row in rows for name in row)]))
     out = io.StringIO()
@@ -304,11 +332,3 @@ def to_csv(rows: Sequence[Mapping[str, object]], columns: Sequence[str] = ()) ->
     writer.writeheader()
     writer.writerows(rows)
     return out.getvalue()
-
-
-def read_inside(path: Path, most: int = _MOST_BYTES) -> bytes:
-    """The content of a file inside its folder, checked as by `check_regular`."""
-    if path.resolve().parent != path.parent.resolve():
-        raise ValueError("it is a link that leads out of the folder")
-    check_regular(path, most)
-    return path.read_bytes()

@@ -49,14 +49,7 @@ def quat_mul(a: Tensor, b: Tensor) -> Tensor:
 
 
 def quat_from_yaw(yaw: Tensor) -> Tensor:
-    """Rotation about world z.
-
-    Args:
-        yaw: Angle [rad], shape ``(...)``.
-
-    Returns:
-        Unit quaternion, shape ``(..., 4)``.
-    """
+    """Unit quaternion of a rotation about world z [rad], shape ``(...)``; shape ``(..., 4)``."""
     half = 0.5 * yaw
     zero = torch.zeros_like(yaw)
     return torch.stack((torch.cos(half), zero, zero, torch.sin(half)), dim=-1)
@@ -104,16 +97,8 @@ def quat_to_matrix(quat: Tensor) -> Tensor:
 
 
 def lowest_point(pos: Tensor, quat: Tensor, shape: str, size: Sequence[float]) -> Tensor:
-    """Height [m] of the lowest point of an object.
-
-    Args:
-        pos: Centre [m], shape ``(..., 3)``.
-        quat: Orientation, shape ``(..., 4)``.
-        shape: A shape of `ObjectCfg`.
-        size: Its sizes [m].
-
-    Returns:
-        World z of the lowest point, shape ``(...)``.
+    """World z of the lowest point [m], shape ``(...)``, of an object with shape and sizes [m] as of
+    `ObjectCfg`, by its centre [m], shape ``(..., 3)``, and orientation, shape ``(..., 4)``.
     """
     up = quat_z_row(quat)
     if shape == "sphere":
@@ -139,15 +124,10 @@ def describe_tensor(value: object) -> str:
 
 
 def not_finite(*parts: Tensor) -> Tensor:
-    """Rows in which a number is NaN or infinite.
-
-    Args:
-        parts: Tensors of shape ``(n, d)``, at least one; each may have its own d.
-
-    Returns:
-        Shape ``(n,)``, bool.
+    """Rows in which a number is NaN or infinite, shape ``(n,)``, bool, of one or more tensors of
+    shape ``(n, d)``; each may have its own d.
     """
-    if not parts[0].is_cuda and all_finite(*parts):
+    if all_finite(*parts):
         return torch.zeros(len(parts[0]), dtype=torch.bool, device=parts[0].device)
     # 0 times what is not finite is NaN, which a sum keeps: fewer kernels than a test of each.
     numbers = torch.cat(parts, dim=1) if len(parts) > 1 else parts[0]
@@ -162,15 +142,8 @@ def all_finite(*parts: Tensor) -> bool:
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """95 % confidence interval of a success rate (Wilson, "Probable inference", JASA 1927), sound
-    at 0 and at all successes too.
-
-    Args:
-        successes: How many succeeded.
-        trials: Of how many, at least 1.
-
-    Returns:
-        Lower and upper end, from 0 to 1.
+    """Lower and upper end of the 95 % confidence interval of a success rate (Wilson, "Probable
+    inference", JASA 1927), sound at 0 and at all successes too. There is at least one trial.
     """
     z = 1.959963984540054  # quantile of the normal distribution
     rate = successes / trials
@@ -188,12 +161,8 @@ def rate_interval(name: str, successes: int, trials: int) -> dict[str, float]:
 
 
 def mcnemar_p_value(only_a: int, only_b: int) -> float:
-    """Two-sided p-value of McNemar's exact test: how probable it is that pairs of which one side
-    alone won are split so unevenly or more, if either side wins such a pair with probability 1/2.
-
-    Args:
-        only_a: Pairs that the first side alone won.
-        only_b: Pairs that the second side alone won.
+    """Two-sided p-value of McNemar's exact test, by the pairs that either side alone won: how
+    probable it is that they are split so unevenly or more, if it wins each with probability 1/2.
     """
     pairs = only_a + only_b
     ways = 1  # binomial coefficient of the pairs; integers are exact

@@ -32,9 +32,10 @@ def available_cores() -> int:
     return max(1, (cores or 1) // int(os.environ.get("LOCAL_WORLD_SIZE", 1)))
 
 
-def own_command(args: Sequence[str], module: str = "mjstack.__main__") -> list[str]:
-    """The command that starts this mjstack, or ``main`` of one of its modules, in a process."""
-    return [sys.executable, "-P", "-c", f"{_START} from {module} import main; main()", *args]
+def own_command(args: Sequence[str]) -> list[str]:
+    """The command that starts this mjstack in a process."""
+    start = f"{_START} from mjstack.__main__ import main; main()"
+    return [sys.executable, "-P", "-c", start, *args]
 
 
 class Child(subprocess.Popen[bytes]):
@@ -49,14 +50,9 @@ class Child(subprocess.Popen[bytes]):
         cores: Collection[int] = (),
         folder: Path | None = None,
     ) -> None:
-        """Start it.
-
-        Args:
-            args: Arguments of the command.
-            log: Gets its output.
-            env: Environment variables, besides those of this process.
-            cores: The cores that it may use; all if empty.
-            folder: Its working folder; by default that of this process.
+        """Start it with the command's arguments; the log gets its output. Environment variables add
+        to those of this process, it may use some cores, or all if there are none, and by default
+        works in the folder of this process.
         """
         self._began = time.monotonic()
         super().__init__(

@@ -7,7 +7,9 @@ of 2048 draws, and no draw depends on which other worlds reset.
 """
 
 import operator
+from contextlib import suppress
 from functools import lru_cache
+from typing import SupportsIndex
 
 import numpy as np
 import torch
@@ -28,14 +30,8 @@ def _round_keys(key: tuple[int, int]) -> np.ndarray:
 
 
 def philox(counter: np.ndarray, key: tuple[int, int]) -> np.ndarray:
-    """Philox4x32-10.
-
-    Args:
-        counter: Four words, shape ``(4, n)``, uint32.
-        key: Two 32-bit words.
-
-    Returns:
-        Four random words, shape ``(4, n)``, uint32.
+    """Philox4x32-10: four random words, shape ``(4, n)``, uint32, of a counter of the same shape
+    and type and a key of two 32-bit words.
     """
     # Words 0 and 2 are multiplied, words 1 and 3 are mixed in: both pairs go through each round
     # together. Mixed in is the lower half of the other pair's product, read where it lies.
@@ -58,7 +54,7 @@ def philox(counter: np.ndarray, key: tuple[int, int]) -> np.ndarray:
 def uniform(
     seed: int, stream: int, world: Tensor, episode: Tensor, step: Tensor | None, size: int
 ) -> Tensor:
-    """Uniform numbers in [-1, 1).
+    """Uniform numbers in [-1, 1), shape ``(n, size)``, float32.
 
     Args:
         seed: The run's seed, a non-negative integer; its low 32 bits are used.
@@ -67,9 +63,6 @@ def uniform(
         episode: Episode of each world, shape ``(n,)``, int64.
         step: Step within the episode, shape ``(n,)``, int64; 0 if None.
         size: How many numbers each world gets.
-
-    Returns:
-        Shape ``(n, size)``, float32.
     """
     blocks = -(-size // 4)
     counter = np.zeros((4, world.shape[0], blocks), dtype=np.uint32)
@@ -86,16 +79,15 @@ def uniform(
     return torch.from_numpy(out.reshape(-1, 4 * blocks)[:, :size]).to(world.device)
 
 
-def check_seed(seed: int, *, masked: bool) -> int:
-    """The seed as a Python integer.
-
-    Raises:
-        ArgumentError: It is no 32-bit integer, or a mask is given beside it.
+def check_seed(seed: SupportsIndex, *, masked: bool = False) -> int:
+    """The seed, which may be NumPy's or torch's, as a Python integer; an ArgumentError if it is no
+    32-bit integer, or a mask is given beside it.
     """
     if masked:
         expected = "no mask beside it, because a seed starts every world anew"
         raise ArgumentError("seed", str(seed), expected, "Leave one out")
-    number = operator.index(seed) if hasattr(seed, "__index__") else -1
-    if isinstance(seed, bool) or not 0 <= number < 1 << 32:
-        raise ArgumentError("seed", repr(seed), "an integer from 0 to 4294967295")
-    return number
+    kind = str(getattr(seed, "dtype", type(seed).__name__))
+    with suppress(TypeError):  # no integer
+        if "bool" not in kind and 0 <= (number := operator.index(seed)) < 1 << 32:
+            return number
+    raise ArgumentError("seed", repr(seed), "an integer from 0 to 4294967295")

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from compositions import make_env
+from doc_blocks import ROOT
 from environments import Patch
 from gymnasium.spaces import Box
 from gymnasium.utils.env_checker import check_env
@@ -19,7 +20,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import ClipAction, DictInfoToList, RecordEpisodeStatistics
 
 import mjstack
-from mjstack.adapters.gymnasium import GymnasiumEnv, GymnasiumVectorEnv
+from mjstack.adapters.gymnasium import GymnasiumEnv, GymnasiumVectorEnv, register_env
 from mjstack.adapters.rsl_rl import RslRlVecEnv
 from mjstack.errors import ArgumentError, MjstackError, UnknownName
 
@@ -176,7 +177,7 @@ def test_vector_wrappers_of_gymnasium_work(make: Make) -> None:
 
 
 WRONG = [
-    ({"action": np.zeros((3, 2))}, r"action: found shape \(3, 2\), expected a float32 array"),
+    ({"action": np.zeros((3, 2))}, r"action: found shape \(3, 2\), expected an array of numbers"),
     ({"action": np.zeros(6)}, r"action: found shape \(6,\), expected"),
     ({"action": "up"}, r"action: found str, expected"),
     ({"action": np.full((3, 6), np.nan)}, r"found \[nan.* in world 0, expected finite numbers"),
@@ -203,6 +204,37 @@ def test_vector_wrong_actions_and_resets(
     env.reset()
     with pytest.raises(MjstackError, match=message):
         env.step(arguments["action"]) if "action" in arguments else env.reset(**arguments)
+
+
+SEEDS = [3, np.int64(3), np.uint8(3), np.array(3), torch.tensor(3)]
+
+
+@pytest.mark.parametrize("seed", SEEDS, ids=lambda seed: type(seed).__name__)
+@pytest.mark.parametrize("adapter", [GymnasiumVectorEnv, GymnasiumEnv])
+def test_seeds_of_other_types(make: Make, adapter: Any, seed: Any) -> None:
+    """As the environment itself takes them."""
+    env = adapter(make(nworld=1))
+    expected, _ = env.inner.reset(seed=3)
+    obs, _ = env.reset(seed=seed)
+    np.testing.assert_array_equal(obs, expected["policy"].numpy().reshape(obs.shape))
+    assert env.np_random_seed == 3
+
+
+WRONG_SEEDS = [True, np.True_, torch.tensor(True), 3.0, np.float64(3.0), "3", [3], np.array([3, 4])]
+WRONG_SEEDS += [-1, np.int64(-1), 1 << 32]
+
+
+@pytest.mark.parametrize("seed", WRONG_SEEDS, ids=repr)
+@pytest.mark.parametrize("adapter", [GymnasiumVectorEnv, GymnasiumEnv])
+def test_a_wrong_seed_resets_no_world(make: Make, adapter: Any, seed: Any) -> None:
+    env = adapter(make(nworld=1))
+    env.reset(seed=5)
+    before = env.inner.sim.qpos.clone()
+    for reset in (env.reset, env.inner.reset):
+        with pytest.raises(ArgumentError, match=r"seed: found .*an integer from 0 to 4294967295"):
+            reset(seed=seed)
+    assert torch.equal(env.inner.sim.qpos, before)
+    assert env.inner.seed == env.np_random_seed == 5
 
 
 # Gymnasium, one world
@@ -382,3 +414,164 @@ def test_missing_extra_is_one_line(adapter: str, library: str, monkeypatch: Patc
     assert "\n" not in out
     assert library in out
     assert "pip install 'mjstack[train]'" in out
+
+
+# Ids
+
+
+PROGRAM = """
+import sys
+{imports}
+assert "torch" not in sys.modules
+ids = sorted(id for id in gymnasium.registry if id.startswith("mjstack/"))
+arms = ("rebot", "so101")
+names = [f"{{task}}-{{arm}}" for task in ("box", "reach", "stack") for arm in arms]
+tasks = [f"mjstack/{{name}}-v0" for name in names]
+assert {named} or ids == tasks, ids
+env = gymnasium.make("{prefix}mjstack/reach-rebot-v0", overrides=["sim=native"])
+assert env.spec.id == "mjstack/reach-rebot-v0"
+assert env.unwrapped.inner.cfg.robot.name == "rebot"
+obs, info = env.reset(seed=1)
+assert obs in env.observation_space
+"""
+
+
+LOOK = "from importlib.util import find_spec; find_spec('gymnasium')"
+
+
+@pytest.mark.parametrize(
+    ("imports", "prefix"),
+    [
+        ("import gymnasium, mjstack", ""),
+        ("import mjstack, gymnasium", ""),
+        (f"import mjstack\n{LOOK}\nimport gymnasium", ""),
+        ("import gymnasium", "mjstack:"),
+    ],
+)
+def test_ids_are_there_whichever_is_imported_first(imports: str, prefix: str) -> None:
+    program = PROGRAM.format(imports=imports, prefix=prefix, named=bool(prefix))
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_mjstack_loads_no_gymnasium() -> None:
+    program = "import sys, mjstack; assert not {'gymnasium', 'torch', 'numpy'} & sys.modules.keys()"
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+SHORT = ["sim=native", f"task.episode_steps={FRAMES}"]
+REACH_ID = "mjstack/reach-so101-v0"
+
+
+def test_an_id_passes_gymnasiums_checker_and_renders() -> None:
+    env = gymnasium.make(REACH_ID, overrides=SHORT, render_mode="rgb_array")
+    assert env.metadata["render_fps"] == 50
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        check_env(env.unwrapped)
+    env.reset(seed=4)
+    first = env.render()
+    assert isinstance(first, np.ndarray)
+    assert (first.shape, first.dtype) == ((128, 128, 3), np.uint8)
+    ended = False
+    images = [first]
+    while not ended:
+        *_, terminated, truncated, _ = env.step(np.ones_like(env.action_space.sample()))
+        ended = terminated or truncated
+        images.append(env.render())
+    assert (images[1] != first).any()
+    # The worlds stand at the next start already, which is not this episode's end.
+    np.testing.assert_array_equal(images[-1], images[-2])
+    env.reset()
+    assert (env.render() != images[-1]).any()
+    env.close()
+
+
+def test_rendering_changes_no_episode() -> None:
+    runs = []
+    for mode in (None, "rgb_array"):
+        env = gymnasium.make(REACH_ID, overrides=SHORT, render_mode=mode)
+        obs, _ = env.reset(seed=2)
+        action = np.full(env.action_space.shape, 0.5, np.float32)
+        runs.append(np.stack([obs, *(env.step(action)[0] for _ in range(FRAMES - 1))]))
+        env.close()
+    np.testing.assert_array_equal(*runs)
+
+
+def test_make_vec_has_worlds_of_one_environment() -> None:
+    mode = "vector_entry_point"
+    overrides = [*SHORT, "reset=randomized"]
+    env = gymnasium.make_vec(
+        REACH_ID, 3, vectorization_mode=mode, overrides=overrides, render_mode="rgb_array"
+    )
+    assert isinstance(env, GymnasiumVectorEnv)
+    assert (env.num_envs, env.inner.nworld) == (3, 3)
+    assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    assert env.spec is not None
+    assert env.spec.kwargs["overrides"] == overrides
+    obs, _ = env.reset(seed=1)
+    images = env.render()
+    assert isinstance(images, tuple)
+    assert len(images) == 3
+    assert (images[0] != images[1]).any()
+    alone = gymnasium.make(REACH_ID, overrides=overrides)
+    np.testing.assert_array_equal(alone.reset(seed=1)[0], obs[0])
+    alone.close()
+    env.close()
+    several = gymnasium.make_vec(REACH_ID, 2, vectorization_mode="sync", overrides=SHORT)
+    assert several.reset(seed=1)[0].shape == (2, obs.shape[1])
+    several.close()
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"render_mode": "ansi"}, "render_mode: found 'ansi', expected None, or one of rgb_array"),
+        ({"render_mode": "human"}, r"on this display \(DISPLAY=not set\)"),
+        ({"overrides": ["robot=ur5"]}, "'ur5' does not exist"),
+        ({"group": "critic"}, "observation group 'critic' does not exist"),
+    ],
+)
+def test_make_refuses_in_one_line(
+    options: dict[str, Any], expected: str, monkeypatch: Patch
+) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.setattr("mjstack.adapters.gymnasium.opens_windows", lambda: False)
+    overrides = options.pop("overrides", [])
+    warnings.simplefilter("ignore")  # pytest restores it
+    with pytest.raises(MjstackError, match=expected):
+        gymnasium.make(REACH_ID, overrides=[*SHORT, *overrides], **options)
+
+
+def test_human_rendering_shows_every_step(monkeypatch: Patch) -> None:
+    shown: list[np.ndarray] = []
+
+    class Window:
+        def __init__(self, model: object, step_dt: float) -> None:
+            assert step_dt == 0.02
+
+        def show(self, qpos: np.ndarray) -> None:
+            shown.append(qpos)
+
+        def close(self) -> None:
+            shown.append(np.empty(0))
+
+    monkeypatch.setattr("mjstack.adapters.gymnasium.opens_windows", lambda: True)
+    monkeypatch.setattr("mjstack.adapters.gymnasium.Window", Window)
+    env = gymnasium.make(REACH_ID, overrides=SHORT, render_mode="human")
+    assert env.metadata["render_modes"] == ("rgb_array", "human")
+    env.reset(seed=0)
+    env.step(np.zeros(env.action_space.shape, np.float32))
+    assert len(shown) == 2
+    env.close()
+    assert not shown.pop().size
+
+
+def test_a_task_of_ones_own_has_an_id(monkeypatch: Patch) -> None:
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(gymnasium.envs.registration, "registry", dict(gymnasium.registry))
+    register_env("mine/push-v0", ["task=push"], config_dir="examples/push/conf")
+    monkeypatch.chdir("/")
+    env: Any = gymnasium.make("mine/push-v0", overrides=["sim=native"])
+    assert env.unwrapped.inner.cfg.task.name == "push"
+    env.close()

@@ -17,11 +17,11 @@ from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.envs import Env, build_env
 from mjstack.math import quat_to_matrix
 from mjstack.mdp.geometry import above_table
+from mjstack.mdp.observation import object_to_place
 from mjstack.scene import SceneIndex, build_model
 from mjstack.scene.index import lowest_height
 from mjstack.scene.phases import nominal_xy
 from mjstack.tasks.box import BoxSuccess
-from mjstack.tasks.box_terms import ToSlot
 from mjstack.tasks.check import make_check
 from mjstack.tasks.progress import Progress
 
@@ -212,10 +212,15 @@ def test_terms_know_the_box(robot: str) -> None:
     put(env, RED, places[RED], [1, 2])
     put(env, BLUE, places[BLUE], [2])
     put(env, RED, np.add(places[RED], [0.0, 0.0, 0.1]), [3])
-    np.testing.assert_allclose(ToSlot(env, object=RED)(env)[1:3], 0.0, atol=1e-6)
-    wanted = np.subtract(places[BLUE], env.sim.model.body(BLUE).pos)
-    np.testing.assert_allclose(ToSlot(env, object=BLUE)(env)[0], wanted, atol=1e-6)
     check = make_check(env.cfg)
+    floor = env.cfg.scene.box.floor
+    offsets = {
+        name: object_to_place(env, object=name, place=check.slots[name], height=floor)
+        for name in (RED, BLUE)
+    }
+    np.testing.assert_allclose(offsets[RED][1:3], 0.0, atol=1e-6)
+    wanted = np.subtract(places[BLUE], env.sim.model.body(BLUE).pos)
+    np.testing.assert_allclose(offsets[BLUE][0], wanted, atol=1e-6)
     placed = check.placed(check.view(env).step()).int().tolist()
     assert placed == [[0, 0], [1, 0], [1, 1], [0, 0]]
     progress = Progress(env)
@@ -345,12 +350,12 @@ def test_lowest_point_of_a_turned_geom(kind: str) -> None:
         ("scene.random_xy=[0.1,-0.1]", ["scene.random_xy", "at least 0"]),
         ("task.check.places=[red_slot]", ["task.check.places", "each object"]),
         ("task.check.places=[red_slot,lid]", ["task.check.places", "lid"]),
-        ("task.check.window=0", ["task.check.window=0", "at least 1"]),
+        ("task.check.window=0", ["task.check.window=0", "from 1 to"]),
         ("task.check.window=2001", ["task.check.window=2001", "2000"]),
         ("task.check.open_fraction=1.2", ["task.check.open_fraction=1.2", "at most 1"]),
         ("task.check.force=0", ["task.check.force=0", "above 0"]),
         ("task.check.inside=-0.001", ["task.check.inside=-0.001", "at least 0"]),
-        ("task.check.lift_steps=0", ["task.check.lift_steps=0", "at least 1"]),
+        ("task.check.lift_steps=0", ["task.check.lift_steps=0", "from 1 to"]),
         ("task.check.rest_sped=1", ["rest_sped", "rest_speed"]),
     ],
 )
@@ -370,7 +375,7 @@ def test_a_bad_value_is_one_line(override: str, parts: list[str]) -> None:
         ("timing=default timing.decimation=11", ["task.control_hz=50"]),
         ("observation.policy.terms.red_to_slot.params.object=red_cub", ["red_to_slot", "red_cub"]),
         ("reward.progress.params.scale=0", ["reward.progress.params.scale=0", "above 0"]),
-        ("task=stack observation=box", ["box"]),
+        ("task=stack observation=box", ["red_to_slot", "place 'red_slot' does not exist"]),
     ],
 )
 def test_bad_input_is_one_line(overrides: str, parts: list[str]) -> None:

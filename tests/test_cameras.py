@@ -45,10 +45,6 @@ ALL = ("rgb", "depth", "segmentation")
 Make = Callable[..., Env]
 
 
-def no_picture(*_: object) -> None:
-    """Draws nothing."""
-
-
 def small(*names: str, outputs: tuple[str, ...] = ("rgb",), size: int = 32) -> list[str]:
     """Overrides that turn on cameras with small images."""
     return [
@@ -439,7 +435,7 @@ def test_images_that_compare_too_little_fail(monkeypatch: Patch) -> None:
 
     monkeypatch.setattr(gate_images, "require_offscreen", lambda model: None)
     stage = Stage(load_config(["cameras=front", "gate.parity.images=x.npz"]))
-    rest = np.zeros((1, stage.model.nq))
+    elsewhere = Run(stage)
     for size, robot, says in (
         (8, 0, ["nothing but the background has gate.parity.image_pixels=1000 ", "71.88 %"]),
         (64, 40, ["99.56 % of the pixels show the same thing"]),
@@ -449,7 +445,7 @@ def test_images_that_compare_too_little_fail(monkeypatch: Patch) -> None:
         monkeypatch.setattr(gate_images, "load_images", lambda cfg, m=mjwarp: (np.zeros(1), m))
         monkeypatch.setattr(gate_images, "_draw_states", lambda *args, n=native: (n, labels))
         result = GateResult(name="parity", status=Status.passed)
-        problems = compare_images(stage, rest, None, no_picture, result)
+        problems = compare_images(elsewhere, result)
         assert len(problems) == len(says)
         assert all(says[k] in problem for k, problem in enumerate(problems))
         assert "image_pixels=1000 pixels: " in result.details[0]
@@ -470,9 +466,9 @@ def test_parity_compares_images_here_and_elsewhere(tmp_path: Path) -> None:
     file = tmp_path / "parity_images.npz"
     cfg = load_config([*overrides, f"gate.parity.images={file}"])
     stage = Stage(cfg)
-    rest = np.zeros((1, stage.model.nq))
+    elsewhere = Run(stage)
     apart = GateResult(name="parity", status=Status.passed)
-    assert compare_images(stage, rest, None, no_picture, apart) == []
+    assert compare_images(elsewhere, apart) == []
     for name in ("images.front.iou.red", "images.wrist.color_of_255"):
         assert apart.metrics[name] == result.metrics[name]
     with np.load(file) as saved:
@@ -481,7 +477,7 @@ def test_parity_compares_images_here_and_elsewhere(tmp_path: Path) -> None:
     arrays["segmentation.front"] = np.roll(arrays["segmentation.front"], 3, axis=2)
     np.savez(file, **arrays)
     other = GateResult(name="parity", status=Status.passed)
-    problems = compare_images(stage, rest, None, no_picture, other)
+    problems = compare_images(elsewhere, other)
     assert any(problem.startswith("camera front: IoU of red is 0.") for problem in problems)
     assert any(problem.startswith("camera top: colours differ by") for problem in problems)
     # Files that cannot be compared are one line, before anything is written.

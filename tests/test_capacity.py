@@ -33,7 +33,6 @@ from mjstack.envs.buffers import (
     SIZED,
     MeasuringWorlds,
     Peaks,
-    Workload,
     join_peaks,
     measured_sizes,
     play_random_actions,
@@ -45,7 +44,7 @@ from mjstack.episodes.stage import Progress, Stage
 from mjstack.errors import FaultError, Unreachable
 from mjstack.gates import capacity as capacity_module
 from mjstack.gates.batch import run_batch
-from mjstack.gates.capacity import run_capacity
+from mjstack.gates.capacity import find_shortages, run_capacity
 from mjstack.managers.episode import required_fields
 from mjstack.report.record import GateResult, Status
 from mjstack.sim import BatchSizes, Overflow, Simulation, make_simulation, resolve_sizes
@@ -57,6 +56,7 @@ def peaks(
     contacts: int = 20,
     nworld: int = 4,
     overflow: np.ndarray | None = None,
+    sizes: BatchSizes | None = None,
     **pools: int,
 ) -> Peaks:
     return Peaks(
@@ -64,6 +64,8 @@ def peaks(
         rows=np.full(nworld, rows),
         overflow=np.zeros(nworld, dtype=np.int64) if overflow is None else overflow,
         pools={"contacts": contacts * nworld} | pools,
+        sizes=sizes,
+        description="",
     )
 
 
@@ -149,7 +151,7 @@ def test_peaks_join() -> None:
 
 def tried(
     monkeypatch: Patch, *losses: Callable[[BatchSizes], int], driven: Sequence[bool] = ()
-) -> tuple[list[BatchSizes], list[Workload]]:
+) -> tuple[list[BatchSizes], list[Peaks]]:
     """The sizes of the worlds that some workloads are tried in, and the last run of each; they lose
     physics. By default none is driven.
     """
@@ -162,8 +164,8 @@ def tried(
 
     lost = [0]
 
-    def read(_: SimpleNamespace) -> Peaks:
-        return peaks(rows=7, overflow=np.array([0, lost[0], 0, 0]))
+    def read(sim: SimpleNamespace) -> Peaks:
+        return peaks(rows=7, overflow=np.array([0, lost[0], 0, 0]), sizes=sim.sizes)
 
     def workload(loss: Callable[[BatchSizes], int], sim: SimpleNamespace) -> None:
         lost[0] = loss(sim.sizes)
@@ -188,11 +190,11 @@ def test_room_to_measure_in_grows_where_it_is_too_little_but_not_for_ever(
         lambda s: int(Overflow.NEFC) * (s.njmax < 2000) | int(Overflow.CCD) * (s.nconmax < 200),
     )
     assert [(s.njmax, s.nconmax) for s in made] == [(768, 128), (1536, 256), (3072, 256)]
-    assert not run.peaks.overflow.any()
+    assert not run.overflow.any()
     assert run.sizes == made[-1]
     assert measured_sizes(load_config([]), run, "").njmax == 16
     made, (run,) = tried(monkeypatch, lambda _: int(Overflow.NEFC))
-    assert run.peaks.overflow.any()
+    assert run.overflow.any()
     assert len(made) == 4
     assert run.sizes == made[-1]
 
@@ -214,11 +216,11 @@ def test_workloads_share_worlds_and_the_room_that_one_of_them_needs(monkeypatch:
     sizes = [(768, 128), (1536, 128), (3072, 128), (3072, 256), (3072, 512), (3072, 1024)]
     assert [(s.njmax, s.nconmax) for s in made] == sizes
     assert [run.sizes for run in runs] == [made[0], made[2], made[5], made[5]]
-    assert not any(run.peaks.overflow.any() for run in runs)
+    assert not any(run.overflow.any() for run in runs)
     # Two that lose physics in any room do not grow it further than one does.
     made, runs = tried(monkeypatch, *[lambda _: int(Overflow.NEFC)] * 2)
     assert [s.njmax for s in made] == [768, 1536, 3072, 6144]
-    assert all(run.peaks.overflow.any() for run in runs)
+    assert all(run.overflow.any() for run in runs)
 
 
 def test_a_driven_workload_begins_with_less_room_and_gets_as_much(monkeypatch: Patch) -> None:
@@ -243,7 +245,7 @@ def test_a_driven_workload_begins_with_less_room_and_gets_as_much(monkeypatch: P
     for driven in (False, True):
         made, (run,) = tried(monkeypatch, always, driven=[driven])
         assert (made[-1].njmax, made[-1].nconmax) == (6144, 1024)
-        assert run.peaks.overflow.any()
+        assert run.overflow.any()
 
 
 def test_a_workload_in_used_worlds_ends_as_in_new_ones(backend: str, new_run: NewRun) -> None:
@@ -285,7 +287,7 @@ def test_a_workload_in_used_worlds_ends_as_in_new_ones(backend: str, new_run: Ne
         with closing(stage.measuring_worlds(*resets)) as worlds:
             first = len(workloads) - driven
             plays = [worlds.play(w, driven=n >= first) for n, w in enumerate(workloads)]
-            return plays[-1].peaks
+            return plays[-1]
 
     expected = last(task, driven=0)
     resets = (randomized,)
@@ -313,8 +315,8 @@ def test_a_workload_in_used_worlds_ends_as_in_new_ones(backend: str, new_run: Ne
     ],
 )
 def test_nothing_is_sized_from_motion_that_lost_physics(bits: Overflow, fix: str) -> None:
-    lost = peaks(overflow=np.array([0, int(bits), 0, int(bits)]))
-    run = workload(peaks=lost, sizes=BatchSizes(nconmax=128, njmax=768))
+    lost = np.array([0, int(bits), 0, int(bits)])
+    run = peaks(overflow=lost, sizes=BatchSizes(nconmax=128, njmax=768))
     with pytest.raises(FaultError) as caught:
         measured_sizes(load_config([]), run, "the driven task")
     says = str(caught.value)
@@ -516,23 +518,18 @@ def test_native_tells_what_it_cannot_know_and_a_layout_out_of_reach_leaves_the_r
     assert any("does not count the pairs" in line for line in lines)
 
 
-def workload(**changes: object) -> Workload:
-    facts = {
-        "peaks": peaks(nworld=2),
-        "sizes": BatchSizes(nconmax=128, njmax=300),
-        "description": "",
-    }
-    return Workload(**(facts | changes))
+def workload(overflow: np.ndarray | None = None) -> Peaks:
+    return peaks(nworld=2, overflow=overflow, sizes=BatchSizes(nconmax=128, njmax=300))
 
 
-def made_up(monkeypatch: Patch, randomized: dict, play: Callable[[str], Workload]) -> None:
+def made_up(monkeypatch: Patch, randomized: dict, play: Callable[[str], Peaks]) -> None:
     """Have workloads made up from their names, in the place of playing them."""
 
     class Worlds(MeasuringWorlds):
         def __init__(self, *_: object) -> None:
             pass
 
-        def play(self, play_name: Callable, *, driven: bool = False) -> Workload:
+        def play(self, play_name: Callable, *, driven: bool = False) -> Peaks:
             name = play_name(None)
             assert driven == (name != "random_actions")
             return play(name)
@@ -576,9 +573,9 @@ def test_the_gate_recommends_nothing_from_motion_that_lost_physics(
     said: list[str] = []
     run = new_run("sim=mjwarp", "sim.device=cpu", "nworld=2", "batch=auto")
     run.stage.progress = Progress(said.append)
-    lost = workload(peaks=peaks(nworld=2, overflow=np.array([0, int(Overflow.NEFC)])))
+    lost = workload(overflow=np.array([0, int(Overflow.NEFC)]))
 
-    def play(name: str) -> Workload:
+    def play(name: str) -> Peaks:
         return lost if name == "random_actions" else workload()
 
     made_up(monkeypatch, run.cfg.gate.capacity.reset, play)
@@ -599,14 +596,13 @@ def test_contacts_and_convex_pairs_are_held_against_their_keys() -> None:
     cfg = load_config(["nworld=4", "batch.nconmax=15", "batch.nccdmax=3"])
     seen = peaks(nworld=4, contacts=20, ccd_pairs=40)
     wanted = recommend_sizes(seen, 1.25, "")
-    facts = {"runs": {}, "lost": "", "peaks": seen, "advice": wanted}
-    group = capacity_module._Group(**facts, sizes=resolve_sizes(cfg))
-    texts = [text for _, text in capacity_module._shortages(group)]
-    assert any("contact pool overflow" in text and "batch.nconmax=32" in text for text in texts)
-    assert any("convex pairs overflow" in text and "batch.nccdmax=16" in text for text in texts)
-    pasted = wanted.as_overrides().split()
-    group.sizes = resolve_sizes(load_config(["nworld=4", *pasted]))
-    assert list(capacity_module._shortages(group)) == []
+    texts = find_shortages(seen, resolve_sizes(cfg), wanted)
+    assert "contact pool overflow" in texts["nconmax"]
+    assert "batch.nconmax=32" in texts["nconmax"]
+    assert "convex pairs overflow" in texts["nccdmax"]
+    assert "batch.nccdmax=16" in texts["nccdmax"]
+    pasted = load_config(["nworld=4", *wanted.as_overrides().split()])
+    assert find_shortages(seen, resolve_sizes(pasted), wanted) == {}
 
 
 # batch=auto
@@ -659,7 +655,7 @@ def test_a_probe_that_lost_physics_makes_no_environment(monkeypatch: Patch) -> N
 def test_gates_get_no_sizes_from_a_task_that_lost_physics(
     new_run: NewRun, monkeypatch: Patch
 ) -> None:
-    lost = workload(peaks=peaks(nworld=2, overflow=np.array([int(Overflow.NEFC), 0])))
+    lost = workload(overflow=np.array([int(Overflow.NEFC), 0]))
     made_up(monkeypatch, {}, lambda *_: lost)
     run = new_run("sim=mjwarp", "sim.device=cpu", "nworld=2", "batch=auto")
     message = "measured by the driven task in 2 worlds: NEFC overflow in 1 of 2 worlds"

@@ -2,20 +2,36 @@
 
 from dataclasses import dataclass, replace
 
+import mujoco
+import numpy as np
 import pytest
 import torch
 from compositions import checked, load_config, refusal
-from environments import NOMINAL
+from environments import NOMINAL, configure
 
 from mjstack.config.fields import spec
-from mjstack.config.schema import Backend
+from mjstack.config.schema import Backend, Config, TermCfg
 from mjstack.config.schema.scene import PlaceCfg
+from mjstack.episodes.failures import FailureMonitor
 from mjstack.episodes.stage import Stage
-from mjstack.errors import UnknownName
+from mjstack.errors import MjstackError, UnknownName
+from mjstack.jobs.gates import check_machine
 from mjstack.scene import SceneIndex, build_model
 from mjstack.sim import make_simulation
 from mjstack.tasks.check import EpisodeCheck, Rule, make_check
-from mjstack.tasks.parts import AtRest, InWindow, Streak, at_place, in_hand, on_table
+from mjstack.tasks.parts import (
+    AtRest,
+    InWindow,
+    Streak,
+    at_place,
+    flat,
+    in_hand,
+    in_zone,
+    on_table,
+    released,
+    upright,
+)
+from mjstack.tasks.placed import Placed
 from mjstack.tasks.view import Step, TaskView
 
 
@@ -125,3 +141,134 @@ class Halfway(EpisodeCheck):
 )
 def test_a_bad_value_is_one_line(override: str, parts: list[str]) -> None:
     refusal(lambda: checked(override), *parts)
+
+
+def turned_step(*overrides: str, nworld: int = 64) -> tuple[Step, np.ndarray]:
+    """Red turned at random in every world, some by little; and how high each of its axes points,
+    by MuJoCo.
+    """
+    stage = Stage(configure("sim=native", *overrides))
+    env = stage.start(stage.simulation(nworld, "native", "cpu"), NOMINAL)
+    rng = np.random.default_rng(3)
+    quats = rng.normal(size=(nworld, 4))
+    quats[::2, 1:] *= 0.05
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    at, _ = env.index.objects["red"]
+    env.sim.qpos[:, at + 3 : at + 7] = torch.tensor(quats).to(env.sim.qpos)
+    matrices = np.empty((nworld, 9))
+    for matrix, quat in zip(matrices, quats, strict=True):
+        mujoco.mju_quat2Mat(matrix, quat)
+    return TaskView(env, ["red"]).step(), matrices.reshape(-1, 3, 3)[:, 2]
+
+
+@pytest.mark.parametrize(("number", "axis"), list(enumerate("xyz")))
+def test_upright_is_an_angle_from_the_vertical(number: int, axis: str) -> None:
+    step, up = turned_step()
+    angles = np.degrees(np.arccos(up[:, number]))
+    np.testing.assert_allclose(step.tilt("red", axis, either_end=False), angles, atol=0.01)
+    folded = np.minimum(angles, 180.0 - angles)
+    np.testing.assert_allclose(step.tilt("red", axis), folded, atol=0.01)
+    for ends, expected in ((True, folded), (False, angles)):
+        holds = upright("red", tilt_deg=40.0, axis=axis, either_end=ends)(step)
+        assert holds.tolist() == (expected <= 40.0).tolist()
+        assert 0 < holds.sum() < len(holds)
+
+
+@pytest.mark.parametrize("shape", ["box", "cylinder"])
+def test_flat_is_a_face_that_is_level(shape: str) -> None:
+    """Any face of a box, the ends of a cylinder."""
+    size = {"box": [0.03, 0.02, 0.02], "cylinder": [0.02, 0.02]}[shape]
+    step, up = turned_step(f"scene.objects.red.shape={shape}", f"scene.objects.red.size={size}")
+    level = np.abs(up).max(axis=1) if shape == "box" else np.abs(up[:, 2])
+    expected = np.degrees(np.arccos(level)) <= 15.0
+    holds = flat("red", tilt_deg=15.0)(step)
+    assert holds.tolist() == expected.tolist()
+    assert 0 < holds.sum() < len(holds)
+
+
+def test_what_has_no_face_is_never_flat() -> None:
+    step, _ = turned_step("scene.objects.red.shape=sphere", "scene.objects.red.size=[0.02]")
+    with pytest.raises(UnknownName, match=r"axis of sphere red 'face'"):
+        flat("red", tilt_deg=5.0)(step)
+    with pytest.raises(UnknownName, match=r"axis of sphere red 'w'.*x, y, z"):
+        upright("red", tilt_deg=5.0, axis="w")(step)
+
+
+def test_a_zone_has_both_ends_in_the_frame_of_its_fixture() -> None:
+    """A wall that is turned by 30 degrees; red goes along its x axis, then along its y axis."""
+    wall = "{size: [0.05, 0.01, 0.02], fixed: true, xy: [0.4, 0.1], yaw: 0.5235987755982988}"
+    step, _ = turned_step(f"+scene.objects.wall={wall}", nworld=8)
+    env = step.view.env
+    along = np.array([-0.08, 0.019, 0.021, 0.03, 0.039, 0.041, 0.03, 0.03])
+    aside = np.array([0.0, 0.0, 0.0, 0.001, 0.0, 0.0, 0.003, -0.003])
+    c, s = np.cos(np.pi / 6), np.sin(np.pi / 6)
+    xy = np.stack((0.4 + c * along - s * aside, 0.1 + s * along + c * aside), axis=1)
+    at, _ = env.index.objects["red"]
+    env.sim.qpos[:, at : at + 2] = torch.tensor(xy).to(env.sim.qpos)
+    zone = in_zone("red", "wall", low=(0.02, -0.002), high=(0.04, 0.002))
+    expected = [False, False, True, True, True, False, False, False]
+    assert zone(TaskView(env, ["red"]).step()).tolist() == expected
+    # Of both conditions, each threshold by its name
+    both = zone & released("red", open_fraction=0.0)
+    assert both.names == ("along_x", "along_y", "untouched", "open_fraction")
+    assert both(TaskView(env, ["red"]).step()).tolist() == expected
+
+
+class Drawer(EpisodeCheck):
+    """The arm is raised: about no object."""
+
+    @dataclass(kw_only=True, slots=True)
+    class Thresholds:
+        window: int = spec(unit="steps", ge=1)
+        least: float = spec(unit="rad")
+        wrong: str = ""
+
+    def build(self) -> list[Rule]:
+        self.objects = []
+        rests = [AtRest(self.t.window, 0.1, 0.1, 1.0)] * (self.t.wrong == "rests")
+        return [InWindow("OPEN", "not open", self.up, self.t.window), *rests]
+
+    def up(self, step: Step) -> torch.Tensor:
+        return step.view.env.sim.qpos[:, 0] >= self.t.least
+
+    def placed(self, step: Step) -> torch.Tensor:
+        return self.up(step) if self.t.wrong == "shape" else self.up(step)[:, None]
+
+
+def drawer(least: float, wrong: str = "") -> Config:
+    """A task about no object, with the expert of task reach."""
+    cfg = configure("task=reach", "sim=native", "nworld=2")
+    check = {"func": f"{__name__}.Drawer", "window": 5, "least": least, "wrong": wrong}
+    success = TermCfg(func="mjstack.tasks.placed.Placed", params={"open_fraction": 0.0})
+    return replace(cfg, task=replace(cfg.task, check=check, success=success))
+
+
+@pytest.mark.parametrize(("least", "broken"), [(-9.0, []), (9.0, ["OPEN"])])
+def test_a_check_may_be_about_no_object(least: float, broken: list[str]) -> None:
+    """Played and watched as gate *success* does; success is that of `placed`."""
+    stage = check_machine(drawer(least))
+    monitor = FailureMonitor()
+    episode = stage.play(stage.batch_simulation(2), stage.cfg.reset, [monitor])
+    assert [stage.check.rules.broken(int(bits)) for bits in episode.failed] == [broken] * 2
+    assert monitor.sign.tolist() == [0, 0]
+    env = stage.start(stage.batch_simulation(2), stage.cfg.reset)
+    assert Placed(env, open_fraction=0.0)(env).tolist() == [not broken] * 2
+
+
+@pytest.mark.parametrize(
+    ("wrong", "text"),
+    [
+        ("shape", r"task.check.func: placed: a torch.bool tensor of shape \(2,\)"),
+        ("rests", "self.objects names none"),
+    ],
+)
+def test_a_check_that_cannot_judge_is_one_line_before_a_run(wrong: str, text: str) -> None:
+    with pytest.raises(MjstackError, match=text):
+        check_machine(drawer(0.0, wrong))
+
+
+def test_supports_need_their_sensors() -> None:
+    """Without, nothing would count as resting on anything."""
+    cfg = configure("task=box", "sim=native", "scene.support_sensors=false")
+    with pytest.raises(MjstackError, match=r"scene.support_sensors=false: expected true"):
+        check_machine(cfg)

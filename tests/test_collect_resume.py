@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
-from dataset_checker import check_dataset
+from dataset_checker import check_dataset, listed
 from environments import Patch, configure, on_cuda, one_second_episode
 from stubs import episodes_of, fake_batches, pairs
 
@@ -227,6 +227,7 @@ def test_a_kill_between_any_two_files(
     copied()
     committed = set()
     for path in copies.iterdir():
+        listed(path / "dataset")
         has_some = (path / "dataset" / "meta/episodes").exists()
         committed.add(len(pairs(path / "dataset")) if has_some else 0)
         assert_same(left_in(path, collect(path)), whole["left"])

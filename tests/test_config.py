@@ -3,8 +3,11 @@ one line.
 """
 
 import runpy
+from collections.abc import Iterator
+from dataclasses import Field, fields, is_dataclass
 from itertools import zip_longest
 from pathlib import Path
+from typing import Any, get_args, get_origin, get_type_hints
 
 import compositions
 import pytest
@@ -12,12 +15,17 @@ from check_cases import limits
 from compositions import checked, refusal
 from doc_blocks import ROOT
 from environments import Patch
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 import mjstack
-from mjstack.config import load_config
+from mjstack.config import fields as config_fields
+from mjstack.config import load_config, schema
 from mjstack.config.help import list_keys
+from mjstack.config.load import compose
 from mjstack.config.schema import Backend, CloneJobCfg, Config
-from mjstack.config.session import CONFIG_FOLDER
+from mjstack.config.session import CONFIG_FOLDER, hydra_session, search_path
+from mjstack.errors import ConfigError
 from mjstack.jobs.gates import check_machine
 from mjstack.tasks.check import make_check
 
@@ -148,6 +156,8 @@ BAD_VALUES = [
     ("timing.decimation=0", "timing.decimation=0"),
     ("timing.decimation=11", "expected 0.02 s, because task.control_hz=50. Change both together"),
     ("timing.physics_dt=nan", "timing.physics_dt"),
+    ("solver.cone=round", "one of elliptic, pyramidal"),
+    ("solver.gripper_condim=2", "1, 3, 4, 6"),
     ("gates=[parityy]", "Did you mean 'parity'?"),
     ("gates=[]", "gates"),
     ("sim.device=gpu", "auto, cpu or cuda:N"),
@@ -183,7 +193,7 @@ BAD_VALUES = [
     (f"seed={1 << 32}", f"seed={1 << 32}"),
     ("gate.capacity.margin=inf", "gate.capacity.margin="),
     ("gate.success.rate=1.01", "gate.success.rate=1.01: expected a number from 0 to 1"),
-    ("gate.success.seeds=0", "gate.success.seeds=0: expected an integer of at least 1"),
+    ("gate.success.seeds=0", "gate.success.seeds=0: expected an integer from 1 to 100000"),
     ("gate.success.yaw_cell_deg=91", "gate.success.yaw_cell_deg"),
     ("gate.success.region=[-0.01,0.1]", "gate.success.region"),
 ]
@@ -267,11 +277,11 @@ BAD = [
     (
         ["job=compare", "job.against=policy=a"],
         "one of = , : ; # & ! < > ^ ~ ` needs double quotes inside of single ones:"
-        " 'starts=\"run(1).csv\"', or in a list 'job.against=[\"policy=DIR\"]'.",
+        " 'policy=\"run (1)\"', or in a list 'job.against=[\"policy=DIR\"]'.",
     ),
     (["+nworld=4"], "An item is already at 'nworld'."),
     (["~nworld"], "~nworld: expected a term of"),
-    (["~gate.batch.seeds"], "~gate.batch.seeds: expected an integer of at least 1 [seeds]."),
+    (["~gate.batch.seeds"], "~gate.batch.seeds: expected an integer from 1 to 100000 [seeds]."),
 ]
 
 
@@ -319,6 +329,7 @@ def test_choices_by_key() -> None:
         ("reach", None, 3.0),
         pytest.param("push", "examples/push/conf", 8.0, marks=pytest.mark.full),
         pytest.param("tower", "examples/tower/conf", 25.0, marks=pytest.mark.full),
+        pytest.param("drawer", "examples/drawer/conf", 8.4, marks=pytest.mark.full),
     ],
 )
 def test_a_task_has_any_rate(task: str, folder: str | None, seconds: float) -> None:
@@ -380,6 +391,84 @@ def test_a_swapped_function_does_not_inherit_parameters() -> None:
     assert load_config([task, f"+reward.reach={whole}"]).reward["reach"].params == {"mine": 3}
 
 
+SWAPS = {
+    "action.arm": ["scale", "joints", "mode", "pose"],
+    "controller.action.arm": ["joints", "mode"],
+    "observation.policy.terms.red_to_blue": ["a", "b"],
+    "job.observation.policy.terms.goals": [],
+    "reset.cubes": ["xy", "yaw"],
+    "gate.success.reset.cubes": ["xy", "gap"],
+    "gate.capacity.reset.cubes": ["xy", "gap"],
+    "termination.joint_limit": ["margin"],
+    "reward.progress": ["scale"],
+    "task.success": [],
+    "task.check": ["window", "xy_err"],
+}
+
+
+def term_of(cfg: Config, key: str) -> dict[str, Any]:
+    """Function and parameters of a term as a mapping."""
+    node: Any = cfg
+    for name in key.split("."):
+        node = node[name] if isinstance(node, dict) else getattr(node, name)
+    return node if isinstance(node, dict) else {"func": node.func, **node.params}
+
+
+def write_yaml(path: Path, values: dict[str, Any]) -> None:
+    """A file of a group whose keys are those of the whole configuration."""
+    nested = OmegaConf.create()
+    for key, value in values.items():
+        OmegaConf.update(nested, key, value, force_add=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"# @package _global_\n{OmegaConf.to_yaml(nested)}")
+
+
+@pytest.mark.parametrize("key", SWAPS)
+def test_a_file_swaps_a_function_as_the_command_line_does(key: str, tmp_path: Path) -> None:
+    """Parameters of the other function are left out: those that come with the new one, or after it
+    on the command line, stay. With the same function all stay.
+    """
+    job = ["job=train", "trainer=clone"] if key.startswith("job.") else []
+    before = term_of(load_config(job), key)
+    assert {*SWAPS[key]} <= {*before}
+    own = {"mine": 3} if key == "task.check" else {"params": {"mine": 3}}
+    write_yaml(tmp_path / "conf/experiment/swap.yaml", {key: {"func": "lab.mine", **own}})
+    write_yaml(tmp_path / "conf/experiment/keep.yaml", {key: {"func": before["func"], **own}})
+    section = key if key == "task.check" else f"{key}.params"
+    more = [*job, f"+{section}.more=4"]
+
+    def composed(*overrides: str) -> dict[str, Any]:
+        return term_of(load_config(overrides, config_dir=tmp_path / "conf"), key)
+
+    swapped = {"func": "lab.mine", "mine": 3, "more": 4}
+    assert composed("experiment=swap", *more) == swapped
+    assert composed("experiment=keep", *more) == before | {"mine": 3, "more": 4}
+    assert composed(f"{key}.func=lab.mine", f"++{section}.mine=3", *more) == swapped
+    # A later file or the command line swaps it back: parameters from before do not come back.
+    back = [f"{key}.func={before['func']}", *more]
+    assert composed("experiment=swap", *back) == {"func": before["func"], "more": 4}
+    assert composed("experiment=[swap,keep]", *job) == {"func": before["func"], "mine": 3}
+
+
+def test_parameters_that_are_another_terms_stay_its(tmp_path: Path) -> None:
+    interpolated = {"func": "lab.mine", "params": "${reward.progress.params}"}
+    write_yaml(tmp_path / "conf/experiment/swap.yaml", {"action.arm": interpolated})
+    cfg = load_config(["experiment=swap"], config_dir=tmp_path / "conf")
+    assert cfg.action["arm"].params == cfg.reward["progress"].params
+    assert "within" in cfg.reward["progress"].params
+
+
+def test_the_next_composition_is_not_touched(tmp_path: Path) -> None:
+    """In one session each composition has its own files."""
+    write_yaml(tmp_path / "conf/experiment/swap.yaml", {"action.arm": {"func": "lab.mine"}})
+    with search_path([tmp_path / "conf"]), hydra_session():
+        swapped, plain = ["experiment=swap"], ["nworld=3"]
+        seen = [compose(o).action.arm.params for o in (swapped, plain, swapped, plain)]
+    assert seen[0] == seen[2] == {}
+    assert seen[1] == seen[3]
+    assert seen[1].scale == 1.2
+
+
 @pytest.mark.full
 def test_every_field_says_what_it_means() -> None:
     keys = list(list_keys(load_config()))
@@ -415,3 +504,68 @@ def test_sizes_of_a_training_follow_the_device(
     job = compositions.load_config(["job=train", *overrides]).job
     assert isinstance(job, CloneJobCfg)
     assert (job.episodes, job.leave_out) == (episodes, leave_out)
+
+
+def schema_floats() -> Iterator[tuple[type, Field, Any]]:
+    """Every field of the schema that is a float or holds floats, with its type."""
+    for owner in vars(schema).values():
+        for item in fields(owner) if is_dataclass(owner) else ():
+            hint = get_type_hints(owner)[item.name]
+            if config_fields.field_range(item).vectors:
+                hint = dict[str, list[float]]
+            if "float" in str(hint):
+                yield owner, item, hint  # type: ignore[misc]
+
+
+def filled(hint: Any, value: object, length: int) -> Any:
+    """A value of a type, filled with one number."""
+    kinds = get_args(hint)
+    if get_origin(hint) is list:
+        return [filled(kinds[0], value, length)] * length
+    if get_origin(hint) is dict:
+        return {"x": filled(kinds[1], value, length)}
+    return filled(kinds[0], value, length) if kinds else value
+
+
+def taken(owner: type, item: Field, value: object) -> Any:
+    """The value of a field of a class as a configuration has it."""
+    merged = OmegaConf.merge(OmegaConf.structured(owner), {item.name: value})
+    plain = OmegaConf.to_container(merged)[item.name]  # type: ignore[call-overload,index]
+    config_fields._check(item.name, plain, owner, item)
+    return plain
+
+
+FLOATS = list(schema_floats())
+
+
+@pytest.mark.parametrize(
+    ("owner", "item", "hint"),
+    FLOATS,
+    ids=[f"{owner.__name__}.{item.name}" for owner, item, _ in FLOATS],
+)
+def test_a_whole_number_is_a_float(owner: type, item: Field, hint: Any) -> None:
+    """Also inside of lists and mappings, and of those in each other. A bool is none."""
+    limits = config_fields.field_range(item)
+    value = next(n for n in (0, 1, 5) if limits.holds(n))
+    got = taken(owner, item, filled(hint, value, limits.length or 2))
+    assert got == filled(hint, value, limits.length or 2)
+    assert "." in repr(got)
+    with pytest.raises((OmegaConfBaseException, ConfigError)):
+        taken(owner, item, filled(hint, True, limits.length or 2))
+
+
+@pytest.mark.parametrize("value", ["[0,0,true]", "[0,0,up]", "[0,1]", "3", "up", "null"])
+def test_a_place_that_is_no_list_of_numbers(value: str) -> None:
+    given = f"+robot.grasp_pos={{x: {value}}}"
+    assert "expected a list of 3 numbers [m]" in refusal(lambda: load_config([given]))
+    given = f"robot.placements.stack.objects.red={'[0.3]' if value == '[0,1]' else value}"
+    line = refusal(lambda: load_config([given]))
+    assert line.startswith("robot.placements.stack.objects.red=")
+    assert "expected a list of 2 numbers [m]" in line
+
+
+def test_places_of_whole_numbers() -> None:
+    cfg = load_config(["+robot.grasp_pos={x: [0, 0, -1]}", "scene.objects.red.mass=1"])
+    assert repr(cfg.robot.grasp_pos) == "{'x': [0.0, 0.0, -1.0]}"
+    cfg = load_config(["robot.placements.stack.objects.red=[0.3, 0]"])
+    assert repr(cfg.scene.objects["red"].xy) == "[0.3, 0.0]"

@@ -20,7 +20,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from dataset_checker import check_dataset, contents, with_column
+from dataset_checker import check_dataset, contents, listed, with_column
 from environments import Patch
 
 from mjstack.datasets import (
@@ -36,6 +36,7 @@ from mjstack.datasets.lerobot import QUANTILES
 from mjstack.datasets.lerobot import STATISTICS as NAMES
 from mjstack.datasets.part import PartWriter
 from mjstack.datasets.reader import uncommitted
+from mjstack.datasets.statistics import RunningStatistics
 from mjstack.errors import ArgumentError, FolderError, MissingExtra, UnknownName
 
 GUIDE = Path(__file__).resolve().parents[1] / "docs" / "datasets.md"
@@ -231,14 +232,37 @@ def test_statistics_are_those_of_all_frames(tmp_path: Path) -> None:
     """
     write(tmp_path, range(4))
     write(tmp_path, range(4, 11))
-    check_dataset(tmp_path)  # of every episode, and of all but for the quantiles
+    check_dataset(tmp_path)
     stats = json.loads((tmp_path / "meta/stats.json").read_text())
-    rows = pq.read_table(tmp_path / "meta/episodes")
-    for name, values in stats.items():
-        for kind in QUANTILES:
-            quantiles = np.array(rows[f"stats/{name}/{kind}"].to_pylist())
-            mean = np.average(quantiles, axis=0, weights=rows["length"].to_numpy())
-            assert np.allclose(values[kind], mean, rtol=1e-9, atol=1e-12)
+    median = np.median(read_dataset(tmp_path).frames("next.done"))
+    assert stats["next.done"]["q50"] == [median] == [0.0]
+    assert stats["episode_index"]["q99"] == [10.0]
+
+
+@pytest.mark.parametrize(
+    ("scale", "offset"), [(1.0, 0.0), (1e-7, 5.0), (1e30, 0.0), (0.0, -3.0), (1e-30, 1.0)]
+)
+def test_quantiles_are_of_all_frames_in_any_order(scale: float, offset: float) -> None:
+    """Groups of unequal size and range, as a range grows in both directions."""
+    random = np.random.default_rng(3)
+    groups = [
+        offset + scale * (random.normal(size=(n, 3)) + shift) * (1.0, 1e-3, 100.0)
+        for n, shift in ((5, 0.0), (1, -40.0), (300, 2.0), (40, 900.0))
+    ]
+    orders = (groups, groups[::-1])
+    found = []
+    for order in orders:
+        running = RunningStatistics(3)
+        for group in order:
+            running.add(group)
+        found.append(running.statistics())
+    assert np.array_equal(found[0][4:], found[1][4:])
+    values = np.concatenate(groups)
+    exact = np.quantile(values, [*QUANTILES.values()], axis=0)
+    assert np.all(np.abs(found[0][4:] - exact) <= np.ptp(values, axis=0) / 8192)
+    assert np.array_equal(found[0][:2], [values.min(0), values.max(0)])
+    assert np.allclose(found[0][2], values.mean(0), rtol=1e-12)
+    assert np.allclose(found[0][3], values.std(0), rtol=1e-6, atol=1e-300)
 
 
 def test_a_resumed_dataset_is_the_uninterrupted_one(tmp_path: Path) -> None:
@@ -266,6 +290,9 @@ def test_tasks_keep_their_indices(tmp_path: Path) -> None:
         writer.add([episode(0, task="stack"), episode(1, task="box")])
     with DatasetWriter(tmp_path, SPEC) as writer:
         writer.add([episode(2, task="reach"), episode(3, task="box")])
+    assert read_dataset(tmp_path).tasks == ["stack", "box", "reach"]
+    path = tmp_path / lerobot.TASKS
+    pq.write_table(pq.read_table(path).take([2, 0, 1]), path, row_group_size=1)
     assert read_dataset(tmp_path).tasks == ["stack", "box", "reach"]
     table = pq.read_table(tmp_path / "data")
     rows = {row["episode_index"]: row["task_index"] for row in table.to_pylist()}
@@ -337,6 +364,7 @@ def test_a_kill_at_any_moment_keeps_what_was_committed(tmp_path: Path, monkeypat
         kept = 6 if folder == copies[-1] else 3
         assert [row["world"] for row in read_dataset(folder).episodes] == list(range(kept))
         assert bool(leftover(folder)) == (kept == 3)
+        assert len(listed(folder)) >= 3
         with DatasetWriter(folder, SPEC) as writer:
             assert writer.committed == [(7, world) for world in range(kept)]
             assert not leftover(folder)
@@ -488,6 +516,10 @@ def test_another_configuration_is_refused(tmp_path: Path) -> None:
     assert contents(tmp_path) == before
 
 
+COUNTS = {"total_episodes": 0, "total_frames": 0}
+FOREIGN = json.dumps({"codebase_version": "v3.0", "fps": 30, "features": {}, **COUNTS})
+
+
 def test_other_folders_are_left_alone(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     with pytest.raises(FolderError, match=r"cannot be written \(File exists\)"):
@@ -497,7 +529,9 @@ def test_other_folders_are_left_alone(tmp_path: Path) -> None:
     with pytest.raises(FolderError, match=r"has cat.jpg and no meta/info.json"):
         DatasetWriter(tmp_path / "photos", SPEC)
     for name, text, message in [
-        ("lerobot", '{"codebase_version": "v3.0", "total_episodes": 1}', "KeyError: 'mjstack'"),
+        ("lerobot", '{"codebase_version": "v3.0", "total_episodes": 1}', "KeyError"),
+        ("foreign", FOREIGN, "was not written by mjstack"),
+        ("older", '{"codebase_version": "v2.1"}', "is a LeRobotDataset v2.1, expected v3.0"),
         ("broken", '{"codebase', "JSONDecodeError"),
         ("list", "[]", "TypeError"),
     ]:
@@ -591,6 +625,9 @@ def edit_table(path: Path, change: Callable[[pa.Table], pa.Table]) -> None:
     groups = [file.read_row_group(k) for k in range(file.num_row_groups)]
     file.close()
     table = change(pa.concat_tables(groups))
+    if len(table) > 69:
+        pq.write_table(table, path)
+        return
     with pq.ParquetWriter(path, table.schema) as writer:
         start = 0
         for group in groups:
@@ -603,31 +640,61 @@ def set_column(name: str, value: Any) -> Callable[[pa.Table], pa.Table]:
     return lambda table: with_column(table, name, [[value] * len(table)])
 
 
+def change_column(
+    name: str, change: Callable[[np.ndarray], np.ndarray]
+) -> Callable[[pa.Table], pa.Table]:
+    """Changes the numbers of a column."""
+
+    def changed(table: pa.Table) -> pa.Table:
+        with np.errstate(all="ignore"):
+            return with_column(table, name, pa.array(change(np.array(table[name]))))
+
+    return changed
+
+
+def zeros(rows: int) -> pa.Table:
+    """Frames of zeros, which take next to no room on the disk."""
+    return lerobot.frames_table(
+        lerobot.frames_schema(SPEC),
+        {
+            name: np.zeros((rows, dim), dtype)
+            for name, (dtype, dim) in lerobot.columns_of(SPEC).items()
+        },
+    )
+
+
 DATA = "data/chunk-000/file-000.parquet"
 ROWS = "meta/episodes/chunk-000/file-000.parquet"
 INFO = lerobot.INFO
 STATS = lerobot.STATS
 OTHER = "cannot be read"
-ORDER = "69 frames of 3 episodes, out of order, expected 3 episodes and 69 frames"
 # By name: the file, what is done to it (None: it gets 100,000 brackets), and the message
 DAMAGE: dict[str, tuple[str, Any, str]] = {
     "frames": (
         DATA,
         lambda table: table.slice(0, 66),
-        "66 frames of 3 episodes, expected 3 episodes and 69 frames",
+        "3 rows of episodes and 66 frames, expected 3 episodes and 69 frames",
     ),
     "rows": (
         ROWS,
         lambda table: table.slice(0, 2),
-        "2 rows of episodes and 69 frames of 3 episodes, expected 3 e",
+        "2 rows of episodes and 69 frames, expected 3 e",
     ),
     "total": (
         INFO,
         lambda info: info.update(total_episodes=4),
-        "69 frames of 3 episodes, expected 4 episodes and 69 frames",
+        "3 rows of episodes and 69 frames, expected 4 episodes and 69 frames",
     ),
-    "shuffled": (DATA, lambda table: table.take([1, 0, *range(2, 69)]), ORDER),
-    "mixed": (DATA, lambda table: table.take([*range(20, 69), *range(20)]), ORDER),
+    "shuffled": (
+        DATA,
+        lambda table: table.take([1, 0, *range(2, 69)]),
+        "frame_index of frame 0 is 1, expected 0",
+    ),
+    "mixed": (
+        DATA,
+        lambda table: table.take([*range(20, 69), *range(20)]),
+        "episode_index of frame 0 is 1, expected 0",
+    ),
     "null index": (DATA, set_column("frame_index", None), OTHER),
     "robot": (INFO, lambda info: info.pop("robot_type"), "cannot be read .*'robot_type'"),
     "features": (INFO, lambda info: info.update(features=[3]), OTHER),
@@ -652,6 +719,48 @@ DAMAGE: dict[str, tuple[str, Any, str]] = {
     "world": (ROWS, set_column("world", "x"), OTHER),
     "dataset_from_index": (ROWS, set_column("dataset_from_index", 7), OTHER),
     "task": (lerobot.TASKS, set_column("task", None), OTHER),
+    "task numbers": (lerobot.TASKS, set_column("task_index", 10**9), "task_index does not count"),
+    "times": (DATA, change_column("timestamp", lambda t: 7 * t), "timestamp of frame 1 is 0.14"),
+    "late": (DATA, change_column("timestamp", lambda t: t + 2e-3), "timestamp of frame 0 is 0.002"),
+    "no time": (DATA, change_column("timestamp", lambda t: t * np.nan), "not finite"),
+    "backwards": (DATA, change_column("index", lambda i: i[::-1]), "index of frame 0 is 68, ex"),
+    "least": (
+        DATA,
+        change_column("index", lambda i: 0 * i + -(2**63)),
+        "index of frame 0 is -9223",
+    ),
+    "far task": (DATA, change_column("task_index", lambda i: i + 10**9), "0 is 1000000000, exp"),
+    "null": (DATA, set_column("observation.state", None), "rows of observation.state without 3"),
+    "null count": (DATA, set_column("count", None), "rows of count without 1 numbers"),
+    "infinite": (DATA, change_column("next.reward", lambda r: r / 0), "reward has .* not finite"),
+    "precision": (DATA, change_column("next.reward", lambda r: r.astype(float)), "float64, expec"),
+    "column": (
+        DATA,
+        lambda table: table.append_column("x", table["index"]),
+        "those expected: x",
+    ),
+    "row column": (ROWS, lambda table: table.append_column("x", table["seed"]), "expected: x"),
+    "place": (ROWS, set_column("data/file_index", 7), "data/file_index is 7, expected 0"),
+    "row task": (ROWS, set_column("tasks", ["box"]), "task_index of frame 0 is 0, expected -1"),
+    "success": (ROWS, set_column("success", "yes"), "success is 'yes', expected bool"),
+    "negative": (INFO, lambda info: info["mjstack"].update(shards=-1), "shards is -1"),
+    "rate": (INFO, lambda info: info.update(fps=0), "fps is 0"),
+    "long footer": (
+        DATA,
+        lambda table: table.replace_schema_metadata({"x": "y" * 2**25}),
+        "its footer has .* bytes, more than",
+    ),
+    "nested": (
+        DATA,
+        lambda table: with_column(table, "action", [[[0.0] * 900]] * 69),
+        "rows of action without 2 numbers",
+    ),
+    "text": (
+        lerobot.TASKS,
+        lambda _: pa.table({"task_index": range(3000), "task": ["x" * 10**6] * 3000}),
+        "bytes would unpack to 30",
+    ),
+    "rows of zeros": (DATA, lambda _: zeros(2_000_000), "bytes would unpack to"),
     "deep": (INFO, None, OTHER),
 }
 
@@ -723,6 +832,99 @@ def test_a_writer_follows_no_link_out_of_the_dataset(tmp_path: Path) -> None:
     with pytest.raises(FolderError, match="data is a link, and what it leads to"):
         DatasetWriter(folder, SPEC)
     assert stale.read_bytes() == b"somebody's"
+
+
+@pytest.mark.parametrize("total", [False, True], ids=["alone", "as info.json says"])
+def test_nothing_is_unpacked_that_is_too_large(
+    total: bool, tmp_path: Path, monkeypatch: Patch
+) -> None:
+    """More frames than a file of that size is meant for, whether info.json has their number."""
+    write(tmp_path, range(3))
+    pq.write_table(zeros(2_000_000), tmp_path / DATA)
+    if total:
+        info = json.loads((tmp_path / INFO).read_text())
+        (tmp_path / INFO).write_text(json.dumps(info | {"total_frames": 2_000_000}))
+    monkeypatch.setattr(pq.ParquetFile, "read", None)
+    for use in (read_dataset, lambda folder: DatasetWriter(folder, SPEC)):
+        with pytest.raises(FolderError, match=r"bytes would unpack to 2\d{8}\)"):
+            use(tmp_path)
+
+
+def test_row_groups_without_end_are_not_opened(tmp_path: Path) -> None:
+    write(tmp_path, range(3))
+    table = pq.read_table(tmp_path / DATA)
+    with pq.ParquetWriter(tmp_path / DATA, table.schema) as writer:
+        for _ in range(32_000):
+            writer.write_table(table.slice(0, 1))
+    with pytest.raises(FolderError, match=r"its footer has .* bytes, more than"):
+        read_dataset(tmp_path)
+
+
+def put(kind: str, path: Path) -> None:
+    """Something else in place of a file or folder: a link to it, a pipe or the other of both."""
+    moved = path.parent.parent / "moved"
+    is_file = path.is_file()
+    if path.exists():
+        path.rename(moved)
+    if kind == "link":
+        path.symlink_to(moved)
+    elif kind == "pipe":
+        os.mkfifo(path)
+    elif is_file or path.name.startswith("."):
+        path.mkdir()
+    else:
+        path.write_text("x")
+
+
+@pytest.mark.parametrize("kind", ["link", "pipe", "other"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("meta", "data", "data/chunk-000", "meta/episodes", STATS, INFO, lerobot.TASKS, DATA),
+        *(ROWS, "data/chunk-000/.file-rank0000-0.parquet.part", "meta/.info.json.x"),
+    ],
+)
+def test_a_writer_writes_files_and_nothing_else(name: str, kind: str, tmp_path: Path) -> None:
+    folder = tmp_path / "dataset"
+    write(folder, range(3))
+    put(kind, folder / name)
+    before = {path: path.lstat().st_mtime_ns for path in tmp_path.rglob("*")}
+    with pytest.raises(FolderError, match=r"is a link|is no regular file|is no folder") as caught:
+        DatasetWriter(folder, SPEC)
+    assert "\n" not in str(caught.value)
+    assert {path: path.lstat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+
+
+def test_a_hard_link_is_not_written_through(tmp_path: Path) -> None:
+    folder = tmp_path / "dataset"
+    write(folder, range(3))
+    names = [STATS, INFO, lerobot.TASKS, DATA, ROWS]
+    for number, name in enumerate(names):
+        os.link(folder / name, tmp_path / str(number))
+    before = [(tmp_path / str(number)).read_bytes() for number in range(len(names))]
+    write(folder, range(3, 5))
+    assert [(tmp_path / str(number)).read_bytes() for number in range(len(names))] == before
+
+
+def test_what_an_earlier_version_left_is_cleared_away(tmp_path: Path) -> None:
+    """It wrote into hidden files whose names end as those of complete ones."""
+    write(tmp_path, range(3))
+    before = contents(tmp_path)
+    for name in (".file-rank0000-0.parquet", ".file-rank0001-0.parquet"):
+        (tmp_path / DATA).with_name(name).write_bytes(b"PAR1")
+    DatasetWriter(tmp_path, SPEC).close()
+    assert contents(tmp_path) == before
+
+
+def test_nothing_unfinished_is_listed(tmp_path: Path) -> None:
+    """LeRobot lists hidden files too."""
+    with DatasetWriter(tmp_path, SPEC) as writer:
+        writer.add([episode(0)])
+        writer.flush()
+        before = listed(tmp_path)
+        writer.add([episode(1)])
+        assert leftover(tmp_path)
+        assert listed(tmp_path) == before
 
 
 def test_statistics_that_were_removed_are_written_anew(tmp_path: Path) -> None:

@@ -70,15 +70,25 @@ def fails(kind: type[MjstackError], call: Callable[[], object], *words: str) -> 
     ("action", "words"),
     [
         (lambda env: zeros(env)[:2], ["shape (2, 6)", "(3, 6)"]),
-        (lambda env: zeros(env).int(), ["a torch.int32 tensor", "float32"]),
+        (lambda env: zeros(env).int(), ["a torch.int32 tensor", "a float32 or float64 tensor"]),
         (lambda env: zeros(env, device="meta"), ["on meta", "cpu"]),
-        (lambda env: zeros(env).numpy(), ["ndarray", "float32 tensor"]),
+        (lambda env: zeros(env).numpy(), ["ndarray", "a float32 or float64 tensor"]),
     ],
 )
 def test_action_of_the_wrong_kind(
     env: Env, action: Callable[[Env], object], words: list[str]
 ) -> None:
     fails(ArgumentError, lambda: env.step(action(env)), "action: found", "expected", *words)  # type: ignore[arg-type]
+
+
+def test_an_action_of_float64_is_taken_as_its_float32(env: Env) -> None:
+    """Both are what the message about other types expects."""
+    seen = []
+    for dtype in (torch.float32, torch.float64):
+        env.reset(seed=3)
+        action = torch.full((3, 6), 0.25).to(dtype)  # exact in both
+        seen.append(env.step(action)[0]["policy"])
+    assert torch.equal(*seen)
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
@@ -325,7 +335,7 @@ OUT_OF_RANGE: list[tuple[str, type[MjstackError], str]] = [
     (
         "action=ee_delta action.arm.params.iterations=0",
         ConfigError,
-        "=0: expected an integer of at",
+        "=0: expected an integer from 1 to",
     ),
     ("termination.joint_limit.params.margin=-0.1", ConfigError, "=-0.1: expected a number of at"),
     ("reward.progress.params.scale=abc", ConfigError, "=abc: expected a number"),

@@ -1,27 +1,38 @@
 """The 3-D page of a run's worlds: geometry and poses are MuJoCo's, and a browser shows them."""
 
+import csv
 import io
 import json
 import re
 import urllib.parse
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import matplotlib.image
 import mujoco
 import numpy as np
 import pytest
+import torch
 from browser import EXECUTABLE, Tab, browse, messages
-from environments import Capture, GetStage, MakeSim, Patch, one_second_episode
+from environments import Capture, GetStage, MakeSim, Patch, configure, one_second_episode
+from torch import Tensor
 
 import mjstack.report.web as web
 from mjstack.cli import run
-from mjstack.episodes.motion import motion_recorder
+from mjstack.config.load import load_config
+from mjstack.config.schema import TermCfg
+from mjstack.episodes.motion import load_worlds, motion_recorder
 from mjstack.episodes.rollout import Hook
-from mjstack.report.geometry import Shapes
+from mjstack.episodes.run import Run
+from mjstack.episodes.seeds import _show as show_worlds
+from mjstack.episodes.stage import Stage
+from mjstack.managers import EnvView, random_uniform, uses_fields
+from mjstack.math import quat_to_matrix
+from mjstack.report.geometry import Shapes, with_fields
 from mjstack.report.page import World, frame_stride
-from mjstack.report.web import choose_worlds, save_episode
+from mjstack.report.web import choose_worlds, not_shown, save_episode
 
 PRIMITIVES = """
 <mujoco>
@@ -59,8 +70,12 @@ def test_shapes_are_mujocos() -> None:
     """Vertices lie on the surfaces, in the frame of the body that moves them."""
     model = mujoco.MjModel.from_xml_string(PRIMITIVES)
     shapes = Shapes(model)
-    assert shapes.bodies == [0, 1]  # a body without joints is part of the one that holds it
-    found = {rgba[:3]: mesh[0] for number, rgba, mesh in shapes.meshes if number == 1}
+    colors = [tuple(shape.rgba[0, :3].tolist()) for shape in shapes.meshes]
+    found = {
+        rgba: shape.mesh[0]
+        for rgba, shape in zip(colors, shapes.meshes, strict=True)
+        if shape.pose == 1
+    }
     assert len(found) == 7  # neither the hidden nor the invisible one
     box = (
         (found[1, 0, 0] - [0.1, 0.0, 0.0])
@@ -80,8 +95,235 @@ def test_shapes_are_mujocos() -> None:
     assert np.allclose(np.linalg.norm(found[1, 0, 1] / [0.1, 0.2, 0.3], axis=1), 1.0)
     assert np.allclose(np.ptp(found[0, 1, 0], 0), 0.1, atol=2e-3)
     places, turns = shapes.poses(model.qpos0[None])
+    # A body without joints is part of the one that holds it.
     assert np.allclose(places[0], [[0, 0, 0], [1, 2, 3]])
     assert np.allclose(turns[0, 1], model.qpos0[3:])
+
+
+ARM = """
+<mujoco>
+  <asset><material name="green" rgba="0 1 0 1"/></asset>
+  <worldbody>
+    <body name="base" pos=".1 .2 .3">
+      <geom type="capsule" size=".02 .1" rgba="1 0 0 1"/>
+      <body name="nested" pos="0 0 .2"><geom type="box" size=".1 .02 .03" material="green"/></body>
+      <body name="link" pos=".3 0 0">
+        <joint axis="0 0 1" pos=".05 0 0"/>
+        <geom type="cylinder" size=".03 .06" pos=".1 0 0" material="green"/>
+        <geom type="ellipsoid" size=".03 .06 .02" pos="0 .1 0" rgba="0 0 1 1"/>
+      </body>
+    </body>
+    <body name="ball" pos="0 0 1"><freejoint/><geom size=".05" rgba="1 1 0 1"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("body_pos", "body_quat", "geom_pos", "geom_quat", "geom_size", "geom_rgba", "mat_rgba"),
+        *("jnt_pos", "jnt_axis", "qpos0", "geom_friction"),
+    ],
+)
+def test_shapes_are_where_mujoco_draws_any_model_field(name: str) -> None:
+    """The middle, the extent and the colour of every geom of three worlds, in the same state."""
+    model = mujoco.MjModel.from_xml_string(ARM)
+    rng = np.random.default_rng(1)
+    nominal = getattr(model, name)
+    worlds = [{name: nominal + rng.uniform(0.0, 0.01, nominal.shape)} for _ in range(2)]
+    if name.endswith(("quat", "axis")):
+        for fields in worlds:
+            fields[name] = nominal + rng.uniform(-0.3, 0.3, nominal.shape)
+            fields[name] /= np.linalg.norm(fields[name], axis=1, keepdims=True)
+    if name.endswith("rgba"):
+        for fields in worlds:
+            fields[name] = np.clip(rng.uniform(0.0, 1.0, nominal.shape), 0.1, 1.0)
+    qpos = model.qpos0 + 0.4
+    qpos[4:] = [1.0, 0.0, 0.0, 0.0]
+    shapes = Shapes(model, [*worlds, {}])
+    places, turns = shapes.poses(np.tile(qpos, (3, 1)))
+    matrices = quat_to_matrix(torch.from_numpy(turns)).numpy()
+    for world, fields in enumerate([*worlds, {}]):
+        drawn = []
+        for shape in shapes.meshes:
+            for row in np.flatnonzero(shape.worlds == world):
+                place = places[world, shape.pose]
+                points = shape.mesh[0] @ matrices[world, shape.pose].T + place
+                drawn.append((shape.rgba[row], points))
+        scene_model = with_fields(model, fields)
+        data = mujoco.MjData(scene_model)
+        data.qpos[:] = qpos
+        mujoco.mj_forward(scene_model, data)
+        scene = mujoco.MjvScene(scene_model, 100)
+        camera = mujoco.MjvCamera()
+        option = mujoco.MjvOption()
+        every = mujoco.mjtCatBit.mjCAT_ALL
+        perturb = mujoco.MjvPerturb()
+        mujoco.mjv_updateScene(scene_model, data, option, perturb, camera, every, scene)
+        geoms = [g for g in scene.geoms[: scene.ngeom] if g.objtype == mujoco.mjtObj.mjOBJ_GEOM]
+        assert len(geoms) == model.ngeom
+        for geom in geoms:
+            near = [points for rgba, points in drawn if np.allclose(rgba, geom.rgba, atol=1e-3)]
+            local = np.concatenate([(points - geom.pos) @ geom.mat for points in near])
+            number = geom.objid
+            half = scene_model.geom_aabb[number, 3:]
+            inside = local[(np.abs(local) <= half + 2e-3).all(1)]
+            assert np.allclose(inside.max(0), half, atol=2e-3), (world, number)
+            assert np.allclose(inside.min(0), -half, atol=2e-3), (world, number)
+
+
+@uses_fields("body_pos", "body_quat")
+def move_wall(env: EnvView, mask: Tensor) -> None:
+    """Move and turn the wall, which stands still."""
+    body = env.sim.model.body("wall").id
+    draw = random_uniform(env, "move", 2)
+    env.sim.fields["body_pos"][mask, body, :2] += 0.05 * draw[mask]
+    half = 0.5 * draw[mask, 0]
+    env.sim.fields["body_quat"][mask, body] = torch.stack(
+        (half.cos(), 0.0 * half, 0.0 * half, half.sin()), 1
+    )
+
+
+@uses_fields("geom_size")
+def resize_wall(env: EnvView, mask: Tensor) -> None:
+    """Make the wall higher."""
+    factor = 1.5 + 0.4 * random_uniform(env, "size", 1)
+    env.sim.fields["geom_size"][mask, env.sim.model.geom("wall").id, 2:] *= factor[mask]
+
+
+@uses_fields("geom_rgba")
+def paint_wall(env: EnvView, mask: Tensor) -> None:
+    """Give the wall a colour."""
+    draw = random_uniform(env, "paint", 3, 0.0, 1.0)
+    env.sim.fields["geom_rgba"][mask, env.sim.model.geom("wall").id, :3] = draw[mask]
+
+
+TERMS = (move_wall, resize_wall, paint_wall)
+
+
+def placed_meshes(path: Path) -> list[tuple[list[int], np.ndarray]]:
+    """Colour and vertices in the scene of every mesh of a page at its start."""
+    placed = []
+    for _, message in messages(path):
+        if message["type"] == "BatchedMeshesMessage":
+            props = message["props"]
+            vertices = props["vertices"].reshape(-1, 3)
+            quats = props["batched_wxyzs"].reshape(-1, 4)
+            colors = np.broadcast_to(props["batched_colors"].reshape(-1, 3), (len(quats), 3))
+            turns = quat_to_matrix(torch.from_numpy(quats.copy())).numpy()
+            for turn, place, color in zip(
+                turns, props["batched_positions"].reshape(-1, 3), colors, strict=True
+            ):
+                placed.append((color.tolist(), vertices @ turn.T + place))
+    return placed
+
+
+def test_a_page_shows_the_model_fields_of_each_world(tmp_path: Path) -> None:
+    """A body that stands still is moved and turned, its geom resized and painted: page, file of
+    motion, and MuJoCo agree.
+    """
+    wall = "+scene.objects.wall={fixed: true, size: [0.01, 0.05, 0.02], xy: [0.2, 0.15]}"
+    cfg = configure(wall, "sim=native", "nworld=3")
+    terms = {f.__name__: TermCfg(func=f"{__name__}.{f.__name__}") for f in TERMS}
+    stage = Stage(replace(cfg, reset=dict(cfg.reset) | terms))
+    sim = stage.batch_simulation(3)
+    env = stage.start(sim, stage.cfg.reset)
+    failed = np.array([0, stage.check.rules["STACKED"], 0], np.int32)
+    played = Run(stage)
+    show_worlds(played, "batch", tmp_path / "m.npz", sim.qpos[None], env, failed)
+    visual = stage.assets.visual_model
+    assert visual.ngeom > sim.model.ngeom  # so that numbers of geoms differ
+    table_size = 2.0 * np.array(stage.cfg.scene.table_half[:2])
+    for worlds in (played.page.worlds3d["batch"], load_worlds(tmp_path / "m.npz")):
+        save_episode(tmp_path / "episode.html", visual, worlds, 0.04)
+        placed = placed_meshes(tmp_path / "episode.html")
+        tables = [
+            mesh
+            for color, mesh in placed
+            if np.allclose(np.ptp(mesh, 0)[:2], table_size, atol=1e-3)
+        ]
+        assert len(tables) == 3
+        for world, table in zip((1, 0, 2), tables, strict=True):  # the one that failed first
+            fields = {name: values[world].numpy() for name, values in sim.fields.items()}
+            geom = sim.model.geom("wall").id
+            color = np.round(255.0 * fields["geom_rgba"][geom, :3]).astype(int).tolist()
+            (mesh,) = (mesh for found, mesh in placed if found == color)
+            corners = np.array(list(product((-1.0, 1.0), repeat=3))) * fields["geom_size"][geom]
+            body = sim.model.body("wall").id
+            turn = quat_to_matrix(torch.from_numpy(fields["body_quat"][body])).numpy()
+            expected = corners @ turn.T + fields["body_pos"][body]
+            offset = table.mean(0)[:2] - stage.cfg.scene.table_center[:2]
+            expected[:, :2] += offset
+            gaps = np.linalg.norm(mesh[:, None] - expected, axis=2)
+            assert gaps.min(1).max() < 1e-3
+            assert gaps.min(0).max() < 1e-3
+            (xpos,) = mesh.mean(0)[None] - [*offset, 0.0]
+            assert np.allclose(xpos, sim.xpos[world, body], atol=1e-3)
+    sim.close()
+
+
+def test_one_looks_at_the_first_failing_world(get_stage: GetStage, tmp_path: Path) -> None:
+    model = get_stage("so101").assets.visual_model
+    looks = []
+    for failing in ((), (4,), (4, 7)):
+        worlds = [replace(w, failed=int(w.label) in failing) for w in motion(get_stage, 9, 2)]
+        save_episode(tmp_path / "e.html", model, worlds, 0.04)
+        sent = [message for _, message in messages(tmp_path / "e.html")]
+        (look,) = [m for m in sent if m["type"] == "SetCameraLookAtMessage"]
+        looks.append(look["look_at"][:2])
+        (first,) = [m for m in sent if "props" in m and m.get("name") == "/0"]
+        places = first["props"]["batched_positions"]
+    offsets = places.reshape(-1, 3)[:, :2]
+    apart = np.linalg.norm(offsets[0] - offsets[1])
+    assert np.linalg.norm(offsets[4] + [0.15, 0.0] - looks[1]) < 0.5 * apart
+    assert np.allclose(looks[1], looks[2])
+    assert not np.allclose(looks[0], looks[1])
+
+
+def test_a_page_says_what_it_does_not_show(get_stage: GetStage) -> None:
+    model = get_stage("so101").assets.visual_model
+    (world,) = motion(get_stage, 1, 2)
+    floor = model.geom_rgba.copy()
+    floor[model.geom("floor").id] = [1.0, 0.0, 0.0, 1.0]
+    same = {"light_pos": model.light_pos, "geom_rgba": model.geom_rgba}
+    other = {"light_pos": model.light_pos + 1.0, "geom_rgba": floor}
+    assert not_shown(model, [replace(world, fields=same)] * 2) == []
+    worlds = [replace(world, fields=fields) for fields in (same, other)]
+    line = "episode.html does not show how worlds differ in light_pos, floor"
+    assert not_shown(model, worlds) == [line]
+
+
+@pytest.mark.full
+def test_drawn_places_are_in_every_file(tmp_path: Path) -> None:
+    """The goal of examples/push: tables, map and 3-D page."""
+    conf = str(Path(__file__).parents[1] / "examples" / "push" / "conf")
+    cfg = load_config(["task=push"], config_dir=conf)
+    quick = [f"controller.phases.{name}.seconds=0.1" for name in cfg.controller.phases]
+    args = ["--config-dir", conf, "task=push", "sim=native", "gates=[success]", "nworld=3", *quick]
+    args += ["task.check.window=5", "task.success.params.steps=5", "gate.success.cell_episodes=1"]
+    out = tmp_path / "out"
+    assert run([*args, f"hydra.run.dir={out}"]) == 1
+    goals = np.load(out / "starts_seed0.npz")["goal_xy"]
+    assert np.ptp(goals, 0).min() > 1e-4
+    with (out / "failing_worlds.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    cells = [[float(row["goal_x_m"]), float(row["goal_y_m"])] for row in rows]
+    assert np.allclose(cells, goals, atol=1e-5)
+    assert "goal_yaw_rad" not in rows[0]
+    with (out / "success_regions.csv").open() as file:
+        assert {row["object"] for row in csv.DictReader(file)} == {"puck", "goal"}
+    text = (out / "report.html").read_text()
+    (figure,) = re.findall(r"<figure><figcaption>goal</figcaption>.*?</figure>", text)
+    assert figure.count("<path class=x") == 3
+    assert "no sign before the result: " in text  # and the rules that broke
+    placed = placed_meshes(out / "episode.html")
+    table = 2.0 * np.array(cfg.scene.table_half[:2])
+    tables = [m for _, m in placed if np.allclose(np.ptp(m, 0)[:2], table, atol=1e-3)]
+    discs = [m for color, m in placed if color == [51, 51, 51]]
+    for goal, disc, mesh in zip(goals, discs, tables, strict=True):
+        offset = 0.5 * (mesh.max(0) + mesh.min(0))[:2] - cfg.scene.table_center[:2]
+        assert np.allclose(disc.mean(0)[:2] - offset, goal, atol=1e-3)
 
 
 def motion(get_stage: GetStage, worlds: int, frames: int) -> list[World]:
@@ -116,7 +358,7 @@ def test_a_page_holds_every_frame(get_stage: GetStage, tmp_path: Path) -> None:
         if message["type"] == "BatchedMeshesMessage"
     }
     assert len(names) == len(shapes.meshes)
-    numbers = [number for number, *_ in shapes.meshes]
+    numbers = [shape.pose for shape in shapes.meshes]
     name = f"/{numbers.index(rising)}"
     updates = [
         (time, message["updates"]["batched_positions"])

@@ -14,6 +14,7 @@ from mjstack.config.schema import Config
 from mjstack.drivers.driver import Driver
 from mjstack.episodes.rollout import play_episode
 from mjstack.episodes.stage import Stage
+from mjstack.mdp.geometry import place_xy
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 FRANKA = Path(os.environ.get("MENAGERIE_ROOT", "/nowhere")) / "franka_emika_panda"
@@ -71,6 +72,8 @@ def play_gates(example: str, robot: str, folder: Path, *overrides: str) -> dict[
         pytest.param("slot", "rebot", "baseline,batch", marks=pytest.mark.full),
         pytest.param("peg", "so101", "batch", marks=pytest.mark.full),
         pytest.param("peg", "rebot", "baseline,batch", marks=pytest.mark.full),
+        ("drawer", "so101", "baseline,batch,success"),
+        pytest.param("drawer", "rebot", "baseline,parity,batch,success", marks=pytest.mark.full),
         pytest.param("panda", "panda", "baseline,batch", marks=needs_franka),
     ],
 )
@@ -83,6 +86,9 @@ def test_the_gates_pass(example: str, robot: str, gates: str, tmp_path: Path) ->
         metrics = results["parity"]["metrics"]
         compared = {name.partition(".")[0] for name in metrics if ".step1." in name}
         assert compared == {"before_contact", "in_contact", "at_end", "in_motion", "swung"}
+    if "parity" in results and example == "drawer":
+        assert 0.0 < results["parity"]["metrics"]["final.drawer.position_m"] < 0.002
+        assert "drawer ends 0." in results["parity"]["reason"]
 
 
 @pytest.mark.full
@@ -102,6 +108,8 @@ def test_a_dataset_and_a_replay(tmp_path: Path) -> None:
     ("example", "threshold", "rules"),
     [
         ("push", "within=1e-6", ["AT_GOAL"]),
+        ("drawer", "open=0.08", ["OPEN"]),
+        pytest.param("drawer", "stop=0.05", ["ON_RAIL"], marks=pytest.mark.full),
         pytest.param("tower", "xy_err=1e-6", ["RED", "GREEN"], marks=pytest.mark.full),
         pytest.param("slot", "depth=0.05", ["DEPTH"], marks=pytest.mark.full),
         pytest.param("peg", "within=1e-6", ["IN_HOLE"], marks=pytest.mark.full),
@@ -132,6 +140,7 @@ class Still(Driver):
     ("example", "rules"),
     [
         ("tower", ["RED", "GREEN"]),
+        ("drawer", ["OPEN"]),
         *(
             pytest.param(*row, marks=pytest.mark.full)
             for row in (("push", ["AT_GOAL"]), ("slot", ["DEPTH"]))
@@ -149,7 +158,15 @@ def test_worlds_that_are_not_driven_fail(example: str, rules: list[str]) -> None
 
 @pytest.mark.parametrize(
     ("example", "most"),
-    [("push", 120), ("tower", 80), ("scara", 40), ("panda", 40), ("slot", 110), ("peg", 130)],
+    [
+        ("push", 120),
+        ("tower", 80),
+        ("scara", 40),
+        ("panda", 40),
+        ("slot", 110),
+        ("peg", 130),
+        ("drawer", 190),
+    ],
 )
 def test_an_example_is_short(example: str, most: int) -> None:
     folder = EXAMPLES / example
@@ -157,3 +174,20 @@ def test_an_example_is_short(example: str, most: int) -> None:
     assert 0 < sum(len(file.read_text().splitlines()) for file in files) <= most
     assert len((folder / "README.md").read_text().splitlines()) <= 12
     assert (folder / f"{example}.png").stat().st_size < 150_000
+
+
+def test_the_cabinet_stands_where_the_handle_is_drawn_and_its_cube_stays_in_it() -> None:
+    """In every world and episode. A drawer that starts open passes, a cube elsewhere does not."""
+    cfg = configure("drawer", "so101", "nworld=4", "reset=randomized")
+    stage = Stage(cfg)
+    env = stage.start(stage.batch_simulation(4), cfg.reset)
+    handle = env.sim.xpos[:, env.sim.model.body("handle").id, :2]
+    assert torch.allclose(handle, place_xy(env, "handle").to(handle), atol=1e-6)
+    assert len(handle.unique(dim=0)) == 4
+    cube = env.index.objects["cube"][0]
+    env.sim.qpos[1, cube] -= 0.2
+    env.sim.qpos[2, cube] -= 0.06
+    env.sim.qpos[2, env.sim.model.joint("drawer").qposadr[0]] = 0.06
+    played = play_episode(env, Still(cfg))
+    failing = stage.check.rules.failing(played.result.failed.numpy())
+    assert failing == {"OPEN": [0, 1, 3], "INSIDE": [1]}

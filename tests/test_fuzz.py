@@ -1,4 +1,5 @@
-"""Seeded command lines, and damaged folders of policies, datasets and runs.
+"""Seeded command lines, damaged folders of policies, datasets and runs, and small files that stand
+for much.
 
 The check of each passes, or ends in one line and exit status 2. Then nothing is written. Nothing
 in the home folder changes, and no process is left. A tenth of the command lines that pass, and
@@ -36,24 +37,32 @@ import mjstack.cli  # before mujoco, which decides at its import how it draws
 # isort: split
 import pytest
 import torch
-from fuzz_cases import CHOSEN, QUICK, Make, command_lines, damaged_folders, is_short
+from fuzz_cases import CHOSEN, QUICK, Make, command_lines, damaged_folders, is_short, small_files
+from fuzz_datasets import damaged_datasets
 
 from mjstack.config.load import compose
 from mjstack.config.session import hydra_session
 
-COUNTS = {"commands": 60, "folders": 60}  # `make fuzz` tries 1,000 and 500
+# `make fuzz` tries 1,000, 500, 200 and 72
+COUNTS = {"commands": 60, "folders": 60, "datasets": 12, "small": 24}
 REAL = 12  # folders that commands in a process of their own are given
-CASES = {"commands": command_lines, "folders": damaged_folders}
+CASES = {
+    "commands": command_lines,
+    "folders": damaged_folders,
+    "datasets": damaged_datasets,
+    "small": small_files,
+}
 UNTOUCHED = ("policy", "run")  # what is only read
 PASSED = 77  # exit status of a child whose check has passed
 ENDS = {PASSED: "passed", 0: "shown, or run", 2: "one line"}
 SECONDS = 20  # of processor time that a check may take; the slowest of them takes three
+MEGABYTES = 1024  # of memory that a check may take beside the modules
 AT_ONCE = 3  # the process that forks works too
 
 
 @pytest.mark.full
 def test_a_check_passes_or_says_one_line() -> None:
-    """Both kinds in one process: loading all modules takes it as long as thirty cases."""
+    """All kinds in one process: loading all modules takes it as long as thirty cases."""
     done = subprocess.run([sys.executable, __file__], capture_output=True, text=True, timeout=1500)
     print(done.stdout[-20_000:])
     assert done.returncode == 0, done.stdout[-20_000:] + done.stderr[-3000:]
@@ -70,6 +79,7 @@ class Outcome(NamedTuple):
     changed: list[str]
     left: bool
     seconds: float
+    megabytes: float
 
     def problem(self, *, ran: bool = False) -> str:
         """Why that is not one of the answers that are allowed; empty if it is."""
@@ -77,6 +87,8 @@ class Outcome(NamedTuple):
             return "a traceback"
         if self.left:
             return "a process is left"
+        if self.megabytes > MEGABYTES and not ran:
+            return f"{self.megabytes:.0f} MB"
         goes_on = self.status in (0, 1, PASSED)
         allowed = re.compile(rf"cwd/(?!({'|'.join(UNTOUCHED)})(/|$))")
         if wrote := [name for name in self.changed if not (goes_on and allowed.match(name))]:
@@ -87,6 +99,8 @@ class Outcome(NamedTuple):
             lines = [line for line in lines if not line.startswith("Warp CUDA warning")]
             if len(lines) != 1 or not lines[0].startswith("mjstack: "):
                 return f"{len(lines)} lines on stderr"
+            if len(lines[0]) > 300:
+                return f"a line of {len(lines[0])} letters"
             if re.search(r"[\x00-\x08\x0b-\x1f\x7f]", lines[0]):
                 return "control characters"
             return "" if not self.out.strip() else "exit 2 with output"
@@ -154,7 +168,9 @@ def judge_cases(kind: str, cases: Sequence[int]) -> int:
 
         passed = judge(cases)
         draw = random.Random(kind)
-        if kind == "folders":
+        if kind == "small":
+            pass
+        elif kind != "commands":
             judge(draw.sample(cases, min(REAL, len(cases))), run=True, real=True)
         else:
             tenth = min(counts["passed"] // 10 + 1, len(passed))
@@ -181,9 +197,10 @@ def _fork_all(
             running[child.pid] = child
         if not running:
             return
-        pid, status = os.waitpid(-1, os.WNOHANG)
+        pid, status, used = os.wait4(-1, os.WNOHANG)
         if pid in running:
-            yield running[pid], _outcome(running.pop(pid), os.waitstatus_to_exitcode(status))
+            more = (used.ru_maxrss - resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) / 1024
+            yield running[pid], _outcome(running.pop(pid), os.waitstatus_to_exitcode(status), more)
         elif not pid:
             time.sleep(0.005)
             for child in running.values():
@@ -249,7 +266,7 @@ def _pass(*_: object, **__: object) -> None:
     os._exit(PASSED)
 
 
-def _outcome(child: Child, status: int) -> Outcome:
+def _outcome(child: Child, status: int, megabytes: float) -> Outcome:
     out, err = ((child.home / name).read_text(errors="replace") for name in ("out", "err"))
     now = _content(child.home)
     changed = sorted(
@@ -263,7 +280,7 @@ def _outcome(child: Child, status: int) -> Outcome:
         os.killpg(child.pid, 0)
     except ProcessLookupError:
         left = False
-    return Outcome(status, out, err, changed, left, time.monotonic() - child.began)
+    return Outcome(status, out, err, changed, left, time.monotonic() - child.began, megabytes)
 
 
 def _content(folder: Path) -> dict[str, str]:

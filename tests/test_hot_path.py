@@ -15,8 +15,7 @@ COPIES = {"tensor", "as_tensor", "from_numpy", "masked_select", "unique", "argwh
 CASTS = {"bool", "int", "float"}
 # The code that runs within a step, by file and class, "" for functions; None for all of a file.
 PATHS: dict[str, dict[str, str] | None] = {
-    "envs/env.py": {"Env": "advance _step_physics _evaluate _reset_ended"},
-    "envs/starts.py": {"Starts": "begin start"},
+    "envs/env.py": {"Env": "advance _step_physics _evaluate _reset_ended _begin _start"},
     "envs/command_delay.py": {"CommandDelay": "late reset"},
     "envs/faults.py": {"FaultLatch": "record record_reward"},
     "envs/outputs.py": {
@@ -64,28 +63,28 @@ PATHS: dict[str, dict[str, str] | None] = {
     "tasks/view.py": {
         "TaskView": "step clear",
         "Step": (
-            "pose pos center quat velocity turn height bounds speed corner_speed pressed in_hand "
-            "untouched narrowest supported judged _judged _sensed"
+            "pose pos center quat velocity turn height bounds speed corner_speed pressed tilt "
+            "in_hand untouched narrowest supported judged _judged _of_each _sensed"
         ),
+        "AllOf": "__call__ apart __and__",
     },
     "tasks/parts.py": {
-        "": "airborne in_hand on_top offset on_table released on_top_of",
+        "": "airborne in_hand on_top offset on_table upright in_zone released on_top_of",
         "Streak": "update _counts",
         "Carried InWindow AtRest": "update",
         "AtLeast": "holds unlocked",
     },
     "tasks/placed.py": {"HeldSuccess": "__call__ _holds reset"},
     "tasks/stack.py": {
-        "StackCheck": "placed placed_of on_top on_table goals",
+        "StackCheck": "placed placed_of on_top goals",
         "StackSuccess": "_look _replace_oldest __call__",
     },
     "tasks/box.py": {
-        "BoxCheck": "airborne resting outside over placed goals at_slot",
+        "BoxCheck": "airborne outside over placed goals at_slot",
         "_CarriedOver _Release _Settled _Order": "update",
         "_Drop": "update holds",
         "BoxSuccess": "__init__",
     },
-    "tasks/box_terms.py": {"ToSlot": "__call__"},
     "tasks/progress.py": {"Progress": "__call__ _placed _measure"},
     "tasks/reach.py": {"ReachCheck": "placed trace"},
     "drivers/open_loop.py": {"JointTrajectory": "command"},
@@ -108,7 +107,6 @@ PATHS: dict[str, dict[str, str] | None] = {
     "policy/network.py": {"PolicyNetwork": "normalized forward"},
     "episodes/failures.py": {"FailureMonitor": "update", "": "_of"},
     "kinematics/batched_ik.py": {"BatchedIk": "solve forward _launch _copy_in"},
-    "scene/index.py": {"Columns": "read write write_masked"},
     "sim/mjwarp.py": {"MjwarpSimulation": "step reset kinematics _decimation _pose _place"},
     "sim/usage.py": {"Usage": "count clear"},
     "sim/fused/constraints.py": {"": "collision solve"},
@@ -116,7 +114,7 @@ PATHS: dict[str, dict[str, str] | None] = {
     "sim/fused/step.py": {"": "rearranged_step"},
     "sim/graph.py": {"": "side_by_side where_any"},
     "sim/draws.py": {"": "draw_uniform"},
-    "sim/simulation.py": {"Simulation": "part"},
+    "sim/simulation.py": {"Columns": "read write write_masked", "Simulation": "part"},
     "math.py": None,
 }
 

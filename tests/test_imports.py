@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 from environments import at_double_speed
@@ -15,11 +16,11 @@ import mjstack
 ROOT = Path(mjstack.__file__).parent
 # A module may import from its own layer and from earlier ones.
 LAYERS = [
-    {"errors", "math", "rng", "files", "interrupt", "process", "distributed"},
+    {"errors", "math", "rng", "files", "interrupt", "process", "distributed", "version"},
     {"config"},
     {"robots"},
-    {"scene"},
     {"sim"},
+    {"scene"},
     {"kinematics"},
     {"managers"},
     {"mdp"},
@@ -35,7 +36,7 @@ LAYERS = [
     {"__main__"},
 ]
 LEAVES = {
-    "report": {"errors", "files", "interrupt", "report"}
+    "report": {"errors", "files", "interrupt", "report", "version"}
 }  # anything may import it, and it imports only these
 HOMES = {
     "mujoco_warp": ("sim/",),
@@ -62,18 +63,30 @@ HOMES = {
 }
 
 
-def imports(path: Path) -> set[str]:
-    """Every module that a file imports, lazily or not."""
+def imports(path: Path, *, typing: bool = True) -> set[str]:
+    """Every module that a file imports, lazily or not; unless ``typing``, not for type checkers
+    alone.
+    """
+    tree = ast.parse(path.read_text())
+    blocks = [node for node in ast.walk(tree) if isinstance(node, ast.If) and not typing]
+    skipped = {
+        node
+        for block in blocks
+        if ast.unparse(block.test) == "TYPE_CHECKING"
+        for node in ast.walk(block)
+    }
     found: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Import):
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import) and node not in skipped:
             found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
+        elif isinstance(node, ast.ImportFrom) and node not in skipped:
             assert node.level == 0, f"{path}: relative import"
-            base = node.module or ""
-            found |= (
-                {f"{base}.{alias.name}" for alias in node.names} if base == "mjstack" else {base}
-            )
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+            paths = {name: ROOT.parent / name.replace(".", "/") for name in names}
+            found |= {
+                name if path.is_dir() or path.with_suffix(".py").exists() else str(node.module)
+                for name, path in paths.items()
+            }
     return found
 
 
@@ -107,6 +120,20 @@ def test_layers_import_downwards_only() -> None:
             if there not in allowed:
                 wrong.append(f"{file} imports {name}")
     assert not wrong
+
+
+def test_no_module_imports_the_face_of_the_package() -> None:
+    assert [file for file, names in FILES.items() if "mjstack" in names] == []
+
+
+def test_no_circle_of_modules() -> None:
+    """At run time, lazily or not: `graphlib.CycleError` names them."""
+    names = {file: f"mjstack.{file[:-3].replace('/', '.')}" for file in FILES}
+    graph = {
+        name.removesuffix(".__init__"): imports(ROOT / file, typing=False)
+        for file, name in names.items()
+    }
+    TopologicalSorter({name: found & graph.keys() for name, found in graph.items()}).prepare()
 
 
 def test_trainers_and_benchmarks_take_a_stage() -> None:

@@ -59,6 +59,12 @@ def test_a_number_is_a_start_wherever_it_stands(four: LerobotVectorEnv) -> None:
     assert torch.equal(four.inner.sim.qpos[[0, 3]], first[[0, 3]])
     four.reset()
     assert len(np.unique(torch.cat((first, four.inner.sim.qpos)).numpy(), axis=0)) == 7
+    for seed in (1000, np.int64(1000), np.arange(1000, 1004)):  # of the first world, or of each
+        four.reset(seed=seed)
+        assert torch.equal(four.inner.sim.qpos[[0, 3]], first[[0, 3]])
+    for seed in (-1, True, [0, 1, 2, -3]):
+        with pytest.raises(ArgumentError, match=r"seed: found .*an integer from 0"):
+            four.reset(seed=seed)
     with pytest.raises(ArgumentError, match=r"seed: found 1 numbers, expected one for each of 4"):
         four.reset(seed=[1])
 

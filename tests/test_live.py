@@ -2,6 +2,7 @@
 
 import contextlib
 import inspect
+import random
 import signal
 import socket
 import subprocess
@@ -141,10 +142,12 @@ def test_worlds_pause_step_and_are_chosen(
         view._worlds.value = "4, 1"
         wait_until(lambda: view._numbers == [4, 1])
         time.sleep(0.2)
-        places, _ = Shapes(stage.assets.visual_model).poses(env.sim.qpos[[4, 1]].double().numpy())
-        for body, handle in view._view._handles:
+        places, _ = Shapes(stage.assets.visual_model).poses(
+            env.sim.qpos[[4, 1]].double().cpu().numpy()
+        )
+        for shape, handle in view._view._handles:
             held = np.asarray(handle.batched_positions)
-            assert np.allclose(held[:, 2], places[:, body, 2], atol=1e-4)
+            assert np.allclose(held[:, 2], places[:, shape.pose, 2], atol=1e-4)
         view._worlds.value = "99"
         line = "Worlds: '99' names none, expected numbers from 0 to 4"
         wait_until(lambda: line in view._status.value)
@@ -351,15 +354,33 @@ NAMES = [
 def test_other_origins_and_hosts_are_refused(
     guarded: Callable[[str], int], host: str, origin: str, allowed: bool
 ) -> None:
-    """Also with the token, which decides alone where other machines are let in."""
+    """Also with the token. Where other machines are let in, a page has to be from the same one."""
     for address in ("127.0.0.1", "0.0.0.0"):
         port = guarded(address)
         names = {"Host": host.format(port=port), "Origin": origin.format(port=port)}
-        lets_in = allowed or address == "0.0.0.0"
+        same = names["Origin"] == f"http://{names['Host']}"
+        lets_in = same and (allowed or address == "0.0.0.0")
         assert opens_websocket(port, "/", COOKIE | names) == lets_in
         assert opens_websocket(port, f"/?token={TOKEN}", names) == lets_in
         assert (get(port, f"/?token={TOKEN}", names)[0] == 200) == lets_in
         assert not opens_websocket(port, "/", names)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("seed", range(12))
+def test_drawn_origins_are_refused(guarded: Callable[[str], int], seed: int) -> None:
+    """Whatever this machine's address is, with the cookie or the token; also a second Host."""
+    draw = random.Random(f"origin {seed}")
+    port = guarded(draw.choice(("127.0.0.1", "0.0.0.0")))
+    host = draw.choice((f"127.0.0.1:{port}", f"127.0.0.2:{port}", "robot.lab", f"[::1]:{port}"))
+    origins = (
+        "null", "", f"https://{host}", f"http://{host}.evil.example", f"http://evil@{host}", host,
+        f"http://{host}/", "http://127.0.0.1:1", f"http://{host}\r\nOrigin: http://evil.example",
+        f"http://{host}\r\nHost: evil.example", f"file://{host}", f"http://{host.upper()}0",
+    )  # fmt: skip
+    names = {"Host": host, "Origin": draw.choice(origins)}
+    assert not opens_websocket(port, "/", COOKIE | names)
+    assert not opens_websocket(port, f"/?token={TOKEN}", names)
 
 
 def test_a_message_of_a_browser_is_short(guarded: Callable[[str], int]) -> None:

@@ -2,6 +2,7 @@
 
 import functools
 import itertools
+import re
 import sys
 from contextlib import closing
 from types import FrameType
@@ -24,7 +25,7 @@ from mjstack.managers import (
 from mjstack.managers.term import Term, in_one_pass, shared
 from mjstack.mdp import reward as reward_terms
 from mjstack.scene import SceneIndex
-from mjstack.scene.index import Columns
+from mjstack.sim.simulation import Columns
 from mjstack.tasks.progress import Progress
 
 
@@ -98,6 +99,23 @@ def test_managers_work_on_any_object_of_that_shape(kind: str) -> None:
         now = getattr(bench.sim, name)
         assert torch.equal(now[[0, 2]], value[[0, 2]])
         assert not torch.equal(now[1], value[1])
+
+
+def test_an_actions_table_has_ranges_and_units() -> None:
+    """Of joint targets the limits of each joint; of a share of a step no unit."""
+    env = on_shared_sim("native", 3, configure("action=joint_absolute"))
+    manager = env.action_manager
+    columns, arm = (
+        [cell.strip() for cell in re.split("[│┃]", line)[1:-1]]
+        for line in str(manager).splitlines()
+        if re.match("[│┃] (term|arm) ", line)
+    )
+    assert columns == ["term", "dim", "range", "unit", "parameters"]
+    assert arm[1] == "5"
+    assert arm[2].split(",")[0] == f"{manager.low[0]:.4g} to {manager.high[0]:.4g}"
+    assert arm[3] == "rad, m"
+    env = on_shared_sim("native", 3, configure("action=joint_delta"))
+    assert re.search(r"│ arm +│ 5 +│ -1 to 1 +│ +│ joints=arm", str(env.action_manager))
 
 
 def test_tables_show_settings_and_the_environment_shows_all_tables() -> None:
@@ -186,17 +204,21 @@ def test_a_part_of_a_view_is_its_memory_where_columns_lie_side_by_side() -> None
 
 
 def test_a_branch_knows_what_came_before_it_and_keeps_the_rest() -> None:
-    def value(name: str) -> torch.Tensor:
-        return shared(name, lambda: torch.zeros(1))
+    @shared
+    def value(env: object, name: str) -> torch.Tensor:
+        return torch.zeros(1)
+
+    env = object()
 
     def work() -> torch.Tensor:
-        before = value("before")
-        assert in_one_pass(lambda: value("before")) is before
-        first, second = (in_one_pass(lambda: value("within")) for _ in range(2))
+        before = value(env, "before")
+        assert in_one_pass(lambda: value(env, "before")) is before
+        assert value(object(), "before") is not before
+        first, second = (in_one_pass(lambda: value(env, "within")) for _ in range(2))
         assert first is not second
         return before
 
-    assert value("before") is not in_one_pass(work)
+    assert value(env, "before") is not in_one_pass(work)
 
 
 def test_an_interrupt_at_any_moment_leaves_no_values_behind() -> None:
@@ -204,8 +226,11 @@ def test_an_interrupt_at_any_moment_leaves_no_values_behind() -> None:
     it is new.
     """
 
-    def value() -> torch.Tensor:
-        return shared("a", lambda: torch.zeros(1))
+    @shared
+    def zero(env: object) -> torch.Tensor:
+        return torch.zeros(1)
+
+    value = functools.partial(zero, None)
 
     def work() -> torch.Tensor:
         value()

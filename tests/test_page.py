@@ -184,6 +184,39 @@ def test_maps_show_ways(tmp_path: Path) -> None:
     assert " ways in 3 of the episodes." in text
 
 
+def test_a_limit_of_a_rule_is_dashed_under_any_name(tmp_path: Path) -> None:
+    """One end, the other, or both; an end at zero or without bound is none."""
+    gate, worlds = batch(64)
+    span = np.linspace(0.5, 2.0, 64)
+    worlds.values = {"open_m": span, "away_m": span, "between_m": span, "free_m": span}
+    infinite = float("inf")
+    worlds.limits = {"open_m": (1.0, infinite), "away_m": (0.0, 1.5), "between_m": (0.75, 1.25)}
+    text = batch_page(tmp_path, gate, worlds)
+    limits = [
+        re.findall(r"<title>threshold ([\d.]+) m<", plot)
+        for plot in re.findall(r"<figure><figcaption>.*?</figure>", text)[:4]
+    ]
+    assert limits == [["1"], ["1.5"], ["0.75", "1.25"], []]
+
+
+def test_maps_show_what_is_judged(tmp_path: Path) -> None:
+    """A place that stays is marked by its name in each map; what the check does not judge, and what
+    the pages do not show, is said.
+    """
+    gate, worlds = batch(8)
+    worlds.maps[0].marks = {"goal": [0.3, 0.1]}
+    worlds.unjudged = ["dummy"]
+    report = Report(folder=tmp_path, gates=[gate])
+    page = Page(worlds={"batch": worlds}, notes=["trajectories.png is not drawn"])
+    text = to_html(make_sections(report, page))
+    (x, y) = re.findall(r"<text x=([\d.]+) y=([\d.]+)>goal</text>", text)[0]
+    scale = 320 / 0.52  # the table's far edge at the top, 2 cm behind the base at the bottom
+    assert float(x) - 6 == pytest.approx(scale * 0.2, abs=0.1)
+    assert float(y) - 4 == pytest.approx(scale * 0.2, abs=0.1)
+    assert "The check does not judge dummy." in text
+    assert "<li>trajectories.png is not drawn" in text
+
+
 def test_text_is_not_markup(tmp_path: Path) -> None:
     bad = "<script>alert(1)</script>'\"&"
     gate = GateResult(
@@ -202,8 +235,8 @@ def test_text_is_not_markup(tmp_path: Path) -> None:
     worlds = Worlds(
         names=[bad] * 2, broken=[[bad], []], rules={bad: bad}, values={bad: two}, maps=maps
     )
-    report = Report(folder=tmp_path, overrides=[bad], provenance={bad: bad}, gates=[gate])
-    shown = Page(title=bad, worlds={bad: worlds}, note=bad)
+    report = Report(folder=tmp_path, provenance={bad: bad}, gates=[gate])
+    shown = Page(title=bad, command=bad, worlds={bad: worlds}, notes=[bad])
     reader = Reader(to_html(make_sections(report, shown)))
     assert "script" not in reader.tags
     assert reader.open == []

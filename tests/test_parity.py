@@ -5,20 +5,30 @@ import math
 import re
 from collections.abc import Callable
 from contextlib import closing
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
 import pytest
 import torch
+from compositions import load_config
 from doc_blocks import ROOT, write_files
 
 import mjstack
 from mjstack.config.schema import Backend
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
-from mjstack.gates.parity import compare_states, differences, end_state, turn_between
+from mjstack.gates.parity import (
+    _compare_ends,
+    compare_options,
+    compare_states,
+    differences,
+    end_state,
+    turn_between,
+)
 from mjstack.math import quat_mul
 from mjstack.report.record import GateResult, Status
+from mjstack.scene import build_model
 from mjstack.sim import make_simulation
 
 SCENES = {"box": "stack", "cylinder": "lift", "box in the jaws": "peg"}
@@ -133,3 +143,70 @@ def test_a_turn_that_nothing_shows_is_none(shape: str, axis: list[float], expect
     start = torch.tensor([0.5, 0.5, 0.5, 0.5], dtype=torch.float64)
     half = torch.tensor([math.cos(0.15), *(math.sin(0.15) * x for x in axis)], dtype=torch.float64)
     assert turn_between(shape, start, quat_mul(start, half)) == pytest.approx(expected, abs=1e-12)
+
+
+JOINTS = """
+<mujoco>
+  <worldbody>
+    <body><joint name="arm"/><geom size="0.1"/></body>
+    <body><joint name="drawer" type="slide"/><geom size="0.1"/></body>
+    <body><joint name="lid"/><geom size="0.1"/></body>
+    <body><joint name="knob" type="ball"/><geom size="0.1"/></body>
+    <body><freejoint name="loose"/><geom size="0.1"/></body>
+    <body><freejoint name="can"/><geom size="0.1"/></body>
+    <body><joint type="slide"/><geom size="0.1"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize(
+    ("dof", "by", "problems", "farthest"),
+    [
+        ("arm", 1.0, [], ["drawer ends 0.00 mm", "can ends 0.00 mm and 0.00 deg"]),
+        ("drawer", 2e-5, [], ["drawer ends 0.02 mm", "can ends 0.00 mm and 0.00 deg"]),
+        ("drawer", -0.003, ["drawer ends 3.00 mm"], None),
+        ("drawer", math.nan, ["drawer ends nan mm"], None),
+        ("lid", 0.02, [], ["lid ends 1.15 deg", "can ends 0.00 mm and 0.00 deg"]),
+        ("lid", 2 * math.pi, ["lid ends 360.00 deg"], None),
+        ("knob", 0.04, ["knob ends 2.29 deg"], None),
+        ("loose", 0.003, ["loose ends 3.00 mm and 0.00 deg"], None),
+        ("can", 0.001, [], ["drawer ends 0.00 mm", "can ends 1.00 mm and 0.00 deg"]),
+        ("can", 0.003, ["can ends 3.00 mm and 0.00 deg"], None),
+        (6, 0.004, ["joint 6 ends 4.00 mm"], None),
+    ],
+)
+def test_ends_of_all_joints_but_the_robots_are_compared(
+    dof: str | int, by: float, problems: list[str], farthest: list[str] | None
+) -> None:
+    """Also of a fixture, by the limits of objects: position of slides, rotation of hinges."""
+    model = mujoco.MjModel.from_xml_string(JOINTS)
+    cfg = mjstack.load_config(["task=reach"])
+    cfg.robot.arm_joints, cfg.robot.gripper_joints = ["arm"], []
+    cfg.scene.objects["can"] = next(iter(cfg.scene.objects.values()))
+    change = np.zeros(model.nv)
+    change[int(model.joint(dof).dofadr[0])] = by
+    ends = [model.qpos0.copy() for _ in range(2)]
+    mujoco.mj_integratePos(model, ends[0], change, 1.0)
+    nominal = SimpleNamespace(world=SimpleNamespace(qpos=ends[1][None]))
+    run = SimpleNamespace(cfg=cfg, stage=SimpleNamespace(model=model), nominal=nominal)
+    result = GateResult(name="parity", status=Status.passed)
+    found, lines = _compare_ends(run, ends[0], result)  # type: ignore[arg-type]
+    assert found == [f"{text} from native's" for text in problems]
+    assert farthest is None or lines == [f"{text} from native's" for text in farthest]
+    assert not any("arm" in name for name in result.metrics)
+    assert {"final.drawer.position_m", "final.lid.rotation_deg"} <= result.metrics.keys()
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
+def test_the_cone_reaches_both_backends(cone: str) -> None:
+    cfg = load_config([f"solver.cone={cone}"])
+    model = build_model(cfg)
+    native, mjwarp = (
+        make_simulation(model, cfg, 1, backend=kind, device="cpu")
+        for kind in (Backend.native, Backend.mjwarp)
+    )
+    configured, compiled, uploaded, equal = compare_options(cfg, native, mjwarp)["cone"]
+    assert configured == compiled == uploaded == f"mjCONE_{cone.upper()}"
+    assert equal

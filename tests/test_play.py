@@ -20,6 +20,7 @@ from mjstack.episodes.rollout import Hook
 from mjstack.episodes.stage import Stage
 from mjstack.errors import MjstackError
 from mjstack.jobs import check_job
+from mjstack.report.page import World
 from mjstack.report.picture import save_video
 from mjstack.scene import build_model
 
@@ -32,10 +33,10 @@ def saved(monkeypatch: Patch) -> list[np.ndarray]:
     videos: list[np.ndarray] = []
 
     def save(
-        path: Path, model: mujoco.MjModel, qpos: np.ndarray, *options: object, **named: object
+        path: Path, model: mujoco.MjModel, worlds: list[World], *options: object, **named: object
     ) -> None:
         path.touch()
-        videos.append(qpos)
+        videos.append(np.stack([world.qpos for world in worlds]))
 
     monkeypatch.setattr(play, "save_video", save)
     monkeypatch.setattr(play, "require_offscreen", lambda model: None)
@@ -104,7 +105,7 @@ def test_a_video_has_worlds_side_by_side(tmp_path: Path) -> None:
     model = build_model(cfg, visuals=True)
     home = np.tile(model.qpos0, (3, 4, 1))
     home[1, :, Stage(cfg).index.object_qpos[0] + 2] += 0.1  # its cube is in the air
-    save_video(tmp_path / "x.mp4", model, home, 0.02)
+    save_video(tmp_path / "x.mp4", model, [World(label="", qpos=qpos) for qpos in home], 0.02)
     frames = imageio_ffmpeg.read_frames(str(tmp_path / "x.mp4"))
     facts = next(frames)
     assert facts["size"] == (960, 720)
@@ -156,7 +157,8 @@ def test_a_loop_lasts_as_long_as_the_episode(ending: str, tmp_path: Path) -> Non
 
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     qpos = np.tile(np.arange(4.0)[None, :, None], (4, 1, 1))
-    save_video(path, model, qpos, 1.0 / 30.0, fps=30.0, width=160, draw=draw)
+    worlds = [World(label="", qpos=states) for states in qpos]
+    save_video(path, model, worlds, 1.0 / 30.0, fps=30.0, width=160, draw=draw)
     with Image.open(path) as video:
         assert video.size == (160, 80)
         assert video.n_frames == 4

@@ -453,16 +453,15 @@ def test_bad_input_is_one_line_and_writes_nothing(
 
 REPORT = "report.json"
 CONFIG = ".hydra/config.yaml"
-NO_CONFIG = "no configuration of this mjstack"
 # By name: the file, its new content or a part of it and what takes its place, and the line.
 # None removes the file.
 DAMAGE: dict[str, tuple[str, str | tuple[str, str] | None, str]] = {
     "no report": (REPORT, None, "has no report.json"),
     "no JSON": (REPORT, "{", "report.json: cannot be read"),
     "another report": (REPORT, "[]", "report.json: cannot be read"),
-    "no YAML": (CONFIG, "a: [1", NO_CONFIG),
-    "empty": (CONFIG, "", NO_CONFIG),
-    "another tool's": (CONFIG, "model: resnet\n", NO_CONFIG),
+    "no YAML": (CONFIG, "a: [1", "config.yaml: cannot be read"),
+    "empty": (CONFIG, "", "is missing, expected every key of this version"),
+    "another tool's": (CONFIG, "model: resnet\n", "config.yaml: cannot be read"),
     "a key too many": (CONFIG, ("nworld: 5\n", "nworld: 5\ncolour: red\n"), "colour"),
     "a value out of range": (CONFIG, ("nworld: 5", "nworld: 0"), "nworld=0"),
     "a key too few": (CONFIG, ("nworld: 5\n", ""), "nworld is missing"),

@@ -10,7 +10,7 @@ import torch
 
 from mjstack.math import atan2, not_finite, quat_angle, quat_from_yaw, quat_mul, quat_z_row
 from mjstack.rng import philox, uniform
-from mjstack.scene.index import Columns
+from mjstack.sim.simulation import Columns
 
 # Four words of the counter, two of the key, and the four that come out
 KNOWN = """

@@ -74,6 +74,10 @@ def test_a_profile_without_start_title_and_ik_joints_gets_them() -> None:
         (["robot.file=/no/folder/arm.xml"], "robot.file=/no/folder/arm.xml: expected an MJCF file"),
         (["robot.name=mine"], "robot.file=null: expected the MJCF file of robot mine"),
         (["model=menagerie", "robot.menagerie_name=''"], "robot.menagerie_name=: expected"),
+        (
+            [f"robot.file={SCARA / 'scara.xml'}", "model=menagerie"],
+            "scara.xml: expected null, because",
+        ),
     ],
 )
 def test_a_robot_without_its_file_is_refused(overrides: list[str], message: str) -> None:

@@ -10,6 +10,9 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from compositions import load_config, put
+
+from mjstack.scene import build_model
 
 REPO = Path(__file__).resolve().parents[1]
 BUILT_IN = REPO / "mjstack" / "robots"
@@ -271,3 +274,17 @@ def test_grasp_point_sites() -> None:
         centroid = np.mean([model.geom(tip).pos for tip in tips] or [np.zeros(3)], axis=0)
         np.testing.assert_allclose(site.pos, centroid, rtol=0, atol=1e-15 if tips else 0)
         assert site.group[0] == 4
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("condim", [3, 6])
+def test_gripper_condim_reaches_the_gripper_alone(robot: str, condim: int) -> None:
+    cfg = load_config([f"robot={robot}"])
+    plain = build_model(cfg)
+    model = build_model(put(cfg, f"solver.gripper_condim={condim}"))
+    bodies = [model.body(name).id for name in cfg.robot.jaw_bodies]
+    gripper = np.isin(model.geom_bodyid, bodies)
+    assert gripper.sum() >= 2
+    assert (model.geom_condim[gripper] == condim).all()
+    assert np.array_equal(model.geom_condim[~gripper], plain.geom_condim[~gripper])
+    assert set(plain.geom_condim[gripper]) <= {3, 4, 6}

@@ -9,13 +9,16 @@ from pathlib import Path
 
 import pytest
 from environments import Capture, Patch, Refused
+from policies import make_policy
 
 import mjstack
 from mjstack.cli import run
 from mjstack.config import load_config
 from mjstack.config.load import load_saved
 from mjstack.config.session import check_term, in_search_path, search_path, search_path_args
+from mjstack.drivers.policy import PolicyDriver
 from mjstack.errors import MjstackError
+from mjstack.policy import save_policy
 
 TASK = """# @package _global_
 defaults:
@@ -58,6 +61,11 @@ def run_upright(run):
 
 
 run_upright.config = UprightCfg
+"""
+SEEN = """
+
+def rise(env):
+    return env.sim.qpos[:, 0]
 """
 GATE = """# A gate of one's own.
 func: lean.run_upright
@@ -163,7 +171,7 @@ def test_a_sweep_and_a_replay(lean: Path, tmp_path: Path) -> None:
     with pytest.raises(MjstackError) as caught:
         load_saved(saved)
     assert "reset.lean.func=lean.lean: expected one of the reset terms" in str(caught.value)
-    assert f"--config-dir {lean}" in str(caught.value)
+    assert f"config_dir='{lean}'" in str(caught.value)
     with search_path([lean]):
         assert load_saved(saved).reset["lean"].func == "lean.lean"
     saved.write_text(saved.read_text().replace("lean.lean", "shutil.rmtree"))
@@ -233,3 +241,71 @@ def test_only_modules_beside_the_folder_are_trusted(lean: Path, monkeypatch: Pat
         assert in_search_path("lean.height", Path("config.yaml"))
         for name in ("os.system", "sys.exit", "shutil.rmtree", "nowhere.at_all"):
             assert not in_search_path(name, Path("config.yaml")), name
+
+
+MARK = "\ufeff"
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_a_byte_order_mark_hides_nothing(end: str, tmp_path: Path, capsys: Capture) -> None:
+    """In any file of the search path: the header, defaults, and the comment that ``list`` shows."""
+    glob = "# @package _global_"
+    files = {
+        "experiment/marked.yaml": f"{glob}|defaults:|  - override /task: leaning|nworld: 7|",
+        "task/leaning.yaml": f"{glob}|# It leans|defaults:|  - stack|task:|  name: leaning|",
+        "robot/ours.yaml": "defaults:|  - so101|title: Ours|",
+        "gate/upright.yaml": "# @package gate.upright|func: mjstack.gates.batch.run_batch|",
+        "task/plain.yaml": "# It has no header|name: plain|",
+    }
+    for name, text in files.items():
+        path = tmp_path / "conf" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes((MARK + text.replace("|", end)).encode())
+    cfg = load_config(["experiment=marked", "robot=ours"], config_dir=tmp_path / "conf")
+    assert (cfg.nworld, cfg.task.name, cfg.robot.title) == (7, "leaning", "Ours")
+    assert run(["--config-dir", str(tmp_path / "conf"), "list", "tasks"]) == 0
+    out = capsys.readouterr().out
+    assert "leaning      It leans" in out
+    assert "plain        It has no header" in out
+
+
+def test_a_policy_with_terms_of_ones_own_plays_in_python(lean: Path, tmp_path: Path) -> None:
+    """By an absolute and a relative folder; without one the advice is that for Python."""
+    module = lean.parent / "lean.py"
+    module.write_text(module.read_text() + SEEN)
+    overrides = ["task=reach", "sim=native", "action=joint_absolute"]
+    seen = "+observation.policy.terms.rise={func: lean.rise}"
+    cfg = load_config([*overrides, seen], config_dir=lean)
+    folder = tmp_path / "policy"
+    save_policy(folder, make_policy(cfg))
+    sys.modules.pop("lean")
+    chosen = ["controller=policy", f"policy='{folder}'", "sim=native", "nworld=1"]
+    gate = [*chosen, "gates=[baseline]", "task.check.distance=10.0"]
+    for config_dir in (lean, str(lean.relative_to(Path.cwd()))):
+        found = mjstack.verify(gate, config_dir=config_dir)
+        assert found.status == "pass", found.messages
+        assert "rise" in mjstack.load_policy(str(folder), config_dir=config_dir).widths
+    env = mjstack.make_env(overrides, nworld=2, config_dir=lean)
+    env.reset(seed=0)
+    driver = PolicyDriver(env, mjstack.load_policy(folder, config_dir=lean))
+    assert driver.command().shape == (2, 6)
+    env.close()
+    for call in (lambda: mjstack.verify(gate), lambda: mjstack.load_policy(folder)):
+        with pytest.raises(MjstackError) as caught:
+            call()
+        assert "expected one of the observation terms of mjstack" in str(caught.value)
+        assert "add config_dir=DIR." in str(caught.value)
+        assert "--config-dir" not in str(caught.value)
+
+
+def test_advice_fits_where_it_is_given(refused: Refused) -> None:
+    with pytest.raises(MjstackError, match=r"A choice of your own needs config_dir=DIR\."):
+        mjstack.make_env(["task=lean"])
+    assert refused("task=lean").endswith("A choice of your own needs --config-dir DIR.")
+    with pytest.raises(MjstackError, match=r"config_dir=DIR\."):  # also after a command line
+        mjstack.verify(["robot=ur5"])
+
+
+def test_the_package_lists_its_public_names() -> None:
+    assert set(mjstack.__all__) <= set(dir(mjstack))
+    assert all(hasattr(mjstack, name) for name in mjstack.__all__)

@@ -7,7 +7,6 @@ import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -25,11 +24,10 @@ from environments import (
     start_moving,
 )
 
-from mjstack import interrupt
 from mjstack.config.schema import Backend
 from mjstack.errors import MjstackError
 from mjstack.scene import build_model
-from mjstack.sim import Simulation, SolverLimit, compiling, make_simulation
+from mjstack.sim import Simulation, SolverLimit, make_simulation
 
 N = 3
 VIEWS = (*STATE, *POSES, "qfrc_actuator", "sensordata")
@@ -464,14 +462,12 @@ def test_twice_the_same_run(backend: str, make_sim: MakeSim, get_stage: GetStage
 
 @pytest.mark.full
 def test_kernels_are_compiled_ahead(tmp_path: Path) -> None:
-    """With an empty cache, a process apart compiles all that a bare step launches. All that our
-    step, its forward and resets launch is loaded before.
-    """
+    """With an empty cache, all that a step, its forward and resets launch is loaded before."""
     script = """
 import logging
 from mjstack.config.load import load_config
 from mjstack.scene import build_model
-from mjstack.sim import compiling, make_simulation, mjwarp
+from mjstack.sim import make_simulation, mjwarp
 from mjstack.sim.mujoco_warp import wp
 
 logging.basicConfig(level=logging.INFO)
@@ -485,69 +481,15 @@ def compile_step(*args):
 mjwarp.compile_step = compile_step
 cfg = load_config(["sim=mjwarp", "sim.device=cpu"])
 model = build_model(cfg)
-assert compiling.compile_apart(model, cfg, "cpu").wait() == 0
 sim = make_simulation(model, cfg, 2)
 sim.step(2, kinematics=True)
 sim.forward()
-print("BARE", flush=True)
-sim.bare_step()()
 """
     (tmp_path / "script.py").write_text(script)
     env = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "cache")}
     command = [sys.executable, str(tmp_path / "script.py")]
     done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=300, check=True)
     assert "compiling MJWarp's kernels" in done.stderr
-    ours, bare = done.stdout.partition("AHEAD")[2].split("BARE", 1)
+    ours = done.stdout.partition("AHEAD")[2]
     loaded = re.findall(r"Module (\S+) .*\((?:compiled|cached)\)", ours)
     assert loaded == ["mjstack.sim.usage"], ours  # the rest of a simulation's step
-    assert "(cached)" in bare
-    assert "(compiled)" not in bare
-
-
-def test_a_compiling_process_starts_once_and_ends_with_its_context(monkeypatch: Patch) -> None:
-    started = []
-
-    def start(model: Any, cfg: Any, device: str) -> subprocess.Popen[bytes]:
-        started.append((model, cfg, device))
-        return subprocess.Popen(["sleep", "600"])
-
-    monkeypatch.setattr(compiling, "compile_apart", start)
-    compiling._compile_planned("cuda:0")  # nobody compares
-    with compiling.stock_step_beside(lambda: ("model", "cfg")):  # type: ignore[arg-type,return-value]
-        assert not started
-        for _ in range(2):
-            compiling._compile_planned("cuda:0")
-        (process,) = compiling._running
-        assert process.poll() is None
-    assert started == [("model", "cfg", "cuda:0")]
-    assert process.poll() is not None
-    with compiling.stock_step_beside(lambda: ("model", "cfg")):  # type: ignore[arg-type,return-value]
-        compiling.wait_for_stock_step()  # from here on something is timed
-        compiling._compile_planned("cuda:0")
-    compiling._compile_planned("cuda:0")
-    assert len(started) == 1
-
-
-def test_a_compiling_process_that_fails_or_hangs_holds_nothing_up(monkeypatch: Patch) -> None:
-    def sleep(*_: Any) -> subprocess.Popen[bytes]:
-        return subprocess.Popen(["sleep", "600"])
-
-    unpicklable = (lambda: None, load_config([]))
-    with compiling.stock_step_beside(lambda: unpicklable):  # type: ignore[arg-type,return-value]
-        compiling._compile_planned("cuda:0")
-        assert not compiling._running
-    monkeypatch.setattr(compiling, "compile_apart", sleep)
-    monkeypatch.setattr(compiling, "_LONGEST", 0.2)
-    with compiling.stock_step_beside(lambda: ("model", "cfg")):  # type: ignore[arg-type,return-value]
-        compiling._compile_planned("cuda:0")
-        (process,) = compiling._running
-        compiling.wait_for_stock_step()
-        assert process.poll() is not None
-    monkeypatch.setattr(compiling, "_LONGEST", 600.0)
-    monkeypatch.setattr(interrupt, "_asked", True)  # as the command's handler does
-    with compiling.stock_step_beside(lambda: ("model", "cfg")):  # type: ignore[arg-type,return-value]
-        compiling._compile_planned("cuda:0")
-        (process,) = compiling._running
-        with pytest.raises(KeyboardInterrupt):
-            compiling.wait_for_stock_step()
-    assert process.poll() is not None

@@ -3,10 +3,7 @@
 import hashlib
 import math
 from collections.abc import Sequence
-from functools import wraps
 from pathlib import Path
-from types import SimpleNamespace
-from typing import ClassVar
 
 import mujoco
 import numpy as np
@@ -14,24 +11,13 @@ import pytest
 import torch
 from box_checker import corners_of
 from environments import (
-    Trace,
-    actions,
-    assert_traces,
     configure,
-    mask_of,
     on_shared_sim,
-    play,
-    returned,
-    state_of,
 )
 
 import mjstack
-from mjstack.config.schema import Backend, Config, TermCfg
+from mjstack.config.schema import Backend, Config
 from mjstack.envs import Env, build_env
-from mjstack.managers import EnvView, repeatable
-from mjstack.managers.term import Term
-from mjstack.mdp.observation import joint_pos
-from mjstack.mdp.reset import JitterObjects
 from mjstack.mdp.starts.placement import Placement, may_meet
 
 MANY = 200
@@ -304,144 +290,3 @@ def check_zeros(env: Env, width: float) -> None:
         np.testing.assert_allclose(env.sim.site_xpos[world], data.site_xpos, rtol=0, atol=1e-9)
         tips.append(data.site_xpos[env.index.grasp_sites[0]].copy())
     assert np.ptp(tips, axis=0).min() > 0.02
-
-
-HISTORY = (
-    "+observation.policy.terms.joint_pos.history=5",
-    "timing.command_delay=1",
-    "timing.random_delay=2",
-    "timing.policy_decimation=3",
-)
-UNMARKED = "+observation.policy.terms.height={func: test_starts.height_of_red, noise: 0.01}"
-SUCCESS = (
-    "task.success={func: test_starts.always, params: {}}",
-    "~termination.success",
-    "+observation.policy.terms.success={func: mjstack.mdp.reward.success}",
-)
-ENDS = {
-    "ends": (),
-    "box": ("task=box",),
-    "fields": ("reset=randomized",),
-    "memory": HISTORY,
-    "unmarked observation": (UNMARKED,),
-    "success": SUCCESS,
-}
-
-
-@pytest.mark.parametrize("overrides", ENDS.values(), ids=ENDS)
-def test_starts_made_ahead_are_those_of_the_moment(overrides: tuple[str, ...]) -> None:
-    """Bit for bit, whichever worlds end, one again before another has, or many at once; and after
-    masked resets, one of no world, too, and after a change of seed, numbers of worlds or fields.
-    """
-    ahead, written = play_ends(overrides)
-    in_time, _ = play_ends(overrides, ahead=False)
-    assert_traces(ahead, in_time, slice(None), slice(None), "native")
-    assert written.count(True) > 50
-    assert written.count(False) >= 6  # full resets, empty ones, and four worlds at once
-
-
-def play_ends(overrides: tuple[str, ...], *, ahead: bool = True) -> tuple[Trace, list[bool]]:
-    """Two runs in which worlds end at every step; and which ends were written from starts that had
-    been made before.
-    """
-    env = build_env(configure(*overrides), nworld=24, backend=Backend.native, device="cpu")
-    write = env._starts._write
-    written = []
-
-    def counted(mask: torch.Tensor) -> bool:
-        written.append(ahead and write(mask))
-        return written[-1]
-
-    env._starts._write = counted  # type: ignore[method-assign]
-
-    def end(step: int) -> None:
-        ending = {20: range(4), 21: (3, 4)}.get(step, (step % 9,))
-        env.episode_step[list(ending)] = env.max_episode_steps
-
-    moves = actions(env, 30)
-    trace = []
-    for seed in (3, 4):
-        env.reset(seed=seed)
-        trace.append(returned(env.reset(mask=mask_of(env))))
-        trace += play(env, moves[:12], end)
-        trace.append(returned(env.reset(mask=mask_of(env, 1, 2))) | state_of(env))
-        env.seed += 7
-        trace += play(env, moves[12:15], lambda step: end(step + 12))
-        env.world += 100
-        trace += play(env, moves[15:18], lambda step: end(step + 15))
-        for field in env.sim.fields.values():
-            field *= 1.01
-        trace += play(env, moves[18:], lambda step: end(step + 18))
-        trace.append(state_of(env))
-    trace.append({"means": torch.tensor([*env.read_statistics().values()])})
-    trace[-1]["peaks"] = torch.stack(env.sim.lasting_peaks())
-    env.close()
-    return trace, written
-
-
-@repeatable
-class Nominal(JitterObjects):
-    """Puts objects a little off their nominal position, and counts how often."""
-
-    calls: ClassVar[list[int]] = []
-    interrupted: ClassVar[bool] = False
-
-    def __call__(self, env: EnvView, mask: torch.Tensor) -> None:
-        """Write qpos."""
-        super().__call__(env, mask)
-        self.calls.append(int(mask.sum()))
-        if self.interrupted:
-            raise KeyboardInterrupt
-
-
-def height_of_red(env: EnvView) -> torch.Tensor:
-    """An observation term of somebody who knows no marks."""
-    return env.sim.part("qpos", env.index.object_columns("red")[0])[:, 2]
-
-
-@wraps(joint_pos)
-def jaws(env: EnvView) -> torch.Tensor:
-    """A function that looks like one of mjstack's."""
-    return env.success[:, None] * joint_pos(env)
-
-
-def always(env: EnvView) -> torch.Tensor:
-    """A success that holds from the start."""
-    return torch.ones(env.nworld, dtype=torch.bool)
-
-
-class Unmarked(Nominal):
-    """A subclass may do more than its class."""
-
-    calls: ClassVar[list[int]] = []
-
-
-def test_only_marked_terms_are_called_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A term that is not may look at what is later known alone. What interrupts it leaves every
-    world where it was.
-    """
-    masks = {}
-    for name in ("Unmarked", "Nominal"):
-        term_cfg = f"reset.cubes={{func: test_starts.{name}, params: {{xy: 0.01, yaw: 0.1}}}}"
-        env = mjstack.make_env([term_cfg, "sim=native"], nworld=16)
-        term = env.reset_manager._terms["cubes"].call
-        env.reset(seed=0)
-        term.calls.clear()
-        for world in (3, 3):
-            env.episode_step[world] = env.max_episode_steps
-            env.step(actions(env, 1)[0])
-        masks[name] = list(term.calls)
-        assert not Term("wrapped", TermCfg("test_starts.jaws"), env).repeatable
-        if name == "Nominal":
-            env.recapture()
-            before = state_of(env)
-            monkeypatch.setattr(Nominal, "interrupted", True)
-            with pytest.raises(KeyboardInterrupt):
-                env.reset(mask=mask_of(env, 5))
-            after = state_of(env)
-            assert all(torch.equal(before[key], after[key]) for key in before)
-            env.reset_manager.terms = [SimpleNamespace(repeatable=False)]
-            env.recapture()
-            assert not env._starts._write(mask_of(env, 5))
-        env.close()
-    assert masks == {"Unmarked": [1, 1], "Nominal": [16, 16]}

@@ -127,7 +127,7 @@ def test_broken_controller_fails_by_rule_and_phase(tmp_path: Path) -> None:
     rate = "0 of 2 episodes succeeded (0 %, 95 % interval 0 to 65.76 %), 99 % wanted"
     assert rate in gate["reason"]
     assert "2 retried, 0 of them succeeded" in gate["reason"]
-    assert f"job=replay run={folder} world=0" in gate["reason"]
+    assert f"mjstack job=replay run={folder} world=0" in gate["reason"].replace("'", "")
     broken = ("failed.LIFT", "failed.CARRY", "failed.STACKED")
     assert counts(gate["metrics"], *broken) == [2] * 3
     (table,) = [table for table in gate["tables"] if "first sign of failure" in table["header"]]

@@ -16,6 +16,7 @@ import pytest
 from compositions import load_config
 from environments import Capture, Patch
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from mjstack.cli import run
 from mjstack.config.schema import Backend, SweepCfg
@@ -167,6 +168,48 @@ def test_the_table_of_a_plain_sweep(tmp_path: Path) -> None:
     assert shown.rows[2] == ["2", "third", "-", "-", "not run"]
     assert "| 1 | rebot | fail: a \\| b | 1 | fail |" in (tmp_path / "summary.md").read_text()
     assert (tmp_path / "summary.png").stat().st_size > 5_000
+
+
+def test_a_result_has_its_details_in_the_files_alone(tmp_path: Path) -> None:
+    jobs = listed(tmp_path, "seed=1", "seed=2")
+    reason = "7 of 8 episodes succeeded (87.5 %), 97 % wanted; 1 of 8 episodes (4) failed"
+    ended = {job.number: report(job, Status.failed, reason, succeeded=7.0) for job in jobs}
+    table_shown, _ = write_summary(tmp_path, SweepCfg(), ended)
+    assert table_shown.rows[0][2] == "fail: 7 of 8 episodes succeeded"
+    assert f"| fail: {reason} |" in (tmp_path / "summary.md").read_text()
+    assert table(tmp_path)[0]["batch"] == f"fail: {reason}"
+
+
+@pytest.mark.parametrize("over", ["nworld", "robot"])
+def test_a_picture_names_its_keys_and_a_rate_ends_at_one(
+    tmp_path: Path, monkeypatch: Patch, over: str
+) -> None:
+    """As curves over a number, and as bars over names."""
+    rows: list[Row] = [
+        {
+            "nworld": n,
+            "robot": f"arm{n}",
+            "gap": gap,
+            "status": "pass",
+            "success_rate": 1.0,
+            RATE: 9,
+        }
+        for n in (1, 2)
+        for gap in (0.01, 0.02)
+    ]
+    panels = {"rate": {"": "success_rate"}, "speed": {"": RATE}}
+    figures: list[Any] = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: figures.append(self))
+    save_sweep(tmp_path / "p.png", Plot(title="T", over=over, lines=["gap"], panels=panels), rows)
+    rate, speed = figures[0].axes
+    if over == "nworld":
+        assert rate.get_legend().get_title().get_text() == "gap"
+        assert rate.get_ylim()[1] == 1.0
+        assert speed.get_ylim()[1] > 9
+    else:
+        assert rate.get_ylabel() == "robot, gap"
+        assert rate.get_xlim()[1] == 1.0
+        assert speed.get_xlim()[1] > 9
 
 
 def test_a_picture_that_fails_takes_no_table_back(tmp_path: Path, monkeypatch: Patch) -> None:

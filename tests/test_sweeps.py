@@ -232,3 +232,18 @@ def test_the_locks_of_gpus_are_the_users_own(tmp_path: Path, monkeypatch: Patch)
     (slot,) = Queueing().slots()
     assert slot.lock is not None
     assert slot.lock.is_relative_to(tmp_path / ".cache")
+
+
+@pytest.mark.parametrize("home", ["/dev/null", "/proc/1", ""])
+def test_locks_without_a_home_are_a_line(home: str, monkeypatch: Patch) -> None:
+    """A file, a folder that takes none, and a user without one."""
+
+    def no_home(path: Path) -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
+    monkeypatch.setenv("HOME", home)
+    if not home:
+        monkeypatch.setattr(Path, "expanduser", no_home)
+    with pytest.raises(FolderError, match=r"expected a folder for the GPUs' locks. Set HOME to"):
+        Queueing().slots()

@@ -10,6 +10,7 @@ import pytest
 import torch
 from environments import Capture, Patch, record_of, report_of
 
+import mjstack
 from mjstack.cli import run
 from mjstack.config import load_config
 from mjstack.config.load import load_saved
@@ -20,7 +21,10 @@ from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
 from mjstack.gates.parity import run_parity
 from mjstack.jobs.train import judged_stage
+from mjstack.mdp.geometry import pose_w
 from mjstack.report.record import Status
+from mjstack.train.clone_network import input_noise
+from mjstack.train.trainer import with_observation
 
 TURN = 0.2  # rad, of the shoulder at the start
 FRICTION = 0.3  # of the first geom
@@ -250,3 +254,36 @@ def test_a_policy_sees_what_a_task_writes(turned: Path) -> None:
     chosen = load_config([*more, "job.observation=task"])
     assert chosen.job.observation == chosen.observation
     assert not chosen.unused_terms
+
+
+def test_terms_without_noise_get_some_in_a_training(turned: Path) -> None:
+    stage = Stage(composed(turned, "job=train", "trainer=clone", "job.input_noise=2.0"))
+    cfg = with_observation(stage.cfg)
+    spread = torch.full((7,), 0.5)
+    noise = input_noise(cfg, stage.model, {"joint_pos": 6, "shoulder": 1}, spread)
+    torch.testing.assert_close(noise, torch.tensor([0.02] * 6 + [0.02]))
+    stage.cfg.job.input_noise = 0.0
+    assert not input_noise(cfg, stage.model, {"joint_pos": 6, "shoulder": 1}, spread).any()
+
+
+@pytest.mark.parametrize("backend", ["native", "mjwarp"])
+def test_a_fixed_object_is_where_a_reset_term_has_moved_it(turned: Path, backend: str) -> None:
+    (turned.parent / "turned.py").write_text(
+        MODULE
+        + """
+@uses_fields("body_pos")
+def shift(env, mask):
+    body = env.index.bodies["blue"]
+    moved = env.sim.fields["body_pos"]
+    moved[:, body, 1] = torch.where(mask, 0.1 + 0.01 * env.world, moved[:, body, 1])
+"""
+    )
+    fixed = ["scene.objects.blue.fixed=true", "+reset.shift={func: turned.shift}"]
+    overrides = [*fixed, f"sim={backend}", "sim.device=cpu", "reset=nominal"]
+    env = mjstack.make_env(["task=turned", *overrides], config_dir=turned, nworld=2)
+    with closing(env):
+        env.reset()
+        pose = pose_w(env, "blue")
+        torch.testing.assert_close(pose[:, 1].float(), torch.tensor([0.1, 0.11]))
+        torch.testing.assert_close(pose[:, 3:].float().abs().amax(1), torch.ones(2))
+        assert float(pose[0, 0]) == pytest.approx(env.index.fixed["blue"][0])

@@ -13,7 +13,14 @@ from environments import MakeSim, NewRun, Patch, at_double_speed, on_cuda
 
 from mjstack.bench import env_step, episode, timing
 from mjstack.bench.env_step import measure_env_step
-from mjstack.bench.timing import EnergyMeter, Measurement, steps_that_fit, timed
+from mjstack.bench.timing import (
+    EnergyMeter,
+    Measurement,
+    describe_lost,
+    lost_worlds,
+    steps_that_fit,
+    timed,
+)
 from mjstack.envs import build_env
 from mjstack.episodes.rollout import Episode, RolloutTiming, State
 from mjstack.episodes.stage import Stage
@@ -21,8 +28,6 @@ from mjstack.gates import throughput
 from mjstack.gates.throughput import run_throughput
 from mjstack.report.record import GateResult, Status
 from mjstack.sim import Simulation
-from mjstack.sim.fused.step import StepPlan
-from mjstack.sim.graph import StepGraph
 from mjstack.sim.native import NativeSimulation
 
 FEW = (
@@ -117,7 +122,6 @@ def test_native_measurements(new_run: NewRun) -> None:
     over = m["env_step.managers_over_physics.median"]
     assert f"managers {100.0 * over:+.1f} % (alone {100.0 * alone:.1f} %)" in result.reason
     assert "(eager)" not in result.reason
-    assert not any("bare" in name for name in m)
 
 
 def episode_of(seconds: float) -> Episode:
@@ -127,7 +131,7 @@ def episode_of(seconds: float) -> Episode:
     )
     result: Any = SimpleNamespace(failed=torch.zeros(4), values={})
     arrays = dict.fromkeys(("start", "waypoint_error", "retries"), np.zeros(4))
-    return Episode(result=result, **arrays, timing=spent, description="some")
+    return Episode(result=result, **arrays, places={}, timing=spent, description="some")
 
 
 @pytest.mark.parametrize(
@@ -184,17 +188,11 @@ def test_two_episodes_that_agree_are_enough(new_run: NewRun, monkeypatch: Patch)
 
 
 @pytest.mark.full
-def test_physics_alternates_with_bare_steps_and_warm_up_and_capture_are_told_apart(
-    new_run: NewRun,
-) -> None:
+def test_warm_up_and_capture_are_told_apart(new_run: NewRun) -> None:
     result = measure(new_run, *MJWARP, "gate.throughput.episodes=1")
     assert result.status is Status.passed, result.reason
     m = result.metrics
     assert m["episode.succeeded"] == 1
-    bare, ours = "physics.bare_ms_per_batched_step", "physics.ms_per_batched_step"
-    least, most = m[f"{bare}.min"] / m[f"{ours}.max"], m[f"{bare}.max"] / m[f"{ours}.min"]
-    assert 0.0 < least <= m["physics.speedup_over_bare.median"] <= most
-    assert "times bare mujoco_warp.step" in result.reason
     assert m["physics.peak_constraint_rows_per_world"] > 0
     # Warp's CPU device: physics is captured, the step around it is not.
     for name in ("episode", "env_step"):
@@ -234,53 +232,6 @@ def test_eager_work_is_void_where_it_should_be_captured(
 
 
 @pytest.mark.full
-def test_bare_steps_play_the_same_physics(new_run: NewRun, make_sim: MakeSim) -> None:
-    """Warp's CPU device is bit-reproducible: whatever else an arranged step does, the physics of
-    both is the same.
-    """
-    run = new_run("nworld=1")
-    sim = make_sim("mjwarp", 1, "sim.step=auto")  # its own, not the one that other tests share
-    sim.plan = StepPlan("arranged")
-    start = episode.carry_start(run.stage, sim, None)
-    ends = []
-    for bare in (None, sim.bare_step()):  # type: ignore[attr-defined]
-        physics = episode.HeldPhysics(sim, start, 10, bare)
-        sim._d.qacc_warmstart.zero_()  # type: ignore[attr-defined]
-        assert physics.play(3) > 0.0
-        assert not physics.lost.any()
-        ends.append(sim.qpos.clone())
-        sim.qpos.fill_(torch.nan)
-    assert torch.equal(*ends)
-    assert (ends[0] - torch.from_numpy(start.qpos).float()).abs().max() > 0.0
-
-
-@pytest.mark.full
-def test_bare_steps_that_lose_worlds_give_no_ratio(new_run: NewRun, monkeypatch: Patch) -> None:
-    """What bare steps lose is looked for after them; ours keep their figure."""
-    run = new_run("nworld=1", "sim=mjwarp", "sim.device=cpu", "gate.throughput.steps=2")
-    sim = run.stage.batch_simulation(1)
-    lose = StepGraph(lambda: sim.qvel.fill_(torch.nan), sim.device, "off", name="it")
-    monkeypatch.setattr(sim, "bare_step", lambda: lose)
-    lost = episode.measure_physics(run.stage, sim)
-
-    def broken() -> StepGraph:
-        raise RuntimeError("out of memory")
-
-    monkeypatch.setattr(sim, "bare_step", broken)
-    missing = episode.measure_physics(run.stage, sim)
-    sim.close()
-    reasons = {
-        "1 worlds overflowed, diverged or were not stepped": lost,
-        "out of memory": missing,
-    }
-    for reason, measured in reasons.items():
-        assert measured.notes["speedup_over_bare"] == f"not measured, bare steps: {reason}"
-        assert not measured.problem
-        assert measured.median("world_steps_per_s") > 0.0
-        assert "speedup_over_bare" not in measured.samples
-
-
-@pytest.mark.full
 def test_worlds_that_fail_void_every_figure(new_run: NewRun) -> None:
     tight = ("gate.throughput.repetitions=1", "task.check.xy_err=1e-7")
     result = measure(new_run, *NATIVE, *tight)
@@ -305,6 +256,16 @@ def test_steps_not_made_void_the_figure(new_run: NewRun, monkeypatch: Patch) -> 
         problem = f"{name}: no figure: 2 worlds overflowed, diverged or were not stepped"
         assert problem in result.reason
     assert speeds(result) == []
+
+
+@pytest.mark.full
+def test_no_time_for_worlds_that_diverged(make_sim: MakeSim, backend: str) -> None:
+    sim = make_sim(backend, 2)
+    sim.step(10)
+    assert describe_lost(lost_worlds(sim, 10)) == ""
+    assert lost_worlds(sim, 20).tolist() == [True, True]
+    sim.qvel[1, 0] = torch.nan
+    assert describe_lost(lost_worlds(sim, 10)).startswith("1 worlds overflowed, diverged")
 
 
 @pytest.mark.full
@@ -414,13 +375,13 @@ def test_the_parts_play_one_trajectory(monkeypatch: Patch) -> None:
 
     monkeypatch.setattr(env_step, "snapshot", keep)
     ends = []  # of physics alone
-    lost = env_step.lost_worlds
+    lost = timing.lost_worlds
 
     def look(sim: Simulation, steps: int) -> torch.Tensor:
         ends.append((steps, sim.qpos.clone()))
         return lost(sim, steps)
 
-    monkeypatch.setattr(env_step, "lost_worlds", look)
+    monkeypatch.setattr(timing, "lost_worlds", look)
     times = measure_env_step(env, "env_step", lambda what, done, total: None)
     figures = times.samples
     names = ("ms_per_env_step", "physics_ms_per_step", "managers_ms_per_step")
@@ -553,9 +514,7 @@ def test_missing_power_says_why(monkeypatch: Patch, nvml: FakeNvml | None, why: 
     energy.start()
     energy.stop()
     assert energy.metrics() == {}
-    (text,) = energy.notes().values()
-    assert text.startswith("not measured: ")
-    assert why in text
+    assert why in energy.missing
 
 
 @pytest.mark.full
@@ -573,7 +532,6 @@ def test_figures_of_2048_worlds_on_cuda(new_run: NewRun) -> None:
     assert result.status is Status.passed, result.reason
     m = result.metrics
     assert m["episode.succeeded"] == 2048
-    assert m["physics.speedup_over_bare.median"] > 2.0
     for name in ("physics", "episode", "env_step"):
         assert 0.0 < m[f"{name}.gpu_memory_arrays_mib"] <= m[f"{name}.gpu_memory_whole_gpu_mib"]
         watts = m.get(f"{name}.gpu_power_mean_w")

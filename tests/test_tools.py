@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import bench_physics
 import bench_solver
 import mujoco
 import numpy as np
@@ -14,7 +15,7 @@ import pytest
 import soak
 import verdicts
 from compositions import load_config
-from environments import Capture, Patch, one_second_episode
+from environments import Capture, Patch, on_cuda, one_second_episode
 from policies import hold_above_red
 from solver_states import FUSED, RANDOM, SCRIPTED, STOCK, Pipeline, Sample, record_states
 
@@ -165,3 +166,12 @@ def test_equal_runs_have_equal_verdicts(tmp_path: Path) -> None:
     records["worlds_seed0.npz"]["arrays"]["qpos"] = "other"
     (line,) = verdicts.compare(before, after)
     assert line.startswith("so101_reach/worlds_seed0.npz: qpos differs")
+
+
+@on_cuda
+def test_the_fused_step_is_twice_as_fast_as_a_bare_one() -> None:
+    stage = Stage(load_config(["sim=mjwarp", "nworld=2048"]))
+    for random in (False, True):
+        times = bench_physics._measure_plans(stage, 5, 3, random)
+        ratios = [a / b for a, b in zip(times[bench_physics.BARE], times["fused"], strict=True)]
+        assert min(ratios) > 2.0

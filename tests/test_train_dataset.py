@@ -38,14 +38,19 @@ TRAIN = (
     *("job.save_every=2", "gate.success.rate=0.0", "web.episode=false"),
 )
 
+COLLECT = (
+    *("job=collect", *REACH, "observation=real", "+observation.policy.noise=false"),
+    "controller=closed_loop",
+)
+ROWS = "meta/episodes/chunk-000/file-000.parquet"
+Damage = Callable[[Path], object]
+
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three episodes of job=collect, their observations without noise."""
     folder = tmp_path_factory.mktemp("demos")
-    quiet = ["observation=real", "+observation.policy.noise=false", "controller=closed_loop"]
-    command = ["job=collect", *REACH, *quiet, "job.episodes=3", f"job.folder={folder}"]
-    assert run(command) == 0
+    assert run([*COLLECT, "job.episodes=3", f"job.folder={folder}"]) == 0
     return folder / "dataset"
 
 
@@ -139,15 +144,20 @@ def shuffle(table: pa.Table) -> pa.Table:
 
 
 SHAPES = "rows of action without 6 numbers"
-ORDER = "3 episodes, out of order, expected 3 episodes and 450 frames"
 DAMAGES: dict[str, tuple[Callable[[pa.Table], pa.Table], str]] = {
     "a null row and a double one": (reshape_rows({7: None, 8: 12}), SHAPES),
     "rows of 5 and 7": (reshape_rows({100: 5, 200: 7}), SHAPES),
-    "the end is missing": (lambda table: table.slice(0, 413), "413 frames of 3 episodes, ex"),
-    "an episode is missing": (lambda table: table.slice(150), "300 frames of 2 episodes, ex"),
-    "shuffled": (shuffle, ORDER),
-    "two steps swapped": (swap(20, 21), ORDER),
-    "episodes mixed": (swap(149, 150), ORDER),
+    "the end is missing": (
+        lambda table: table.slice(0, 413),
+        "3 rows of episodes and 413 frames",
+    ),
+    "an episode is missing": (
+        lambda table: table.slice(150),
+        "3 rows of episodes and 300 frames",
+    ),
+    "shuffled": (shuffle, "episode_index of frame 2 is 1, expected 0"),
+    "two steps swapped": (swap(20, 21), "frame_index of frame 20 is 21, expected 20"),
+    "episodes mixed": (swap(149, 150), "episode_index of frame 149 is 1, expected 0"),
 }
 
 
@@ -163,6 +173,78 @@ def test_a_damaged_dataset_that_still_reads_is_refused(
     assert str(folder) in line
 
 
+def column_of(change: Callable[[np.ndarray], np.ndarray], name: str) -> Damage:
+    """Other numbers of a column of the frames."""
+
+    def damage(folder: Path) -> None:
+        def changed(table: pa.Table) -> pa.Table:
+            return with_column(table, name, pa.array(change(np.array(table[name]))))
+
+        change_table(folder, changed)
+
+    return damage
+
+
+def cut(name: str) -> Damage:
+    def damage(folder: Path) -> None:
+        content = (folder / name).read_bytes()
+        (folder / name).write_bytes(content[: len(content) // 2])
+
+    return damage
+
+
+def linked(name: str) -> Damage:
+    def damage(folder: Path) -> None:
+        (folder / name).rename(folder.parent / "moved")
+        (folder / name).symlink_to(folder.parent / "moved")
+
+    return damage
+
+
+def put_folder(folder: Path) -> None:
+    (folder / "meta/stats.json").unlink()
+    (folder / "meta/stats.json").mkdir()
+
+
+def without_shards(folder: Path) -> None:
+    path = folder / "meta/info.json"
+    info = json.loads(path.read_text())
+    info["mjstack"]["shards"] = -1
+    path.write_text(json.dumps(info))
+
+
+READ: dict[str, tuple[Damage, str]] = {
+    "null row": (lambda folder: change_table(folder, reshape_rows({7: None})), SHAPES),
+    "times": (column_of(lambda t: 7 * t, "timestamp"), "timestamp of frame 1 is 0.14"),
+    "backwards": (column_of(lambda i: i[::-1], "index"), "index of frame 0 is 449, expected 0"),
+    "task": (column_of(lambda i: i + 10**9, "task_index"), "is 1000000000"),
+    "reward": (column_of(lambda r: r * np.float32("nan"), "next.reward"), "are not finite"),
+    "cut": (cut("data/chunk-000/file-000.parquet"), "file-000.parquet: cannot be read"),
+    "cut rows": (cut(ROWS), f"{ROWS}: cannot be read"),
+    "shards": (without_shards, "shards is -1"),
+}
+WRITTEN: dict[str, tuple[Damage, str]] = {
+    "stats": (linked("meta/stats.json"), "stats.json is a link"),
+    "meta": (linked("meta"), "meta is a link"),
+    "chunk": (linked("data/chunk-000"), "chunk-000 is a link"),
+    "folder": (put_folder, "stats.json is no regular file"),
+}
+
+
+@pytest.mark.parametrize("name", [*READ, *WRITTEN])
+def test_collect_and_train_refuse_the_same_before_they_write(
+    name: str, dataset: Path, tmp_path: Path, refused: Refused
+) -> None:
+    """Links and folders where files are written, collect refuses alone."""
+    damage, says = (READ | WRITTEN)[name]
+    folder = tmp_path / "demos" / "dataset"
+    shutil.copytree(dataset, folder)
+    damage(folder)
+    assert says in refused(*COLLECT, "job.episodes=4", "job.folder=demos")
+    if name in READ:
+        assert says in refused(*TRAIN, "job.dataset=demos/dataset", "job.folder=out")
+
+
 def test_a_file_that_is_there_twice_is_refused(dataset: Path, tmp_path: Path) -> None:
     """A dataset of ours says which files count."""
     for change in (None, as_lerobot):
@@ -173,7 +255,7 @@ def test_a_file_that_is_there_twice_is_refused(dataset: Path, tmp_path: Path) ->
             assert len(read(folder).ends) == 3
         else:
             line = refusal_of([f"job.dataset={folder}"])
-            assert "has 3 rows of episodes and 900 frames of 3 episodes, expected 3 epis" in line
+            assert "has 3 rows of episodes and 900 frames, expected 3 episodes and 450 fr" in line
 
 
 def test_without_a_success_all_episodes_count(dataset: Path, tmp_path: Path) -> None:
@@ -263,14 +345,33 @@ def test_a_dataset_that_does_not_fit_is_one_line(name: str, dataset: Path, tmp_p
     assert says in refusal_of([f"job.dataset={folder}"])
 
 
-ROWS = "meta/episodes/chunk-000/file-000.parquet"
 COLUMNS: dict[str, tuple[str, str, list[Any], str]] = {
-    "seeds null": (ROWS, "seed", [None, 0, 0], f"{ROWS}: cannot be read (TypeError"),
-    "seeds in words": (ROWS, "seed", ["0", "0", "0"], f"{ROWS}: cannot be read (TypeError"),
-    "lengths": (ROWS, "length", [149, 151, 150], "as long as its row says"),
-    "a negative length": (ROWS, "length", [-1, 301, 150], "as long as its row says"),
+    "seeds null": (
+        ROWS,
+        "seed",
+        [None, 0, 0],
+        "(ValueError: row 0: seed is None",
+    ),
+    "seeds in words": (
+        ROWS,
+        "seed",
+        ["0", "0", "0"],
+        "(ValueError: row 0: seed is '0'",
+    ),
+    "lengths": (ROWS, "length", [149, 151, 150], "row 0: dataset_to_index is 150, expected 149"),
+    "a negative length": (
+        ROWS,
+        "length",
+        [-1, 301, 150],
+        "dataset_to_index is 150, expected -1",
+    ),
     "no length": (ROWS, "length", [None, 150, 150], f"{ROWS}: cannot be read (TypeError"),
-    "task": ("meta/tasks.parquet", "task_index", [None], "tasks.parquet: cannot be read (TypeEr"),
+    "task": (
+        "meta/tasks.parquet",
+        "task_index",
+        [None],
+        "tasks.parquet: cannot be read (Val",
+    ),
 }
 
 

@@ -1,6 +1,7 @@
 """Nothing that a stranger's folder names is run or followed, and no damage in it is a traceback."""
 
 import importlib
+import io
 import json
 import os
 import pkgutil
@@ -8,10 +9,12 @@ import shutil
 import signal
 import subprocess
 import sys
+import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 import pytest
@@ -22,12 +25,24 @@ from omegaconf import OmegaConf
 from policies import write_policy
 
 import mjstack
-from mjstack import make_env
+from mjstack import files, make_env
 from mjstack.cli import run
+from mjstack.config.fields import Range, field_range
 from mjstack.config.fingerprint import config_content
+from mjstack.config.functions import find_object
+from mjstack.config.schema import Config, JobCfg
 from mjstack.config.session import check_term, in_search_path, search_path
 from mjstack.episodes.record import EpisodeRecord
-from mjstack.errors import MjstackError
+from mjstack.errors import (
+    ArgumentError,
+    ConfigError,
+    FolderError,
+    KeyedError,
+    MjstackError,
+    TermError,
+    UnknownName,
+    describe_error,
+)
 from mjstack.files import read_inside
 from mjstack.jobs import check_job
 from mjstack.policy import load_policy, save_policy
@@ -103,7 +118,7 @@ def test_a_replay_runs_no_command_of_its_folder(key: str, stranger: Path) -> Non
     if key in USED:
         found = refused(lambda: replay(stranger))
         assert f"{key}.func=pydoc.pipepager: expected one of the" in found
-        assert found.endswith("add --config-dir DIR.")
+        assert found.endswith("add config_dir=DIR.")
     else:
         replay(stranger)
     assert not Path("PWNED").exists()
@@ -152,8 +167,8 @@ def test_a_run_names_terms_alone(name: str, term: str, stranger: Path) -> None:
 
 
 def test_each_kind_of_term_is_listed(tmp_path: Path) -> None:
-    """A policy names observation and action terms, a run action and reset terms and checks: those
-    of the list, and nothing else of mjstack.
+    """A policy names observation and action terms, a run action and reset terms, checks and
+    drivers: those of the list, and nothing else of mjstack.
     """
     listed = set((ROOT / "tests" / "data" / "may_be_named.txt").read_text().splitlines())
     named = set()
@@ -163,7 +178,7 @@ def test_each_kind_of_term_is_listed(tmp_path: Path) -> None:
         for name, value in vars(importlib.import_module(module.name)).items():
             if getattr(value, "__module__", "") != module.name:
                 continue
-            for kind in ("observation term", "action term", "reset term", "check"):
+            for kind in ("observation term", "action term", "reset term", "check", "driver"):
                 with suppress(MjstackError):
                     check_term("", f"{module.name}.{name}", kind, tmp_path / "policy.json")
                     named.add(f"{kind}: {module.name}.{name}")
@@ -186,7 +201,7 @@ def test_a_gate_declares_itself(capsys: Capture) -> None:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("key", ["reset.evil", "controller.action.arm", "task.check"])
+@pytest.mark.parametrize("key", ["reset.evil", "controller.action.arm", "controller", "task.check"])
 @pytest.mark.parametrize("given", ["", "conf", "beside"])
 def test_no_module_of_the_folder_is_imported(
     key: str, given: str, stranger: Path, monkeypatch: Patch
@@ -198,7 +213,8 @@ def test_no_module_of_the_folder_is_imported(
     sys.path.insert(0, str(Path.cwd()))
     monkeypatch.delitem(sys.modules, "beside", raising=False)
     # The second is the user's own module, whose import runs nothing, with another's function.
-    edit(stranger, key, {"func": "beside.rmtree" if given == "beside" else "stranger.payload.X"})
+    func = "beside.rmtree" if given == "beside" else "stranger.payload.X"
+    edit(stranger, *((f"{key}.func", func) if key == "controller" else (key, {"func": func})))
     with search_path(["conf"] if given else []):
         found = refused(lambda: replay(stranger))
         assert not given or in_search_path("beside.X", stranger)
@@ -259,8 +275,8 @@ FOLLOWED = {
     "environment": ("task.instruction", "${oc.env:HOME}", "it has ${...}"),
     "robot's name": ("robot.name", "../../x", "robot.name=../../x: expected a name that"),
     "absolute name": ("robot.menagerie_file", "/etc/passwd", "robot.menagerie_file=/etc/passwd"),
-    "robot's file": ("robot.file", "{stranger}/arm.xml", "robot.file={stranger}/arm.xml: expected"),
-    "relative file": ("robot.file", "stranger/arm.xml", "add --config-dir {stranger}."),
+    "robot's file": ("robot.file", "{stranger}/arm.xml", "stranger/arm.xml: expected a fil"),
+    "relative file": ("robot.file", "stranger/arm.xml", "add config_dir='{stranger}'."),
 }
 
 
@@ -315,7 +331,7 @@ def test_only_regular_files_are_read(kind: str, stranger: Path) -> None:
             assert "it is no regular file" in refused(lambda: replay(stranger))
         else:
             edit(stranger, "task.check.func", "os.system")
-            assert "add --config-dir DIR." in refused(lambda: replay(stranger))
+            assert "add config_dir=DIR." in refused(lambda: replay(stranger))
     state = swap(stranger / "training.safetensors")
     assert "it is no regular file" in refused(lambda: read_state(state))
     starts = swap(stranger / "starts.npz")
@@ -337,7 +353,7 @@ def test_a_policy_cannot_claim_more_than_it_is(tmp_path: Path) -> None:
     facts = path.read_text()
     many = json.loads(facts)
     terms = many["observation"]["terms"]
-    terms.update({f"x{n}": next(iter(terms.values())) for n in range(20_000)})
+    terms.update({f"x{n}": next(iter(terms.values())) for n in range(110)})
     many["observation"]["widths"] = dict.fromkeys(terms, 1)
     path.write_text(json.dumps(many))
     assert "terms, expected at most 100" in refused(lambda: load_policy(folder))
@@ -351,7 +367,7 @@ def test_a_policy_cannot_claim_more_than_it_is(tmp_path: Path) -> None:
 
 def test_arrays_are_not_unpacked_without_end(stranger: Path, monkeypatch: Patch) -> None:
     """A few bytes of an npz file may stand for gigabytes."""
-    monkeypatch.setattr("mjstack.files._MOST_BYTES", 2**22)
+    monkeypatch.setitem(files._MOST, ".npz", 2**22)
     for name in ("worlds_seed0.npz", "starts.npz"):
         np.savez_compressed(stranger / name, zeros=np.zeros(2**20))
         assert (stranger / name).stat().st_size < 2**14
@@ -359,6 +375,204 @@ def test_arrays_are_not_unpacked_without_end(stranger: Path, monkeypatch: Patch)
     starts = stranger / "starts.npz"
     overrides = ["reset=starts_file", f"starts={starts}", "sim=native", "nworld=1"]
     assert f"starts={starts}" in refused(lambda: make_env(overrides))
+
+
+def put_array(
+    name: str, dtype: str, shape: tuple[int, ...], data: bytes = b"", times: int = 1
+) -> Any:
+    """An array in the run's record, as its header claims it to be."""
+
+    def put(folder: Path) -> None:
+        header = io.BytesIO()
+        claim = {"descr": dtype, "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(header, claim)
+        with zipfile.ZipFile(folder / "worlds_seed0.npz", "a", zipfile.ZIP_DEFLATED) as file:
+            for number in range(times):
+                again = f"{number}" * (times > 1)
+                file.writestr(f"{name}{again}.npy", header.getvalue() + data)
+
+    return put
+
+
+def add_yaml(text: str) -> Callable[[Path], object]:
+    """More keys in the run's configuration."""
+
+    def add(folder: Path) -> None:
+        path = folder / CONFIG
+        path.write_text(f"{path.read_text()}{text}\n")
+
+    return add
+
+
+# A few kilobytes or megabytes that stand for minutes or gigabytes, and what is said of them
+CONFIG = ".hydra/config.yaml"
+VALUES = "it has more than 5000 values, or 3000 letters in one"
+SMALL: dict[str, tuple[Callable[[Path], object], str]] = {
+    "base 60": (add_yaml("x: 1" + ":00" * 300_000), VALUES),
+    "hexadecimal": (add_yaml("x: 0x" + "f" * 500_000), VALUES),
+    "a short number in base 60": (add_yaml("x: 1" + ":00" * 900), "Key 'x' not in 'Config'"),
+    "brackets": (add_yaml(f"x: {'[' * 100_000}{']' * 100_000}"), VALUES),
+    "dashes": (add_yaml(f"x:\n  {'- ' * 100_000}x"), VALUES),
+    "keys": (add_yaml("".join(f"k{n}: 1\n" for n in range(50_000))), VALUES),
+    "long text": (add_yaml("#" * 2**20), "more than 1048576"),
+    "arrays": (put_array("value.x", "<f8", (1,), bytes(8), times=1000), "more than 1000 arrays"),
+    "no bytes": (put_array("object_names", "<U0", (30_000_000,)), "more than 1048576 rows"),
+    "empty lists": (put_array("object_names", "<U4", (30_000_000, 0)), "more than 1048576 rows"),
+    "a lie": (put_array("value.x", "<f8", (10**18,)), "cannot be read (MemoryError"),
+    "names": (put_array("phase_names", "|i1", (10**7,), bytes(10**7)), "more than 1048576 rows"),
+    "wide names": (put_array("phase_names", "|i1", (10, 10**7), bytes(10**8)), "of size 1"),
+    "worlds": (put_array("failed", "|i1", (10**7,), bytes(10**7)), "more than 1048576 rows"),
+}
+
+
+@pytest.mark.usefixtures("soon")
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+@pytest.mark.parametrize("name", SMALL)
+def test_a_small_file_does_not_stand_for_much(name: str, stranger: Path) -> None:
+    damage, says = SMALL[name]
+    damage(stranger)
+    assert says in refused(lambda: replay(stranger))
+
+
+@pytest.mark.usefixtures("soon")
+def test_what_is_listed_of_a_report_is_bounded(stranger: Path) -> None:
+    path = stranger / "report.json"
+    report = json.loads(path.read_text())
+    report["provenance"]["versions"] = {f"v{n}": [] for n in range(5000)}
+    path.write_text(json.dumps(report))
+    assert VALUES in refused(lambda: replay(stranger))
+
+
+@pytest.mark.usefixtures("soon")
+def test_tensors_have_few_names(tmp_path: Path) -> None:
+    """A header of 20 MB would be 300,000 tensors, each of which takes a kilobyte."""
+    path = tmp_path / "training.safetensors"
+    path.write_bytes((2**22 + 8).to_bytes(8, "little") + b"{" + b" " * (2**22 + 8))
+    assert "its header has more than 4194304 bytes" in refused(lambda: read_state(path))
+
+
+@pytest.mark.usefixtures("soon")
+def test_a_digest_with_escapes_is_read_as_it_is(tmp_path: Path) -> None:
+    """The text of policy.json need not have it letter by letter. Damaged weights are read twice at
+    most: the next ones may have been saved meanwhile.
+    """
+    folder = write_policy(tmp_path / "policy", load_config(["sim=native"]))
+    path = folder / "policy.json"
+    digest = json.loads(path.read_text())["weights_sha256"]
+    escaped = digest[:30] + f"\\u{ord(digest[30]):04x}" + digest[31:]
+    path.write_text(path.read_text().replace(digest, escaped))
+    load_policy(folder)
+    weights = next(folder.glob("weights-*"))
+    content = bytearray(weights.read_bytes())
+    content[-1] ^= 1
+    weights.write_bytes(content)
+    assert "its content is not that of policy.json" in refused(lambda: load_policy(folder))
+    weights.unlink()
+    assert "No such file" in refused(lambda: load_policy(folder))
+
+
+PARAMETERS = {  # of allowed terms in a policy: value, and what is said of it
+    "iterations": ("mjstack.mdp.action.EndEffectorDelta", {"scale": 0.1, "iterations": 10**9}),
+    "joints": ("mjstack.mdp.action.JointPosition", {"joints": ["shoulder_pan"] * 100_000}),
+}
+
+
+@pytest.mark.usefixtures("soon")
+def test_an_allowed_term_takes_no_value_without_end(tmp_path: Path) -> None:
+    folder = write_policy(tmp_path / "policy", load_config(["sim=native"]))
+    path = folder / "policy.json"
+    content = path.read_text()
+    overrides = ["controller=policy", f"policy={folder}", "gates=[success]", "sim=native"]
+
+    def play() -> None:
+        check_job(load_config([*overrides, "nworld=1"]))
+
+    for name, (func, params) in PARAMETERS.items():
+        facts = json.loads(content)
+        facts["action"]["terms"]["evil"] = {"func": func, "params": params}
+        path.write_text(json.dumps(facts))
+        says = VALUES if name == "joints" else "iterations=1000000000: expected an integer from 1"
+        assert says in refused(play)
+
+
+def integers(hint: Any) -> Iterator[Range]:
+    """The ranges of the integers in an annotation."""
+    inner = get_args(hint)
+    if hint is int or (get_origin(hint) is Annotated and inner[0] is int):
+        yield next((part for part in inner[1:] if isinstance(part, Range)), Range())
+    elif get_origin(hint) is not Literal:
+        for part in inner:
+            yield from integers(part)
+
+
+def test_each_integer_that_a_folder_may_set_has_an_upper_end() -> None:
+    """Of the parameters of terms, the thresholds of checks, and a run's configuration."""
+    ranges: dict[str, Range] = {}
+    models = [Config]
+    for line in (ROOT / "tests" / "data" / "may_be_named.txt").read_text().splitlines():
+        term = find_object("", line.split(": ")[1])
+        called = term.__init__ if isinstance(term, type) else term
+        hints = {} if line.startswith("check") else get_type_hints(called, include_extras=True)
+        ranges |= {f"{line}.{k}": one for k, hint in hints.items() for one in integers(hint)}
+        models += [term.Thresholds] if hasattr(term, "Thresholds") else []
+    while models:
+        model = models.pop()
+        for item in fields(model):
+            hint = get_type_hints(model)[item.name]
+            for part in (hint, *get_args(hint), *(p for h in get_args(hint) for p in get_args(h))):
+                if is_dataclass(part) and part is not JobCfg:
+                    models.append(part)
+            if any(True for _ in integers(hint)):
+                ranges[f"{model.__name__}.{item.name}"] = field_range(item)
+    assert len(ranges) > 40
+    assert not [name for name, one in ranges.items() if one.le is None and not one.choices]
+
+
+LONG = "x" * 10**6
+LINES: dict[str, Callable[[], Exception]] = {
+    "value": lambda: ConfigError("task.name", LONG, "a name", "Set another"),
+    "key": lambda: ConfigError(LONG, 3, "a name", "Set another"),
+    "words": lambda: ConfigError("task.name", "x " * 10**6, "a name", "Set another"),
+    "argument": lambda: ArgumentError("name", [LONG], "a name", "Set another"),
+    "unknown": lambda: UnknownName("object", LONG, ["red", "blue"]),
+    "names": lambda: UnknownName("object", "re", [f"red{n}" for n in range(200_000)]),
+    "long names": lambda: UnknownName("object", "re", [LONG, LONG[1:]]),
+    "term": lambda: TermError("reset.x", LONG),
+    "file": lambda: FolderError(LONG, "Name another"),
+    "fix": lambda: FolderError("no", LONG),
+    "library": lambda: KeyError(LONG),
+    "lines": lambda: ValueError("x\n" * 10**6),
+}
+
+
+@pytest.mark.usefixtures("soon")
+@pytest.mark.parametrize("name", LINES)
+def test_a_line_is_short(name: str) -> None:
+    """It begins with the key and ends with what to do."""
+    error = LINES[name]()
+    line = describe_error(error)
+    assert 2 < len(line) <= 290
+    if isinstance(error, ConfigError | ArgumentError) and name != "key":
+        assert line.startswith(("task.name=", "name: found"))
+        assert line.endswith("expected a name. Set another.")
+    if isinstance(error, KeyedError):
+        error.move("the.key")
+        assert str(error).startswith("the.key")
+        assert len(str(error)) <= 290
+    if name == "names":
+        assert "Did you mean" in line
+        assert line.endswith("and 199993 more.")
+
+
+def test_a_line_of_some_length_is_whole() -> None:
+    """Paths lose their middle before the words between them do."""
+    path = "/home/somebody/with/a/very/long/path/of/folders/" * 2
+    error = FolderError(
+        f"run={path}: {path}: cannot be read, expected it as written", "Run it again"
+    )
+    assert "cannot be read, expected it as written. Run it again." in str(error)
+    text = "x" * 200 + " expected a name. Set another"
+    assert str(FolderError(text)) == f"{text}."
 
 
 def test_a_policy_that_a_training_saves_meanwhile_is_read_again(
@@ -398,7 +612,6 @@ def damage_record(**changes: Any) -> Callable[[Path], object]:
 
 
 RECORD = "worlds_seed0.npz: cannot be read"
-CONFIG = ".hydra/config.yaml"
 
 
 def write(name: str, content: bytes) -> Callable[[Path], object]:
@@ -421,9 +634,9 @@ DAMAGE = {
     "deep report": (write("report.json", DEEP), "report.json: cannot be read (RecursionError"),
     "list": (write("report.json", b'{"provenance": []}'), "report.json: cannot be read"),
     "versions": (write("report.json", b'{"provenance": {"versions": 3}}'), "json: cannot be read"),
-    "deep configuration": (write(CONFIG, DEEP), "config.yaml: cannot be read (ParserError"),
+    "deep configuration": (write(CONFIG, DEEP), "config.yaml: cannot be read (ValueError"),
     "bytes": (write(CONFIG, bytes(range(256))), "config.yaml: cannot be read"),
-    "hydra": (damage_hydra, "add --config-dir DIR."),
+    "hydra": (damage_hydra, "add config_dir=DIR."),
 }
 
 

@@ -1,23 +1,15 @@
 """The gates from Python."""
 
 import gc
-import sys
-from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 from compositions import load_config
-from environments import Capture, NewRun, Patch
+from environments import Capture, Patch
 
 import mjstack
 import mjstack.sim
-from mjstack.config.schema import Backend
-from mjstack.episodes.run import Run
-from mjstack.episodes.stage import Stage
-from mjstack.gates import runner as gate_runner
 from mjstack.jobs import runner as job_runner
-from mjstack.report.record import GateResult
-from mjstack.sim import compiling
 
 REACH = ["task=reach", "sim=native", "nworld=2"]
 
@@ -47,39 +39,6 @@ def test_what_fails_is_said() -> None:
     assert found.gates["baseline"].beyond == ["reached_steps"]
     with pytest.raises(mjstack.MjstackError, match=r"nworld=0: expected"):
         mjstack.verify(["nworld=0"])
-
-
-@pytest.mark.parametrize("change", ["", "measurements", "phases", "import"])
-def test_the_stock_step_compiles_beside_gates_where_it_is_compared(
-    change: str, new_run: NewRun, monkeypatch: Patch, tmp_path: Path
-) -> None:
-    """Not where physics is not measured or has no phases; gates run all the same."""
-    choice = ["gate.throughput.measurements=[episode]"] if change == "measurements" else []
-    run = new_run("sim=native", "nworld=1", "gates=[throughput]", *choice)
-    monkeypatch.setattr(Stage, "backend", (Backend.mjwarp, "cuda:0"))  # which no gate here uses
-    ran: list[str] = []
-    beside: list[object] = []
-
-    def gate(run: Run) -> list[GateResult]:
-        ran.append("throughput")
-        return []
-
-    gates = {"throughput": gate}
-    monkeypatch.setattr(gate_runner, "find_gates", lambda cfg: gates)
-
-    def start(stage: object) -> nullcontext:
-        beside.append(stage)
-        return nullcontext()
-
-    monkeypatch.setattr(compiling, "stock_step_beside", start)
-    if change == "phases":
-        monkeypatch.setattr(Stage, "phases", [])
-    if change == "import":
-        monkeypatch.delattr(mjstack.sim, "compiling")
-        monkeypatch.setitem(sys.modules, "mjstack.sim.compiling", None)
-    gate_runner.run_gates(run, tmp_path)
-    assert ran == ["throughput"]
-    assert len(beside) == (change == "")
 
 
 def test_a_warp_that_cannot_be_loaded_fails_no_run(monkeypatch: Patch) -> None:

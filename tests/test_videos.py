@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from compositions import load_config, refusal
-from dataset_checker import contents
+from dataset_checker import contents, listed
 from environments import SHORT_REACH, Patch, has_gl
 
 from mjstack.cli import run
@@ -86,6 +86,44 @@ def test_decoded_images_are_those_that_were_added(tmp_path: Path, codec: str) ->
         stored.images("observation.images.front", 5)
 
 
+def assert_quantiles(total: dict[str, Any], name: str, worlds: int, atol: float = 1e-9) -> None:
+    """Those of stats.json are of the sampled frames of all episodes."""
+    chosen = []
+    for world in range(worlds):
+        images = episode(world).images[name]
+        count = min(len(images), 100)
+        chosen.append(images[np.round(np.linspace(0, len(images) - 1, count)).astype(int)])
+    values = np.concatenate(chosen).reshape(-1, 3) / 255.0
+    for kind, quantile in QUANTILES.items():
+        expected = np.quantile(values, quantile, axis=0)
+        assert np.allclose(np.ravel(total[name][kind]), expected, atol=atol), kind
+
+
+def test_quantiles_are_kept_up_over_calls_and_versions(tmp_path: Path) -> None:
+    """An earlier version left no counts of pixels: those of the decoded images are taken."""
+    write(tmp_path, range(3))
+    write(tmp_path, range(3, 4))
+    total = json.loads((tmp_path / "meta/stats.json").read_text())
+    for name in SIZES:
+        assert_quantiles(total, name, 4)
+    path = tmp_path / "meta/episodes/chunk-000/file-000.parquet"
+    pq.write_table(pq.read_table(path).replace_schema_metadata(None), path)
+    (tmp_path / "meta/stats.json").unlink()
+    DatasetWriter(tmp_path, SPEC).close()
+    total = json.loads((tmp_path / "meta/stats.json").read_text())
+    for name in SIZES:
+        assert_quantiles(total, name, 4, atol=3.0 / 255.0)
+
+
+def test_a_cut_video_is_one_line(tmp_path: Path) -> None:
+    write(tmp_path, range(3))
+    path = tmp_path / "videos/observation.images.wrist/chunk-000/file-000.mp4"
+    path.write_bytes(path.read_bytes()[:-100])
+    for use in (read_dataset, lambda folder: DatasetWriter(folder, SPEC)):
+        with pytest.raises(FolderError, match="the video is cut"):
+            use(tmp_path)
+
+
 def test_statistics_are_per_channel_and_in_0_to_1(tmp_path: Path) -> None:
     write(tmp_path, range(3))
     rows = pq.read_table(tmp_path / "meta/episodes").to_pylist()
@@ -109,6 +147,7 @@ def test_statistics_are_per_channel_and_in_0_to_1(tmp_path: Path) -> None:
         means = np.array([row[f"{key}/mean"] for row in rows])[..., 0, 0]
         assert total[name]["count"] == [int(counts.sum())]
         assert np.allclose(np.ravel(total[name]["mean"]), counts @ means / counts.sum())
+        assert_quantiles(total, name, 3)
     assert total["action"]["count"] == [146]
 
 
@@ -160,6 +199,7 @@ def test_a_kill_leaves_what_was_committed(tmp_path: Path, monkeypatch: Patch) ->
     monkeypatch.setattr(os, "replace", copied)
     write(whole, range(3, 6))
     assert uncommitted(left, 1)
+    assert len(listed(left)) == 2 + 3
     assert len(read_dataset(left).episodes) == 3
     with DatasetWriter(left, SPEC):
         pass

@@ -18,6 +18,7 @@ from pathlib import Path
 import mujoco
 import mujoco_warp
 import torch
+from bench_physics import bare_step
 from common import count, spread
 
 from mjstack.bench.timing import lost_worlds, timed
@@ -87,7 +88,7 @@ def measure(path: Path, cfg: Config, args: argparse.Namespace) -> list[str]:
     sim = build(model, cfg, sizes)
     settle(sim, controls[:_SETTLE])
     state = snapshot(sim)
-    bare = sim.bare_step()
+    bare = bare_step(sim)
 
     def bare_steps() -> None:
         for _ in range(_DECIMATION):

@@ -23,8 +23,11 @@ from mjstack.episodes.stage import Progress, Stage
 from mjstack.errors import MjstackError
 from mjstack.report.table import Table
 from mjstack.sim import Simulation, resolve_device
+from mjstack.sim.compiling import compile_step
 from mjstack.sim.fused.step import StepPlan
+from mjstack.sim.graph import StepGraph
 from mjstack.sim.mjwarp import MjwarpSimulation
+from mjstack.sim.mujoco_warp import mjw, torch_stream_scope
 from mjstack.sim.sizes import resolve_env_sizes
 
 BARE = "bare mujoco_warp.step"
@@ -61,7 +64,7 @@ def _measure_plans(
         plans = {"stock": StepPlan(), "arranged": StepPlan("arranged"), "fused": sim.plan}
     state, targets = (_random_targets if random else _task_targets)(stage, sim, steps)
     columns = torch.as_tensor(stage.index.ctrl, device=sim.device)
-    bare = sim.bare_step()
+    bare = bare_step(sim)
 
     def bare_steps() -> None:
         for _ in range(decimation):
@@ -85,12 +88,30 @@ def _measure_plans(
             seconds = timed(sim, partial(play, step))
             if repetition:
                 milliseconds.append(1e3 * seconds / (len(targets) * decimation))
+            sim.latch()  # a bare step counts nothing
             if bool(lost_worlds(sim).any()):
                 raise MjstackError(
                     f"{name}: physics was lost, and a figure would be void. Run gates=[capacity]."
                 )
+            graph = bare if name == BARE else sim.graph_of(decimation)
+            if sim.device.type == "cuda" and cfg.graph != "off" and not graph.captured:
+                raise MjstackError(f"{name}: it ran eagerly. graph=off measures it like that.")
         stage.progress.advance("repetitions", repetition, repetitions)
     return times
+
+
+def bare_step(sim: MjwarpSimulation) -> StepGraph:
+    """One plain ``mujoco_warp.step``, captured and replayed with nothing else: what the rest is
+    measured by.
+    """
+    assert sim.sizes is not None
+    compile_step(sim.model, sim._m, sim.sizes, sim._device, StepPlan())
+
+    def work() -> None:
+        with torch_stream_scope(sim._device):
+            mjw.step(sim._m, sim._d)
+
+    return StepGraph(work, sim.device, sim._graph_mode, name="a bare step", scratch=False)
 
 
 def _task_targets(stage: Stage, sim: Simulation, steps: int) -> tuple[State, list[torch.Tensor]]:

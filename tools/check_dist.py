@@ -89,7 +89,7 @@ def check_versions() -> str:
     """The version, which is the same wherever it is written."""
     version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     for file, line in {
-        "mjstack/__init__.py": f'__version__ = "{version}"',
+        "mjstack/version.py": f'__version__ = "{version}"',
         "CITATION.cff": f"version: {version}",
         "CHANGELOG.md": f"## {version}",
     }.items():

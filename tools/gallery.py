@@ -22,12 +22,13 @@ CLIPS = [
     *((f"{task}-{arm}", "", [f"task={task}", f"robot={arm}"]) for task in ("stack", "box", "reach")
       for arm in ARMS),
     *((f"{task}-{arm}", task, [f"task={task}", f"robot={arm}"])
-      for task in ("slot", "peg", "push", "tower") for arm in ARMS),
+      for task in ("slot", "peg", "push", "tower", "drawer") for arm in ARMS),
     ("stack-scara", "scara", ["robot=scara"]),
     *((f"{task}-panda", "panda", ["robot=panda", "model=menagerie", f"task={task}"])
       for task in ("stack", "box", "reach")),
 ]  # fmt: skip
 NEAR = ("{pos: [0.42, 0.36, 0.36], target: [-0.1, 0.0, 0.06]}", 38.0)  # m; degrees
+SIDE = ("{pos: [-0.05, -0.55, 0.4], target: [-0.02, 0.0, 0.05]}", 38.0)  # of what opens to the arm
 FAR = ("{pos: [0.75, 0.7, 0.75], target: [-0.25, 0.0, 0.15]}", 38.0)  # of arms a metre long
 LONG = ("panda", "scara")
 
@@ -74,6 +75,8 @@ def fit(path: Path) -> None:
 def make_clip(path: Path, args: list[str]) -> None:
     """Four worlds side by side, as a camera of the scene sees them."""
     pose, fovy = FAR if any(arm in path.stem for arm in LONG) else NEAR
+    if "drawer" in path.stem:
+        pose, fovy = SIDE
     with tempfile.TemporaryDirectory() as folder:
         camera = [f"scene.cameras.front.pose={pose}", f"scene.cameras.front.fovy={fovy}"]
         size = ["scene.cameras.front.size=[240,320]", "job.width=320", "job.fps=5"]

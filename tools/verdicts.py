@@ -48,6 +48,7 @@ RUNS = {
     "push": f"--config-dir=examples/push/conf task=push {_BOTH} nworld=8",
     "rebot_push": f"--config-dir=examples/push/conf task=push robot=rebot {_BATCH} nworld=8",
     "tower": f"--config-dir=examples/tower/conf task=tower {_BOTH} nworld=4",
+    "drawer": f"--config-dir=examples/drawer/conf task=drawer {_BOTH} nworld=8",
     "scara": f"--config-dir=examples/scara/conf robot=scara {_BOTH} nworld=8",
     # MJWarp
     "warp_so101_stack": f"{_WARP} {_BATCH} nworld=8",

@@ -6,20 +6,16 @@ import torch
 
 from mjstack.config.fields import spec
 from mjstack.managers import EnvView
-from mjstack.mdp.geometry import pose_w
+from mjstack.mdp.observation import object_to_object
 from mjstack.tasks.check import EpisodeCheck, Rule
-from mjstack.tasks.parts import AtRest, InWindow, on_table, released
+from mjstack.tasks.parts import AtRest, InWindow, in_zone, on_table, released, upright
 from mjstack.tasks.view import Step
-
-
-def to_hole(env: EnvView) -> torch.Tensor:
-    """From the peg to the hole [m], shape ``(nworld, 3)``."""
-    return pose_w(env, "hole")[:, :3] - pose_w(env, "peg")[:, :3]
 
 
 def near(env: EnvView, *, scale: float) -> torch.Tensor:
     """Reward for a peg near the hole: ``1 - tanh(distance / scale)``, scale in m."""
-    return 1.0 - torch.tanh(torch.linalg.vector_norm(to_hole(env)[:, :2], dim=1) / scale)
+    away = object_to_object(env, a="peg", b="hole")
+    return 1.0 - torch.tanh(away[:, :2].norm(dim=1) / scale)
 
 
 class PegCheck(EpisodeCheck):
@@ -30,23 +26,30 @@ class PegCheck(EpisodeCheck):
         """When an episode succeeded."""
 
         within: float = spec(unit="m", gt=0.0)
+        gap: float = spec(unit="m", gt=0.0)
+        tilt_deg: float = spec(unit="deg", gt=0.0)
         window: int = spec(unit="steps", ge=2)
 
     def build(self) -> list[Rule]:
         """The rules, in the order of their bits."""
         self.objects = ["peg"]
-        w = self.t.window
+        t = self.t
+        self.over = in_zone("peg", "hole", low=[-t.within] * 2, high=[t.within] * 2)
+        self.stands = on_table("peg", gap=t.gap) & upright("peg", tilt_deg=t.tilt_deg)
+        hole = InWindow("IN_HOLE", "peg not in the hole", self.over, t.window, measure=self.trace)
+        hole.limits[0]["off_m"] = (0.0, t.within)
         return [
-            InWindow("IN_HOLE", "peg not in the hole", self.placed, w, measure=self.trace),
-            InWindow("BOTTOM", "peg not at the bottom", on_table("peg", gap=0.002), w),
-            InWindow("RELEASED", "peg not released", released("peg", open_fraction=0.8), w),
-            AtRest(w, speed=0.05, position=0.005, rotation_deg=3.0),
+            hole,
+            InWindow("BOTTOM", "peg does not stand at the bottom", self.stands, t.window),
+            InWindow("RELEASED", "peg not released", released("peg", open_fraction=0.8), t.window),
+            AtRest(t.window, speed=0.05, position=0.005, rotation_deg=3.0),
         ]
 
     def placed(self, step: Step) -> torch.Tensor:
-        """Whether the peg is over the hole or in it, shape ``(nworld, 1)``."""
-        return (to_hole(step.view.env)[:, :2].abs() <= self.t.within).all(dim=1, keepdim=True)
+        """Whether the peg stands in the hole, shape ``(nworld, 1)``."""
+        return (self.over & self.stands)(step)[:, None]
 
     def trace(self, step: Step) -> dict[str, torch.Tensor]:
         """Values for a replay."""
-        return {"off_m": to_hole(step.view.env)[:, :2].abs().amax(1)}
+        away = object_to_object(step.view.env, a="peg", b="hole")
+        return {"off_m": away[:, :2].abs().amax(1), "tilt_deg": step.tilt("peg")}

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from mjstack.config import load_config
-from mjstack.managers import EnvView, random_uniform, repeatable, uses_fields
+from mjstack.managers import EnvView, random_uniform, uses_fields
 from mjstack.scene.build import build_model
 
 # The figures of group actuator, and the constants that MuJoCo's compiler makes of the armature
@@ -14,7 +14,6 @@ FIELDS = ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange", "dof_ar
 FIELDS += ("dof_frictionloss", "dof_damping", "dof_invweight0", "body_invweight0")
 
 
-@repeatable
 @uses_fields(*FIELDS)
 class AnyServo:
     """Draws one of some choices of ``actuator`` for all joints of a world."""

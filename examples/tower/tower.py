@@ -6,7 +6,7 @@ import torch
 
 from mjstack.config.fields import spec
 from mjstack.tasks.check import EpisodeCheck, Rule
-from mjstack.tasks.parts import AtRest, InWindow, on_table, on_top, on_top_of, released
+from mjstack.tasks.parts import AtRest, InWindow, flat, on_table, on_top, on_top_of, released
 from mjstack.tasks.view import Step
 
 ONTO = {"red": "blue", "green": "red"}
@@ -20,6 +20,7 @@ class TowerCheck(EpisodeCheck):
         """When an episode succeeded."""
 
         xy_err: float = spec(unit="m", gt=0.0)
+        tilt_deg: float = spec(unit="deg", gt=0.0)
         window: int = spec(unit="steps", ge=2)
 
     def build(self) -> list[Rule]:
@@ -27,6 +28,7 @@ class TowerCheck(EpisodeCheck):
         near = {"xy_err": self.t.xy_err, "dz_min": 0.035, "dz_max": 0.055}  # m
         self.stands = {"blue": on_table("blue", gap=0.005)}
         self.stands |= {each: on_top(each, onto, **near) for each, onto in ONTO.items()}
+        self.stands = {n: c & flat(n, tilt_deg=self.t.tilt_deg) for n, c in self.stands.items()}
         self.objects = list(self.stands)
         w = self.t.window
         rules = [InWindow(n.upper(), f"{n} not in place", c, w) for n, c in self.stands.items()]

@@ -1,13 +1,25 @@
 """Gymnasium's interfaces with NumPy arrays: worlds as a `VectorEnv`, or one as an `Env`."""
 
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 from numpy import ndarray
 
-from mjstack.envs import Env
+from mjstack.adapters.ids import register_env
+from mjstack.config import load_config
+from mjstack.config.schema import CameraCfg
+from mjstack.envs import Env, build_env
 from mjstack.errors import ArgumentError, ConfigError, MissingExtra, require_names
+from mjstack.managers import offers
+from mjstack.report.picture import Window, opens_windows
+from mjstack.rng import check_seed
+from mjstack.scene import build_model
+from mjstack.sim import StateRenderer
+from mjstack.sim.cameras import with_outputs
 
 try:
     import gymnasium
@@ -17,8 +29,10 @@ try:
 except ImportError as error:
     raise MissingExtra("mjstack.adapters.gymnasium", str(error.name), "train") from error
 
+__all__ = ["GymnasiumEnv", "GymnasiumVectorEnv", "make", "register_env"]
 Observation = ndarray | dict[str, ndarray]
 Info = dict[str, Any]
+_MODES = ("rgb_array", "human")  # of rendering
 
 
 class GymnasiumVectorEnv(VectorEnv):
@@ -37,23 +51,53 @@ class GymnasiumVectorEnv(VectorEnv):
     Actions beyond ``action_space`` are passed on as they are;
     ``gymnasium.wrappers.vector.ClipAction`` clips them.
 
+    With ``render_mode="rgb_array"`` `render` returns a tuple with an image of each world by the
+    first camera; ``human`` shows the first world in MuJoCo's viewer.
+
     Attributes:
         inner: The environment.
         group: The observation group that is returned, as one array; None for all and the images,
             in a dict.
+        seen: Positions and model fields of the state that `render` shows; None for the present one.
     """
 
-    def __init__(self, env: Env, *, group: str | None = "policy") -> None:
-        """Take over an environment, and close it when it is closed.
+    def __init__(
+        self,
+        env: Env,
+        *,
+        group: str | None = "policy",
+        render_mode: str | None = None,
+        cameras: Mapping[str, CameraCfg] | None = None,
+    ) -> None:
+        """Take over an environment, and close it when it is closed. The group and the render mode,
+        ``rgb_array``, ``human`` or None, are as of the class; ``cameras`` are those to render by,
+        if not those of its configuration.
 
         Raises:
-            UnknownName: There is no such observation group.
-            ConfigError: With images, a camera does not draw the ends of episodes.
+            MjstackError: This machine has no display, the scene no camera, the environment no such
+                group, or, with images, a camera does not draw the ends of episodes.
         """
         self.inner = env
         self.group = group
         self.num_envs = env.nworld
-        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
+        self.render_mode = render_mode
+        self._film = [*(cameras or env.cfg.scene.cameras).items()][:1]
+        self._renderer: StateRenderer | None = None
+        self._window: Window | None = None
+        self.seen: tuple[torch.Tensor, Info] | None = None
+        if render_mode == "rgb_array" and not self._film:
+            fix = "Build the environment with cameras=front"
+            raise ArgumentError("render_mode", repr(render_mode), "a scene with a camera", fix)
+        modes = _MODES[not self._film : 1 + opens_windows()]
+        if render_mode not in (None, *modes):
+            display = os.environ.get("DISPLAY", "not set")
+            expected = f"None, or one of {', '.join(modes)} on this display (DISPLAY={display})"
+            raise ArgumentError("render_mode", repr(render_mode), expected)
+        self.metadata = {
+            "autoreset_mode": AutoresetMode.SAME_STEP,
+            "render_modes": modes,
+            "render_fps": round(1.0 / env.cfg.timing.decision_dt),
+        }
         boxes: dict[str, spaces.Space] = {
             name: spaces.Box(-np.inf, np.inf, (dim,), np.float32)
             for name, dim in env.observation_manager.group_dims.items()
@@ -95,16 +139,18 @@ class GymnasiumVectorEnv(VectorEnv):
         require_names("reset option", rest, ("reset_mask",))
         if mask is not None:
             mask = torch.as_tensor(mask, device=self.inner.device)
+        if seed is not None:  # before any world is reset; Gymnasium takes Python's integers alone
+            seed = check_seed(seed, masked=mask is not None)
         obs, _ = self.inner.reset(seed=seed, mask=mask)
-        # After the environment, whose message about a wrong seed says more.
         super().reset(seed=seed)
+        self._show()
         return _numpy(obs, self.group), {}
 
     def step(self, actions: ndarray) -> tuple[Observation, ndarray, ndarray, ndarray, Info]:
         """Advance every world by one control interval.
 
         Args:
-            actions: Shape ``(num_envs, action_dim)``, float32.
+            actions: Shape ``(num_envs, action_dim)``, numbers.
 
         Returns:
             Observations ``(num_envs, dim)``, float32; rewards ``(num_envs,)``, float32;
@@ -125,11 +171,36 @@ class GymnasiumVectorEnv(VectorEnv):
                 last = {"final_obs": _row(final, world), "final_info": info}
                 infos = self._add_info(infos, last, world)
         rewards, ends, cuts = (part.cpu().numpy() for part in (reward, terminated, truncated))
+        self._show()
         return _numpy(obs, self.group), rewards, ends, cuts, infos
 
+    def render(self) -> tuple[ndarray, ...] | None:
+        """Images of all worlds, or None; see the class."""
+        env = self.inner
+        qpos, fields = self.seen or (env.sim.qpos, env.sim.fields)
+        if self.render_mode is None:
+            fix = "Give it to gymnasium.make"
+            raise ArgumentError("render_mode", None, f"one of {', '.join(_MODES)}", fix)
+        if self.render_mode == "human":
+            self._window = self._window or Window(env.sim.model, env.cfg.timing.decision_dt)
+            self._window.show(qpos[0].cpu().numpy())
+            return None
+        if self._renderer is None:
+            cameras = with_outputs(dict(self._film), ["rgb"])
+            cfg = replace(env.cfg, scene=replace(env.cfg.scene, cameras=cameras))
+            self._renderer = StateRenderer(env.sim.model, cfg, env.nworld, fields=[*fields])
+        (images,) = self._renderer.draw(qpos, fields).values()
+        return tuple(images.to("cpu", copy=True).numpy())
+
+    def _show(self) -> None:
+        if self.render_mode == "human":
+            self.render()
+
     def close_extras(self, **kwargs: Any) -> None:
-        """Give the simulation's threads and buffers back."""
-        self.inner.close()
+        """Give the simulation's threads and buffers back, and close the viewer."""
+        for opened in (self._renderer, self._window, self.inner):
+            if opened is not None:
+                opened.close()
 
 
 class GymnasiumEnv(gymnasium.Env):
@@ -137,24 +208,27 @@ class GymnasiumEnv(gymnasium.Env):
 
     An episode ends when ``step`` says so; then call ``reset``. ``info`` has ``success``, bool.
 
+    `render` is that of `GymnasiumVectorEnv`, of one world: an image, or the viewer. After the step
+    that ends an episode it shows the state before that step.
+
     Attributes:
         inner: The environment.
         group: The observation group that is returned, as one array; None for all, in a dict.
     """
 
-    def __init__(self, env: Env, *, group: str | None = "policy") -> None:
-        """Take over an environment of one world, and close it when it is closed.
-
-        Raises:
-            MjstackError: It has more worlds than one, or no such observation group.
+    def __init__(self, env: Env, **options: Any) -> None:
+        """Take over an environment of one world, and close it when it is closed; options and errors
+        as of `GymnasiumVectorEnv`. More worlds are an ArgumentError.
         """
         if env.nworld != 1:
             fix = "Build it with nworld=1, or use GymnasiumVectorEnv"
             raise ArgumentError("env", f"{env.nworld} worlds", "one", fix)
         self.inner = env
-        self.group = group
-        self._worlds = GymnasiumVectorEnv(env, group=group)
-        self.metadata = {"render_modes": [], "render_fps": round(1.0 / env.cfg.timing.decision_dt)}
+        self._worlds = GymnasiumVectorEnv(env, **options)
+        self.group = self._worlds.group
+        self.render_mode = self._worlds.render_mode
+        self.metadata = dict(self._worlds.metadata)
+        del self.metadata["autoreset_mode"]
         self.observation_space = self._worlds.single_observation_space
         self.action_space = self._worlds.single_action_space
         # What the next episode has shown first: it starts in the step that ends one
@@ -163,56 +237,82 @@ class GymnasiumEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: Info | None = None
     ) -> tuple[Observation, Info]:
-        """Start a new episode.
-
-        Args:
-            seed: Starts with the first episode of this seed. Without one, the next episode under
-                the seed that is in use, at first the configured one.
-            options: None are known.
-
-        Returns:
-            The observation, ``(dim,)``, float32, and an empty dict.
-
-        Raises:
-            MjstackError: The seed or an option cannot be used.
+        """Start a new episode: the first one of a seed, or the next one as of
+        `GymnasiumVectorEnv.reset`. No options are known. Returns the observation, ``(dim,)``,
+        float32, and an empty dict.
         """
         require_names("reset option", options or (), ())
         first = self._first
+        self._worlds.seen = None
         if seed is not None or first is None:
             first, _ = self._worlds.reset(seed=seed)
         self._first = None
-        super().reset(seed=seed)
+        super().reset(seed=None if seed is None else check_seed(seed))
         return _row(first, 0), {}
 
     def step(self, action: ndarray) -> tuple[Observation, float, bool, bool, Info]:
-        """Advance the world by one control interval.
-
-        Args:
-            action: Shape ``(action_dim,)``, float32.
-
-        Returns:
-            The observation ``(dim,)``, float32, the reward, whether the episode terminated, whether
-            it was truncated, and the info, see the class.
-
-        Raises:
-            MjstackError: The action cannot be used, the episode has ended, or something went wrong
-                in the world.
+        """Advance the world by one control interval, as `GymnasiumVectorEnv.step` does, by an
+        action ``(action_dim,)``: observation ``(dim,)``, float32, reward, whether the episode
+        terminated, whether it was truncated, and the info, see the class. A MjstackError as there,
+        or if the episode has ended.
         """
         if self._first is not None:
             value = "step() after the end of an episode"
             raise ArgumentError("env", value, "reset() first", "Call env.reset()")
         actions = _array(action, self.action_space)[None]
+        sim = self.inner.sim
+        before = sim.qpos.clone(), {name: field.clone() for name, field in sim.fields.items()}
+        self._worlds.seen = None
         obs, reward, terminated, truncated, infos = self._worlds.step(actions)
         seen = _row(obs, 0)
         if "final_obs" in infos:
             self._first = obs
             seen = infos["final_obs"][0]
+            self._worlds.seen = before
         info = {"success": bool(infos["success"])}
         return seen, float(reward[0]), bool(terminated), bool(truncated), info
 
+    def render(self) -> ndarray | None:
+        """An image ``(height, width, 3)``, uint8, or None; see the class."""
+        images = self._worlds.render()
+        return images[0] if images else None
+
     def close(self) -> None:
         """Give the simulation's threads and buffers back."""
-        self.inner.close()
+        self._worlds.close()
+
+
+@offers(metadata={"render_modes": _MODES})
+def make(
+    num_envs: int | None = None,
+    *,
+    choices: Sequence[str] = (),
+    overrides: Sequence[str] = (),
+    config_dir: str | os.PathLike | None = None,
+    **options: Any,
+) -> GymnasiumVectorEnv | GymnasiumEnv:
+    """The environment of ``gymnasium.make`` or, with a number of worlds, of ``make_vec``.
+
+    Args:
+        num_envs: Number of worlds.
+        choices: Overrides of the registered id.
+        overrides: More of them, such as ``["reset=randomized", "sim=native"]``.
+        config_dir: A folder with more choices, as of `mjstack.make_env`.
+        options: ``group`` and ``render_mode`` of `GymnasiumVectorEnv`. Without a camera in the
+            scene, it is seen by ``cameras=front``, which changes no observation.
+
+    Raises:
+        MjstackError: An override or an option cannot be used.
+    """
+    words = [*choices, *overrides, f"nworld={1 if num_envs is None else num_envs}"]
+    cfg = filmed = load_config(words, config_dir=config_dir)
+    if options.get("render_mode") and not cfg.scene.cameras:
+        filmed = load_config([*words, "cameras=front"], config_dir=config_dir)
+    env = build_env(cfg, model=build_model(filmed))  # with what pictures need
+    kind = GymnasiumEnv if num_envs is None else GymnasiumVectorEnv
+    made = kind(env, cameras=filmed.scene.cameras, **options)
+    made.metadata["render_modes"] = _MODES[: 1 + opens_windows()]  # a camera is added for one
+    return made
 
 
 def _numpy(obs: dict[str, torch.Tensor], group: str | None) -> Observation:
@@ -234,7 +334,7 @@ def _row(obs: Observation, world: int) -> Observation:
 
 
 def _array(action: Any, space: spaces.Space) -> ndarray:
-    expected = f"a float32 array of shape {space.shape}"
+    expected = f"an array of numbers of shape {space.shape}"
     try:
         array = np.asarray(action, np.float32)
     except (TypeError, ValueError) as error:

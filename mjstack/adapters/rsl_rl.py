@@ -39,15 +39,9 @@ class RslRlVecEnv(VecEnv):
     """
 
     def __init__(self, env: Env, *, log_interval: int = 24) -> None:
-        """Take over an environment and start its first episodes.
-
-        Args:
-            env: The environment.
-            log_interval: Steps between two readings of the episode statistics, each of which waits
-                for the device. The runner's ``num_steps_per_env`` gives one reading per iteration.
-
-        Raises:
-            MjstackError: The worlds cannot start.
+        """Take over an environment and start its first episodes; a MjstackError if they cannot.
+        ``log_interval`` is the number of steps between two readings of the episode statistics, each
+        of which waits for the device. The runner's ``num_steps_per_env`` gives one per iteration.
         """
         self.env = env
         self.num_envs: int = env.nworld
@@ -75,11 +69,7 @@ class RslRlVecEnv(VecEnv):
         self.env.episode_step.copy_(value - value % self.env.cfg.timing.policy_decimation)
 
     def get_observations(self) -> TensorDict:
-        """The current observations.
-
-        Returns:
-            Every group, each ``(num_envs, dim)``, float32.
-        """
+        """The current observations: every group, each ``(num_envs, dim)``, float32."""
         groups = self.env.observation_manager.groups
         return self._tensordict({name: group.clone() for name, group in groups.items()})
 
@@ -89,7 +79,7 @@ class RslRlVecEnv(VecEnv):
         """Advance every world by one decision; worlds that end are reset in the same step.
 
         Args:
-            actions: Shape ``(num_envs, num_actions)``, float32.
+            actions: Shape ``(num_envs, num_actions)``, float32 or float64.
 
         Returns:
             ``observations``: every group, each ``(num_envs, dim)``, float32.

@@ -24,18 +24,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mjstack.bench.timing import (
-    NO_METER,
-    WARM_UP,
-    EnergyMeter,
-    Measurement,
-    describe_lost,
-    lost_worlds,
-    settled,
-    steps_that_fit,
-    time_budget,
-    timed,
-)
+from mjstack.bench import timing
+from mjstack.bench.timing import EnergyMeter, Measurement
 from mjstack.config.functions import offered
 from mjstack.envs import Env
 from mjstack.envs.buffers import Advance
@@ -47,12 +37,8 @@ _COST = 4.0  # of a repetition over that of its whole steps from the start, when
 
 
 def measure_env_step(env: Env, name: str, advance: Advance) -> Measurement:
-    """Play random actions in interleaved repetitions.
-
-    Args:
-        env: The environment; its ``cfg.gate.throughput`` says how many, and how long they take.
-        name: The measurement's name.
-        advance: Shows progress.
+    """Play random actions in interleaved repetitions, as many as the environment's
+    ``cfg.gate.throughput`` says.
 
     Returns:
         Samples of the whole step (``ms_per_env_step``), its physics and its managers.
@@ -68,19 +54,19 @@ def measure_env_step(env: Env, name: str, advance: Advance) -> Measurement:
     t = env.cfg.gate.throughput
     parts = _Parts(env, t.action_share)
     seconds = _COST * (t.repetitions + 1) * parts.warm_up()
-    steps = steps_that_fit(t.env_steps, time_budget(env.cfg, sim), seconds)
+    steps = timing.steps_that_fit(t.env_steps, timing.time_budget(env.cfg, sim), seconds)
 
     # The repetitions; the first one warms up
     times: list[list[float]] = []
     ended = 0.0
     meter = EnergyMeter(str(env.device))
-    parts.play(steps, NO_METER)
+    parts.play(steps, timing.NO_METER)
     for repetition in range(t.repetitions):
         spent, episodes = parts.play(steps, meter)
         ended += episodes
         times.append(spent)
         advance(f"{name}, repetitions", repetition + 1, t.repetitions)
-        if settled(env.cfg, [whole / physics for whole, physics, *_ in times]):
+        if timing.settled(env.cfg, [whole / physics for whole, physics, *_ in times]):
             break  # the times themselves are of other states each
 
     # The result
@@ -97,7 +83,7 @@ def measure_env_step(env: Env, name: str, advance: Advance) -> Measurement:
         "residual_ms_per_step": ms * (whole - physics - managers - images),
     }
     out.facts["episodes_ended"] = int(ended)
-    out.problem = describe_lost(parts.lost) or parts.problem or out.problem
+    out.problem = timing.describe_lost(parts.lost) or parts.problem or out.problem
     cameras = env.cameras.cameras if env.cameras is not None else {}
     out.headline = f"{out.median('env_steps_per_s'):,.0f} env-steps/s"
     if cameras:
@@ -121,11 +107,6 @@ def measure_env_step(env: Env, name: str, advance: Advance) -> Measurement:
 class _Parts:
     """Plays the parts of a repetition, each from the same state. The next repetition goes on where
     the whole steps ended.
-
-    Attributes:
-        graphs: Physics, managers and, with cameras, images, as `Env.parts` has them.
-        lost: Worlds whose physics was lost or not stepped, shape ``(nworld,)``, bool.
-        problem: The terminations by which physics was lost in the whole steps; empty where none.
     """
 
     def __init__(self, env: Env, share: float) -> None:
@@ -137,8 +118,8 @@ class _Parts:
         self._span = share * (high - low)
         self._low = 0.5 * (low + high - self._span)
         self.on_cuda = env.device.type == "cuda"
-        self.lost = torch.zeros(env.nworld, dtype=torch.bool, device=env.device)
-        self.problem = ""
+        self.lost = torch.zeros(env.nworld, dtype=torch.bool, device=env.device)  # or not stepped
+        self.problem = ""  # the terminations by which physics was lost in the whole steps
 
     def warm_up(self) -> float:
         """Start worlds at random ages, compile and capture; return the seconds of a step."""
@@ -146,11 +127,13 @@ class _Parts:
         env.reset(seed=env.cfg.seed)
         ages = torch.randint(env.max_episode_steps, (env.nworld,), generator=self._generator)
         env.episode_step.copy_(ages)
-        seconds = [timed(env.sim, partial(env.step, action)) for action in self._actions(WARM_UP)]
+        actions = self._actions(timing.WARM_UP)
+        seconds = [timing.timed(env.sim, partial(env.step, action)) for action in actions]
+        # Physics, managers and, with cameras, images
         self.graphs: Sequence[StepGraph] = env.parts() if env.images else env.parts()[:2]
         if self.on_cuda:  # a repetition may be too short to warm them up
             for graph in self.graphs:
-                for _ in range(WARM_UP):
+                for _ in range(timing.WARM_UP):
                     graph()
         self._start = snapshot(env.sim)
         return seconds[-1]
@@ -192,7 +175,7 @@ class _Parts:
         # The whole step
         restore(sim, start)
         env.read_statistics()
-        times = [timed(sim, play_whole, meter)]
+        times = [timing.timed(sim, play_whole, meter)]
         counted = env.read_statistics()
         self._find_losses(counted)
         self._start = snapshot(sim)
@@ -200,16 +183,16 @@ class _Parts:
 
         # Physics alone, with the same joint targets
         restore(sim, start)
-        times.append(timed(sim, play_physics))
-        self.lost |= lost_worlds(sim, steps * env.cfg.timing.decimation)
+        times.append(timing.timed(sim, play_physics))
+        self.lost |= timing.lost_worlds(sim, steps * env.cfg.timing.decimation)
 
         # The managers alone
         restore(sim, start)
         self._set_ages(ages)
-        times.append(timed(sim, play_managers))
+        times.append(timing.timed(sim, play_managers))
         env.faults.raise_first()
         self._set_ages(end_ages)
-        times.append(timed(sim, play_images) if images else 0.0)
+        times.append(timing.timed(sim, play_images) if images else 0.0)
         return times, counted["episodes"]
 
     def _set_ages(self, ages: Tensor) -> None:

@@ -1,82 +1,23 @@
-"""Physics steps with the object in hand, on MJWarp beside bare ones; the whole judged episode."""
+"""Physics steps with the object in hand, and the whole judged episode."""
 
 import statistics
 import time
-from typing import TYPE_CHECKING, cast
+from functools import partial
 
 import numpy as np
 
-from mjstack.bench.timing import (
-    NO_METER,
-    WARM_UP,
-    EnergyMeter,
-    EnergyObserver,
-    Measurement,
-    describe_lost,
-    lost_worlds,
-    settled,
-    steps_that_fit,
-    time_budget,
-    timed,
-)
+from mjstack.bench import timing
+from mjstack.bench.timing import EnergyMeter, Measurement
 from mjstack.config.schema import Backend
 from mjstack.episodes.rollout import Episode, State, restore, rollout, snapshot
 from mjstack.episodes.stage import Stage
-from mjstack.errors import first_line, name_worlds
+from mjstack.errors import name_worlds
 from mjstack.mdp.geometry import objects_in_hand
 from mjstack.sim import Simulation
-from mjstack.sim.graph import StepGraph
-
-if TYPE_CHECKING:
-    from mjstack.sim.mjwarp import MjwarpSimulation
-
-
-class HeldPhysics:
-    """Physics under a held joint target, timed again and again from one state.
-
-    Attributes:
-        lost: Worlds that overflowed, diverged or were not stepped in some repetition, shape
-            ``(nworld,)``, bool.
-        bare: What plays; None: the simulation's own steps.
-    """
-
-    def __init__(
-        self, sim: Simulation, state: State, decimation: int, bare: StepGraph | None = None
-    ) -> None:
-        """Put the worlds into the state in which every repetition starts."""
-        self.sim = sim
-        self.state = state
-        self.decimation = decimation
-        self.bare = bare
-        restore(sim, state)
-        self.lost = lost_worlds(sim)
-
-    def warm_up(self) -> float:
-        """Compile and capture the step; return the seconds that one takes then."""
-        return [timed(self.sim, lambda: self._play(1)) for _ in range(WARM_UP)][-1]
-
-    def play(self, steps: int, meter: EnergyMeter = NO_METER) -> float:
-        """Seconds that some control steps take from the state."""
-        restore(self.sim, self.state)
-        seconds = timed(self.sim, lambda: self._play(steps), meter)
-        if self.bare is None:
-            self.lost |= lost_worlds(self.sim, steps * self.decimation)
-        else:  # which counts no steps
-            cast("MjwarpSimulation", self.sim).latch()
-            self.lost |= lost_worlds(self.sim)
-        return seconds
-
-    def _play(self, steps: int) -> None:
-        for _ in range(steps * self.decimation if self.bare else steps):
-            if self.bare:
-                self.bare()
-            else:
-                self.sim.step(self.decimation)
 
 
 def measure_physics(stage: Stage, sim: Simulation, carry: State | None = None) -> Measurement:
-    """Measure physics steps under a held joint target, the object in hand; on MJWarp in turns with
-    bare steps from the same state.
+    """Measure physics steps under a held joint target, the object in hand.
 
     A grasp may be empty at the start, about to be retried. The number of full ones is reported, and
     there is no figure if they are less than half. The figure includes the rest of a simulation's
@@ -85,7 +26,10 @@ def measure_physics(stage: Stage, sim: Simulation, carry: State | None = None) -
     """
     t = stage.cfg.gate.throughput
     out = Measurement(name="physics")
-    physics = HeldPhysics(sim, carry_start(stage, sim, carry), stage.cfg.timing.decimation)
+    decimation = stage.cfg.timing.decimation
+    state = carry_start(stage, sim, carry)
+    restore(sim, state)
+    lost = timing.lost_worlds(sim)
     carried = stage.phase(t.from_phase).carried
     full = sim.nworld
     if carried >= 0:  # both jaws press on the phase's object
@@ -97,90 +41,64 @@ def measure_physics(stage: Stage, sim: Simulation, carry: State | None = None) -
             return out
 
     # The repetitions
-    bare: HeldPhysics | None = None
-    bare_problem = ""
-    seconds = physics.warm_up()
-    if sim.backend == "mjwarp":
-        try:
-            step = cast("MjwarpSimulation", sim).bare_step()
-            bare = HeldPhysics(sim, physics.state, physics.decimation, step)
-            seconds += bare.warm_up()
-        except Exception as error:  # our figure stands without it
-            bare = None
-            bare_problem = first_line(error)
-    steps = steps_that_fit(t.steps, time_budget(stage.cfg, sim), t.repetitions * seconds)
+    def play(count: int) -> None:
+        for _ in range(count):
+            sim.step(decimation)
+
+    seconds = [timing.timed(sim, partial(play, 1)) for _ in range(timing.WARM_UP)][-1]
+    budget = timing.time_budget(stage.cfg, sim)
+    steps = timing.steps_that_fit(t.steps, budget, t.repetitions * seconds)
     meter = EnergyMeter(str(sim.device))
     times: list[float] = []
-    bare_times: list[float] = []
     for repetition in range(t.repetitions):
-        if bare is not None:
-            bare_times.append(bare.play(steps))
-        times.append(physics.play(steps, meter))  # last: it leaves the peaks
+        restore(sim, state)
+        times.append(timing.timed(sim, partial(play, steps), meter))
+        lost |= timing.lost_worlds(sim, steps * decimation)
         stage.progress.advance("physics, repetitions", repetition + 1, t.repetitions)
-        if settled(stage.cfg, times):
+        if timing.settled(stage.cfg, times):
             break
 
     # The result
-    graph = sim.graph_of(physics.decimation)
+    graph = sim.graph_of(decimation)
     captured = graph is not None and graph.captured
     out.add_repetitions(sim, stage.cfg, times, steps, meter, graph, captured=captured, whole=False)
     out.facts |= {
         "peak_contacts_per_world": int(sim.peak_contacts.max()),
         "peak_constraint_rows_per_world": int(sim.peak_constraints.max()),
     }
-    out.problem = describe_lost(physics.lost) or out.problem
+    out.problem = timing.describe_lost(lost) or out.problem
     out.headline = (
         f"{out.median('world_steps_per_s'):,.0f} world-steps/s,"
         f" {out.median('ms_per_batched_step'):.3g} ms per step of {sim.nworld} worlds"
     )
     if full < sim.nworld:
         out.headline += f" ({sim.nworld - full} of them with an empty grasp)"
-    if bare is not None and bare.bare is not None:
-        eager = sim.device.type == "cuda" and stage.cfg.graph != "off" and not bare.bare.captured
-        bare_problem = "they could not be captured" if eager else describe_lost(bare.lost)
-    if bare_problem:
-        out.notes["speedup_over_bare"] = f"not measured, bare steps: {bare_problem}"
-    elif bare_times:
-        out.samples["bare_ms_per_batched_step"] = [
-            1e3 * seconds / (steps * physics.decimation) for seconds in bare_times
-        ]
-        ratios = [slow / fast for slow, fast in zip(bare_times, times, strict=True)]
-        out.samples["speedup_over_bare"] = ratios
-        out.headline += f", {statistics.median(ratios):.3g} times bare mujoco_warp.step"
     return out
 
 
 def carry_start(stage: Stage, sim: Simulation, state: State | None) -> State:
     """States at the start of the measured phase.
 
-    Those of gate *batch*, ``state``, or those of some native worlds over and over.
+    Those of gate *batch*, ``state``, or those of some native worlds over and over, played from the
+    configured starts.
     """
     if state is not None and state.qpos.shape[0] == sim.nworld:
         return state
     count = min(sim.nworld, stage.cfg.gate.throughput.start_worlds)
     native = stage.simulation(count, Backend.native, "cpu")
-    state = play_to_phase(stage, native)
+    env = stage.start(native, stage.cfg.reset)
+    phase = stage.cfg.gate.throughput.from_phase
+    steps = stage.phase(phase).start
+    label = f"steps to {phase}"
+    rollout(env, stage.driver(env), steps=steps, advance=stage.progress.advance, label=label)
+    state = snapshot(native)
     native.close()
     rows = np.arange(sim.nworld) % count
     return State(state.qpos[rows], state.qvel[rows], state.ctrl[rows])
 
 
-def play_to_phase(stage: Stage, sim: Simulation) -> State:
-    """The state of every world as the measured phase begins, played from the configured starts."""
-    phase = stage.cfg.gate.throughput.from_phase
-    env = stage.start(sim, stage.cfg.reset)
-    steps = stage.phase(phase).start
-    label = f"steps to {phase}"
-    rollout(env, stage.driver(env), steps=steps, advance=stage.progress.advance, label=label)
-    return snapshot(sim)
-
-
 def measure_episode(
-    stage: Stage,
-    sim: Simulation,
-    before: Episode | None = None,
-    *,
-    step_seconds: float = 0.0,
+    stage: Stage, sim: Simulation, before: Episode | None = None, *, step_seconds: float = 0.0
 ) -> Measurement:
     """Measure whole episodes with their check.
 
@@ -188,15 +106,12 @@ def measure_episode(
     worlds lasts minutes, so it is played only as often as the time allows, and not at all where
     even one would not fit.
 
-    Args:
-        stage: Scene and planner.
-        sim: The worlds.
-        before: The episode of gate *batch*, if it was timed.
-        step_seconds: About how long a control step takes [s].
+    ``before`` is the episode of gate *batch*, if it was timed, and ``step_seconds`` about how long
+    a control step takes [s].
     """
     cfg = stage.cfg
     t = cfg.gate.throughput
-    seconds = time_budget(cfg, sim)
+    seconds = timing.time_budget(cfg, sim)
     out = Measurement(name="episode")
     steps = stage.episode_steps
     # The repetitions, and about how long one takes
@@ -210,10 +125,10 @@ def measure_episode(
         if time.perf_counter() - began + estimate > seconds:
             break
         repetition_began = time.perf_counter()
-        played.append(stage.play(sim, cfg.reset, [EnergyObserver(meter)]))
+        played.append(stage.play(sim, cfg.reset, [timing.EnergyObserver(meter)]))
         estimate = time.perf_counter() - repetition_began
         stage.progress.advance("episode, repetitions", number + 1, rounds)
-        if settled(cfg, [episode.timing.seconds for episode in played]):
+        if timing.settled(cfg, [episode.timing.seconds for episode in played]):
             break
     if not played:
         key = "max_seconds" if sim.device.type == "cuda" else "cpu_max_seconds"
@@ -226,14 +141,14 @@ def measure_episode(
     # The result
     failed = np.flatnonzero(np.any([episode.failed for episode in played], axis=0)).tolist()
     timings = [episode.timing for episode in played]
-    times = [timing.seconds for timing in timings]
+    times = [spent.seconds for spent in timings]
     out.samples = {"seconds": times}
     out.facts = {
         "of_the_batch_gate": int(played[0] is before),
         "succeeded": sim.nworld - len(failed),
     }
-    used = meter if played[-1] is not before else NO_METER
-    captured = all(timing.captured for timing in timings)
+    used = meter if played[-1] is not before else timing.NO_METER
+    captured = all(spent.captured for spent in timings)
     out.add_repetitions(sim, cfg, times, steps, used, *timings, captured=captured)
     out.headline = f"{statistics.median(times):.3g} s"
     if failed:

@@ -75,10 +75,6 @@ class EnergyMeter:
             return {}
         return {"gpu_power_mean_w": self._joules / self._seconds, "gpu_energy_j": self._joules}
 
-    def notes(self) -> dict[str, str]:
-        """Why they are missing."""
-        return {"gpu_power_mean_w": f"not measured: {self.missing}"} if self.missing else {}
-
 
 NO_METER = EnergyMeter("cpu")  # which has no counter
 
@@ -166,7 +162,8 @@ class Measurement:
 
         # Energy, and the memory that is taken on the GPU
         self.totals |= meter.metrics()
-        self.notes |= meter.notes()
+        if meter.missing:
+            self.notes["gpu_power_mean_w"] = f"not measured: {meter.missing}"
         if (used := device_memory(str(sim.device))) is not None:
             self.facts["gpu_memory_arrays_mib"] = used[0] / 2**20
             self.facts["gpu_memory_whole_gpu_mib"] = used[1] / 2**20
@@ -217,11 +214,8 @@ def timed(sim: Simulation, work: Callable[[], object], meter: EnergyMeter = NO_M
 
 
 def lost_worlds(sim: Simulation, steps: int | None = None) -> Tensor:
-    """Worlds whose time would be void, shape ``(nworld,)``, bool.
-
-    Args:
-        sim: The worlds.
-        steps: Physics steps that they must have made since their last reset; None for any number.
+    """Worlds whose time would be void, shape ``(nworld,)``, bool. ``steps`` are the physics steps
+    that they must have made since their last reset; None for any number.
     """
     lost = not_finite(sim.qpos, sim.qvel) | ((sim.overflow & LOST_PHYSICS) != 0)
     return lost if steps is None else lost | (sim.step_count != steps)

@@ -89,9 +89,10 @@ def _run(cfg: Config) -> Checks:
     yield "resume", wrong, expected
     wrong = cfg.devices is not None and not _DEVICES.fullmatch(cfg.devices)
     yield "devices", wrong, "all, or a number of GPUs of at least 1"
-    plays = cfg.controller.name == "policy" or cfg.job.name in ("play", "export")
     expected = "null, because no policy drives the worlds. Add controller=policy"
-    yield "policy", cfg.policy is not None and not plays, expected
+    played = cfg.job.name in ("play", "export")
+    wrong = cfg.policy is not None and not (played or offered(cfg.controller.func, "plays_policy"))
+    yield "policy", wrong, expected
     wrong = cfg.starts is not None and not reads_starts_file(cfg.reset)
     yield "starts", wrong, "null, because no reset term reads it. Add reset=starts_file"
 
@@ -110,6 +111,8 @@ def _robot(cfg: Config) -> Checks:
         path = Path(getattr(robot, key))
         wrong = path.is_absolute() or ".." in path.parts
         yield f"robot.{key}", wrong, "a name that does not lead out of a folder"
+    wrong = robot.file is not None and cfg.model.source == "menagerie"
+    yield "robot.file", wrong, "null, because model=menagerie has its own. Add model=builtin"
     names = (*robot.ik_joints, *robot.locked)
     require_names("robot.ik_joints, robot.locked: arm joint", names, robot.arm_joints)
     require_names("robot.roll_joint: arm joint", [robot.roll_joint], robot.arm_joints)
@@ -195,7 +198,6 @@ def _phases(cfg: Config) -> Checks:
     gain = max(controller.posture_gain, controller.approach_gain)
     wrong = gain > 0 and controller.step_iterations < 4
     yield "controller.step_iterations", wrong, "at least 4 with a posture_gain or an approach_gain"
-    closed_loop = controller.name == "closed_loop" or "success" in cfg.gates
     phases = controller.phases
     names = list(phases)
     known = [*cfg.scene.objects, *cfg.scene.places]
@@ -209,7 +211,9 @@ def _phases(cfg: Config) -> Checks:
         require_names(f"{key}.retry: phase", [phase.retry], phases)
         for role, source in (("anchor", phase.anchor), ("toward", phase.toward)):
             require_names(f"{key}.{role}: object or place", [source], known)
-            wrong = closed_loop and not phase.observe and source not in observed
+            wrong = not phase.observe and source not in observed
+            # Looks at the driver, which loads torch, only where it may be wrong.
+            wrong = wrong and ("success" in cfg.gates or offered(controller.func, "measures"))
             expected = f"true here or before, as closed_loop does not know yet where {source} is"
             yield f"{key}.observe", wrong, expected
             observed.add(source)

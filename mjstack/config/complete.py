@@ -36,11 +36,8 @@ _values: dict[tuple[type, str], Any] = {}  # of terms by their content: most are
 
 def complete(cfg: schema.Config) -> None:
     """Give every term its type, and fill in the robot and the phases that gates name, in place. A
-    term that is null is left out.
-
-    Raises:
-        MjstackError: A term has an unknown key, lacks one, or a value has the wrong type; or
-            ``robot.file`` is in none of the folders.
+    term that is null is left out. A MjstackError if a term has an unknown key, lacks one, or a
+    value has the wrong type; or if ``robot.file`` is in none of the folders.
     """
     cfg.view = cfg.view.lower()  # YAML's false and true
     for name in vars(cfg.gate).keys() - {field.name for field in fields(cfg.gate)}:
@@ -51,6 +48,7 @@ def complete(cfg: schema.Config) -> None:
         if hasattr(parent, last):  # not every job has observations
             setattr(parent, last, _typed_all(key, getattr(parent, last), kind))
     robot = cfg.robot
+    check_fields("robot", robot)
     robot.title = robot.title or robot.name
     robot.start = robot.start or list(robot.home)
     robot.ik_joints = robot.ik_joints or [n for n in robot.arm_joints if n not in robot.locked]
@@ -72,10 +70,8 @@ def _typed_all(key: str, nodes: dict[str, Any], kind: type) -> dict[str, Any]:
 
 
 def typed(key: str, node: Any, kind: type) -> Any:
-    """A mapping of a composed configuration, at a dotted key, as a dataclass.
-
-    Raises:
-        MjstackError: A key is unknown or missing, or its field does not accept a value.
+    """A mapping of a composed configuration, at a dotted key, as a dataclass; a MjstackError if a
+    key is unknown or missing, or its field does not accept a value.
     """
     items = {field.name: field for field in fields(kind)}
     if not isinstance(node, dict):

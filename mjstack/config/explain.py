@@ -1,11 +1,14 @@
-"""One line for what is wrong with overrides: what was given, what was expected, what to do.
+"""Overrides, read and written, and one line for what is wrong with them: what was given, what was
+expected, what to do.
 
 Some overrides are checked before Hydra sees them, which answers with a traceback or with words
 about its own parser; its chained, multi-line errors about the others are turned into one line.
 """
 
 import re
+import shlex
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
 from typing import Any
@@ -20,7 +23,7 @@ from omegaconf.errors import ConfigKeyError
 from mjstack.config import session
 from mjstack.config.fields import accepted, find_field
 from mjstack.config.schema import JOB_SCHEMAS, Config, GateCfg
-from mjstack.errors import MjstackError, UnknownName, first_line, suggest
+from mjstack.errors import MjstackError, UnknownName, first_line, shorten, suggest
 
 COMMANDS = ("demo", "doctor", "list", "new")  # first words of a command line
 LISTS = ("cameras", "experiment")  # groups of which several may be chosen
@@ -63,11 +66,31 @@ def parse(override: str) -> Override:
             problem = f"override {override!r} cannot be read: expected key=value, or a command"
             raise MjstackError(f"{problem}. {suggest(override, COMMANDS)}") from error
         raise MjstackError(
-            f"override {override!r} cannot be read: expected key=value without spaces around the"
-            " sign, such as nworld=64. A value with a bracket, a quote, a letter beyond ASCII or"
+            f"override {shorten(override, 60)!r} cannot be read: expected key=value without spaces"
+            " around the sign. A value with a bracket, a quote, a letter beyond ASCII or"
             " one of = , : ; # & ! < > ^ ~ ` needs double quotes inside of single ones:"
-            " 'starts=\"run(1).csv\"', or in a list 'job.against=[\"policy=DIR\"]'."
+            " 'policy=\"run (1)\"', or in a list 'job.against=[\"policy=DIR\"]'."
         ) from error
+
+
+def assign(key: str, value: object) -> str:
+    """An override that sets a key to a text or a path. It has quotes where Hydra would take the
+    text for anything else.
+    """
+    text = str(value)
+    plain = f"{key}={text}"
+    with suppress(HydraException):
+        if "${" not in text and OverridesParser.create().parse_override(plain).value() == text:
+            return plain
+    text = re.sub(r"(\\*)\$\{", r"\1\1\\${", text)  # else an interpolation
+    text = re.sub(r'(\\*)"', r'\1\1\\"', text)
+    text = re.sub(r"(\\+)$", r"\1\1", text)
+    return f'{key}="{text}"'
+
+
+def command(*overrides: str) -> str:
+    """A command on the current search path, as a shell takes it."""
+    return shlex.join(["mjstack", *session.search_path_args(), *overrides])
 
 
 def check_added(section: DictConfig, overrides: Sequence[str], parent: str = "") -> None:
@@ -97,14 +120,12 @@ def explain(error: Exception, overrides: Sequence[str] = ()) -> MjstackError:
         choices = error.options or session.list_choices().get(group, [])
         problem: MjstackError = UnknownName(f"{group}={name}:", name, choices)
         if not session.config_folders() and not group.startswith("hydra/"):
-            problem = MjstackError(f"{problem} A choice of your own needs --config-dir DIR.")
+            advice = f"A choice of your own needs {session.folder_advice()}."
+            problem = MjstackError(f"{problem} {advice}")
     else:
         problem = _explain(error, overrides)
     inside = re.match(r"In '([^']+)': ", str(error))
-    if inside is None or inside[1] in (
-        session.CONFIG_NAME,
-        "hydra/config",
-    ):  # an override does not fit
+    if inside is None or inside[1] in (session.CONFIG_NAME, "hydra/config"):  # an override's
         return problem
     name = f"{inside[1]}.yaml"
     paths = [folder / name for folder in session.config_folders() if (folder / name).is_file()]
@@ -132,7 +153,7 @@ def _explain(error: Exception, overrides: Sequence[str]) -> MjstackError:
         value_text = settings[-1].partition("=")[2]
         one_name = settings[-1] in overrides and re.match(r"(?!null$)[^\[{]", value_text)
         names = expected.startswith("a list of names")
-        cure = f" Write '{key}=[{value_text}]'." if one_name and names else ""
+        cure = f" Write {shlex.quote(f'{key}=[{value_text}]')}." if one_name and names else ""
         return MjstackError(f"{settings[-1]}: expected {expected}.{cure}")
     return MjstackError(f"{key or ' '.join(overrides) or 'the values'}: {text}.")
 

@@ -27,6 +27,7 @@ from mjstack.errors import ConfigError
 
 MOST_WORLDS = (1 << 31) - 1  # Warp counts them with 32 bits
 MOST_SEEDS = 1 << 32  # seeds are 32-bit
+MOST_COUNT = 1_000_000  # steps or episodes, one after the other
 _SPEC = "mjstack"  # key of a field's metadata
 _NOUNS = {int: "an integer", float: "a number", bool: "true or false", str: "text"}
 _PLURALS = {int: "integers", float: "numbers", str: "names"}
@@ -43,6 +44,8 @@ class Range:
         ge: Values are at least this.
         le: Values are at most this.
         length: Number of items of a list.
+        vectors: Whether a mapping, of type ``dict[str, Any]``, holds lists of numbers. With their
+            type OmegaConf would refuse whole ones.
         choices: The only values.
         finite: Whether infinity is refused; NaN always is.
     """
@@ -52,6 +55,7 @@ class Range:
     ge: float | None = None
     le: float | None = None
     length: int | None = None
+    vectors: bool = False
     choices: tuple[object, ...] = ()
     finite: bool = True
 
@@ -78,20 +82,18 @@ class Range:
         return noun + (f" [{self.unit}]" if self.unit else "")
 
 
-# Annotations of a term's parameters, which its manager checks
+# Annotations of a term's parameters, which its manager checks. A stranger's policy or run may set
+# one, so that each integer has an upper end.
 Positive = Annotated[float, Range(gt=0.0)]
 NotNegative = Annotated[float, Range(ge=0.0)]
 Fraction = Annotated[float, Range(ge=0.0, le=1.0)]
-Count = Annotated[int, Range(ge=1)]
+Count = Annotated[int, Range(ge=1, le=MOST_COUNT)]
+Repeats = Annotated[int, Range(ge=1, le=1000)]  # of a computation that nothing interrupts
 
 
 def spec(default: Any = MISSING, **limits: Any) -> Any:
-    """Declare a configuration field with its unit and range.
-
-    Args:
-        default: Its value where the YAML has none, of a list or mapping a copy; without one, the
-            YAML must have it.
-        limits: Attributes of its `Range`.
+    """Declare a configuration field with the attributes of its `Range`. Its default is its value
+    where the YAML has none, of a list or mapping a copy; without one, the YAML must have it.
     """
     metadata = {_SPEC: Range(**limits)}
     if isinstance(default, list | dict):
@@ -121,15 +123,9 @@ def find_field(owner: type, key: str) -> tuple[type, Field] | None:
 
 
 def check_fields(key: str, value: Any) -> None:
-    """Hold every number, list and choice below a key against its field's range.
-
-    Args:
-        key: Dotted configuration key of the value, empty for the whole configuration.
-        value: A dataclass. Dataclasses in its fields, lists and mappings are checked too.
-
-    Raises:
-        ConfigError: The first value that its field does not accept, or a ``NAME_min`` above its
-            ``NAME_max``.
+    """Hold every number, list and choice in a dataclass against its field's range, also those in
+    dataclasses, lists and mappings in it. Its dotted key is empty for the whole configuration. A
+    ConfigError for the first value that is not accepted, or a ``NAME_min`` above its ``NAME_max``.
     """
     for item in fields(value):
         path = f"{key}.{item.name}" if key else item.name
@@ -148,6 +144,10 @@ def _check(path: str, value: object, owner: type, item: Field, *, inside: bool =
         check_fields(path, value)
     elif isinstance(value, Mapping):
         for name, part in value.items():
+            if limits.vectors:
+                if not isinstance(part, list) or {*map(type, part)} - {int, float}:
+                    raise ConfigError(f"{path}.{name}", part, accepted(owner, item, inside=True))
+                part[:] = map(float, part)
             _check(f"{path}.{name}", part, owner, item, inside=True)
     elif isinstance(value, list | tuple):
         if limits.length not in (None, len(value)) or not all(map(limits.holds, value)):
@@ -161,9 +161,9 @@ def accepted(owner: type, item: Field, *, inside: bool = False) -> str:
     [s]``.
     """
     hint = _hints(owner)[item.name]
-    kind, holders = _kind(hint)
-    holders = holders[inside:]
     limits = field_range(item)
+    kind, holders = _kind(dict[str, list[float]] if limits.vectors else hint)
+    holders = holders[inside:]
     if limits.choices or isinstance(kind, EnumMeta):
         choices = limits.choices or kind.__members__
         words = f"{'some' if holders else 'one'} of {', '.join(map(str, choices))}"
@@ -179,23 +179,15 @@ def accepted(owner: type, item: Field, *, inside: bool = False) -> str:
     return limits.describe(words) + null
 
 
+@cache
 def field_docs(owner: type) -> dict[str, str]:
     """The docstring under each field of a dataclass and of those it derives from, by name."""
     docs: dict[str, str] = {}
-    for cls in reversed(owner.__mro__):
-        if is_dataclass(cls):
-            docs |= _own_docs(cls)
-    return docs
-
-
-@cache
-def _own_docs(cls: type) -> dict[str, str]:
-    (tree,) = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
-    body = tree.body if isinstance(tree, ast.ClassDef) else []
-    docs = {}
-    for node, after in pairwise(body):
-        if isinstance(node, ast.AnnAssign) and isinstance(after, ast.Expr):
-            docs[ast.unparse(node.target)] = " ".join(ast.literal_eval(after.value).split())
+    for cls in filter(is_dataclass, reversed(owner.__mro__)):
+        tree: Any = ast.parse(textwrap.dedent(inspect.getsource(cls)))
+        for node, after in pairwise(tree.body[0].body):
+            if isinstance(node, ast.AnnAssign) and isinstance(after, ast.Expr):
+                docs[ast.unparse(node.target)] = " ".join(ast.literal_eval(after.value).split())
     return docs
 
 

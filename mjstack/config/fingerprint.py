@@ -23,10 +23,8 @@ SHIPPED = Path(__file__).parents[1] / "policies"  # verified policies that come 
 
 def config_content(cfg: Config, without: Iterable[str] = ()) -> dict[str, Any]:
     """The whole configuration in JSON's types, with the SHA-256 of the robot's file, of each starts
-    file and of the policy in place of its path; some keys at its top may be left out.
-
-    Raises:
-        ConfigError: One of these files cannot be read.
+    file and of the policy in place of its path; a ConfigError if one cannot be read. Some keys at
+    its top may be left out.
     """
     config: dict[str, Any] = json.loads(json.dumps(asdict(cfg)))
     if cfg.robot.file is not None:

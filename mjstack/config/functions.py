@@ -16,17 +16,9 @@ from mjstack.errors import MissingExtra, TermError, first_line, suggest
 def resolve_func(
     label: str, path: str, *, first: str = "env", base: type | None = None
 ) -> Callable[..., Any]:
-    """Find a function or class by its dotted name, and check that it declares itself.
-
-    Args:
-        label: Dotted configuration key, for errors.
-        path: The dotted name.
-        first: Name of its first parameter.
-        base: The class that it must be a subclass of, instead.
-
-    Raises:
-        TermError: There is no such module, or nothing of that name in it that is meant to be called
-            here.
+    """Find a function or class by its dotted name, and check that it declares itself: by the name
+    of its first parameter, or instead by its base class. The label is its configuration key. A
+    TermError if there is no such module, or nothing of that name in it that is meant to be called.
     """
     func = find_object(label, path)
     declared = False
@@ -43,11 +35,8 @@ def resolve_func(
 
 
 def find_object(label: str, path: str) -> Any:
-    """Find anything in a module by its dotted name.
-
-    Raises:
-        TermError: There is no such module, or nothing of that name in it.
-        MissingExtra: The module needs a package that is not installed.
+    """Find anything in a module by its dotted name; a TermError if there is no such module or
+    nothing of that name in it, a MissingExtra if it needs a package that is not installed.
     """
     module_name, _, attribute = path.rpartition(".")
     if not module_name:

@@ -33,7 +33,7 @@ mjstack: a task of a robot arm, from native MuJoCo to thousands of MuJoCo Warp w
 Usage: mjstack [group=choice ...] [key=value ...] [flags]
        mjstack list [tasks|robots|terms|conditions|gates|trainers|policies]
        mjstack demo    16 worlds stack by a shipped policy, shown in a browser
-       mjstack new task NAME | robot NAME FILE.xml    a folder of your own
+       mjstack new task|driver|action NAME, or robot NAME FILE.xml    a folder of your own
 In a checkout: python scripts/run.py ...  What this machine has: mjstack doctor
 
 Examples:
@@ -100,13 +100,13 @@ def list_groups() -> dict[str, tuple[list[str], str]]:
     }
 
 
-def list_keys(value: object, name: str = "", *, named: bool = True) -> Iterator[Key]:
+def list_keys(value: Any, name: str = "", *, named: bool = True) -> Iterator[Key]:
     """Keys of a configuration at and below one of its parts, whose dotted key is ``name``.
 
     With ``named``, entries that users name, such as terms, are listed each. Otherwise the first one
     stands for all, as NAME and without values.
     """
-    docs = field_docs(type(value))
+    docs = field_docs(value.__class__)
     for item in fields(value) if is_dataclass(value) else ():
         part = getattr(value, item.name)
         key = f"{name}.{item.name}".lstrip(".")
@@ -123,10 +123,8 @@ def list_keys(value: object, name: str = "", *, named: bool = True) -> Iterator[
 
 
 def key_help(cfg: Config, prefix: str, width: int) -> str:
-    """Keys of a configuration at and below a dotted one, with unit, range and meaning.
-
-    Raises:
-        UnknownName: There is no such key.
+    """Keys of a configuration at and below a dotted one, with unit, range and meaning; an
+    UnknownName if there are none.
     """
     nodes = {f"gate.{name}": (node, "config") for name, node in cfg.gate.added.items()}
     if cfg.task.check:
@@ -165,7 +163,7 @@ def help_text(cfg: Config, width: int) -> str:
         name: f"{words}: {', '.join(names)}" for name, (names, words) in list_groups().items()
     }
     keys = {key.name: f"{key.words} ({key.value})" for key in list_keys(cfg) if "." not in key.name}
-    for name in groups:
+    for name in (*groups, "unused_terms"):  # which mjstack fills in
         keys.pop(name, None)
     text = _TEXT.format(groups=_table(groups), keys=_table(keys))
     lines = []
@@ -191,10 +189,7 @@ def _table(rows: Mapping[str, str]) -> str:
 
 def list_text(kinds: Sequence[str]) -> str:
     """What there is to choose from, of mjstack and of the search path, with a line each; of terms
-    alone also their parameters. Without kinds, all of them.
-
-    Raises:
-        UnknownName: There is no such kind.
+    alone also their parameters. Without kinds, all of them; an unknown one is an UnknownName.
     """
     require_names("list", kinds, _LISTED)
     lines = []
@@ -211,7 +206,7 @@ def _files(group: str) -> Iterator[tuple[str, str]]:
     """Choices of a group, and the comments that their files begin with."""
     for folder in (CONFIG_FOLDER, *config_folders()):
         for path in sorted(folder.glob(f"{group}/*.yaml")):
-            comment = re.search("(?m)^# (?!@)(.+)", path.read_text(encoding="utf-8"))
+            comment = re.search("(?m)^# (?!@)(.+)", path.read_text("utf-8-sig"))
             yield path.stem, comment[1] if comment else ""
 
 
@@ -221,7 +216,8 @@ def _functions(kind: str, with_parameters: bool) -> Iterator[tuple[str, str]]:
     text = ""
     if kind == "terms":  # also those that the search path's files name
         modules = [f"mjstack.mdp.{name}" for name in _TERMS]
-        text = "".join(p.read_text() for f in config_folders() for p in sorted(f.rglob("*.yaml")))
+        paths = [path for folder in config_folders() for path in sorted(folder.rglob("*.yaml"))]
+        text = "".join(path.read_text("utf-8-sig") for path in paths)
     names = [f"{m}.{name}" for m in modules for name in vars(import_module(m)) if name[0] != "_"]
     for name in dict.fromkeys([*names, *re.findall(r"func: ([\w.]+)", text)]):
         func: Any = find_object("list", name)

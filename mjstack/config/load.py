@@ -1,9 +1,8 @@
 """Composes `conf/` into the dataclasses of `schema`."""
 
-import json
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
@@ -24,7 +23,7 @@ from mjstack.config.fingerprint import POLICY_FILE, policy_folder
 from mjstack.config.schema import JOB_SCHEMAS, TRAINER_SCHEMAS, Backend, Config
 from mjstack.config.task_terms import complete_terms
 from mjstack.errors import ConfigError, MjstackError
-from mjstack.files import read_inside, reading
+from mjstack.files import read_json, reading
 
 _schema = OmegaConf.structured(Config)
 _schema.gate._set_flag("struct", False)  # gates of the search path are added to it
@@ -44,7 +43,7 @@ def _control_steps(seconds: float | None, *, _root_: DictConfig) -> int:
 def _by_device(cuda: Any, cpu: Any, *, _root_: DictConfig) -> Any:
     """The value for the device of the run, which ``${by_device:CUDA,CPU}`` stands for."""
     device = _root_.sim.device
-    if _is_native(_root_):
+    if _root_.sim.backend == Backend.native:
         device = "cpu"
     elif device == "auto":
         from torch.cuda import is_available  # takes a second
@@ -53,9 +52,14 @@ def _by_device(cuda: Any, cpu: Any, *, _root_: DictConfig) -> Any:
     return cuda if device.startswith("cuda") else cpu
 
 
-def _is_native(root: DictConfig) -> bool:
-    return root.sim.backend == Backend.native
-
+# The functions that a replay calls: where a run's configuration names them, and of which kind.
+_REPLAYED = {
+    "controller.func": "driver",
+    "controller.action.": "action term",
+    "gate.success.reset.": "reset term",
+    "reset.": "reset term",
+    "task.check.": "check",
+}
 
 # Overrides by the key where a choice of a group goes, such as gate.success.reset=jitter
 _CHOICE = re.compile(r"^(?:gate\.\w+\.|job\.)(reset|observation)=(?!null$)[\w,]+$")
@@ -64,7 +68,7 @@ _CHOICE = re.compile(r"^(?:gate\.\w+\.|job\.)(reset|observation)=(?!null$)[\w,]+
 _RESOLVERS: dict[str, Callable] = {
     "steps": _control_steps,
     "by_device": _by_device,
-    "if_native": lambda native, mjwarp, *, _root_: native if _is_native(_root_) else mjwarp,
+    "if_native": lambda a, b, *, _root_: a if _root_.sim.backend == Backend.native else b,
     "at_most": lambda value, limit, small, large: small if value <= limit else large,
 }
 for _name, _function in _RESOLVERS.items():
@@ -87,9 +91,20 @@ def load_config(
     Raises:
         MjstackError: An override does not fit; the message says which and what would.
     """
+    with configured(overrides, config_dir) as cfg:
+        return cfg
+
+
+@contextmanager
+def configured(overrides: Sequence[str], config_dir: str | os.PathLike | None) -> Iterator[Config]:
+    """The configuration of `load_config`, whose search path goes on inside: a policy that is loaded
+    there may name functions beside it.
+    """
     folders = [] if config_dir is None else [config_dir]
-    with extended_search_path(overrides, folders) as composed, session.hydra_session():
-        return to_config(compose(composed))
+    with extended_search_path(overrides, folders) as composed:
+        with session.hydra_session():
+            cfg = to_config(compose(composed))
+        yield cfg
 
 
 @contextmanager
@@ -97,11 +112,8 @@ def extended_search_path(
     overrides: Sequence[str], folders: Sequence[str | os.PathLike]
 ) -> Iterator[list[str]]:
     """Add folders, and those of overrides of ``hydra.searchpath``, to the search path of every
-    composition inside.
-
-    Yields:
-        The other overrides, starts and observations that they choose by a key as choices of their
-        group, and what the policy that they name was trained for.
+    composition inside. Yields the other overrides, starts and observations that they choose by a
+    key as choices of their group, and what the policy that they name was trained for.
     """
     entries = list(map(str, folders))
     remaining = [o for o in overrides if not o.lstrip("+").startswith("hydra.searchpath=")]
@@ -137,10 +149,10 @@ def _policy_choices(overrides: Sequence[str]) -> list[str]:
     if not isinstance(folder, str):
         return []
     try:
-        facts = json.loads(read_inside(policy_folder(folder) / POLICY_FILE))
+        facts = read_json(policy_folder(folder) / POLICY_FILE)
         trained = {group: [facts["config"][group]["name"]] for group in ("robot", "task")}
         trained["cameras"] = list(facts["observation"].get("images", {}))
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+    except Exception:  # it may hold anything
         return []
     choices = session.list_choices()
     return [
@@ -156,14 +168,14 @@ def compose(overrides: Sequence[str], run_mode: RunMode = RunMode.RUN) -> DictCo
     """
     if run_mode is RunMode.RUN:
         check_overrides(overrides)
-    loader = GlobalHydra.instance().config_loader()
+    loader: Any = GlobalHydra.instance().config_loader()
     try:
         cfg = loader.load_configuration(
             config_name=session.CONFIG_NAME, overrides=list(overrides), run_mode=run_mode
         )
         if run_mode is RunMode.RUN:
             check_added(session.without_hydra(cfg), overrides)
-            _drop_inherited(cfg, overrides)
+            _drop_inherited(cfg, loader.files[id(cfg)], overrides)
             complete_terms(cfg, overrides)
     except (HydraException, OmegaConfBaseException, AssertionError, TypeError, ValueError) as error:
         raise explain(error, overrides) from error
@@ -172,49 +184,47 @@ def compose(overrides: Sequence[str], run_mode: RunMode = RunMode.RUN) -> DictCo
     return cfg
 
 
-def _drop_inherited(cfg: DictConfig, overrides: Sequence[str]) -> None:
-    """Leave a term whose ``func`` an override swaps with the parameters that overrides give it:
-    those of the other function are not its own.
+def _drop_inherited(
+    cfg: DictConfig, files: Sequence[Mapping[str, object]], overrides: Sequence[str]
+) -> None:
+    """Leave a term, and the check, whose ``func`` a file or an override swaps with the parameters
+    that are given with the new one or after it: those of the other function are not its own.
+    ``files`` are the keys and values of each, in the order of composition.
     """
-    if not any("func" in override for override in overrides):
-        return
-    values = {o.key_or_group: o.value() for o in map(parse, own_overrides(overrides))}
-    # Other keys of a job or a gate are no parameters of its function.
-    terms = {
-        key: key.removesuffix(".func")
-        for key, value in values.items()
-        if (key.endswith(".func") or (isinstance(value, dict) and "func" in value))
-        and not re.match(r"job\.|gate\.(?!.*\.reset\.)", key)
-    }
-    rest = [o for o in overrides if o.lstrip("+").partition("=")[0] not in terms]
-    before = (
-        GlobalHydra.instance()
-        .config_loader()
-        .load_configuration(config_name=session.CONFIG_NAME, overrides=rest, run_mode=RunMode.RUN)
-    )
-    for term in terms.values():
-        old = OmegaConf.select(before, f"{term}.func")
-        if old is None or old == OmegaConf.select(cfg, f"{term}.func"):
+    typed: dict[str, object] = {}
+    for override in map(parse, own_overrides(overrides)):
+        value: Any = None if override.is_delete() else override.value()
+        typed |= {override.key_or_group: value}
+        typed |= dict(session.list_items(value, f"{override.key_or_group}."))
+    functions: dict[str, object] = {}  # by the mapping of their parameters
+    params: dict[str, set[str]] = {}
+    swapped = set()
+    for source in (*files, typed):
+        for key, value in source.items():
+            term, _, name = key.rpartition(".")
+            section = term if term == "task.check" else f"{term}.params"
+            if name == "func" and functions.setdefault(section, value) != value:
+                functions[section] = value
+                params[section] = {"func"}
+                swapped.add(section)
+        for key in source:
+            section, _, name = key.rpartition(".")
+            params.setdefault(section, set()).add(name)
+    for section in swapped:
+        parent, _, name = section.rpartition(".")
+        owner = OmegaConf.select(cfg, parent)
+        if not isinstance(owner, DictConfig) or name not in owner:
             continue
-        section = term if term == "task.check" else f"{term}.params"
-        changes = OmegaConf.create()
-        for key, value in values.items():
-            if f"{key}.".startswith(f"{term}."):
-                OmegaConf.update(changes, key, value)
-        params = {"func", *(OmegaConf.select(changes, section) or ())}
-        node = OmegaConf.select(cfg, section) or {}
-        with open_dict(cfg):
-            for name in node.keys() - params:
-                del node[name]
+        if isinstance(owner[name], DictConfig) and not OmegaConf.is_interpolation(owner, name):
+            with open_dict(cfg):
+                for key in owner[name].keys() - params[section]:
+                    del owner[name][key]
 
 
 def load_saved(path: Path) -> Config:
     """The configuration that a run left in ``.hydra/config.yaml``, typed and checked as a new one
-    is.
-
-    Raises:
-        MjstackError: The file cannot be read, is no configuration of this version, or names
-            functions or a robot that are not in the search path.
+    is; a MjstackError if the file cannot be read, is no configuration of this version, or names
+    functions or a robot that are not in the search path.
     """
     with reading(path, "Name another folder"):
         plain = session.read_yaml(path)
@@ -223,16 +233,24 @@ def load_saved(path: Path) -> Config:
         merged = cast(DictConfig, OmegaConf.merge(_schema, plain))
         if missing := sorted(OmegaConf.missing_keys(merged)):
             raise MjstackError(f"{missing[0]} is missing, expected every key of this version.")
-        session.check_replayed(merged, path)
+        for key, name in session.list_items(merged):
+            for place, kind in _REPLAYED.items():
+                if key.startswith(place) and key.endswith(".func"):
+                    session.check_term(key.removesuffix(".func"), str(name), kind, path)
         try:
             cfg = to_config(merged)
         except ConfigError as error:
             if not error.key.endswith(".file"):
                 raise
             raise MjstackError(f"{error} {session.add_folder(path)}") from error
-        session.check_beside("robot.file", cfg.robot.file)
-        for name, thing in cfg.scene.objects.items():
-            session.check_beside(f"scene.objects.{name}.file", thing.file)
+        files = {"robot.file": cfg.robot.file}
+        files |= {f"scene.objects.{k}.file": thing.file for k, thing in cfg.scene.objects.items()}
+        folders = [folder.parent for folder in session.config_folders()]
+        for key, file in files.items():
+            if file is not None and not any(map(Path(file).is_relative_to, folders)):
+                advice = session.folder_advice([Path(file).parent])
+                problem = f"{key}={file}: expected a file beside a folder of the search path"
+                raise MjstackError(problem, f"If you trust it, add {advice}")
     return cfg
 
 

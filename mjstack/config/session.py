@@ -19,13 +19,14 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import yaml  # type: ignore[import-untyped]
 from hydra import initialize_config_dir
+from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.plugins import Plugins
 from hydra.core.singleton import Singleton
+from hydra.plugins.config_source import ConfigResult
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
@@ -33,26 +34,13 @@ from typing_extensions import override
 
 from mjstack.config.functions import find_object
 from mjstack.errors import MjstackError
-from mjstack.files import check_regular
+from mjstack.files import CONFIG_FOLDER, yaml_text
 
-_PACKAGE_FOLDER = Path(__file__).parents[1]
-# In a checkout the configuration lies beside the package, in a wheel inside of it.
-CONFIG_FOLDER = next(
-    folder
-    for folder in (_PACKAGE_FOLDER.parent / "conf", _PACKAGE_FOLDER / "conf")
-    if (folder / "config.yaml").is_file()
-)
 CONFIG_NAME = "config"
+SEEN = "observation@job.observation="  # of a new policy
+TASK_SEEN = f"{SEEN}task"
 ENTRY_POINTS = "mjstack.configs"
 PROVIDER = "mjstack.search_path"  # of added entries, in a run's .hydra/hydra.yaml
-_FILE = "file://"
-# The functions that a replay calls: where a run's configuration names them, and of which kind.
-_REPLAYED = {
-    "controller.action.": "action term",
-    "gate.success.reset.": "reset term",
-    "reset.": "reset term",
-    "task.check.": "check",
-}
 
 # An override that adds an entry to a mapping by names, of which the schema knows the type
 _ENTRY = re.compile(
@@ -61,17 +49,13 @@ _ENTRY = re.compile(
 )
 
 _added: ContextVar[tuple[Path, ...]] = ContextVar("search path", default=())
+_on_command_line: ContextVar[bool] = ContextVar("command line", default=False)
 
 
 @contextmanager
 def search_path(entries: Sequence[str | os.PathLike]) -> Iterator[None]:
-    """Add folders to the search path of every composition inside.
-
-    Args:
-        entries: Folders, also as Hydra writes them: ``file://...``.
-
-    Raises:
-        MjstackError: There is no such folder, or it has a file of mjstack's name.
+    """Add folders, also as Hydra writes them, ``file://...``, to the search path of every
+    composition inside; a MjstackError if there is none, or it has a file of mjstack's name.
     """
     folders = [_checked_folder(str(entry)) for entry in entries]
     token = _added.set(tuple(dict.fromkeys((*_added.get(), *folders))))
@@ -85,31 +69,37 @@ def search_path(entries: Sequence[str | os.PathLike]) -> Iterator[None]:
         _added.reset(token)
 
 
+@contextmanager
+def command_line() -> Iterator[None]:
+    """Let advice inside be that for a command line, not for Python."""
+    token = _on_command_line.set(True)
+    try:
+        yield
+    finally:
+        _on_command_line.reset(token)
+
+
+def folder_advice(folders: Sequence[Path] = ()) -> str:
+    """The words that add folders to the search path where they are needed; any folder if none."""
+    if _on_command_line.get():
+        return shlex.join(search_path_args(folders)) or "--config-dir DIR"
+    return " and ".join(f"config_dir='{folder}'" for folder in folders) or "config_dir=DIR"
+
+
 def search_path_args(folders: Sequence[Path] | None = None) -> list[str]:
     """Arguments of a command that adds folders; those of the current search path if None."""
     folders = _added.get() if folders is None else folders
     return [arg for folder in folders for arg in ("--config-dir", str(folder))]
 
 
-def quoted(path: Path) -> str:
-    """A path as a value of an override."""
-    text = str(path).replace("\\", "\\\\").replace("'", "\\'")
-    return f"'{text}'"
-
-
 def add_folder(saved: Path) -> str:
-    """The advice where the search path lacks a folder that a run had used.
-
-    Args:
-        saved: The run's ``config.yaml``.
-    """
+    """The advice where the search path lacks a folder that the run of a config.yaml had used."""
     try:
         sources = read_yaml(saved.with_name("hydra.yaml"))["hydra"]["runtime"]["config_sources"]
         folders = lacking_folders(sources)
     except Exception:  # the file may be missing, or hold anything
         folders = []
-    flag = shlex.join(search_path_args(folders)) or "--config-dir DIR"
-    return f"If you trust the folder that the run had used, add {flag}."
+    return f"If you trust the folder that it had used, add {folder_advice(folders)}."
 
 
 def lacking_folders(sources: Iterable[Any]) -> list[Path]:
@@ -119,18 +109,10 @@ def lacking_folders(sources: Iterable[Any]) -> list[Path]:
 
 
 def read_yaml(path: Path) -> Any:
-    """Read YAML of a run's folder, which may be a stranger's: interpolations stay text.
-
-    Raises:
-        Exception: It cannot be read, or has aliases: a few stand for any number of values.
+    """Read YAML of a run's folder, which may be a stranger's: interpolations stay text. Any
+    exception says that it cannot be read, as of `yaml_text`.
     """
-    check_regular(path)
-    text = path.read_text()
-    # libyaml, where PyYAML has it: the other parser takes minutes for brackets nested very deep.
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, Loader=loader)):
-        raise yaml.YAMLError("an alias")
-    return OmegaConf.to_container(OmegaConf.create(text))
+    return OmegaConf.to_container(OmegaConf.create(yaml_text(path)))
 
 
 def config_folders() -> list[Path]:
@@ -146,33 +128,12 @@ def _registered() -> list[str]:
     return [point.value for point in entry_points(group=ENTRY_POINTS)]
 
 
-def check_replayed(cfg: DictConfig, saved: Path) -> None:
-    """`check_term` for every function that a replay of a run calls.
-
-    Args:
-        cfg: The configuration of an earlier run.
-        saved: Its file.
-    """
-    for key, name in list_items(cfg):
-        for place, kind in _REPLAYED.items():
-            if key.startswith(place) and key.endswith(".func"):
-                check_term(key.removesuffix(".func"), str(name), kind, saved)
-
-
 def check_term(label: str, dotted: str, kind: str, saved: Path) -> None:
     """Check that the folder of a policy or of a run, which may be a stranger's, may name a function
-    or class: one that declares itself in an installed package (`mjstack.managers.offers`), or any
-    that was defined beside a folder of the search path.
-
-    Args:
-        label: Dotted configuration key, for errors.
-        dotted: Its name.
-        kind: The kind of term that it is to be.
-        saved: The file that names it.
-
-    Raises:
-        MjstackError: It may not.
-        TermError: There is no such function.
+    or class: one that declares itself as a kind of term in an installed package
+    (`mjstack.managers.offers`), or any that was defined beside a folder of the search path. The
+    label is its configuration key, and ``saved`` the file that names it. A MjstackError if it may
+    not, a TermError if there is no such function.
     """
     installed = {"mjstack", *(name.partition(".")[0] for name in _registered())}
     # A module runs when it is imported, and imports others' functions too.
@@ -182,17 +143,14 @@ def check_term(label: str, dotted: str, kind: str, saved: Path) -> None:
         if getattr(func, "term_kind", "") == kind or in_search_path(home, saved):
             return
     raise MjstackError(
-        f"{label}.func={dotted}: expected one of the {kind}s of mjstack, of a package registered"
-        f" under {ENTRY_POINTS}, or beside a folder of the search path. {add_folder(saved)}"
+        f"{label}.func={dotted}: expected one of the {kind}s of mjstack, a registered package or"
+        f" the search path. {add_folder(saved)}"
     )
 
 
 def in_search_path(dotted: str, saved: Path) -> bool:
-    """Whether a function or module lies beside a folder of the search path.
-
-    Args:
-        dotted: Its dotted name.
-        saved: The file that names it. No package that it lies in counts.
+    """Whether a function or module, by its dotted name, lies beside a folder of the search path. No
+    package counts in which the file lies that names it, ``saved``.
     """
     package = dotted.partition(".")[0]
     try:
@@ -216,20 +174,6 @@ def in_search_path(dotted: str, saved: Path) -> bool:
     )
 
 
-def check_beside(key: str, file: str | None) -> None:
-    """Check that an MJCF file, if a saved run names one, lies beside a folder of the search path.
-
-    Raises:
-        MjstackError: It lies elsewhere.
-    """
-    folders = [folder.parent for folder in config_folders()]
-    if file is not None and not any(map(Path(file).is_relative_to, folders)):
-        raise MjstackError(
-            f"{key}={file}: expected a file beside a folder of the search path. If you trust"
-            f" it, add {shlex.join(search_path_args([Path(file).parent]))}."
-        )
-
-
 def list_items(node: object, prefix: str = "") -> Iterator[tuple[str, object]]:
     """Every dotted key of a composition, in OmegaConf's types or plain, and its value."""
     if isinstance(node, DictConfig):
@@ -249,6 +193,7 @@ def hydra_session() -> Iterator[Any]:
     GlobalHydra.instance().clear()
     try:
         Plugins.instance().register(_Folders)
+        Plugins.instance().register(_Folder)
         # All gates of the search path are composed, as mjstack's are.
         added = [
             n for n in list_choices()["gate"] if not (CONFIG_FOLDER / f"gate/{n}.yaml").exists()
@@ -257,11 +202,28 @@ def hydra_session() -> Iterator[Any]:
         ConfigStore.instance().store("added_gates", {"defaults": defaults}, provider="mjstack")
         initialize_config_dir(str(CONFIG_FOLDER), "run", version_base="1.3")
         hydra: Any = GlobalHydra.instance().hydra
-        loader = hydra.config_loader
-        loader.load_configuration = _once(loader.load_configuration)
+        _compose_once(hydra.config_loader)
         yield hydra
     finally:
         Singleton.set_state(outer)
+
+
+class _Folder(FileConfigSource):
+    """A folder of the search path. A file may begin with a byte order mark, which would hide its
+    header from Hydra.
+    """
+
+    @staticmethod
+    @override
+    def scheme() -> str:
+        return "mjstack"
+
+    @override
+    def load_config(self, config_path: str) -> ConfigResult:
+        result = super().load_config(config_path)
+        path = Path(self.path, self._normalize_file_name(config_path))
+        result.header = self._get_header_dict(path.read_text("utf-8-sig"))
+        return result
 
 
 class _Folders(SearchPathPlugin):
@@ -270,33 +232,43 @@ class _Folders(SearchPathPlugin):
     @override
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         for folder in config_folders():
-            search_path.append(PROVIDER, f"{_FILE}{folder}")
+            search_path.append(PROVIDER, f"{_Folder.scheme()}://{folder}")
 
 
-def _once(load: Callable[..., DictConfig]) -> Callable[..., DictConfig]:
-    """Return the composition of an earlier call with the same overrides."""
+def _compose_once(loader: Any) -> None:
+    """Let a loader of Hydra return the composition of an earlier call with the same overrides, and
+    keep in ``loader.files``, by the composition's id, the keys and values of each file behind it.
+    """
+    load, load_file = loader.load_configuration, loader._load_single_config
     composed: dict[tuple, DictConfig] = {}
+    files: list[dict[str, object]] = []
+    loader.files = {}
+
+    def load_one_file(default: Any, repo: Any) -> ConfigResult:
+        result = load_file(default, repo)
+        files.append(dict(list_items(result.config)))
+        return result
 
     def load_once(*, overrides: list[str], run_mode: RunMode, **options: Any) -> DictConfig:
         key = (*overrides, run_mode)
         if key not in composed:
-            from mjstack.config.task_terms import choose_observation  # it reads CONFIG_FOLDER
 
             def compose(overrides: list[str]) -> DictConfig:
+                files.clear()
                 return load(overrides=_add_entries(overrides), run_mode=run_mode, **options)
 
-            composed[key] = compose(choose_observation(overrides, compose))
+            composed[key] = compose(_choose_observation(overrides, compose))
+            loader.files[id(composed[key])] = files.copy()
         return composed[key]
 
-    return load_once
+    loader._load_single_config = load_one_file
+    loader.load_configuration = load_once
 
 
 def _add_entries(overrides: Sequence[str]) -> list[str]:
     """Let the next composition end with an empty entry of the right type for each object, place,
-    phase, camera or servo that a ``+`` adds: OmegaConf would take none from a command line.
-
-    Returns:
-        The overrides, which set such an entry's values over its defaults.
+    phase, camera or servo that a ``+`` adds: OmegaConf would take none from a command line. The
+    overrides come back, and set such an entry's values over its defaults.
     """
     entries = DictConfig({})
     out = []
@@ -307,6 +279,34 @@ def _add_entries(overrides: Sequence[str]) -> list[str]:
         out.append(f"++{text.lstrip('+')}" if entry else text)
     ConfigStore.instance().store("added_entries", entries, package="_global_", provider="mjstack")
     return out
+
+
+def _choose_observation(
+    overrides: list[str], compose: Callable[[list[str]], DictConfig]
+) -> list[str]:
+    """Let a new policy see the task's own observation: where the overrides say so, or where they
+    say nothing and the task writes all of its terms, without a choice of a file. The overrides come
+    back with that choice, whose terms are ready for the next composition.
+    """
+    chosen = [o for o in overrides if o.startswith(SEEN)]
+    trains = any(o.startswith(("job=train", "trainer=", "experiment=")) for o in overrides)
+    if TASK_SEEN not in chosen and (chosen or not trains):
+        return overrides
+    _store_observation({})
+    # An override of one of its terms fits only where the choice has been made.
+    cfg = compose([o for o in overrides if "job.observation" not in o])
+    choices = cfg.hydra.runtime.choices
+    alone = choices.get("observation") is None and bool(cfg.observation)
+    if not (chosen or (alone and choices.get(SEEN.rstrip("=")) == "state")):
+        return overrides
+    _store_observation(OmegaConf.to_container(cfg.observation))
+    return [*(o for o in overrides if o != TASK_SEEN), TASK_SEEN]
+
+
+def _store_observation(terms: Any) -> None:
+    """Set what ``conf/observation/task.yaml`` includes."""
+    node = OmegaConf.create(terms)
+    ConfigStore.instance().store("task_observation", node, provider="mjstack")
 
 
 def without_hydra(cfg: DictConfig) -> DictConfig:
@@ -329,7 +329,7 @@ def list_choices() -> dict[str, list[str]]:
 
 def _checked_folder(text: str) -> Path:
     """A folder with configuration files, absolute."""
-    folder = Path(text.removeprefix(_FILE)).absolute()
+    folder = Path(text.removeprefix("file://")).absolute()
     if not folder.is_dir():
         raise MjstackError(
             f"configuration folder {folder}: there is no such folder, expected one with YAML files"

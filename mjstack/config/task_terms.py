@@ -5,21 +5,18 @@ trainers have copies of groups, each with a choice of its own. A term that is wr
 acts in its copies too.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
-from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from mjstack.config.schema import CloneJobCfg
-from mjstack.config.session import CONFIG_FOLDER
+from mjstack.config.session import CONFIG_FOLDER, TASK_SEEN
 
 Terms = dict[str, Any]
 
 _JUDGED = "gate.success.reset"
 _COPIES = ("gate.baseline.reset", "gate.capacity.reset", _JUDGED)
-_SEEN = "observation@job.observation="
-_TASK_SEEN = f"{_SEEN}task"
 # Groups that a job leaves out, and what stands in their place
 _LEFT_OUT = {
     "action": "drivers command controller.action, policies their own action",
@@ -28,47 +25,10 @@ _LEFT_OUT = {
 }
 
 
-def choose_observation(
-    overrides: Sequence[str], compose: Callable[[list[str]], DictConfig]
-) -> list[str]:
-    """Let a new policy see the task's own observation: where the overrides say so, or where they
-    say nothing and the task writes all of its terms, without a choice of a file.
-
-    Args:
-        overrides: Of the command line.
-        compose: Composes a configuration.
-
-    Returns:
-        The overrides with that choice, whose terms are ready for the next composition.
-    """
-    chosen = [o for o in overrides if o.startswith(_SEEN)]
-    trains = any(o.startswith(("job=train", "trainer=", "experiment=")) for o in overrides)
-    if _TASK_SEEN not in chosen and (chosen or not trains):
-        return list(overrides)
-    _store_observation({})
-    # An override of one of its terms fits only where the choice has been made.
-    cfg = compose([o for o in overrides if "job.observation" not in o])
-    choices = cfg.hydra.runtime.choices
-    alone = choices.get("observation") is None and bool(cfg.observation)
-    if not (chosen or (alone and choices.get(_SEEN.rstrip("=")) == "state")):
-        return list(overrides)
-    _store_observation(OmegaConf.to_container(cfg.observation))
-    return [*(o for o in overrides if o != _TASK_SEEN), _TASK_SEEN]
-
-
-def _store_observation(terms: Any) -> None:
-    """Set what ``conf/observation/task.yaml`` includes."""
-    node = OmegaConf.create(terms)
-    ConfigStore.instance().store("task_observation", node, provider="mjstack")
-
-
 def complete_terms(cfg: DictConfig, overrides: Sequence[str]) -> None:
     """Put the terms that are written over ``reset`` into its copies, and a line for each term that
-    does not act into ``unused_terms``, in place.
-
-    Args:
-        cfg: A composition, with Hydra's part.
-        overrides: Of the command line.
+    does not act into ``unused_terms``, in place. The composition, of the command line's overrides,
+    has Hydra's part.
     """
     chosen = any(o.startswith(f"reset@{_JUDGED}=") for o in overrides)
     with open_dict(cfg):
@@ -80,10 +40,8 @@ def complete_terms(cfg: DictConfig, overrides: Sequence[str]) -> None:
 
 
 def _complete_copy(cfg: DictConfig, key: str) -> Iterator[str]:
-    """Put the terms that are written over ``reset`` into a copy of it.
-
-    Yields:
-        A line for each that does not act in gate *success*, if that runs.
+    """Put the terms that are written over ``reset`` into a copy of it, and yield a line for each
+    that does not act in gate *success*, if that runs.
     """
     shipped = _shipped(cfg, "reset")
     copy = _terms(cfg, key)
@@ -120,7 +78,7 @@ def _unseen(cfg: DictConfig) -> Iterator[str]:
     written = _written(cfg, "observation", cfg.job.group)
     if unseen := [n for n, term in written.items() if term and _content(term) not in known]:
         line = f"the policy sees {', '.join(seen)}; the task's own {', '.join(unseen)}"
-        yield f"{line} it does not see ({_TASK_SEEN} has them)"
+        yield f"{line} it does not see ({TASK_SEEN} has them)"
 
 
 def _terms(cfg: DictConfig, key: str, group: str = "") -> Terms:

@@ -14,14 +14,13 @@ changed once they count.
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
-from mjstack.datasets.spec import INDICES, DatasetSpec
+from mjstack.datasets.spec import DTYPES, INDICES, DatasetSpec, Video
 from mjstack.errors import MissingExtra
 
 VERSION = "v3.0"
@@ -32,10 +31,13 @@ EPISODES = f"meta/episodes/{FILE}.parquet"
 VIDEO = f"videos/{{video_key}}/{FILE}.mp4"
 DATA_MB = 100  # size at which a data file is full
 VIDEO_MB = 200  # the same of a video
+MOST_ROWS = 5000  # episodes with which a file is full too: its footer tells of each
 INFO = "meta/info.json"
 STATS = "meta/stats.json"
 TASKS = "meta/tasks.parquet"
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
+STATISTICS = ("min", "max", "mean", "std", *QUANTILES)  # `count` stands beside them
+PIXELS = b"mjstack.pixels"  # key of an episodes file's counts of its videos' pixels, in JSON
 # What pandas writes of a data frame of task indices whose index is the text
 _PANDAS = (
     '{"index_columns": ["task"], "column_indexes": [{"name": null, "field_name": null,'
@@ -45,7 +47,6 @@ _PANDAS = (
     ' "pandas_type": "unicode", "numpy_type": "object", "metadata": null}],'
     ' "pandas_version": "2.3.3"}'
 )
-STATISTICS = ("min", "max", "mean", "std", *QUANTILES)  # `count` stands beside them
 
 
 def require_pyarrow() -> tuple[Any, Any]:
@@ -67,6 +68,11 @@ def shard_indices(shard: int) -> dict[str, int]:
     return {"chunk_index": shard // CHUNK, "file_index": shard % CHUNK}
 
 
+def shard_of(row: Mapping[str, Any]) -> int:
+    """The shard of an episode, by its row."""
+    return row["data/chunk_index"] * CHUNK + row["data/file_index"]
+
+
 def shard_path(folder: Path, files: str, shard: int, video: str = "") -> Path:
     """Where a shard's frames (`DATA`), episodes (`EPISODES`) or images (`VIDEO`) are."""
     return folder / files.format(**shard_indices(shard), video_key=video)
@@ -76,12 +82,6 @@ def columns_of(spec: DatasetSpec) -> dict[str, tuple[str, int]]:
     """Type and dimension of every column of the frames, in the order of the files."""
     columns = {name: (feature.dtype, feature.dim) for name, feature in spec.features.items()}
     return columns | {name: (dtype, 1) for name, dtype in INDICES.items()}
-
-
-def statistics_of(spec: DatasetSpec) -> dict[str, list[int]]:
-    """Shape of the statistics of every column and, after those, of every video's channels."""
-    shapes = {name: [dim] for name, (_, dim) in columns_of(spec).items()}
-    return shapes | {name: [3, 1, 1] for name in spec.videos}
 
 
 def make_info(
@@ -137,6 +137,72 @@ def make_info(
     }
 
 
+def episode_columns(
+    videos: Iterable[str], fps: float, shard: int, number: int, first: int, start: int, end: int
+) -> dict[str, Any]:
+    """Columns of the row of an episode that say where it is: in a shard whose first frame is
+    ``first``, from frame ``start`` to before ``end``.
+    """
+    columns = {
+        "episode_index": number,
+        "length": end - start,
+        "dataset_from_index": start,
+        "dataset_to_index": end,
+    }
+    folders = [f"videos/{name}" for name in videos]
+    for name, value in shard_indices(shard).items():
+        columns |= {f"{files}/{name}": value for files in ("data", "meta/episodes", *folders)}
+    times = {"from_timestamp": (start - first) / fps, "to_timestamp": (end - first) / fps}
+    return columns | {f"{files}/{name}": time for files in folders for name, time in times.items()}
+
+
+def is_foreign(info: Mapping[str, Any]) -> bool:
+    """Whether mjstack has not written a dataset, so that there may be other columns and files."""
+    return "mjstack" not in info
+
+
+def check_info(info: Any) -> None:
+    """Raise an error of any kind where info.json is not what `make_info` makes; of a foreign
+    dataset, where its features and counts are not.
+    """
+    empty = make_info(DatasetSpec(robot_type="", fps=1, features={}, config_sha256=""))
+    foreign = is_foreign(info)
+    used = ("codebase_version", "fps", "features", "total_episodes", "total_frames")
+    blocks = [(info, {name: empty[name] for name in used} if foreign else empty)]
+    if not foreign:
+        blocks.append((info["mjstack"], empty["mjstack"]))
+    for block, model in blocks:
+        for name, value in model.items():
+            kinds = {"video_path": str | None, "fps": int | float}.get(name, type(value))
+            number = block[name] if isinstance(block[name], int | float) else 0
+            right = isinstance(block[name], kinds) and not isinstance(block[name], bool)
+            if not right or not 0 <= number < math.inf or (name == "fps" and not number):
+                raise ValueError(f"{name} is {block[name]!r:.60}")
+    for name, feature in info["features"].items():
+        if not all(type(number) is int and number > 0 for number in feature["shape"]):
+            raise ValueError(f"the shape of {name} is {feature['shape']!r:.60}")
+        if not foreign and feature["dtype"] not in (*DTYPES, "video"):
+            raise ValueError(f"the dtype of {name} is {feature['dtype']!r:.60}")
+    for entry in () if foreign else info["mjstack"]["provenance"]:
+        if not 0 <= entry["from_episode"] <= info["total_episodes"]:
+            raise ValueError(f"from_episode is {entry['from_episode']}")
+    videos_of(info)
+
+
+def videos_of(info: Mapping[str, Any]) -> dict[str, Video]:
+    """The videos of info.json."""
+    return {
+        name: Video(height=feature["shape"][0], width=feature["shape"][1])
+        for name, feature in info["features"].items()
+        if feature["dtype"] == "video"
+    }
+
+
+def numeric_columns(info: Mapping[str, Any]) -> list[str]:
+    """The columns of info.json but for the videos."""
+    return [name for name, feature in info["features"].items() if feature["dtype"] != "video"]
+
+
 def to_json(data: Mapping[str, Any]) -> str:
     """Text of a JSON file."""
     return json.dumps(data, indent=4, ensure_ascii=False, allow_nan=False) + "\n"
@@ -172,104 +238,3 @@ def tasks_table(tasks: Sequence[str]) -> Any:
     pa, _ = require_pyarrow()
     table = pa.table({"task_index": range(len(tasks)), "task": list(tasks)})
     return table.replace_schema_metadata({"pandas": _PANDAS})
-
-
-def episode_statistics(frames: np.ndarray) -> np.ndarray:
-    """Statistics of every number over one episode.
-
-    Args:
-        frames: Shape ``(frames, dim)``, float64.
-
-    Returns:
-        Shape ``(statistics, dim)``, in the order of `STATISTICS`; std is that of these frames
-        (divided by n), quantiles interpolate.
-    """
-    quantiles = np.quantile(frames, [*QUANTILES.values()], axis=0)
-    return np.stack([frames.min(0), frames.max(0), frames.mean(0), frames.std(0), *quantiles])
-
-
-def sampled_frames(frames: int) -> np.ndarray:
-    """The frames of an episode whose images statistics are of, as LeRobot chooses them."""
-    count = max(min(100, frames), min(int(frames**0.75), 10_000))
-    return np.round(np.linspace(0, frames - 1, count)).astype(int)
-
-
-def image_statistics(images: np.ndarray) -> np.ndarray:
-    """Statistics of red, green and blue in 0 to 1, over all pixels of some images.
-
-    Args:
-        images: Shape ``(n, height, width, 3)``, uint8.
-
-    Returns:
-        Shape ``(statistics, 3)``, in the order of `STATISTICS`.
-    """
-    side = max(images.shape[1:3])
-    if side >= 300:  # LeRobot leaves pixels of large images out
-        images = images[:, :: side // 150, :: side // 150]
-    values = np.arange(256.0)
-    statistics = []
-    for channel in range(3):
-        pixels = torch.from_numpy(np.ascontiguousarray(images[..., channel]))
-        counts = torch.bincount(pixels.flatten(), minlength=256).numpy()  # NumPy's: six times it
-        present = np.flatnonzero(counts)
-        mean = np.average(values, weights=counts)
-        std = math.sqrt(np.average((values - mean) ** 2, weights=counts))
-        quantiles = np.searchsorted(np.cumsum(counts) / counts.sum(), list(QUANTILES.values()))
-        statistics.append([present[0], present[-1], mean, std, *quantiles])
-    return np.array(statistics).T / 255.0
-
-
-def merge_statistics(*parts: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Statistics of all frames, exact but for the quantiles, and the number of frames of each
-    number, shape ``(dim,)``.
-
-    The quantiles are the parts' quantiles weighted by frames, as LeRobot has them: those of all
-    frames would need all frames.
-
-    Args:
-        parts: Statistics of each part, as `episode_statistics` returns them, and frames of each
-            number, shape ``(dim,)``.
-    """
-    stacked = np.stack([statistics for statistics, _ in parts])
-    frames = np.stack([counts for _, counts in parts])
-    weights = frames / frames.sum(0)
-    merged = (weights[:, None] * stacked).sum(0)
-    lows, highs, means, stds = stacked[:, :4].swapaxes(0, 1)
-    merged[0] = lows.min(0)
-    merged[1] = highs.max(0)
-    merged[3] = np.sqrt((weights * (stds**2 + (means - merged[2]) ** 2)).sum(0))
-    return merged, frames.sum(0)
-
-
-def name_statistics(
-    spec: DatasetSpec, statistics: np.ndarray, counts: np.ndarray
-) -> dict[str, dict[str, list]]:
-    """Statistics ``(statistics, dim)`` by feature and name, and the number of frames that they are
-    of, shape ``(dim,)``: the content of stats.json.
-    """
-    named: dict[str, dict[str, list]] = {}
-    start = 0
-    for name, shape in statistics_of(spec).items():
-        values = statistics[:, start : start + shape[0]].reshape(-1, *shape).tolist()
-        named[name] = dict(zip(STATISTICS, values, strict=True))
-        named[name]["count"] = [int(counts[start])]
-        start += shape[0]
-    return named
-
-
-def row_statistics(spec: DatasetSpec, row: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Statistics of an episode from its row, as `episode_statistics` returns them, and the number
-    of frames that each number's are of, shape ``(dim,)``.
-
-    Raises:
-        Exception: The row has others.
-    """
-    shapes = statistics_of(spec)
-    rows = [[np.ravel(row[f"stats/{name}/{kind}"]) for name in shapes] for kind in STATISTICS]
-    statistics = np.array([np.concatenate(values) for values in rows], dtype=float)
-    counts = np.concatenate([row[f"stats/{name}/count"] * shapes[name][0] for name in shapes])
-    dims = sum(shape[0] for shape in shapes.values())
-    whole = statistics.shape == (len(STATISTICS), dims) and counts.shape == (dims,)
-    if not whole or not np.isfinite(statistics).all() or counts.min() < 1:
-        raise ValueError(f"statistics of episode {row['episode_index']}")
-    return statistics, counts

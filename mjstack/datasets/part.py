@@ -10,6 +10,13 @@ import numpy as np
 
 from mjstack.datasets import lerobot
 from mjstack.datasets.spec import INDICES, DatasetSpec, EpisodeData
+from mjstack.datasets.statistics import (
+    by_name,
+    count_pixels,
+    frame_statistics,
+    image_statistics,
+    sampled_frames,
+)
 from mjstack.datasets.video import VideoEncoder
 
 IMAGES_GIB = 1.0  # images that may wait for being encoded
@@ -23,12 +30,14 @@ class Part:
         path: The data file.
         videos: The file of each video.
         rows: Rows of the episodes.
+        pixels: Of each video, as of `count_pixels`.
         waited: Time for which the writer has waited for encoders [s].
     """
 
     path: Path
     videos: dict[str, Path] = field(default_factory=dict)
     rows: list[dict[str, Any]] = field(default_factory=list)
+    pixels: dict[str, np.ndarray] = field(default_factory=dict)
     waited: float = 0.0
 
 
@@ -56,9 +65,10 @@ class PartWriter:
         """
         self._spec = spec
         path = lerobot.shard_path(folder, lerobot.DATA, 0)
-        self.part = Part(path=path.with_name(f".file-{name}.parquet"))
+        # Readers list names that end in .parquet and .mp4, hidden ones too.
+        self.part = Part(path=path.with_name(f".file-{name}.parquet.part"))
         self.part.path.parent.mkdir(parents=True, exist_ok=True)
-        self._file = open(self.part.path, "wb")  # noqa: SIM115
+        self._file = open(self.part.path, "xb")  # noqa: SIM115
         # Few floats occur twice: a dictionary of them takes three times the time, and more room.
         self._writer = lerobot.require_pyarrow()[1].ParquetWriter(
             self._file,
@@ -68,17 +78,18 @@ class PartWriter:
         )
         for video in spec.videos:
             path = lerobot.shard_path(folder, lerobot.VIDEO, 0, video)
-            self.part.videos[video] = path.with_name(f".file-{name}.mp4")
+            self.part.videos[video] = path.with_name(f".file-{name}.mp4.part")
         most = images_gib * 2**30
         self._videos = VideoEncoder(spec.videos, spec.fps, self.part.videos, most)
 
     def is_full(self) -> bool:
         """Whether one more episode like these would make the data file larger than
-        `lerobot.DATA_MB`, or a video larger than `lerobot.VIDEO_MB`.
+        `lerobot.DATA_MB`, or a video larger than `lerobot.VIDEO_MB`, or its footer too long.
         """
         data = self._file.tell() / (lerobot.DATA_MB * 2**20)
-        share = max(data, self._videos.megabytes() / lerobot.VIDEO_MB)
-        return share * (1.0 + 1.0 / len(self.part.rows)) > 1.0
+        rows = len(self.part.rows)
+        share = max(data, self._videos.megabytes() / lerobot.VIDEO_MB, rows / lerobot.MOST_ROWS)
+        return share * (1.0 + 1.0 / rows) > 1.0
 
     def write(
         self,
@@ -112,48 +123,30 @@ class PartWriter:
         table = lerobot.frames_table(self._writer.schema, columns)
         self._writer.write_table(table, row_group_size=length)
         self._videos.add(episode.images)
-        # float64 holds every type's values exactly, but int64's beyond 2^53.
-        joined = np.concatenate([columns[name] for name in table.column_names], axis=1, dtype=float)
-        named = self._statistics(joined, episode)
-        before = sum(row["length"] for row in self.part.rows)  # frames before it in the videos
-        times = {
-            "from_timestamp": before / self._spec.fps,
-            "to_timestamp": (before + length) / self._spec.fps,
+        statistics = {
+            name: by_name(frame_statistics(columns[name]), length) for name in table.column_names
         }
-        place = lerobot.shard_indices(0)  # the commit knows it
-        self.part.rows.append(
+        sampled = sampled_frames(length)
+        for name in self._spec.videos:
+            pixels = count_pixels(episode.images[name][sampled])
+            statistics[name] = by_name(image_statistics(pixels), len(sampled), video=True)
+            self.part.pixels[name] = self.part.pixels.get(name, 0) + pixels
+        rows = self.part.rows
+        first = rows[0]["dataset_from_index"] if rows else start
+        rows.append(
             {
-                "episode_index": number,
+                **lerobot.episode_columns(
+                    self._spec.videos, self._spec.fps, 0, number, first, start, start + length
+                ),
                 "tasks": [episode.task],
-                "length": length,
-                **{f"data/{name}": index for name, index in place.items()},
-                "dataset_from_index": start,
-                "dataset_to_index": start + length,
-                **{
-                    f"videos/{name}/{key}": value
-                    for name in self._spec.videos
-                    for key, value in (place | times).items()
-                },
                 **facts,
-                **{f"meta/episodes/{name}": index for name, index in place.items()},
                 **{
                     f"stats/{name}/{kind}": values
-                    for name, kinds in named.items()
+                    for name, kinds in statistics.items()
                     for kind, values in kinds.items()
                 },
             }
         )
-
-    def _statistics(self, frames: np.ndarray, episode: EpisodeData) -> dict[str, dict[str, list]]:
-        """Statistics of an episode's frames, shape ``(frames, dim)``, and of its images."""
-        statistics = [lerobot.episode_statistics(frames)]
-        counts = [len(frames)] * frames.shape[1]
-        sampled = lerobot.sampled_frames(len(frames))
-        for name in self._spec.videos:
-            statistics.append(lerobot.image_statistics(episode.images[name][sampled]))
-            counts += [len(sampled)] * 3
-        joined = np.concatenate(statistics, axis=1)
-        return lerobot.name_statistics(self._spec, joined, np.array(counts))
 
     def complete(self) -> Part:
         """Close the files; they are on the disk then."""

@@ -1,10 +1,7 @@
 """Opening a dataset: to read it, or to go on with it."""
 
-import json
 import math
-import re
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,14 +9,16 @@ from typing import Any
 import numpy as np
 
 from mjstack.config.fingerprint import differences
-from mjstack.datasets import lerobot
-from mjstack.datasets.spec import DatasetSpec, Video
+from mjstack.datasets import lerobot, parquet, tables
+from mjstack.datasets.lerobot import STATISTICS, is_foreign, numeric_columns, videos_of
+from mjstack.datasets.spec import INDICES, DatasetSpec
+from mjstack.datasets.statistics import count_pixels, sampled_frames
 from mjstack.datasets.video import decode
 from mjstack.errors import FolderError, require_names
-from mjstack.files import reading
+from mjstack.files import refuse_links
 
-_USED = ("codebase_version", "fps", "features", "total_episodes", "total_frames")
-_ORDER = ("episode_index", "frame_index")
+_FIX = "Restore its files, or give another folder"
+_SLACK = 1e-4  # s: LeRobot lets no timestamp be off further
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +29,8 @@ class StoredDataset:
         folder: The dataset.
         info: The content of info.json.
         tasks: Texts of the tasks, by index.
-        episodes: A row per episode: its columns but for the statistics.
+        episodes: A row per episode: its columns but for the statistics. Of a dataset that mjstack
+            has not written: its length, and its seed if there is one.
     """
 
     folder: Path
@@ -53,13 +53,12 @@ class StoredDataset:
             IndexError: There is no such episode.
             FolderError: A file is missing or damaged.
         """
-        videos = _videos(self.info)
+        videos = videos_of(self.info)
         require_names("video", [name], videos)
         row = self.episodes[episode]
-        place = {key: row[f"videos/{name}/{key}"] for key in ("chunk_index", "file_index")}
-        path = self.folder / lerobot.VIDEO.format(video_key=name, **place)
+        path = lerobot.shard_path(self.folder, lerobot.VIDEO, lerobot.shard_of(row), name)
         start = row[f"videos/{name}/from_timestamp"]
-        with readable(path):
+        with tables.readable(path):
             return decode(path, videos[name], start, row["length"], self.info["fps"])
 
     def frames(self, name: str) -> np.ndarray:
@@ -76,104 +75,90 @@ class StoredDataset:
             UnknownName: There is no such column.
             FolderError: A file is missing or damaged.
         """
-        videos = _videos(self.info)
         features = self.info["features"]
-        require_names("feature", [name], features.keys() - videos.keys())
-        dtype = features[name]["dtype"]
-        parts = [np.empty((0, *features[name]["shape"]), dtype)]
-        for path in data_files(self.folder, self.info):
-            with readable(path):
-                part = read_columns(path, self.info, [name])[name]
-                if part.dtype != dtype:
-                    raise ValueError(f"{name} is {part.dtype}")
-                parts.append(part.reshape(-1, *parts[0].shape[1:]))
-        return np.concatenate(parts)
+        require_names("feature", [name], numeric_columns(self.info))
+        shape = features[name]["shape"]
+        columns = [np.empty((0, math.prod(shape)), features[name]["dtype"])]
+        for path in tables.data_files(self.folder, self.info):
+            with tables.readable(path):
+                columns.append(tables.read_columns(path, self.info, [name])[name])
+        return np.concatenate(columns).reshape(-1, *shape)
+
+    def pixels(self, shard: int) -> dict[str, np.ndarray]:
+        """How many pixels of each video of a shard have each value, as of `count_pixels`: those
+        that its writer counted or, as an earlier version did not, those of the decoded images.
+
+        Raises:
+            FolderError: A file is missing or damaged.
+        """
+        path = lerobot.shard_path(self.folder, lerobot.EPISODES, shard)
+        with tables.readable(path):
+            if counts := tables.read_pixels(path, self.info):
+                return counts
+        counts = {name: np.zeros((3, 256), np.int64) for name in videos_of(self.info)}
+        for number, row in enumerate(self.episodes):
+            for name in counts if lerobot.shard_of(row) == shard else ():
+                images = self.images(name, number)
+                counts[name] += count_pixels(images[sampled_frames(row["length"])])
+        return counts
 
 
-def read_dataset(folder: Path | str) -> StoredDataset:
-    """Open a dataset to read from it.
+def read_dataset(folder: Path | str, used: Iterable[str] = ()) -> StoredDataset:
+    """Open a dataset to read from it. Its files, but for images, are held to what they say of one
+    another.
+
+    Args:
+        folder: The dataset.
+        used: Columns that will be read. Of a dataset that mjstack has not written, others are not
+            looked at.
 
     Raises:
-        FolderError: There is none, or a file is missing or damaged.
+        FolderError: There is none, or a file is missing, damaged or too large for what it holds.
     """
-    lerobot.require_pyarrow()
     folder = Path(folder)
-    info = read_info(folder)
-    if info is None:
-        raise FolderError(f"{folder} has no {lerobot.INFO}, expected a dataset. Give its folder")
-    rows = [
-        {name: value for name, value in row.items() if not name.startswith("stats/")}
-        for row in read_rows(folder, info)
-    ]
-    return StoredDataset(folder=folder, info=info, tasks=read_tasks(folder, info), episodes=rows)
+    info = tables.read_info(folder)
+    columns = [*INDICES, *used] if is_foreign(info) else numeric_columns(info)
+    require_names("feature", columns, info["features"])
+    _check_sizes(folder, info, columns)
+    tasks = tables.read_tasks(folder, info)
+    rows = (tables.read_lengths if is_foreign(info) else tables.read_rows)(folder, info)
+    stored = StoredDataset(folder=folder, info=info, tasks=tasks, episodes=rows)
+    _check_frames(stored, columns)
+    return stored
 
 
-def read_info(folder: Path) -> dict[str, Any] | None:
-    """The content of info.json, or None where no dataset has been begun.
+def read_begun(folder: Path, spec: DatasetSpec) -> StoredDataset | None:
+    """Open a dataset to go on with it; None where none has been begun.
 
     Raises:
-        FolderError: It cannot be read, was not written by mjstack, or is missing beside other
-            files.
+        FolderError: It is damaged, as of `read_dataset`, or of another configuration; or there are
+            other files, or links where files are written, or a folder in place of a file.
     """
-    path = folder / lerobot.INFO
-    if not path.is_file():
-        begun = f".{path.name}."
+    names = ["data", "meta/episodes", *(f"videos/{name}" for name in spec.videos)]
+    chunks = [chunk for name in names for chunk in (folder / name).glob("chunk-*")]
+    folders = [*(folder / name for name in ("meta", "videos", *names)), *chunks]
+    files = [folder / name for name in (lerobot.INFO, lerobot.STATS, lerobot.TASKS)]
+    files += [*folder.glob("meta/.*"), *(file for chunk in chunks for file in chunk.glob("*"))]
+    refuse_links(folders + files, "Write into another folder")
+    for path in [*(path for path in folders if not path.is_dir()), *files]:
+        if path.exists() and (path in folders or not path.is_file()):
+            kind = "folder" if path in folders else "regular file"
+            raise FolderError(f"{path} is no {kind}, expected one. {_FIX}")
+    if not files[0].exists():
+        begun = f".{files[0].name}."
         for file in folder.rglob("*"):
             if file.is_file() and not file.name.startswith(begun):
                 name = file.relative_to(folder)
                 expected = "expected a dataset or an empty folder. Give another"
                 raise FolderError(f"{folder} has {name} and no {lerobot.INFO}, {expected}")
         return None
-    with readable(path):
-        info = json.loads(path.read_text(encoding="utf-8"))
-        check_types(info)
-    return info
-
-
-def check_types(info: Any, *, written_here: bool = True) -> None:
-    """Raise an error of any kind where info.json is not what `make_info` makes; of a dataset that
-    mjstack has not written, where its features and counts are not.
-    """
-    empty = lerobot.make_info(DatasetSpec(robot_type="", fps=1, features={}, config_sha256=""))
-    used = empty if written_here else {name: empty[name] for name in _USED}
-    blocks = [(info, used)]
-    if written_here:
-        blocks.append((info["mjstack"], empty["mjstack"]))
-    for block, model in blocks:
-        for name, value in model.items():
-            kinds = {"video_path": str | None, "fps": int | float}.get(name, type(value))
-            if not isinstance(block[name], kinds) or isinstance(block[name], bool):
-                raise ValueError(f"{name} is {block[name]!r:.60}")
-    for name, feature in info["features"].items():
-        if not all(type(number) is int and number > 0 for number in feature["shape"]):
-            raise ValueError(f"the shape of {name} is {feature['shape']!r:.60}")
-        if written_here and feature["dtype"] != "video":
-            np.dtype(feature["dtype"])
-    for entry in info["mjstack"]["provenance"] if written_here else ():
-        if not 0 <= entry["from_episode"] <= info["total_episodes"]:
-            raise ValueError(f"from_episode is {entry['from_episode']}")
-    _videos(info)
-
-
-def _videos(info: dict[str, Any]) -> dict[str, Video]:
-    """The videos of info.json."""
-    return {
-        name: Video(height=int(feature["shape"][0]), width=int(feature["shape"][1]))
-        for name, feature in info["features"].items()
-        if feature["dtype"] == "video"
-    }
-
-
-def check_same(folder: Path, info: dict[str, Any], spec: DatasetSpec) -> None:
-    """Raise where a dataset is not the one that a spec describes.
-
-    Raises:
-        FolderError: It has another configuration, or other columns.
-    """
+    info = tables.read_info(folder)
+    if is_foreign(info):
+        raise FolderError(f"{folder} was not written by mjstack", "Give another folder")
     if changes := differences(_identity(info), _identity(lerobot.make_info(spec))):
-        raise FolderError(
-            f"{folder} has {changes}", "Give another folder, or what it was begun with"
-        )
+        fix = "Give another folder, or what it was begun with"
+        raise FolderError(f"{folder} has {changes}", fix)
+    return read_dataset(folder)
 
 
 def _identity(info: dict[str, Any]) -> dict[str, Any]:
@@ -183,112 +168,70 @@ def _identity(info: dict[str, Any]) -> dict[str, Any]:
     return block | {key: info[key] for key in keys}
 
 
-def read_tasks(folder: Path, info: dict[str, Any]) -> list[str]:
-    """Texts of the tasks that count, by index.
+def _check_sizes(folder: Path, info: dict[str, Any], columns: Iterable[str]) -> None:
+    """Check how many rows the files have and what they unpack to, before any is unpacked."""
+    width = sum(math.prod(info["features"][name]["shape"]) for name in columns)
+    counts = []
+    for files, numbers in (
+        (lerobot.EPISODES, 2 if is_foreign(info) else width * len(STATISTICS)),
+        (lerobot.DATA, width),
+    ):
+        rows = disk = 0
+        for path in tables.data_files(folder, info, files):
+            with tables.readable(path):
+                rows += parquet.count_rows(path)
+                disk += path.stat().st_size
+                parquet.check_size(rows * numbers, disk)
+        counts.append(rows)
+    total = [info["total_episodes"], info["total_frames"]]
+    if counts != total:
+        raise FolderError(
+            f"{folder} has {counts[0]} rows of episodes and {counts[1]} frames, expected {total[0]}"
+            f" episodes and {total[1]} frames as {lerobot.INFO} says. {_FIX}"
+        )
+
+
+def _check_frames(stored: StoredDataset, names: Iterable[str]) -> None:
+    """Check columns of the frames: those of each episode are in one piece, in order.
 
     Raises:
-        FolderError: The file is missing or damaged.
+        FolderError: A number is missing or not finite, or an index or a time is another.
     """
-    count = info["total_tasks"]
-    if not count:
-        return []
-    path = folder / lerobot.TASKS
-    with readable(path):
-        tasks = read_table(path, ["task"])["task"].to_pylist()[:count]
-        if [type(task) for task in tasks] != [str] * count:
-            raise ValueError(f"not {count} texts")
-    return tasks
-
-
-def read_rows(folder: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
-    """Rows of every episode that counts, in order.
-
-    Raises:
-        FolderError: A file is missing or damaged, or has other episodes or frames than it should.
-    """
-    rows: list[dict[str, Any]] = []
-    for shard in range(info["mjstack"]["shards"]):
-        path = lerobot.shard_path(folder, lerobot.EPISODES, shard)
-        with readable(path):
-            for row in read_table(path).to_pylist():
-                start = rows[-1]["dataset_to_index"] if rows else 0
-                place = (len(rows), start, start + row["length"])
-                names = ("episode_index", "dataset_from_index", "dataset_to_index")
-                if tuple(row[name] for name in names) != place or row["length"] < 1:
-                    raise ValueError(f"row {len(rows)} is not of that episode")
-                if min(row["seed"], row["world"]) < 0:
-                    raise ValueError(f"row {len(rows)} has a negative seed or world")
-                rows.append(row)
-        for video in _videos(info):
-            with readable(lerobot.shard_path(folder, lerobot.VIDEO, shard, video)):
-                pass
-    check_frames(folder, info, [row["length"] for row in rows])
-    return rows
-
-
-def data_files(folder: Path, info: dict[str, Any], files: str = lerobot.DATA) -> list[Path]:
-    """The data files that count, or those of episodes (`lerobot.EPISODES`), in order. If some are
-    missing, the first of them is among these.
-    """
-    there = sorted(folder.glob(re.sub(r"{.*?}", "*", files)))
-    if "mjstack" not in info:
-        return there
-    shards = min(info["mjstack"]["shards"], len(there) + 1)
-    return [lerobot.shard_path(folder, files, shard) for shard in range(shards)]
-
-
-def check_frames(folder: Path, info: dict[str, Any], lengths: Sequence[int]) -> None:
-    """Check that the frames are as many as info.json says, and those of each episode in one piece.
-
-    Args:
-        folder: The dataset.
-        info: The content of info.json, as of `check_types`.
-        lengths: Frames of each episode, as its row says.
-
-    Raises:
-        FolderError: Frames or episodes are missing, there twice or out of order.
-    """
-    parts = [np.empty((0, 2))]
-    for path in data_files(folder, info):
-        with readable(path):
-            parts.append(np.hstack([*read_columns(path, info, _ORDER).values()]))
-    episode, frame = np.concatenate(parts).T
-    counts = (len(lengths), len(frame))
-    total = (info["total_episodes"], info["total_frames"])
-    if counts == total and min(lengths, default=1) > 0 and sum(lengths) == len(frame):
-        steps = np.concatenate([np.arange(length) for length in (0, *lengths)])
-        number = np.repeat(np.arange(len(lengths)), lengths)
-        if np.array_equal(episode, number) and np.array_equal(frame, steps):
-            return
-    raise FolderError(
-        f"{folder} has {counts[0]} rows of episodes and {counts[1]} frames of"
-        f" {len(np.unique(episode))} episodes{', out of order' * (counts == total)}, expected"
-        f" {total[0]} episodes and {total[1]} frames as {lerobot.INFO} says, each episode in one"
-        " piece, as long as its row says and frame_index rising by one in it. Restore its files,"
-        " or give another folder"
-    )
-
-
-def read_columns(path: Path, info: dict[str, Any], names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Columns of a data file, each shape ``(frames, numbers)``, in the file's types.
-
-    Raises:
-        Exception: It cannot be read, or a row has not as many numbers as info.json says.
-    """
-    table = read_table(path, names)
-    columns = {}
-    for name in names:
-        column = table[name].combine_chunks()
-        width = math.prod(info["features"][name]["shape"])
-        if hasattr(column, "flatten"):
-            if set(column.value_lengths().unique().to_pylist()) - {width}:  # a null has none
-                raise ValueError(f"rows of {name} without {width} numbers")
-            column = column.flatten()
-        values = column.to_numpy(zero_copy_only=False)
-        if values.dtype.kind not in "biuf":
-            raise ValueError(f"{name} has other values than numbers")
-        columns[name] = values.reshape(len(table), width)
-    return columns
+    info, tasks = stored.info, stored.tasks
+    lengths = [row["length"] for row in stored.episodes]
+    frames = info["total_frames"]
+    if min(lengths, default=1) < 1 or sum(lengths) != frames:
+        problem = f"{stored.folder} has episodes of {sum(lengths)} frames, expected {frames}"
+        raise FolderError(f"{problem} as {lerobot.INFO} says. {_FIX}")
+    frame = np.arange(frames) - np.repeat(np.cumsum([0, *lengths])[:-1], lengths)
+    expected = {
+        "episode_index": np.repeat(np.arange(len(lengths)), lengths),
+        "frame_index": frame,
+        "index": np.arange(frames),
+        "timestamp": (frame / info["fps"]).astype(np.float32),
+    }
+    if not is_foreign(info):
+        numbers = {task: number for number, task in enumerate(tasks)}
+        task_numbers = [numbers.get(row["tasks"][0], -1) for row in stored.episodes]
+        expected["task_index"] = np.repeat(task_numbers, lengths)
+    start = 0
+    for path in tables.data_files(stored.folder, info):
+        with tables.readable(path):
+            columns = tables.read_columns(path, info, names)
+            stop = start + len(columns["index"])
+            for name, values in expected.items():
+                column, values = columns[name][:, 0], values[start:stop]
+                differs = column != values
+                if name == "timestamp":
+                    differs = np.abs(column - values) > _SLACK + np.spacing(values)
+                if differs.any():
+                    k = int(differs.argmax())
+                    problem = f"{name} of frame {start + k} is {column[k]}, expected {values[k]}"
+                    raise ValueError(problem)
+            task = columns["task_index"]
+            if not ((task >= 0) & (task < len(tasks))).all():
+                raise ValueError(f"task_index goes to {task.max()}, with {len(tasks)} tasks")
+            start = stop
 
 
 def uncommitted(folder: Path, shards: int) -> list[Path]:
@@ -304,13 +247,3 @@ def uncommitted(folder: Path, shards: int) -> list[Path]:
     patterns += [f"meta/.{Path(name).name}.*" for name in totals]
     paths = [path for pattern in patterns for path in folder.glob(pattern)]
     return [path for path in paths if f"{path.parent.name}/{path.stem}" not in counted]
-
-
-def read_table(path: Path, columns: Sequence[str] | None = None) -> Any:
-    """A file as an Arrow table, or these of its columns."""
-    return lerobot.require_pyarrow()[1].ParquetFile(path).read(columns=columns)
-
-
-def readable(path: Path) -> AbstractContextManager[None]:
-    """Raise a `FolderError` for whatever goes wrong with a file inside."""
-    return reading(path, "Restore it, or give another folder")

@@ -6,6 +6,7 @@ frame is complete in itself.
 
 import errno
 import os
+import struct
 import subprocess
 import time
 from collections import deque
@@ -81,6 +82,21 @@ def decode(path: Path, video: Video, start: float, frames: int, fps: int) -> np.
     if len(content) != np.prod(shape):
         raise OSError(errno.EIO, f"{len(content)} bytes of images, expected {np.prod(shape)}")
     return np.frombuffer(content, np.uint8).reshape(shape)
+
+
+def check_video(path: Path) -> None:
+    """Raise an error of any kind for an mp4 that is cut or has no index of its frames."""
+    with open(path, "rb") as file:
+        end = path.stat().st_size
+        kinds: list[bytes] = []
+        while file.tell() < end and len(kinds) < 64:  # ffmpeg's has four boxes
+            start = file.tell()
+            size, kind = struct.unpack(">I4s", file.read(8))
+            (size,) = struct.unpack(">Q", file.read(8)) if size == 1 else (size,)
+            kinds.append(kind)
+            file.seek(start + max(size, 8))
+        if file.tell() != end or b"moov" not in kinds:
+            raise ValueError("the video is cut")
 
 
 def check_encoder(videos: Mapping[str, Video], fps: int) -> None:

@@ -4,20 +4,27 @@ committed.
 
 import contextlib
 import io
+import itertools
 import json
 import os
 import weakref
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
-from mjstack.datasets import lerobot, reader
+from mjstack.datasets import lerobot, reader, tables
 from mjstack.datasets.part import Part, PartWriter
 from mjstack.datasets.spec import DatasetSpec, EpisodeData, typed_episode
+from mjstack.datasets.statistics import (
+    RunningStatistics,
+    by_name,
+    image_statistics,
+    sampled_frames,
+)
 from mjstack.errors import FolderError
-from mjstack.files import lock_folder, refuse_links, write_atomic
+from mjstack.files import lock_folder, write_atomic
 
 
 class DatasetWriter:
@@ -64,8 +71,9 @@ class DatasetWriter:
         self._shards = 0
         self._provenance: list[dict[str, Any]] = []
         self._tasks: dict[str, int] = {}
-        # Statistics of the committed frames, and the number of frames of each number
-        self._statistics: tuple[np.ndarray, np.ndarray] | None = None
+        self._statistics: dict[str, RunningStatistics] = {}  # of the committed frames
+        self._pixels: dict[str, np.ndarray] = {}  # of those of their images that are sampled
+        self._sampled = 0
         self._part: PartWriter | None = None  # since the last commit
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -146,21 +154,13 @@ class DatasetWriter:
 
     def _resume(self) -> None:
         """Count what is committed, and clear away what is not."""
-        patterns = "data data/* meta meta/* meta/episodes/* videos videos/* videos/*/*"
-        paths = (path for name in patterns.split() for path in self.folder.glob(name))
-        refuse_links(paths, "Write into another folder")
-        info = reader.read_info(self.folder)
-        if info is not None:
-            reader.check_same(self.folder, info, self.spec)
-            self._tasks = {
-                task: index for index, task in enumerate(reader.read_tasks(self.folder, info))
-            }
-            self._provenance = info["mjstack"]["provenance"]
-            if rows := reader.read_rows(self.folder, info):  # else there are no files of them
-                with reader.readable(self.folder / "meta/episodes"):
-                    for row in rows:
-                        self._count(row)
-            self._shards = info["mjstack"]["shards"]
+        stored = reader.read_begun(self.folder, self.spec)
+        if stored is not None:
+            self._tasks = {task: index for index, task in enumerate(stored.tasks)}
+            self._provenance = stored.info["mjstack"]["provenance"]
+            for shard, rows in itertools.groupby(stored.episodes, lerobot.shard_of):
+                self._count(shard, rows, stored.pixels(shard))
+            self._shards = stored.info["mjstack"]["shards"]
         for path in reader.uncommitted(self.folder, self._shards):
             path.unlink()
         # Where the last writer and this one differ, such as in a version, both are on record.
@@ -188,10 +188,11 @@ class DatasetWriter:
             self.waited += part.waited
         self._write_table(lerobot.tasks_table(list(self._tasks)), self.folder / lerobot.TASKS)
         for shard, part in enumerate(parts, self._shards):
+            pixels = {name: counts.tolist() for name, counts in part.pixels.items()}
             rows = self._pa.Table.from_pylist(part.rows)
+            rows = rows.replace_schema_metadata({lerobot.PIXELS: json.dumps(pixels)})
             self._write_table(rows, lerobot.shard_path(self.folder, lerobot.EPISODES, shard))
-            for row in part.rows:
-                self._count(row)
+            self._count(shard, part.rows, part.pixels)
         self._shards += len(parts)
         self._write_totals()
 
@@ -201,20 +202,33 @@ class DatasetWriter:
         self._parquet.write_table(table, buffer)
         write_atomic(path, buffer.getvalue())
 
-    def _count(self, row: dict[str, Any]) -> None:
-        """Count an episode by its row."""
-        statistics = lerobot.row_statistics(self.spec, row)
-        if self._statistics is not None:
-            statistics = lerobot.merge_statistics(self._statistics, statistics)
-        self._statistics = statistics
-        self.frames += row["length"]
-        self.committed.append((row["seed"], row["world"]))
+    def _count(
+        self, shard: int, rows: Iterable[dict[str, Any]], pixels: Mapping[str, np.ndarray]
+    ) -> None:
+        """Count a shard, by its frames, its episodes' rows and the pixels of its videos."""
+        path = lerobot.shard_path(self.folder, lerobot.DATA, shard)
+        columns = lerobot.columns_of(self.spec)
+        with tables.readable(path):
+            frames = tables.read_columns(path, lerobot.make_info(self.spec), columns)
+        for name, (_, dim) in columns.items():
+            self._statistics.setdefault(name, RunningStatistics(dim)).add(frames[name])
+        for name, counts in pixels.items():
+            self._pixels[name] = self._pixels.get(name, 0) + counts
+        for row in rows:
+            self.frames += row["length"]
+            self._sampled += len(sampled_frames(row["length"]))
+            self.committed.append((row["seed"], row["world"]))
 
     def _write_totals(self) -> None:
         """Write statistics, and last the file that says what counts."""
         (self.folder / "meta").mkdir(exist_ok=True)
-        if self._statistics is not None:
-            stats = lerobot.name_statistics(self.spec, *self._statistics)
+        if self._shards:
+            stats = {
+                name: by_name(running.statistics(), running.count)
+                for name, running in self._statistics.items()
+            }
+            for name, pixels in self._pixels.items():
+                stats[name] = by_name(image_statistics(pixels), self._sampled, video=True)
             write_atomic(self.folder / lerobot.STATS, lerobot.to_json(stats))
         info = lerobot.make_info(
             self.spec,
@@ -243,7 +257,7 @@ class DatasetWriter:
             if self._part is not None:
                 self._part.abandon()
                 self._part = None
-            info = cast(dict[str, Any], reader.read_info(self.folder))
+            info = tables.read_info(self.folder)
             del self.committed[info["total_episodes"] :]
             self.frames = info["total_frames"]
             for path in reader.uncommitted(self.folder, info["mjstack"]["shards"]):

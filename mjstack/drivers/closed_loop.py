@@ -11,7 +11,7 @@ from torch import Tensor
 from mjstack.drivers.feedback import STAY, FeedbackDriver, measure_planar
 from mjstack.drivers.open_loop import OpenLoopPlanner, smoothstep
 from mjstack.envs import Env
-from mjstack.managers.view import EnvView
+from mjstack.managers.view import EnvView, offers
 from mjstack.math import atan2, norm
 from mjstack.mdp.geometry import jaw_forces, objects_in_hand, robot
 from mjstack.tasks.check import make_check
@@ -23,6 +23,7 @@ _OFF = 0.03  # m: so far off the grasp point, a held object is made up for
 _DONE = 1e-3  # steps: a phase is over this much before its last step would be
 
 
+@offers("driver")
 class ClosedLoopDriver(FeedbackDriver):
     """Phase, time and targets of every world as tensors; targets from where its objects are.
 
@@ -39,6 +40,9 @@ class ClosedLoopDriver(FeedbackDriver):
     ``retries`` are those of the current episode.
     """
 
+    phased = True
+    measures = True  # objects, in phases that say so
+
     def __init__(self, env: EnvView, nominal: np.ndarray) -> None:
         """Allocate for the environment's worlds; see `FeedbackDriver`."""
         super().__init__(env, nominal, clock=True)
@@ -46,19 +50,16 @@ class ClosedLoopDriver(FeedbackDriver):
         self._home_grip = robot(env).home[self._n_arm :].float()
 
         # Buffers
-        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-            return torch.zeros((env.nworld, *shape), dtype=dtype, device=env.device)
-
-        self._time = zeros()
-        self._rate = zeros()
-        # Whose grasp has been tried again
-        self._tried = zeros(len(self._cfg.scene.objects), dtype=torch.bool)
-        self._again = zeros(dtype=torch.bool)  # the phase was entered to try a grasp once more
+        self._time = torch.zeros_like(self.error)
+        self._rate = torch.zeros_like(self.error)
+        self._roll = torch.zeros_like(self.error)
+        # Whether the phase was entered to try a grasp once more, and whose has been tried again
+        self._again = torch.zeros_like(self.error, dtype=torch.bool)
+        self._tried = self._again[:, None].repeat(1, len(self._cfg.scene.objects))
         # Grasp point and gripper at both ends of the phase
-        self._from = zeros(3 + len(self._cfg.robot.gripper_joints))
+        self._from = self.error.new_zeros((env.nworld, 3 + len(self._cfg.robot.gripper_joints)))
         self._to = torch.zeros_like(self._from)
         self._at = torch.zeros_like(self._from)  # what the last command led to
-        self._roll = zeros()
 
     def command(self) -> Tensor:
         """Commands of the next step, shape ``(nworld, nu)``, float32. The controller's own memory:
@@ -239,14 +240,9 @@ def _put(buffer: Tensor, mask: Tensor, values: Tensor) -> None:
 
 
 def make_expert(env: Env) -> ClosedLoopDriver:
-    """Closed-loop driver of an environment: call ``command()`` once before every
-    ``env.step``.
-
-    Worlds may end and start anew whenever they like; each goes through its own phases from its own
-    reset on.
-
-    Args:
-        env: The environment, built with ``action=joint_absolute``.
+    """Closed-loop driver of an environment built with ``action=joint_absolute``: call ``command()``
+    once before every ``env.step``. Worlds may end and start anew whenever they like; each goes
+    through its own phases from its own reset on.
 
     Raises:
         ArgumentError: Its actions are not absolute joint commands, or its worlds have moved on

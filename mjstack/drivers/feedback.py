@@ -10,8 +10,11 @@ import mujoco
 import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import override
 
-from mjstack.drivers.driver import Driver, require_actions
+from mjstack.config.schema import Config
+from mjstack.drivers.driver import Assets, Driver, require_actions
+from mjstack.envs import Env
 from mjstack.errors import ArgumentError
 from mjstack.kinematics.batched_ik import BatchedIk
 from mjstack.managers.view import EnvView
@@ -59,10 +62,7 @@ class CarryTilt:
         self, env: EnvView, phases: Sequence[Phase], ik: BatchedIk, nominal: Tensor
     ) -> None:
         """Allocate for the worlds of a driver with these phases, solver and nominal commands, shape
-        ``(phases, nu)``, float32.
-
-        Raises:
-            ConfigError: The arm's first joint does not turn about the vertical.
+        ``(phases, nu)``, float32; a ConfigError if the arm's first joint is not vertical.
         """
         self._ik = ik
         self._nominal = nominal
@@ -78,7 +78,8 @@ class CarryTilt:
     def desired_approach(
         self, command: Tensor, phase: Tensor, there: Tensor, fresh: Tensor
     ) -> Tensor:
-        """Desired approach axis of the next step. Fixed shapes, no host read.
+        """Desired approach axis of the next step, unit vectors, shape ``(nworld, 3)``, float32.
+        Fixed shapes, no host read.
 
         Args:
             command: Joint positions at which the arm starts [rad, m], shape ``(nworld, nu)``,
@@ -87,9 +88,6 @@ class CarryTilt:
             there: Target of the phase ``place[phase]``, where the next object or the held one is
                 released [m], shape ``(nworld, 3)``.
             fresh: Worlds that start an episode, shape ``(nworld,)``, bool.
-
-        Returns:
-            Unit vectors, shape ``(nworld, 3)``, float32.
         """
         start = torch.where(fresh[:, None], self._nominal[self.place[phase]], self._there)
         self._there.copy_(self._there_ik.solve(start, there)[0])
@@ -149,17 +147,19 @@ def _places(phases: Sequence[Phase]) -> list[int]:
 class FeedbackDriver(Driver):
     """Base class of drivers that give joint targets from where the objects of every world are."""
 
+    needs_phases = True
+    noun = "expert"
+
+    @classmethod
+    @override
+    def build(cls, env: Env, cfg: Config, assets: Assets) -> Driver:
+        return cls.with_params(cfg, env, assets.planner.nominal)
+
     def __init__(self, env: EnvView, nominal: np.ndarray, *, clock: bool) -> None:
-        """Allocate for the environment's worlds.
-
-        Args:
-            env: The environment; its action terms must take absolute joint commands.
-            nominal: Commands at the end of each phase of the nominal plan, which redundant joints
-                keep close to, shape ``(phases, nu)``.
-            clock: Whether worlds go through the phases one after the other.
-
-        Raises:
-            MjstackError: The environment takes other actions, or worlds have moved on.
+        """Allocate for the worlds of an environment, whose action terms must take absolute joint
+        commands. Redundant joints keep close to the nominal plan's commands at the end of each
+        phase, shape ``(phases, nu)``. With a clock worlds go through the phases one by one. A
+        MjstackError if the environment takes other actions, or worlds have moved on.
         """
         cfg = env.cfg
         device = env.device

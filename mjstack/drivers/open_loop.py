@@ -56,13 +56,8 @@ class JointTrajectory:
         return replace(self, knots=knots, weights=weights, numbers=self.numbers.to(device))
 
     def command(self, step: int | Tensor) -> Tensor:
-        """Commands of one step.
-
-        Args:
-            step: Its number; or shape ``(1,)``, int64, on the same device, for a captured graph.
-
-        Returns:
-            Shape ``(nworld, nu)``.
+        """Commands of one step, shape ``(nworld, nu)``, by its number; or of shape ``(1,)``, int64,
+        on the same device, for a captured graph.
         """
         if isinstance(step, int):
             step = torch.tensor([step], device=self.numbers.device)
@@ -82,10 +77,8 @@ class OpenLoopPlanner:
     """
 
     def __init__(self, cfg: Config) -> None:
-        """Plan the nominal start, from which every other plan starts.
-
-        Raises:
-            Unreachable: A nominal target is out of reach.
+        """Plan the nominal start, from which every other plan starts; a target out of reach is an
+        Unreachable.
         """
         self._cfg = cfg
         self.phases = build_phases(cfg)
@@ -103,17 +96,10 @@ class OpenLoopPlanner:
         (self._knots,), (self._error,) = plan
 
     def plan(self, sources_xy: ndarray, names: Sequence[int] | None = None) -> JointTrajectory:
-        """Plan one trajectory per world, which does not depend on the other worlds. The worlds are
-        divided among threads.
-
-        Args:
-            sources_xy: Position of each object and place at the start [m], shape ``(nworld,
-                sources, 2)``; see `source_names`.
-            names: Numbers of the worlds, for the error; from 0 on if None.
-
-        Raises:
-            Unreachable: A target is out of reach; names the world (the first one), the phase and
-                the distance.
+        """Plan one trajectory per world, which does not depend on the other worlds, from where each
+        object and place is at the start [m], shape ``(nworld, sources, 2)``; see `source_names`.
+        The worlds are divided among threads. A target out of reach is an Unreachable, with the
+        phase, the distance and the number of the first such world; from 0 on without ``names``.
         """
         for sources, plan in self._plans:
             if np.array_equal(sources, sources_xy):

@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from mjstack.config.schema import CameraCfg, Config
-from mjstack.drivers.driver import Driver, require_actions
+from mjstack.drivers.driver import Assets, Driver, require_actions
 from mjstack.envs.env import Env
 from mjstack.errors import ArgumentError, FolderError, TermError
+from mjstack.managers import offers
 from mjstack.managers.observation import ObservationManager
 from mjstack.policy import Policy
 from mjstack.policy.lerobot import IMAGES, SEEN, STATE
@@ -54,6 +56,7 @@ class QueryImages:
             self._cameras.draw(self._buffers, dict.fromkeys(self.images, mask))
 
 
+@offers("driver")
 class PolicyDriver(Driver):
     """Actions of a policy for every world, for an environment with the policy's action terms.
 
@@ -72,19 +75,23 @@ class PolicyDriver(Driver):
         query_images: These images.
     """
 
+    plays_policy = True
+    noun = "policy"
+
+    @classmethod
+    @override
+    def build(cls, env: Env, cfg: Config, assets: Assets) -> Driver:
+        if assets.lerobot_policy:
+            return LerobotDriver.with_params(cfg, env, assets.lerobot_policy, cfg)
+        return cls.with_params(cfg, env, assets.policy, cfg.scene.cameras)
+
     def __init__(
         self, env: Env, policy: Policy, cameras: Mapping[str, CameraCfg] | None = None
     ) -> None:
-        """Build the policy's observation and allocate for the environment's worlds.
-
-        Args:
-            env: The environment, its worlds started; its action terms must be the policy's.
-            policy: The policy.
-            cameras: The scene's cameras, if the environment's configuration does not have them.
-
-        Raises:
-            MjstackError: The policy was trained for something else, or the environment takes other
-                actions.
+        """Build the policy's observation and allocate for the environment's worlds, which have
+        started; its action terms must be the policy's. ``cameras`` are the scene's, if its
+        configuration does not have them. A MjstackError if the policy was trained for something
+        else, or the environment takes other actions.
         """
         cfg = env.cfg
         require_actions(cfg, policy.action, "those that the policy was trained with")
@@ -213,12 +220,10 @@ class LerobotDriver(Driver):
         here = {name: part.shape[1:] for name, part in self._words.observe().items()}
         for name, shape in inputs.items():
             if here.get(name) not in (shape, (*shape[1:], *shape[:1])):  # images are (…, 3) here
-                there = f"{here.get(name, 'missing')}: expected the same"
-                problem = (
-                    f"policy={cfg.policy}: takes {name} of shape {shape}, and here it is {there}"
-                )
+                there = f"and here it is {here.get(name, 'missing')}: expected the same"
+                problem = f"policy={cfg.policy}: takes {name} of shape {shape}"
                 fix = "Set cameras, scene.cameras.NAME.size and observation as in its training"
-                raise FolderError(problem, fix)
+                raise FolderError(f"{problem}, {there}", fix)
         self._policy.reset()
 
     def command(self) -> Tensor:

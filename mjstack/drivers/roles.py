@@ -40,15 +40,9 @@ class ObjectRoles(NamedTuple):
 
 
 def find_roles(cfg: Config, phases: Sequence[Phase]) -> list[ObjectRoles]:
-    """The objects that the phases move, in the order in which they do.
-
-    Args:
-        cfg: The configuration.
-        phases: Its phases.
-
-    Raises:
-        ConfigError: They do nothing that a state tells, or commands are late: a state does not
-            have those that are still to come.
+    """The objects that a configuration's phases move, in the order in which they do; a ConfigError
+    if they do nothing that a state tells, or commands are late: a state does not have those that
+    are still to come.
     """
     for key in ("command_delay", "random_delay"):
         if delay := getattr(cfg.timing, key):

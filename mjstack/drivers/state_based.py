@@ -12,7 +12,7 @@ from typing_extensions import override
 
 from mjstack.drivers.feedback import STAY, FeedbackDriver, State, servo_lag
 from mjstack.drivers.roles import Role, find_roles
-from mjstack.managers.view import EnvView
+from mjstack.managers.view import EnvView, offers
 from mjstack.math import atan2, norm, quat_to_matrix
 from mjstack.mdp.geometry import pose_w, robot
 from mjstack.tasks.check import make_check
@@ -74,6 +74,7 @@ class _Due(NamedTuple):
     beside: Tensor
 
 
+@offers("driver")
 class StateBasedDriver(FeedbackDriver):
     """Joint targets that are a function of the simulation's state: no clock, no memory.
 
@@ -96,12 +97,11 @@ class StateBasedDriver(FeedbackDriver):
             ``(nworld,)``, int64.
     """
 
-    def __init__(self, env: EnvView, nominal: np.ndarray) -> None:
-        """Allocate for the environment's worlds; arguments as of `FeedbackDriver`.
+    stateless = True
 
-        Raises:
-            MjstackError: As of `FeedbackDriver`, the task has no check, or its phases do nothing
-                that a state tells, see `find_roles`.
+    def __init__(self, env: EnvView, nominal: np.ndarray) -> None:
+        """Allocate for the environment's worlds; arguments and errors as of `FeedbackDriver`. It is
+        also an error if the task has no check, or as of `find_roles`.
         """
         super().__init__(env, nominal, clock=False)
         cfg = env.cfg
@@ -116,7 +116,7 @@ class StateBasedDriver(FeedbackDriver):
         things = list(cfg.scene.objects)
         judged = self._check.objects
         tensor = self._tensor
-        columns = [judged.index(r.name) if r.name in judged else len(judged) for r in moved]
+        columns = [1 + judged.index(r.name) if r.name in judged else 0 for r in moved]
         self._judged = tensor(columns)
         self._moved = tensor(things.index(r.name) for r in moved)
         self._grasps = tensor(r.way == "grasp" for r in moved)
@@ -132,19 +132,17 @@ class StateBasedDriver(FeedbackDriver):
         self._has_faces = tensor(thing.has_faces for thing in cfg.scene.objects.values())
 
         # Heights of targets: over an object that is not carried, wherever it is, or over the table
-        objects = {*range(len(things))}
         self._above = tensor(target.above for _, target in self._aimed)
         self._follows = tensor(
-            phase.spec.level != "table" and target.source in objects - {phase.carried}
+            phase.spec.level != "table" and phase.carried != target.source < len(things)
             for phase, target in self._aimed
         )
         self._off_center = tensor(_OFF_CENTER)
 
         # The robot
-        names = cfg.robot.joints
         aligned = cfg.robot.roll_joint if self._aligns else None
         locked = cfg.robot.locked.items()
-        self._locked = [(names.index(name), value) for name, value in locked if name != aligned]
+        self._locked = [(cfg.robot.joints.index(k), v) for k, v in locked if k != aligned]
         tensors = robot(env)
         self._quarters = 0.5 * math.pi * torch.arange(4, device=device)[:, None]
         self._grip_lead = _GRIP * (tensors.gripper_open - tensors.gripper_closed).abs().float()
@@ -249,7 +247,7 @@ class StateBasedDriver(FeedbackDriver):
             grasped[:, k] = between[:, k] & (state.opening <= _SHUT)
         placed = self._check.placed(self._view.step())
         unknown = torch.zeros_like(placed[:, :1])  # of an object that the check does not judge
-        placed = torch.cat((placed, unknown), dim=1).index_select(1, self._judged)
+        placed = torch.cat((unknown, placed), dim=1).index_select(1, self._judged)
         places = [self._point(state, row[Role.place].expand(len(pos))) for row in self._roles]
         offset = pos - (torch.stack(places, dim=1) - offsets)
         across = norm(offset[..., :2])

@@ -57,12 +57,16 @@ class Peaks:
             must hold too, and convex pairs of one combination of geom types. Native MuJoCo has no
             pool and counts no pairs: contacts alone, the sum of the worlds' peaks, which bounds
             them.
+        sizes: The room that there was, or None on native MuJoCo, which has no fixed buffers.
+        description: Backend and hardware.
     """
 
     contacts: np.ndarray
     rows: np.ndarray
     overflow: np.ndarray
     pools: dict[str, int]
+    sizes: BatchSizes | None
+    description: str
 
     @property
     def share(self) -> float:
@@ -74,6 +78,18 @@ class Peaks:
         """Convex pairs that must fit, per world; None where they are not counted."""
         return self.pools["ccd_pairs"] / len(self.rows) if "ccd_pairs" in self.pools else None
 
+    @property
+    def loss(self) -> str:
+        """The physics that was lost although there was room to spare, and what to do; empty if none
+        was.
+        """
+        loss, keys = describe_loss(self.overflow, self.sizes)
+        if not loss:
+            return ""
+        fix = f"Set {' and '.join(f'batch.{key}' for key in keys)} higher still" if keys else NO_KEY
+        room = f" even with {self.sizes.as_overrides()}" if self.sizes is not None else ""
+        return f"{loss}{room}. {fix}"
+
 
 def read_peaks(sim: Simulation) -> Peaks:
     """The peaks since the simulation's last full reset. Waits for the device."""
@@ -84,12 +100,15 @@ def read_peaks(sim: Simulation) -> Peaks:
         rows=rows,
         overflow=bits & LOST_PHYSICS,
         pools=dict(zip(_POOLS, pools, strict=False)),
+        sizes=sim.sizes,
+        description=sim.description,
     )
 
 
 def join_peaks(a: Peaks, b: Peaks) -> Peaks:
-    """The larger of the peaks of two runs of the same worlds."""
-    return Peaks(
+    """The larger of the peaks of two runs of as many worlds."""
+    return replace(
+        a,
         contacts=np.maximum(a.contacts, b.contacts),
         rows=np.maximum(a.rows, b.rows),
         overflow=a.overflow | b.overflow,
@@ -118,33 +137,6 @@ def recommend_sizes(peaks: Peaks, margin: float, source: str) -> BatchSizes:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Workload:
-    """One run and what it used.
-
-    Attributes:
-        peaks: The most it used.
-        sizes: The room it had, or None on native MuJoCo, which has no fixed buffers.
-        description: Backend and hardware.
-    """
-
-    peaks: Peaks
-    sizes: BatchSizes | None
-    description: str
-
-    @property
-    def loss(self) -> str:
-        """The physics that was lost although there was room to spare, and what to do; empty if none
-        was.
-        """
-        loss, keys = describe_loss(self.peaks.overflow, self.sizes)
-        if not loss:
-            return ""
-        fix = f"Set {' and '.join(f'batch.{key}' for key in keys)} higher still" if keys else NO_KEY
-        room = f" even with {self.sizes.as_overrides()}" if self.sizes is not None else ""
-        return f"{loss}{room}. {fix}"
-
-
 class MeasuringWorlds:
     """Worlds in which workloads are played one after the other, each as if the worlds were new."""
 
@@ -166,31 +158,26 @@ class MeasuringWorlds:
         )
         self._sim: Simulation | None = None
         self._first = resolve_measuring_sizes(cfg)  # for random actions
-        self._room = self._first  # of the worlds as they are
         self._rooms = {False: self._first, True: resolve_measuring_sizes(cfg, driven=True)}
 
-    def play(self, play: Play, *, driven: bool = False) -> Workload:
+    def play(self, play: Play, *, driven: bool = False) -> Peaks:
         """Play a workload, and again in worlds of more room, twice as much or more, wherever it
-        was too little, up to a limit.
+        was too little, up to a limit. One that is ``driven`` begins with the room of the driven
+        task, not with that of random actions, which is larger, so that steps take longer.
 
         Peaks of a run that lost physics are those of another motion. Where the last run, which is
         returned, has lost some too, its ``overflow`` tells: nothing may be sized from it.
-
-        Args:
-            play: What to play.
-            driven: Begin with the room of the driven task, not with that of random actions, which
-                is larger, so that steps take longer.
         """
         while True:
             room = self._rooms[driven]
             run = self._play_once(play, room)
-            bits = int(np.bitwise_or.reduce(run.peaks.overflow)) & SIZED
+            bits = int(np.bitwise_or.reduce(run.overflow)) & SIZED
             # In this room convex pairs have as much as contacts, so they grow together.
-            room = replace(
-                room,
-                njmax=_grown(room.njmax, self._first.njmax, bits & ROWS),
-                nconmax=_grown(room.nconmax, self._first.nconmax, bits & ~ROWS),
-            )
+            for key, lacking in {"njmax": bits & ROWS, "nconmax": bits & ~ROWS}.items():
+                size, first = getattr(room, key), getattr(self._first, key)
+                if lacking:
+                    grown = min(max(2 * size, first), _GROWTH * first)
+                    room = replace(room, **{key: max(size, grown)})
             if run.sizes is None or room == self._rooms[driven]:
                 return run
             self._rooms[driven] = room
@@ -203,28 +190,20 @@ class MeasuringWorlds:
         self._sim = None
         gc.collect()  # an environment and its managers refer to each other, and hold the worlds
 
-    def _play_once(self, play: Play, room: BatchSizes) -> Workload:
-        if self._sim is not None and self._sim.sizes is not None and room != self._room:
+    def _play_once(self, play: Play, room: BatchSizes) -> Peaks:
+        if self._sim is not None and self._sim.sizes not in (None, room):
             self.close()
         else:
             gc.collect()  # what the play before left: an environment, its graphs and their memory
-        self._room = room
         self._sim = sim = self._sim or self._make(sizes=room)
         for name, field in sim.fields.items():
             field.copy_(torch.from_numpy(getattr(sim.model, name)))
         sim.reset()
         play(sim)
-        return Workload(peaks=read_peaks(sim), sizes=sim.sizes, description=sim.description)
+        return read_peaks(sim)
 
 
-def _grown(room: int, first: int, lacking: int) -> int:
-    """The room to try next: where it is ``lacking`` twice as much, at least the ``first`` room of
-    random actions, and at most `_GROWTH` times that.
-    """
-    return max(room, min(max(2 * room, first), _GROWTH * first)) if lacking else room
-
-
-def measured_sizes(cfg: Config, run: Workload, source: str) -> BatchSizes:
+def measured_sizes(cfg: Config, run: Peaks, source: str) -> BatchSizes:
     """Sizes for ``batch=auto`` from one run, which ``source`` has in words, with the configured
     margin; sizes that the configuration sets win.
 
@@ -235,7 +214,7 @@ def measured_sizes(cfg: Config, run: Workload, source: str) -> BatchSizes:
         raise FaultError(f"batch=auto: sizes cannot be measured by {source}: {run.loss}")
     margin = cfg.gate.capacity.margin
     how = f"batch=auto: {source}, times {margin:g}"
-    return apply_configured(cfg, recommend_sizes(run.peaks, margin, how))
+    return apply_configured(cfg, recommend_sizes(run, margin, how))
 
 
 def play_random_actions(
@@ -259,12 +238,6 @@ def play_random_actions(
 def probe_env_sizes(cfg: Config, model: mujoco.MjModel, nworld: int, device: str) -> BatchSizes:
     """Sizes for an environment on MJWarp with ``batch=auto``, from a probe of random actions; sizes
     that the configuration sets win.
-
-    Args:
-        cfg: The configuration.
-        model: The compiled scene.
-        nworld: Worlds of the environment.
-        device: Its device.
 
     Raises:
         FaultError: Physics was lost in all the room that the probe tried.

@@ -11,7 +11,6 @@ from mjstack.envs.camera_schedule import CameraSchedule
 from mjstack.envs.command_delay import CommandDelay
 from mjstack.envs.faults import FaultLatch
 from mjstack.envs.outputs import EpisodeStatistics, Outputs, ResetResult, StepResult
-from mjstack.envs.starts import Starts
 from mjstack.envs.threads import few_threads
 from mjstack.errors import ArgumentError
 from mjstack.managers.action import ActionManager
@@ -47,8 +46,8 @@ class Env:
     after the last one, and with a history after each.
 
     On CUDA the whole step is one graph: the first step after a build runs eagerly, the second is
-    captured, and later ones replay it. After a change of anything that it, or a start made ahead of
-    time, has baked in, such as a term's Python number, call `recapture`.
+    captured, and later ones replay it. After a change of anything that it has baked in, such as a
+    term's Python number, call `recapture`.
 
     Values that derive from contacts (``sensordata``, ``contact_count``) are those of the last
     physics step before, and zero in a world that has just been reset. Attributes are those of
@@ -69,7 +68,6 @@ class Env:
     """
 
     observation_manager: ObservationManager
-    reset_manager: ResetManager
 
     def __init__(
         self,
@@ -113,14 +111,13 @@ class Env:
         self._started = False
         self._closed = False
         self.command_delay = CommandDelay(self)
-        self._starts = Starts(self)
         if self.device.type != "cuda":  # autograd's records take a tenth of their time
-            for owner, name in ((self, "_evaluate"), (self._starts, "begin")):
-                setattr(owner, name, torch.inference_mode()(getattr(owner, name)))
+            for name in ("_evaluate", "_begin"):
+                setattr(self, name, torch.inference_mode()(getattr(self, name)))
 
         # Terms are checked on worlds that have started, because a term may read anything.
         self.reset_manager = ResetManager(self, cfg.reset)
-        self._starts.start(self._all_worlds)
+        self._start(self._all_worlds)
         self.action_manager = ActionManager(self, cfg.action)
         self.action = self.action_manager.action
         self.previous_action = self.action_manager.previous_action
@@ -132,8 +129,7 @@ class Env:
         self.reward_manager = RewardManager(self, cfg.reward)
         self.observation_manager = ObservationManager(self, cfg.observation)
         self.statistics = EpisodeStatistics(self)
-        self._starts.forget()
-        self._starts.begin(self._all_worlds)
+        self._begin(self._all_worlds)
         self._draws = CameraSchedule(self)
         self.images = self._draws.images
         self.cameras = self._draws.cameras
@@ -176,7 +172,7 @@ class Env:
             self.seed = check_seed(seed, masked=mask is not None)
             self.key.fill_(self.seed)
             self.episode.fill_(-1)
-        self._starts.begin(self._all_worlds if mask is None else mask)
+        self._begin(self._all_worlds if mask is None else mask)
         if mask is None:
             self.faults.clear()
             self._started = True
@@ -188,7 +184,7 @@ class Env:
         """Advance every world by one decision of the policy; see the class for the order.
 
         Args:
-            action: Shape ``(nworld, action_dim)``, float32.
+            action: Shape ``(nworld, action_dim)``, float32 or float64.
 
         Returns:
             ``obs``: by group, ``(nworld, dim)``, float32; of worlds that ended, the first of the
@@ -242,9 +238,8 @@ class Env:
         )
 
     def recapture(self) -> None:
-        """Have graphs captured and starts made anew, after a change of something baked in."""
+        """Have graphs captured anew, after a change of something baked in."""
         self._version += 1
-        self._starts.forget()
 
     def parts(self) -> tuple[StepGraph, StepGraph, StepGraph]:
         """The physics of a control step, the managers, and the images of all cameras: three graphs,
@@ -350,10 +345,28 @@ class Env:
 
         def restart() -> None:
             self.statistics.update(done)
-            self._starts.begin(done)
+            self._begin(done)
 
         self._draws.draw_ended(done)
         if ending:
             where_any(done, restart)
         elif broken is not None:
             self._outputs.restore_observations()
+
+    def _begin(self, mask: Tensor) -> None:
+        """Begin and observe the next episode of the masked worlds, shape ``(nworld,)``, bool."""
+        self._start(mask)
+        self.command_delay.reset(mask)
+        for manager in (self.action_manager, self.termination_manager, self.reward_manager):
+            manager.reset(mask)
+        self.success.masked_fill_(mask, False)
+        if self.success_term is not None:
+            self.success_term.reset(mask)
+        in_one_pass(partial(self.observation_manager.refresh, mask))
+
+    def _start(self, mask: Tensor) -> None:
+        """Put the masked worlds at their next start, from seed, world and episode alone."""
+        self.episode += mask
+        self.episode_step.masked_fill_(mask, 0)
+        self.reset_manager.reset(mask)
+        self.sim.kinematics(mask)

@@ -1,6 +1,5 @@
 """The folder of an earlier run: its configuration, report and records, and its starts file."""
 
-import json
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -15,7 +14,7 @@ from mjstack.config.schema import Config, TermCfg
 from mjstack.config.session import read_yaml
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.errors import FolderError, MjstackError
-from mjstack.files import made_by, reading, write_atomic
+from mjstack.files import made_by, read_json, reading, write_atomic
 
 REPORT = "report.json"
 COPY = "starts_played.npz"
@@ -61,10 +60,9 @@ class EarlierRun:
         try:
             cfg = load_saved(saved)
         except MjstackError as error:
-            problem = f".hydra/config.yaml{made_by(folder)} is no configuration of this mjstack"
-            raise FolderError(f"{key}={name}: {problem}: {error}") from error
+            raise FolderError(f"{key}={name}{made_by(folder)}: {error}") from error
         with reading(report, "Name another folder"):
-            provenance = dict(json.loads(report.read_text())["provenance"])
+            provenance = dict(read_json(report, "provenance"))
             provenance["versions"] = dict(provenance["versions"])
         return cls(folder=folder, cfg=cfg, provenance=provenance)
 
@@ -103,14 +101,8 @@ class EarlierRun:
 
 
 def archive_starts(cfg: Config, folder: Path) -> Config:
-    """Copy the starts file that worlds start from, byte for byte, for the run and its replays.
-
-    Args:
-        cfg: The run's configuration.
-        folder: The run's folder.
-
-    Returns:
-        The configuration with the copy as the file of its terms.
+    """Copy the starts file that worlds start from into a run's folder, byte for byte, for the run
+    and its replays, and return the configuration with the copy as the file of its terms.
 
     Raises:
         OSError: The file cannot be read, or the copy cannot be written.
@@ -137,13 +129,11 @@ def archived_starts(cfg: Config, folder: Path) -> Config:
         )
 
     def swap(reset: Mapping[str, TermCfg]) -> dict[str, TermCfg]:
-        params = {"path": str(copy)}
-        return {
-            key: replace(term, params=term.params | params)
-            if term.params.get("path") == path
-            else term
-            for key, term in reset.items()
-        }
+        terms = dict(reset)
+        for key, term in reset.items():
+            if term.params.get("path") == path:
+                terms[key] = replace(term, params=term.params | {"path": str(copy)})
+        return terms
 
     success = replace(cfg.gate.success, reset=swap(cfg.gate.success.reset))
     return replace(cfg, reset=swap(cfg.reset), gate=replace(cfg.gate, success=success))

@@ -67,10 +67,6 @@ class FailureMonitor(Observer):
             phase ended with it, the first one after that phase.
     """
 
-    sign: Tensor
-    phase: Tensor
-    step: Tensor
-
     def start(self, env: Env, driver: Driver) -> None:
         """Read what belongs where, and allocate for the environment's worlds."""
         super().start(env, driver)
@@ -116,15 +112,11 @@ class FailureMonitor(Observer):
         left = ((phase[:, None] > self._release) & self._placed & ~placed).any(1)
 
         seen = torch.zeros_like(self.sign)
-        signs = {
-            Sign.LEFT: left,
-            Sign.MISSED: missed,
-            Sign.DROPPED: dropped,
-            Sign.EMPTY: empty,
-            Sign.PHYSICS: lost,
-        }
-        for sign, worlds in signs.items():
-            seen.masked_fill_(worlds, sign)
+        seen.masked_fill_(left, Sign.LEFT)
+        seen.masked_fill_(missed, Sign.MISSED)
+        seen.masked_fill_(dropped, Sign.DROPPED)
+        seen.masked_fill_(empty, Sign.EMPTY)
+        seen.masked_fill_(lost, Sign.PHYSICS)
         first = (self.sign == 0) & (seen > 0)
         ended = (seen == Sign.EMPTY) | (seen == Sign.MISSED)  # what the phase before has left
         self.sign.copy_(torch.where(first, seen, self.sign))
@@ -139,4 +131,6 @@ class FailureMonitor(Observer):
 
 def _of(table: Tensor, column: Tensor) -> Tensor:
     """Each world's column, shape ``(nworld,)``; the first one where there is none (-1)."""
+    if not table.shape[1]:  # the task is about no object
+        return torch.zeros_like(column, dtype=torch.bool)
     return table.gather(1, column.clamp(min=0)[:, None])[:, 0]

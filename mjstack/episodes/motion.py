@@ -1,5 +1,6 @@
 """Worlds in motion, for the run's 3-D page: recorded on the device, failing ones first."""
 
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -10,14 +11,13 @@ from torch import Tensor
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.recorder import Channels, Read, Recorder
-from mjstack.episodes.rollout import POLICY
 from mjstack.episodes.stage import Stage
 from mjstack.files import read_npz, reading, write_npz
-from mjstack.report.page import MOST_WORLDS, Page, World, frame_stride
-from mjstack.report.write import safely_write
+from mjstack.mdp.geometry import place_xy
+from mjstack.report.geometry import Fields, is_visible, match_geoms
+from mjstack.report.page import World, frame_stride
 from mjstack.sim import Simulation
 
-MOST_SEEN = 4  # worlds of a gate with what their driver saw
 _BYTES = 64 * 2**20  # of one recording
 _PARTS = ("label", "failed", "qpos")  # of a world, in the file
 
@@ -40,6 +40,34 @@ def motion_recorder(step_dt: float) -> Recorder:
     return Recorder(Channels(bind, ends))
 
 
+def world_fields(stage: Stage, env: Env, worlds: Sequence[int]) -> list[Fields]:
+    """Model fields of some worlds that pictures show, with the drawn places, those of the model
+    with visuals.
+    """
+    sim = env.sim
+    places = env.cfg.scene.places.items()
+    centers = {name: place_xy(env, name) for name, place in places if any(place.random_xy)}
+    fields = {name: values for name, values in sim.fields.items() if is_visible(name)}
+    if not centers and not fields:
+        return [{}] * len(worlds)
+    visual = stage.assets.visual_model
+    geoms = match_geoms(sim.model, visual)
+    rows = {}
+    for name, values in fields.items():
+        array = values[list(worlds)].cpu().numpy()
+        nominal = np.repeat(getattr(visual, name)[None], len(worlds), 0)
+        if name.startswith("geom_"):  # physics has fewer of them
+            nominal[:, geoms] = array
+        elif array.shape == nominal.shape:  # physics may have no light
+            nominal[:] = array
+        rows[name] = nominal
+    for name, xy in centers.items():
+        nominal = np.repeat(visual.geom_pos[None], len(worlds), 0)
+        disc = visual.geom(f"place/{name}").id
+        rows.setdefault("geom_pos", nominal)[:, disc, :2] = xy[list(worlds)].cpu().numpy()
+    return [{name: values[row] for name, values in rows.items()} for row in range(len(worlds))]
+
+
 def draw_seen(
     stage: Stage, qpos: np.ndarray, sim: Simulation, world: int = 0, stride: int = 1
 ) -> dict[str, np.ndarray]:
@@ -57,10 +85,8 @@ def draw_seen(
         Images by camera, each ``(frames, height, width, 3)``, uint8, which change where the policy
         was queried. None of a driver that sees no images, or of LeRobot's.
     """
-    if stage.cfg.controller.name != POLICY or stage.assets.lerobot_policy:
-        return {}
-    policy = stage.assets.policy
-    if not policy.network.vision.sizes:
+    policy = stage.policy
+    if policy is None or not policy.network.vision.sizes:
         return {}
     looks = {name: values[world : world + 1] for name, values in sim.fields.items()}
     queried = np.arange(len(qpos)) * stride // policy.execute * policy.execute // stride
@@ -75,52 +101,56 @@ def draw_seen(
     return {name: np.stack(part)[rows] for name, part in images.items()}
 
 
-def show_batch(
-    stage: Stage,
-    page: Page,
-    path: Path,
-    gate: str,
-    qpos: Tensor,
-    sim: Simulation,
-    failed: np.ndarray,
-) -> None:
-    """Add a gate's worlds to the page, failing ones first. A file keeps them for a resumed run.
+def moving_worlds(
+    stage: Stage, env: Env, qpos: Tensor, failed: np.ndarray, names: Mapping[int, str], seen: int
+) -> list[World]:
+    """Worlds of a batch in motion.
 
     Args:
-        stage: On which the gate has played.
-        page: The run's page.
-        path: The file.
-        gate: The gate's name.
-        qpos: Positions that `motion_recorder` has recorded of the configured seed.
-        sim: The worlds that have played it.
+        stage: On which they were played.
+        env: The worlds, as the episode left them.
+        qpos: Positions that `motion_recorder` has recorded.
         failed: Bits of the task's rules, shape ``(nworld,)``.
+        names: Of the worlds that are shown, by their rows; the rules that they broke follow.
+        seen: How many of them show what their driver saw.
     """
     rules = stage.check.rules
-    chosen = np.argsort(failed[: qpos.shape[1]] == 0, kind="stable")[:MOST_WORLDS].tolist()
-    motions = qpos[:, chosen].float().swapaxes(0, 1).cpu().numpy()
-    moving: list[World] = []
     stride = frame_stride(stage.cfg.timing.step_dt)
-    for world, motion in zip(chosen, motions, strict=True):
-        problem = rules.describe(failed[world])
-        label = f"{world}: {problem}" if problem else str(world)
-        seen = draw_seen(stage, motion, sim, world, stride) if len(moving) < MOST_SEEN else {}
-        moving.append(World(label=label, qpos=motion, failed=bool(problem), images=seen))
-    page.worlds3d[gate] = moving
-    arrays = {name: [getattr(world, name) for world in moving] for name in _PARTS}
-    if problem := safely_write(path, write_npz, arrays, stops=False):
-        stage.progress.print_line(problem)
+    motions = qpos[:, [*names]].float().swapaxes(0, 1).cpu().numpy()
+    fields = world_fields(stage, env, [*names])
+    moving: list[World] = []
+    for (row, name), motion, values in zip(names.items(), motions, fields, strict=True):
+        problem = rules.describe(failed[row])
+        label = f"{name} {problem}".rstrip(" :")
+        images = draw_seen(stage, motion, env.sim, row, stride) if len(moving) < seen else {}
+        moving.append(
+            World(label=label, qpos=motion, failed=bool(problem), images=images, fields=values)
+        )
+    return moving
 
 
-def restore_batch(page: Page, path: Path, gate: str) -> None:
-    """Add the worlds to the page that an earlier call of the run has shown, if it has.
+def save_worlds(path: Path, worlds: Sequence[World]) -> None:
+    """Write worlds in motion, without images, for a resumed run."""
+    arrays = {name: [getattr(world, name) for world in worlds] for name in _PARTS}
+    arrays |= {name: [world.fields[name] for world in worlds] for name in worlds[0].fields}
+    write_npz(path, arrays)
+
+
+def load_worlds(path: Path) -> list[World]:
+    """The worlds that `save_worlds` has written.
 
     Raises:
-        FolderError: Their file cannot be read.
+        FolderError: The file cannot be read.
     """
-    if path.exists():
-        with reading(path, "Remove it"):
-            arrays = read_npz(path)
-            page.worlds3d[gate] = [
-                World(label=str(label), failed=bool(failed), qpos=qpos)
-                for label, failed, qpos in zip(*(arrays[name] for name in _PARTS), strict=True)
-            ]
+    with reading(path, "Remove it"):
+        arrays = read_npz(path)
+        parts = zip(*(arrays.pop(name) for name in _PARTS), strict=True)
+        return [
+            World(
+                label=str(label),
+                failed=bool(failed),
+                qpos=qpos,
+                fields={name: rows[n] for name, rows in arrays.items() if is_visible(name)},
+            )
+            for n, (label, failed, qpos) in enumerate(parts)
+        ]

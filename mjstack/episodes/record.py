@@ -3,7 +3,7 @@ people.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -26,21 +26,12 @@ _NAMES = ("object_names", "phase_names")
 
 
 def circumstances(episode: Episode, monitor: FailureMonitor) -> dict[str, np.ndarray]:
-    """Where the episodes that a monitor has watched started and where they went wrong; arrays as of
-    `EpisodeRecord`.
-    """
-    env = monitor.env
-    # Objects stand flat at a start, so that all of a rotation is about z.
-    places = []
-    for at in env.index.object_qpos:
-        x, y, _, w, _, _, z = episode.start[:, at : at + 7].astype(float).T
-        places.append(np.column_stack((x, y, 2.0 * np.arctan2(z, w))))
+    """Where the episodes that a monitor has watched went wrong; arrays as of `EpisodeRecord`."""
     signs = torch.stack((monitor.sign, monitor.phase, monitor.step)).cpu().numpy()
     return {
-        "start_places": np.stack(places, axis=1),
         "retries": episode.retries,
         # NaN is not reached.
-        "unreachable": ~(episode.waypoint_error <= env.cfg.controller.ik_tolerance),
+        "unreachable": ~(episode.waypoint_error <= monitor.env.cfg.controller.ik_tolerance),
         **dict(zip(("sign", "sign_phase", "sign_step"), signs, strict=True)),
     }
 
@@ -57,13 +48,13 @@ class EpisodeRecord:
         worlds: Arrays over the worlds by their name in the file: ``failed``, bits of the task's
             rules, ``(nworld,)``, int32; ``qpos`` and ``start_qpos``, positions at the end and at
             the start, ``(nworld, nq)``, in the backend's precision; measurements of the check
-            (``value.<name>``) and others (``measured.<name>``), each ``(nworld,)``. Where
-            circumstances are recorded also ``start_places``, x and y [m] and rotation about z
-            [rad] of each object, ``(nworld, objects, 3)``; ``retries`` of grasps; ``unreachable``,
-            whether a target was out of reach; ``sign``, the first `Sign` of failure, with
-            ``sign_phase`` and ``sign_step``, -1 without one.
-        object_names: Names of the objects, where circumstances are recorded.
-        phase_names: Names of the phases, likewise.
+            (``value.<name>``) and others (``measured.<name>``), each ``(nworld,)``;
+            ``start_places``, x and y [m] and rotation about z [rad] of `object_names`, NaN for a
+            place, ``(nworld, objects, 3)``. Where circumstances are recorded also ``retries`` of
+            grasps; ``unreachable``, whether a target was out of reach; ``sign``, the first `Sign`
+            of failure, with ``sign_phase`` and ``sign_step``, -1 without one.
+        object_names: Names of all that an episode may place, as of `start_places`.
+        phase_names: Names of the phases, where circumstances are recorded.
         seconds: Wall time of the steps, in the slowest rank [s].
         steps: Physics steps of all worlds.
         ranks: The first world of each rank that has played some, and its host and device.
@@ -121,11 +112,6 @@ class EpisodeRecord:
         """Read the record of a gate's seed in a run's folder; None if the gate did not get there,
         or there is no folder.
 
-        Args:
-            folder: The folder.
-            seed: The seed.
-            gate: The gate.
-
         Raises:
             FolderError: The file cannot be read.
         """
@@ -138,9 +124,9 @@ class EpisodeRecord:
             arrays.pop("sign_names", None)
             record = cls(
                 **{n: arrays.pop(n).item() for n in _FACTS},
-                **{n: arrays.pop(n).tolist() for n in _NAMES if n in arrays},
+                **{n: _items(arrays.pop(n)) for n in _NAMES if n in arrays},
                 worlds=arrays,
-                ranks=dict(zip(*(rank.tolist() for rank in ranks), strict=True)),
+                ranks=dict(zip(*map(_items, ranks), strict=True)),
             )
             record._check()
         return record
@@ -162,20 +148,31 @@ class EpisodeRecord:
     def arrays(self) -> dict[str, Any]:
         """The content of its file, `record_name`."""
         arrays: dict[str, Any] = self.worlds | {name: getattr(self, name) for name in _FACTS}
+        arrays["object_names"] = self.object_names
         if "sign" in arrays:
-            arrays |= {name: getattr(self, name) for name in _NAMES}
+            arrays["phase_names"] = self.phase_names
             arrays["sign_names"] = [sign.name for sign in Sign]
         ranks = {"rank_first_world": list(self.ranks), "rank_place": list(self.ranks.values())}
         return arrays | ranks
 
-    def failing_rows(self, rules: Rules) -> list[dict[str, object]]:
-        """Cells of every failing episode by column: rules, circumstances, and all measurements."""
+    def failing_rows(
+        self, rules: Rules, places: Mapping[str, np.ndarray]
+    ) -> list[dict[str, object]]:
+        """Cells of every failing episode by column: rules, circumstances, ``places`` at its start
+        as of `start_places`, and all measurements.
+        """
         return [
             {
                 "seed": self.seed,
                 "world": world,
                 "rules": " ".join(rules.broken(self.failed[world])),
                 **(self._sign_cells(world) if "sign" in self.worlds else {}),
+                **{
+                    f"{name}_{part}": f"{number:.6g}"
+                    for name, rows in places.items()
+                    for part, number in zip(("x_m", "y_m", "yaw_rad"), rows[world], strict=True)
+                    if not np.isnan(number)
+                },
                 **{name: f"{values[world]:.6g}" for name, values in self.values.items()},
             }
             for world in np.flatnonzero(self.failed).tolist()
@@ -185,17 +182,18 @@ class EpisodeRecord:
         """A world's circumstances as cells of the table of failing episodes, by column."""
         row = {name: values[world] for name, values in self.worlds.items()}
         phase = row["sign_phase"]
-        cells = {
+        return {
             "sign": Sign(row["sign"]).name,
             "phase": self.phase_names[phase] if 0 <= phase < len(self.phase_names) else "",
             "step": row["sign_step"] if row["sign_step"] >= 0 else "",
             "retries": row["retries"],
             "unreachable": int(row["unreachable"]),
         }
-        for name, place in zip(self.object_names, row["start_places"], strict=True):
-            for part, number in zip(("x_m", "y_m", "yaw_rad"), place, strict=True):
-                cells[f"{name}_{part}"] = f"{number:.6g}"
-        return cells
+
+
+def _items(array: np.ndarray) -> Any:
+    """The items of a flat array, in Python's types."""
+    return [item.item() for item in array]
 
 
 def starts_name(seed: int | str) -> str:

@@ -65,8 +65,6 @@ class WorldTrace(Recorder):
             file; from the end of the episode on.
     """
 
-    arrays: dict[str, np.ndarray]
-
     channels = (Channels(_read_start, lambda steps: [0]), Channels(_read_trace))
 
     @override

@@ -10,20 +10,16 @@ import torch
 from typing_extensions import override
 
 from mjstack.config.schema import Config, TermCfg
-from mjstack.drivers.driver import Driver
+from mjstack.drivers.driver import Driver, find_driver
 from mjstack.envs import Env
 from mjstack.envs.buffers import Advance
 from mjstack.errors import ConfigError
+from mjstack.managers.term import current_term
+from mjstack.mdp.geometry import place_xy, pose_w
 from mjstack.sim import Simulation
 from mjstack.sim.graph import StepGraph
 from mjstack.tasks.check import CheckResult, make_check
 
-# Controllers with feedback; any other name plays a plan.
-CLOSED_LOOP = "closed_loop"
-STATE_BASED = "state_based"
-POLICY = "policy"
-FEEDBACK = (CLOSED_LOOP, STATE_BASED, POLICY)
-PHASELESS = (STATE_BASED, POLICY)
 Reset = dict[str, TermCfg]
 
 
@@ -101,6 +97,7 @@ def rollout(
 
     # A step, and its graph
     def work() -> None:
+        current_term.label = "controller"
         env.action_manager.process(driver.command())
         env.advance()
         for observer in observers:
@@ -191,6 +188,7 @@ class Episode:
     Attributes:
         result: The check of every world.
         start: Positions before the first step, shape ``(nworld, nq)``, in the backend's precision.
+        places: As of `start_places`.
         waypoint_error: Largest distance from a target that inverse kinematics left [m], shape
             ``(nworld,)``.
         retries: Grasps that were tried again, shape ``(nworld,)``.
@@ -200,6 +198,7 @@ class Episode:
 
     result: CheckResult
     start: np.ndarray
+    places: dict[str, np.ndarray]
     waypoint_error: np.ndarray
     retries: np.ndarray
     timing: RolloutTiming
@@ -216,6 +215,34 @@ class Episode:
         return {name: value.double().cpu().numpy() for name, value in self.result.values.items()}
 
 
+def start_places(env: Env) -> dict[str, np.ndarray]:
+    """Where all that an episode may place is at its start: the objects that move, bodies that stand
+    still or are joined to what does, where model fields can move them, and the places that each
+    episode draws.
+
+    Returns:
+        x and y [m] and rotation about z [rad], which is NaN for a place, each ``(nworld, 3)``, by
+        name.
+    """
+    sim = env.sim
+    model = sim.model
+    poses = {name: pose_w(env, name) for name in env.index.objects}
+    if not sim.fields.keys().isdisjoint(("body_pos", "body_quat")):
+        for body in np.flatnonzero(model.body_weldid[model.body_parentid] == 0)[1:].tolist():
+            pose = torch.cat((sim.xpos[:, body], sim.xquat[:, body]), dim=1)
+            poses.setdefault(model.body(body).name or f"body {body}", pose)
+    out = {}
+    for name, pose in poses.items():
+        # Objects stand flat at a start, so that all of a rotation is about z.
+        x, y, _, w, _, _, z = pose.double().cpu().numpy().T
+        out[name] = np.column_stack((x, y, 2.0 * np.arctan2(z, w)))
+    for name, place in env.cfg.scene.places.items():
+        if any(place.random_xy):
+            xy = place_xy(env, name).double().cpu().numpy()
+            out[name] = np.column_stack((xy, np.full(len(xy), np.nan)))
+    return out
+
+
 def play_episode(
     env: Env,
     driver: Driver,
@@ -228,11 +255,13 @@ def play_episode(
     Arguments as of `rollout`.
     """
     start = env.sim.qpos.cpu().numpy().copy()
+    places = start_places(env)
     judge = Judge()
     timing = rollout(env, driver, [judge, *observers], advance=advance, label=label)
     return Episode(
         result=judge.result,
         start=start,
+        places=places,
         waypoint_error=driver.error.double().cpu().numpy(),
         retries=driver.retries.cpu().numpy(),
         timing=timing,
@@ -277,7 +306,7 @@ class Hook(Observer):
 
 def lacks_episode(cfg: Config) -> str:
     """Why no driver can play a judged episode of the task; empty if one can."""
-    if not cfg.controller.phases and cfg.controller.name != POLICY:
+    if not cfg.controller.phases and find_driver(cfg).needs_phases:
         return f"task {cfg.task.name} has no phases: no open- or closed-loop driver"
     if cfg.task.check is None:
         return f"task {cfg.task.name} has no check"

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from mjstack.config.schema import Backend, Config
-from mjstack.episodes.motion import draw_seen
+from mjstack.envs import Env
+from mjstack.episodes.motion import draw_seen, world_fields
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.recorder import Snapshots, WorldRecorder
 from mjstack.episodes.rollout import Episode, Observer, State
@@ -56,14 +57,14 @@ class Artifacts:
         carry_start: States of all worlds as the phase ``gate.throughput.from_phase`` begins, from
             *batch*.
         timed_episode: Time of the first seed's episode, from *batch*.
-        pictured: Title of the one-world episode that pictures show, and its positions, shape
-            ``(steps, nq)``.
+        pictured: The one-world episode that pictures show, its title as label, with positions at
+            every step end.
     """
 
     results: dict[str, GateResult] = field(default_factory=dict)
     carry_start: State | None = None
     timed_episode: Episode | None = None
-    pictured: tuple[str, np.ndarray] | None = None
+    pictured: World | None = None
 
 
 @dataclass(eq=False)
@@ -159,7 +160,7 @@ class Run:
         label: str,
         qpos: np.ndarray,
         status: Status,
-        sim: Simulation,
+        env: Env,
         title: str = "",
     ) -> None:
         """Show a world that was played alone, on the run's page if that has worlds in motion.
@@ -169,15 +170,16 @@ class Run:
             label: Its text on the page.
             qpos: Positions at every step end, shape ``(steps, nq)``.
             status: How it ended.
-            sim: The world.
+            env: The world.
             title: Title of the run's pictures, if they show it too.
         """
+        (fields,) = world_fields(self.stage, env, [0])
         if self.page.motion:
             stride = frame_stride(self.cfg.timing.step_dt)
             frames = qpos[::stride]
-            seen = draw_seen(self.stage, frames, sim, stride=stride)
+            seen = draw_seen(self.stage, frames, env.sim, stride=stride)
             failed = status is Status.failed
-            world = World(label=label, qpos=frames, failed=failed, images=seen)
+            world = World(label=label, qpos=frames, failed=failed, images=seen, fields=fields)
             self.page.worlds3d[part] = [world]
         if title:
-            self.artifacts.pictured = (title, qpos)
+            self.artifacts.pictured = World(label=title, qpos=qpos, fields=fields)

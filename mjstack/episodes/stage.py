@@ -6,23 +6,17 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from pathlib import Path
 from typing import Any
 
 import mujoco
 
 from mjstack.config.schema import Backend, Config, TermCfg
 from mjstack.distributed import Ranks, current_ranks
-from mjstack.drivers.driver import Driver, OpenLoopDriver
+from mjstack.drivers.driver import Assets, Driver, find_driver
 from mjstack.drivers.open_loop import OpenLoopPlanner
-from mjstack.drivers.policy import LerobotDriver, PolicyDriver
 from mjstack.envs import Env, build_env, driven_config
 from mjstack.envs.buffers import Advance, MeasuringWorlds, measured_sizes
 from mjstack.episodes.rollout import (
-    CLOSED_LOOP,
-    PHASELESS,
-    POLICY,
-    STATE_BASED,
     Episode,
     Observer,
     Reset,
@@ -30,12 +24,9 @@ from mjstack.episodes.rollout import (
     reset_worlds,
     rollout,
 )
-from mjstack.errors import ConfigError
 from mjstack.managers.episode import required_fields
-from mjstack.mdp.geometry import source_xy
-from mjstack.policy import Policy, load_policy
-from mjstack.policy.lerobot import PREFIX, load_lerobot
-from mjstack.scene import SceneIndex, build_model
+from mjstack.policy import Policy
+from mjstack.scene import SceneIndex
 from mjstack.scene.phases import Phase
 from mjstack.sim import (
     BatchSizes,
@@ -63,55 +54,6 @@ class Progress:
 
     print_line: TextHook = lambda line: None
     advance: Advance = lambda what, done, total: None
-
-
-@dataclass(eq=False)
-class Assets:
-    """Scene, plan and policy, each built once when it is first needed.
-
-    Attributes:
-        cfg: The configuration of scene, robot and phases.
-    """
-
-    cfg: Config
-
-    @cached_property
-    def model(self) -> mujoco.MjModel:
-        """The scene for physics."""
-        return build_model(self.cfg)
-
-    @cached_property
-    def visual_model(self) -> mujoco.MjModel:
-        """The same scene with everything that only pictures need."""
-        return build_model(self.cfg, visuals=True)
-
-    @cached_property
-    def index(self) -> SceneIndex:
-        """Addresses in the model."""
-        return SceneIndex(self.model, self.cfg.robot, self.cfg.scene)
-
-    @cached_property
-    def planner(self) -> OpenLoopPlanner:
-        """The planner, its nominal plan made."""
-        return OpenLoopPlanner(self.cfg)
-
-    @cached_property
-    def policy(self) -> Policy:
-        """The policy of ``controller=policy``.
-
-        Raises:
-            MjstackError: There is none, or it cannot be read.
-        """
-        if self.cfg.policy is None:
-            expected = "the folder of a trained policy, which controller=policy plays"
-            raise ConfigError("policy", None, expected)
-        return load_policy(Path(self.cfg.policy))
-
-    @cached_property
-    def lerobot_policy(self) -> tuple[Any, Any, Any] | None:
-        """That of ``policy=lerobot:FOLDER``, as of `load_lerobot`; None if the policy is ours."""
-        name = self.cfg.policy or ""
-        return load_lerobot(name, resolve_backend(self.cfg)[1]) if name.startswith(PREFIX) else None
 
 
 @dataclass(eq=False)
@@ -182,9 +124,20 @@ class Stage:
         return self.ranks.share(self.cfg.nworld)
 
     @property
+    def driver_class(self) -> type[Driver]:
+        """The configured driver's, which says what it can do."""
+        return find_driver(self.cfg)
+
+    @property
+    def policy(self) -> Policy | None:
+        """The policy that drives; None of any other driver, and of a policy of LeRobot's."""
+        plays = self.driver_class.plays_policy and not self.assets.lerobot_policy
+        return self.assets.policy if plays else None
+
+    @property
     def phases(self) -> list[Phase]:
-        """Those of the driver: a policy and the state-based expert have none."""
-        return [] if self.cfg.controller.name in PHASELESS else self.planner.phases
+        """Those that the driver's worlds go through; none of a policy and other drivers without."""
+        return self.planner.phases if self.driver_class.phased else []
 
     @property
     def episode_steps(self) -> int:
@@ -202,21 +155,22 @@ class Stage:
         Raises:
             MjstackError: The policy cannot be read, or was trained for something else.
         """
-        if self.cfg.controller.name != POLICY or self.assets.lerobot_policy:
+        policy = self.policy
+        if policy is None:
             return self.cfg.controller.action
-        policy = self.assets.policy
         policy.check_fit(self.cfg)
         return policy.action
 
     def driven(self, reset: Reset) -> Config:
-        """The configuration of a driven episode. A policy's has success in every step, and that of
-        the live view rewards too.
+        """The configuration of a driven episode. Of a driver that needs no phases it has success in
+        every step, and that of the live view rewards too.
         """
         cfg = driven_config(self.cfg, reset, self.action)
         if self.cfg.view == "web":
             cfg = replace(cfg, reward=self.cfg.reward, task=self.cfg.task)
-        if self.cfg.controller.name == POLICY:
-            graph = "off" if self.assets.lerobot_policy else cfg.graph  # it acts on the host
+        if not self.driver_class.needs_phases:
+            on_host = self.driver_class.on_host or self.assets.lerobot_policy
+            graph = "off" if on_host else cfg.graph
             cfg = replace(cfg, task=self.cfg.task, graph=graph)
         return cfg
 
@@ -243,23 +197,7 @@ class Stage:
 
     def driver(self, env: Env) -> Driver:
         """The configured driver, for worlds that have started."""
-        name = env.cfg.controller.name
-        if name == POLICY and self.assets.lerobot_policy:
-            return LerobotDriver(env, self.assets.lerobot_policy, self.cfg)
-        if name == POLICY:
-            return PolicyDriver(env, self.assets.policy, self.cfg.scene.cameras)
-        if name == CLOSED_LOOP:  # loads Warp, which a native open-loop run does not need
-            from mjstack.drivers.closed_loop import ClosedLoopDriver
-
-            return ClosedLoopDriver(env, self.planner.nominal)
-        if name == STATE_BASED:
-            from mjstack.drivers.state_based import StateBasedDriver
-
-            return StateBasedDriver(env, self.planner.nominal)
-        sim = env.sim
-        sources = source_xy(env).double().cpu().numpy()
-        trajectory = self.planner.plan(sources, names=env.world.tolist())
-        return OpenLoopDriver(trajectory.to(sim.device, sim.ctrl.dtype), self.planner.phases)
+        return find_driver(env.cfg).build(env, self.cfg, self.assets)
 
     def play(
         self, sim: Simulation, reset: Reset, observers: Sequence[Observer] = (), **options: Any

@@ -1,13 +1,12 @@
 """Sums over a gate's episodes, and their report."""
 
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from mjstack.config.session import search_path_args
+from mjstack.config.explain import assign, command
 from mjstack.episodes.failures import describe_sign
 from mjstack.episodes.record import FAILING, EpisodeRecord
 from mjstack.episodes.rollout import Episode
@@ -73,6 +72,20 @@ class EpisodeTally:
         return {name: self.array(f"value.{name}") for name in self.records[0].values}
 
     @property
+    def places(self) -> dict[str, np.ndarray]:
+        """Where each object started, and all else that did not start the same in every episode, as
+        of `start_places`, over the episodes of all seeds.
+        """
+        names = self.records[0].object_names
+        rows = self.array("start_places").swapaxes(0, 1) if names else ()
+        movable = self.check.cfg.scene.free
+        return {
+            name: places
+            for name, places in zip(names, rows, strict=True)
+            if name in movable or np.ptp(np.nan_to_num(places), 0).any()
+        }
+
+    @property
     def episodes(self) -> int:
         """Number of episodes played."""
         return sum(len(record.failed) for record in self.records)
@@ -95,7 +108,12 @@ class EpisodeTally:
 
     def write_failing(self) -> None:
         """Write the table of failing episodes, if any. A full disk takes no result back."""
-        rows = [row for record in self.records for row in record.failing_rows(self.check.rules)]
+        rows = []
+        places = self.places
+        for number, record in enumerate(self.records):
+            share = slice(number * len(record.failed), (number + 1) * len(record.failed))
+            starts = {name: values[share] for name, values in places.items()}
+            rows += record.failing_rows(self.check.rules, starts)
         if rows and self.path is not None:
             problem = safely_write(self.path, Path.write_text, to_csv(rows), stops=False)
             has = f"{self.path.name} has every failing episode with what was measured"
@@ -163,8 +181,9 @@ class EpisodeTally:
         look = ""
         if len(failed) and self.path is not None and self.replayed:
             gate = "" if self.path.name == FAILING else f"{self.gate}:"
-            run = shlex.join([*search_path_args(), "job=replay", f"run={self.path.parent}"])
-            look = f". To look at one: {run} world={gate}{self.names(failed[:1])[0]}"
+            world = assign("world", gate + self.names(failed[:1])[0])
+            look = command("job=replay", assign("run", self.path.parent), world)
+            look = f". To look at one: {look}"
         if "sign" in self.records[0].worlds and self.array("unreachable").any():
             unreachable = np.flatnonzero(self.array("unreachable"))
             broken = {"target out of reach": unreachable.tolist()} | broken
@@ -196,18 +215,20 @@ class EpisodeTally:
             tables.append(Table(title="Seeds", header=header, rows=rows))
         failed = np.flatnonzero(self.array("failed"))
         if "sign" in last.worlds and len(failed):
-            signs: dict[tuple[int, int], list[str]] = {}
-            keys = (self.array(name)[failed].tolist() for name in ("sign_phase", "sign"))
-            for name, *key in zip(self.names(failed), *keys, strict=True):
-                signs.setdefault(tuple(key), []).append(name)
+            signs: dict[tuple[int, int, str], list[str]] = {}
+            keys = (self.array(name)[failed].tolist() for name in ("sign_phase", "sign", "failed"))
+            for name, phase, sign, bits in zip(self.names(failed), *keys, strict=True):
+                # Where there is no sign, the rules say more.
+                rules = "" if sign else f": {self.check.rules.describe(bits)}"
+                signs.setdefault((phase, sign, rules), []).append(name)
             phases = [*last.phase_names, ""]  # the last one for no sign, -1
             rows = [
                 [
-                    describe_sign(sign, phases[phase]),
+                    describe_sign(sign, phases[phase]) + rules,
                     str(len(names)),
                     ", ".join(names[:8]) + (", ..." if len(names) > 8 else ""),
                 ]
-                for (phase, sign), names in sorted(signs.items())
+                for (phase, sign, rules), names in sorted(signs.items())
             ]
             header = ["first sign of failure", "failed episodes", "which"]
             tables.append(Table(title="Where it went wrong", header=header, rows=rows))

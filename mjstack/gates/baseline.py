@@ -25,8 +25,9 @@ def run_baseline(run: Run) -> list[GateResult]:
         metrics["waypoint_error_m"] = float(episode.waypoint_error.max())
         metrics["path_error_m"] = run.stage.planner.path_error()
         thresholds["waypoint_error_m"] = cfg.controller.ik_tolerance
-    qpos = run.nominal.world.qpos
-    run.show_world("baseline", "baseline, native", qpos, status, sim, "baseline world")
+    world = run.nominal.world
+    label = "baseline, native"
+    run.show_world("baseline", label, world.qpos, status, world.env, "baseline world")
     result = GateResult(name="baseline", status=status, reason=reason or headline)
     result.thresholds = thresholds
     result.metrics = metrics

@@ -3,9 +3,7 @@ they be?
 """
 
 import math
-from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import dataclass
 from functools import partial, reduce
 
 import numpy as np
@@ -14,7 +12,6 @@ from mjstack.config.schema import Backend
 from mjstack.envs.buffers import (
     Peaks,
     Play,
-    Workload,
     join_peaks,
     play_random_actions,
     recommend_sizes,
@@ -30,17 +27,6 @@ from mjstack.sim.sizes import apply_configured, configured_sizes, resolve_env_si
 # few worlds that a CPU plays: docs/history/first-run-2026-11-27.md.
 _RANDOM_STEPS = 200
 _TITLES = {"task": "driven task", "env": "environments (random actions, randomised starts)"}
-
-
-@dataclass(kw_only=True, slots=True)
-class _Group:
-    """Workloads whose worlds have the same buffer sizes."""
-
-    runs: dict[str, Workload]
-    peaks: Peaks  # the most that any of them used
-    sizes: BatchSizes  # in force
-    advice: BatchSizes  # recommended
-    lost: str  # physics that was lost in all room tried; nothing may be sized from it then
 
 
 @each_rank
@@ -68,14 +54,11 @@ def run_capacity(run: Run) -> list[GateResult]:
         except Unreachable as error:  # starts of the user's own; the rest stands
             result.details.append(f"randomised starts: not measured: {error}")
         loads["task"] = worlds.play(partial(stage.drive, reset=cfg.reset), driven=True)
-    task = _recommend(run, resolve_sizes(cfg), {"task": loads.pop("task")})
-    env = _recommend(run, resolve_env_sizes(cfg), loads)
-
-    # Problems. Motion that lost physics sizes nothing that follows.
-    groups = {"task": task, "env": env}
-    run.stage.measured |= {name: part.advice for name, part in groups.items() if not part.lost}
-    problems = [text for _, text in _shortages(task)]
-    for key, text in _shortages(env):
+    task = loads.pop("task")
+    sizes, shortages = _judge(run, "task", resolve_sizes(cfg), {"task": task}, result)
+    problems = list(shortages.values())
+    _, shortages = _judge(run, "env", resolve_env_sizes(cfg), loads, result)
+    for key, text in shortages.items():
         # A size that was set may be meant for the batch alone; those of the robot's profile should
         # do for both.
         remarks = result.details if key in configured_sizes(cfg.batch) else problems
@@ -84,11 +67,7 @@ def run_capacity(run: Run) -> list[GateResult]:
         result.details.append(
             f"from {nworld} worlds: more of them meet rarer peaks, above all under random actions"
         )
-
-    # Report
-    sizes = task.sizes
-    peaks = task.peaks
-    used = f"{peaks.contacts.max()} of {sizes.nconmax} contacts, {peaks.rows.max()} of"
+    used = f"{task.contacts.max()} of {sizes.nconmax} contacts, {task.rows.max()} of"
     result.reason = "; ".join(problems) or f"{used} {sizes.njmax} rows, at most, in {nworld} worlds"
     result.status = Status.failed if problems else Status.passed
     result.thresholds = {
@@ -96,9 +75,7 @@ def run_capacity(run: Run) -> list[GateResult]:
         "njmax": sizes.njmax,
         "margin": t.margin,
     }
-    result.notes |= {"backend": task.runs["task"].description, "sizes_from": sizes.source}
-    for name, group in groups.items():
-        _report(run, name, group, result)
+    result.notes |= {"backend": task.description, "sizes_from": sizes.source}
     if cameras := cfg.scene.cameras:
         mjwarp = run.stage.backend[0] is Backend.mjwarp
         size = image_bytes(run.stage.model, cameras, cfg.nworld, mjwarp=mjwarp)
@@ -106,65 +83,62 @@ def run_capacity(run: Run) -> list[GateResult]:
     return [result]
 
 
-def _recommend(run: Run, configured: BatchSizes, runs: dict[str, Workload]) -> _Group:
-    """Recommend sizes for some workloads."""
+def _judge(
+    run: Run, name: str, sizes: BatchSizes, loads: dict[str, Peaks], result: GateResult
+) -> tuple[BatchSizes, dict[str, str]]:
+    """Add a group of workloads whose worlds have the same sizes to the result: peaks, memory and
+    the recommended sizes, in which later gates play with ``batch=auto``.
+
+    ``name`` is ``task`` or ``env``; ``sizes`` are in force unless ``batch=auto`` takes those that
+    are recommended.
+
+    Returns:
+        The sizes in force, and why they are too small, by key as of `find_shortages`.
+    """
     cfg = run.cfg
     margin = cfg.gate.capacity.margin
-    peaks = reduce(join_peaks, (load.peaks for load in runs.values()))
-    how = f"batch=auto: gate capacity, {run.stage.measuring_nworld} worlds, times {margin:g}"
+    peaks = reduce(join_peaks, loads.values())
+    how = f"batch=auto: gate capacity, {len(peaks.rows)} worlds, times {margin:g}"
     advice = recommend_sizes(peaks, margin, how if cfg.batch.auto else "gate capacity")
-    return _Group(
-        runs=runs,
-        peaks=peaks,
-        sizes=apply_configured(cfg, advice) if cfg.batch.auto else configured,
-        advice=advice,
-        lost="; ".join(load.loss for load in runs.values() if load.sizes and load.loss),
-    )
-
-
-def _report(run: Run, name: str, group: _Group, result: GateResult) -> None:
-    """Add the peaks, recommended sizes and memory of a group, ``task`` or ``env``, to the
-    result.
-    """
-    native = any(load.sizes is None for load in group.runs.values())
-    for workload, load in group.runs.items():
+    sizes = apply_configured(cfg, advice) if cfg.batch.auto else sizes
+    native = peaks.sizes is None
+    for workload, load in loads.items():
         prefix = "" if workload == "task" else f"{workload}."
-        peaks = load.peaks
         result.metrics |= {
-            f"{prefix}peak_contacts_per_world": int(peaks.contacts.max()),
-            **{f"{prefix}pool_{key}": peak for key, peak in peaks.pools.items()},
-            f"{prefix}peak_constraint_rows_per_world": int(peaks.rows.max()),
+            f"{prefix}peak_contacts_per_world": int(load.contacts.max()),
+            **{f"{prefix}pool_{key}": peak for key, peak in load.pools.items()},
+            f"{prefix}peak_constraint_rows_per_world": int(load.rows.max()),
         }
-    title = _TITLES[name]
-    line = f"{title}: {group.advice.as_overrides()}"
-    if group.lost:
-        line = f"{title}: not known, physics was lost"
+    # Motion that lost physics sizes nothing.
+    lost = "; ".join(load.loss for load in loads.values() if not native and load.loss)
+    line = f"{_TITLES[name]}: {advice.as_overrides()}"
+    if lost:
+        line = f"{_TITLES[name]}: not known, physics was lost"
     elif native and name == "task":
         line += " (contacts alone: native MuJoCo does not count the pairs that share their pool)"
     run.print_line(line)
     result.details.append(line)
-    if group.lost:
-        return
+    if lost:
+        return sizes, {"": lost}
+    run.stage.measured[name] = advice
     prefix = "recommended" if name == "task" else "recommended_env"
-    for key, size in configured_sizes(group.advice).items():
+    for key, size in configured_sizes(advice).items():
         result.metrics[f"{prefix}.{key}"] = size
     if not native:
         from mjstack.sim.usage import data_bytes  # loads Warp, which native runs do not need
 
-        for which, sizes in (("current", group.sizes), ("recommended", group.advice)):
-            size = data_bytes(run.stage.model, run.cfg.nworld, sizes)
+        for which, rooms in (("current", sizes), ("recommended", advice)):
+            size = data_bytes(run.stage.model, cfg.nworld, rooms)
             result.metrics[f"memory.{name}.{which}_mb"] = size / 1e6
+    return sizes, find_shortages(peaks, sizes, advice)
 
 
-def _shortages(group: _Group) -> Iterator[tuple[str, str]]:
-    """Buffers in force that are too small for a group's peaks: the key of each, and a sentence; or
-    the physics that was lost. Exactly at capacity fits.
+def find_shortages(peaks: Peaks, sizes: BatchSizes, advice: BatchSizes) -> dict[str, str]:
+    """Buffers that are too small for peaks: a sentence for the key of each. Exactly at capacity
+    fits.
     """
-    if group.lost:
-        yield "", group.lost
-        return
-    peaks = group.peaks
-    rooms = configured_sizes(group.sizes)
+    shortages = {}
+    rooms = configured_sizes(sizes)
     # Buffer, most needed per world, and use of each world. MJWarp counts what all worlds hold at
     # once. Convex pairs are in the contact pool too, so without a size of their own they fit.
     needs: dict[str, tuple[str, float, np.ndarray]] = {
@@ -177,6 +151,7 @@ def _shortages(group: _Group) -> Iterator[tuple[str, str]]:
         if need > room:
             worlds = np.flatnonzero(used > room).tolist()
             where = f" in {name_worlds(worlds, len(used))}" if worlds else ""
-            fix = f"Raise it: batch.{key}={getattr(group.advice, key)}"
+            fix = f"Raise it: batch.{key}={getattr(advice, key)}"
             problem = f"{name} overflow{where}; room for {room:g} per world, {need:g} needed"
-            yield key, f"{problem}. {fix}"
+            shortages[key] = f"{problem}. {fix}"
+    return shortages

@@ -11,6 +11,7 @@ import torch
 
 from mjstack.config.fingerprint import differences
 from mjstack.config.schema import OUTPUTS, Backend, Config
+from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
 from mjstack.errors import FolderError, MjstackError
 from mjstack.files import read_npz, reading, write_npz
@@ -30,58 +31,38 @@ Images = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Agreement:
-    """How far the images of a camera agree, over all states.
+class _Agreement:
+    """How far the images of a camera agree, over all states."""
 
-    Attributes:
-        same: Share of the pixels in which both show the same thing.
-        iou: Intersection over union of each thing that is large enough, by name.
-        left_out: Names of the things that are too small to compare.
-        color: Mean difference of the colours in those pixels, of 255.
-        depth: Median difference of the depths there [m].
-        worst: State with the fewest such pixels.
-    """
-
-    same: float
-    iou: dict[str, float]
-    left_out: list[str]
-    color: float
-    depth: float
-    worst: int
+    same: float  # share of the pixels in which both show the same thing
+    iou: dict[str, float]  # intersection over union of each thing that is large enough, by name
+    left_out: list[str]  # names of the things that are too small to compare
+    color: float  # mean difference of the colours in the same pixels, of 255
+    depth: float  # median difference of the depths there [m]
+    worst: int  # state with the fewest such pixels
 
 
-def compare_images(
-    stage: Stage,
-    path: np.ndarray,
-    folder: Path | None,
-    draw: Callable[..., None],
-    result: GateResult,
-) -> list[str]:
+def compare_images(run: Run, result: GateResult) -> list[str]:
     """Render states of the reference episode with MJWarp and with native MuJoCo, and compare them.
 
     MJWarp's images and the states are kept in the run's folder. Where native MuJoCo cannot render,
-    another machine compares them with its own.
-
-    Args:
-        stage: Scene and cameras.
-        path: Positions of the reference episode, shape ``(steps, nq)``.
-        folder: The run's, if it has one.
-        draw: Draws a picture of the run, as `Run.draw` does.
-        result: The gate's, which gets figures, thresholds and notes.
+    another machine compares them with its own. The result gets figures, thresholds and notes.
 
     Returns:
         The problems.
     """
+    stage = run.stage
     scene = stage.cfg.scene
     cfg = replace(stage.cfg, scene=replace(scene, cameras=with_outputs(scene.cameras, OUTPUTS)))
     limits = cfg.gate.parity
     if limits.images is None:
+        path = run.nominal.world.qpos
         path = path[np.isfinite(path).all(axis=1)]
         steps = np.linspace(0, len(path) - 1, limits.image_states).round().astype(int)
         qpos = path[steps]
         mjwarp, _ = _draw_states(stage.model, cfg, qpos, Backend.mjwarp, stage.backend[1])
-        if folder is not None:
-            write_npz(folder / FILE, {"qpos": qpos, "about": json.dumps(_about(cfg)), **mjwarp})
+        if run.folder is not None:
+            write_npz(run.folder / FILE, {"qpos": qpos, "about": json.dumps(_about(cfg)), **mjwarp})
     else:
         qpos, mjwarp = load_images(cfg)
     try:
@@ -102,7 +83,8 @@ def compare_images(
         a, b = (images[f"images.{name}"][camera.worst].astype(int) for images in (native, mjwarp))
         difference = np.minimum(np.abs(a - b) * _AMPLIFIED, 255)
         rows[f"{name}, state {camera.worst}"] = [a, b, difference]
-    draw(PICTURE, save_images, rows, ["native MuJoCo", "MJWarp", f"difference x {_AMPLIFIED}"])
+    columns = ["native MuJoCo", "MJWarp", f"difference x {_AMPLIFIED}"]
+    run.draw(PICTURE, save_images, rows, columns)
     result.thresholds |= {
         "images.same_thing": limits.image_same,
         "images.iou": limits.image_iou,
@@ -112,7 +94,7 @@ def compare_images(
     return _report(stage, result, agreements)
 
 
-def _report(stage: Stage, result: GateResult, agreements: dict[str, Agreement]) -> list[str]:
+def _report(stage: Stage, result: GateResult, agreements: dict[str, _Agreement]) -> list[str]:
     """Add figures and a table; return where images differ too much, and which cameras compared
     nothing but the background.
     """
@@ -166,7 +148,7 @@ def _report(stage: Stage, result: GateResult, agreements: dict[str, Agreement]) 
 
 def agree(
     camera: str, native: Images, mjwarp: Images, labels: list[str], least_pixels: int
-) -> Agreement:
+) -> _Agreement:
     """How far images of a camera agree.
 
     Args:
@@ -194,7 +176,7 @@ def agree(
         a, b = (images[f"{prefix}.{camera}"][same].astype(float) for images in (native, mjwarp))
         return float(mean(np.abs(a - b))) if same.any() else np.inf
 
-    return Agreement(
+    return _Agreement(
         same=float(same.mean()),
         iou=iou,
         left_out=left_out,

@@ -4,11 +4,11 @@ import logging
 import time
 import traceback
 from collections.abc import Callable
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
 from mjstack.config.complete import typed
+from mjstack.config.explain import assign, command
 from mjstack.config.functions import resolve_func
 from mjstack.config.schema import Config
 from mjstack.distributed import Ranks, current_ranks
@@ -57,33 +57,14 @@ def run_gates(run: Run, folder: Path) -> None:
     elif stage.ranks.writes:  # of several ranks, the first makes the copies
         cfg = archive_starts(cfg, folder)
     run = replace(run, stage=stage.with_config(cfg, measured=stage.measured))
-    gates = find_gates(run.cfg)
-    compares = "throughput" in gates and "physics" in cfg.gate.throughput.measurements
-    compares = compares and stage.ranks.size == 1 and stage.backend[1] != "cpu"
-    compares = compares and bool(stage.phases) and not lacks_episode(cfg)  # else no physics
-    with ExitStack() as beside:
-        if compares:
-            try:
-                from mjstack.sim import compiling  # loads Warp
-            except Exception:  # the gates that need it say why
-                compares = False
-        if compares:
-            beside.enter_context(compiling.stock_step_beside(lambda: (run.stage.model, run.cfg)))
-        for name, gate in gates.items():
-            if compares and name in ("batch", "throughput"):  # they time an episode
-                compiling.wait_for_stock_step()
-            run_guarded(run, name, gate)
+    for name, gate in find_gates(run.cfg).items():
+        run_guarded(run, name, gate)
 
 
 def run_guarded(run: Run, name: str, gate: Gate, spread: str = "") -> None:
     """Run one gate, or other work that judges like one, and record its results. If it raises it has
-    failed, with the error as its reason.
-
-    Args:
-        run: The run.
-        name: The gate's name.
-        gate: Its function.
-        spread: How ranks share its work, as the marks of gates say; by default as it is marked.
+    failed, with the error as its reason. ``spread`` is how ranks share its work, as the marks of
+    gates say; by default as it is marked.
 
     Raises:
         Exception: It failed in a rank whose part the others need, or a rank has gone: the run is
@@ -112,7 +93,9 @@ def run_guarded(run: Run, name: str, gate: Gate, spread: str = "") -> None:
         gone = isinstance(cause, RankError) and cause.gone
         over = cause if gone or (ranks.size > 1 and spread == "worlds") else None
         if over is not None and run.cfg.job.name == "gates" and run.folder is not None:
-            results[0].reason += f" To go on after the last finished seed: resume={run.folder}"
+            rest = [o for o in run.overrides if not o.startswith("resume=")]
+            resuming = command(*rest, assign("resume", run.folder))
+            results[0].reason += f" To go on after the last finished seed: {resuming}"
     seconds = time.perf_counter() - began
     for result in results:
         if result.status is not Status.skipped and not result.seconds:

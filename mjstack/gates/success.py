@@ -15,10 +15,10 @@ from typing_extensions import override
 from mjstack.config.check import places_objects, reads_starts_file, with_region
 from mjstack.config.schema import Config, SuccessGateCfg
 from mjstack.distributed import Ranks
-from mjstack.drivers.driver import Driver
+from mjstack.drivers.driver import Driver, find_driver, with_controller
 from mjstack.envs import Env
 from mjstack.episodes.record import REGIONS, starts_name
-from mjstack.episodes.rollout import CLOSED_LOOP, FEEDBACK, POLICY, Observer
+from mjstack.episodes.rollout import Observer
 from mjstack.episodes.run import Run, needs_episode, spread
 from mjstack.episodes.seeds import play_seeds
 from mjstack.episodes.tally import rate_cells
@@ -40,14 +40,16 @@ _EDGE = 1e-9  # cells: a place this close below a cell's edge is on it
 
 
 def success_config(cfg: Config) -> Config:
-    """The configuration under which the gate plays: its controller, and how its worlds start."""
+    """The configuration under which the gate plays: how its worlds start, and its controller, the
+    closed-loop expert in the place of a plan.
+    """
     t = cfg.gate.success
     reset = dict(cfg.reset if reads_starts_file(cfg.reset) else t.reset)
     region = t.region
     if region is not None:
         reset = with_region(reset, lambda xy: list(region))
-    name = cfg.controller.name if cfg.controller.name in FEEDBACK else CLOSED_LOOP
-    return replace(cfg, reset=reset, controller=replace(cfg.controller, name=name))
+    cfg = with_controller(cfg, "closed_loop") if find_driver(cfg).planned else cfg
+    return replace(cfg, reset=reset)
 
 
 @spread
@@ -60,7 +62,8 @@ def run_success(run: Run) -> list[GateResult]:
     cfg = success_run.cfg
     t = cfg.gate.success
     unwritten: list[str] = []
-    goals = [Goal(success_run.stage.ranks)] if cfg.controller.name == POLICY else []
+    counts = not success_run.stage.driver_class.needs_phases
+    goals = [Goal(success_run.stage.ranks)] if counts else []
     tally = play_seeds(
         success_run,
         "success",
@@ -69,13 +72,14 @@ def run_success(run: Run) -> list[GateResult]:
         signs=True,
         observers=lambda seed: [_StartsWriter(success_run, seed, unwritten), *goals],
     )
-    starts = tally.array("start_places")
+    places = tally.places
+    starts = np.stack([*places.values()], axis=1)
     retries = tally.array("retries")
     succeeded = tally.array("failed") == 0
     retried = int((retries > 0).sum())
     retried_succeeded = int(((retries > 0) & succeeded).sum())
-    regions = find_regions(t, starts, succeeded, tally.records[0].object_names)
-    distinct = len(np.unique(np.round(starts, 6).reshape(len(starts), -1), axis=0))
+    regions = find_regions(t, starts, succeeded, list(places))
+    distinct = len(np.unique(np.round(np.nan_to_num(starts), 6).reshape(len(starts), -1), axis=0))
     lost = sum(goal.lost for goal in goals)
     doubts = find_doubts(distinct, tally.episodes, tally.successes, lost, t.rate)
     tally.details = unwritten + doubts + tally.details
@@ -201,8 +205,8 @@ def find_regions(
 
     Args:
         cfg: The configuration of the gate, with their widths and the least number of episodes.
-        places: x and y [m] and rotation about z [rad] of each object at the start, shape ``(n,
-            objects, 3)``.
+        places: x and y [m] and rotation about z [rad] of each object at the start, NaN for a place,
+            shape ``(n, objects, 3)``.
         succeeded: Whether each episode was, shape ``(n,)``, bool.
         objects: Names of the objects.
     """
@@ -213,7 +217,7 @@ def find_regions(
         yaw = radial_yaw_deg(places[:, number])
         keys = np.floor(np.column_stack((places[:, number, :2], yaw)) / widths + _EDGE)
         keys[keys[:, 2] * cfg.yaw_cell_deg >= 90.0, 2] = 0.0  # on the edge of 90, which is 0
-        for axes in ([0, 1], [2], [0, 1, 2]):
+        for axes in ([0, 1],) if np.isnan(yaw).any() else ([0, 1], [2], [0, 1, 2]):
             cells, which = np.unique(keys[:, axes], axis=0, return_inverse=True)
             for row, key in enumerate(cells):
                 outcomes = succeeded[which.ravel() == row]

@@ -98,12 +98,12 @@ def _on_driven_worlds(
     run: Run, backend: Backend, device: str, result: GateResult
 ) -> dict[str, Measurement]:
     """Measurements *physics* and *episode*, on the same worlds."""
-    t = run.cfg.gate.throughput
-    chosen: list[str] = [name for name in ("physics", "episode") if name in t.measurements]
-    measured = {name: Measurement(name=name, missing=lacks_episode(run.cfg)) for name in chosen}
-    if "physics" in measured and not run.stage.phases:
-        measured["physics"].missing = "it starts as a phase begins, and a policy has none"
-    names = [name for name, part in measured.items() if not part.missing]
+    lack = lacks_episode(run.cfg)
+    no_phase = "it starts as a phase begins, and a policy has none"
+    lacks = {"physics": lack if run.stage.phases else no_phase, "episode": lack}
+    chosen = [name for name in lacks if name in run.cfg.gate.throughput.measurements]
+    measured = {name: Measurement(name=name, missing=lacks[name]) for name in chosen}
+    names = [name for name in chosen if not lacks[name]]
     if not names:
         return measured
     gc.collect()  # environments hold on to their worlds in cycles, and a GPU has not room for all
@@ -117,20 +117,17 @@ def _on_driven_worlds(
     result.notes["backend"] = sim.description
     if sim.sizes is not None:
         result.notes["sizes"] = str(sim.sizes)
-    worlds = (run.stage, sim)
     step_seconds = 0.0
     if "physics" in names:
         carry = run.artifacts.carry_start
-        physics = _guarded("physics", measure_physics, *worlds, carry)
-        measured["physics"] = physics
+        measured["physics"] = physics = _guarded("physics", measure_physics, run.stage, sim, carry)
         if physics.samples:
             step_ms = physics.median("ms_per_batched_step")
             step_seconds = 1e-3 * step_ms * run.cfg.timing.decimation
     if "episode" in names:
         before = run.artifacts.timed_episode
         measure = partial(measure_episode, step_seconds=step_seconds)
-        episode = _guarded("episode", measure, *worlds, before)
-        measured["episode"] = episode
+        measured["episode"] = _guarded("episode", measure, run.stage, sim, before)
     sim.close()
     return measured
 

@@ -268,7 +268,7 @@ class Collection:
             succeeded = sum(batch.succeeded for batch in self.batches)
             result.metrics |= {"worlds_played": worlds, **rate_metrics(succeeded, worlds)}
             result.metrics["retries"] = sum(batch.retries for batch in self.batches)
-            driver = "expert" if self._stage.phases else "policy"
+            driver = self._stage.driver_class.noun
             share = f"{succeeded:,} of {worlds:,} worlds ({100.0 * succeeded / worlds:.4g} %)"
             reasons.append(f"the {driver} succeeded in {share}")
             broken = sum((Counter(batch.broken) for batch in self.batches), Counter())

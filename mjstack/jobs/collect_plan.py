@@ -2,6 +2,7 @@
 of the batches that were played.
 """
 
+import dataclasses
 import json
 import os
 from collections.abc import Mapping, Sequence
@@ -16,8 +17,10 @@ from mjstack.config.fingerprint import WITHOUT_EFFECT, config_content, config_ha
 from mjstack.config.functions import offered
 from mjstack.config.schema import CollectJobCfg, Config, ObservationTermCfg
 from mjstack.datasets import DatasetSpec, Feature, Video
-from mjstack.datasets.reader import check_same, read_info
+from mjstack.datasets.lerobot import INFO
+from mjstack.datasets.reader import read_begun
 from mjstack.datasets.spec import term_columns
+from mjstack.datasets.tables import read_info, readable
 from mjstack.datasets.video import check_encoder
 from mjstack.envs import Env, demonstration_config
 from mjstack.episodes.stage import Stage
@@ -122,23 +125,25 @@ def _check_starts(env: Env) -> None:
 
 
 def check_folder(dataset: Path, spec: DatasetSpec) -> None:
-    """Refuse a dataset that is not this configuration's.
+    """Refuse a dataset that cannot be gone on with.
 
     Raises:
-        FolderError: It is of another one, or another process is writing it.
+        FolderError: It is of another configuration or damaged, or another process is writing it.
     """
-    if not dataset.exists():
+    if not os.path.lexists(dataset):
         return
+    if not dataset.is_dir():
+        raise FolderError(f"{dataset} is no folder, expected one", "Set job.folder to another")
     os.close(lock_folder(dataset))
-    info = read_info(dataset)
-    if info is None:
-        return
-    if info["mjstack"]["config_sha256"] != spec.config_sha256:
-        recorded = (info["mjstack"]["provenance"] or [{}])[-1].get("config", {})
-        changes = differences(recorded, spec.provenance["config"])
-        problem = f"{dataset} has episodes of another configuration: {changes}"
-        raise FolderError(problem, "Set job.folder to another folder, or these keys back")
-    check_same(dataset, info, spec)
+    if (dataset / INFO).is_file():
+        info = read_info(dataset)
+        with readable(dataset / INFO):
+            recorded = [{}, *info.get("mjstack", {"provenance": []})["provenance"]][-1]
+            changes = differences(recorded.get("config", {}), spec.provenance["config"])
+        if recorded and changes:
+            problem = f"{dataset} has episodes of another configuration: {changes}"
+            raise FolderError(problem, "Set job.folder to another folder, or these keys back")
+    read_begun(dataset, spec)
     read_batches(dataset.parent / BATCHES)
 
 
@@ -177,7 +182,12 @@ def read_batches(path: Path) -> list[BatchRecord]:
         if any("kept" in batch for batch in batches):
             reason = f"{path.parent} has a dataset of version 0.1, expected one of this version"
             raise FolderError(reason, "Set job.folder to another folder")
-        return [BatchRecord(**batch) for batch in batches]
+        records = [BatchRecord(**batch) for batch in batches]
+        for record in records:
+            *counts, broken = dataclasses.astuple(record)
+            if not all(type(count) is int and count >= 0 for count in (*counts, *broken.values())):
+                raise ValueError(f"a record is {record!r:.60}")
+        return records
 
 
 def episode_config(cfg: Config) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from mjstack.config.fingerprint import config_content, differences
 from mjstack.config.load import load_config
 from mjstack.config.schema import Backend, Config
 from mjstack.episodes.batches import BatchPlan, play_batches
-from mjstack.episodes.motion import motion_recorder
+from mjstack.episodes.motion import motion_recorder, moving_worlds
 from mjstack.episodes.replay import simulate_alone
 from mjstack.episodes.rollout import require_episode
 from mjstack.episodes.run import Run
@@ -81,7 +82,11 @@ def check_compare(cfg: Config, overrides: Sequence[str]) -> CheckedJob:
         raise ConfigError("job.against", against, "equal starts, which these keys change")
     notes["b"] += f", {' '.join(against)}"
     title = f"task {cfg.task.name}, a against b ({' '.join(against)})"
-    return CheckedJob(stage=sides["a"], title=title, work=partial(_run, sides, notes))
+    return CheckedJob(
+        stage=sides["a"],
+        title=title,
+        work=lambda run, folder: run_guarded(run, NAME, partial(_compare, sides, notes, folder)),
+    )
 
 
 def _key(override: str) -> str:
@@ -94,15 +99,10 @@ def _start_of_first_world(stage: Stage) -> dict[str, np.ndarray]:
         return start_arrays(stage.start(sim, stage.cfg.reset, worlds=[0]))
 
 
-def _run(sides: Sides, notes: Mapping[str, str], run: Run, folder: Path) -> None:
-    """Play both sides and compare them."""
+def _compare(sides: Sides, notes: Mapping[str, str], folder: Path, run: Run) -> list[GateResult]:
+    """Play both sides and compare them: it passes if the comparison was made."""
     for stage in sides.values():
         stage.progress = run.stage.progress
-    run_guarded(run, NAME, partial(_compare, sides, notes, folder))
-
-
-def _compare(sides: Sides, notes: Mapping[str, str], folder: Path, run: Run) -> list[GateResult]:
-    """The comparison as a result: it passes if it was made."""
     (failed_a, starts_a), (failed_b, starts_b) = (_play(*side) for side in sides.items())
     rounding = _ROUNDING if sides["a"].backend != sides["b"].backend else 0.0
     if not np.abs(starts_a - starts_b).max() <= rounding:
@@ -190,22 +190,19 @@ def _play(name: str, stage: Stage) -> tuple[np.ndarray, np.ndarray]:
 
 def _replay(sides: Sides, rows: Sequence[Mapping[str, Any]]) -> list[World]:
     """Some worlds in motion, each as a plays it and as b does."""
-    places = sorted((row["seed"], row["world"]) for row in rows)
-    groups = groupby(places, key=lambda place: place[0])
+    episodes = sorted((row["seed"], row["world"]) for row in rows)
+    groups = groupby(episodes, key=itemgetter(0))
     plans = [BatchPlan(seed, [world for _, world in group]) for seed, group in groups]
-    moving: dict[tuple[int, int, str], World] = {}
+    moving: dict[str, list[World]] = {name: [] for name in sides}
     for name, stage in sides.items():
         channels = motion_recorder(stage.cfg.timing.step_dt).channels
         simulate = partial(simulate_alone, stage, *stage.backend)
         for batch in play_batches(stage, plans, channels, simulate=simulate):
-            seed = batch.plan.seed
-            motions = batch.rows["qpos"].float().swapaxes(0, 1).cpu().numpy()
-            bits = batch.episode.failed.tolist()
-            for world, qpos, failed in zip(batch.plan.worlds, motions, bits, strict=True):
-                problem = stage.check.rules.describe(failed)
-                label = f"{seed}:{world} {name} {problem}".rstrip()
-                moving[seed, world, name] = World(label=label, qpos=qpos, failed=failed > 0)
-    return [moving[key] for key in sorted(moving)]
+            worlds = batch.plan.worlds
+            names = {row: f"{batch.plan.seed}:{world} {name}" for row, world in enumerate(worlds)}
+            failed, qpos = batch.episode.failed, batch.rows["qpos"]
+            moving[name] += moving_worlds(stage, batch.env, qpos, failed, names, 0)
+    return [world for pair in zip(*moving.values(), strict=True) for world in pair]
 
 
 JOB = Job(check_compare, overrides=True)

@@ -3,16 +3,14 @@ MuJoCo; or the policy as a folder of LeRobot's.
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import mujoco
 
-import mjstack
 from mjstack.config.schema import Config
+from mjstack.drivers.driver import with_controller
 from mjstack.envs import driven_config
-from mjstack.episodes.rollout import POLICY as DRIVER
 from mjstack.episodes.stage import Stage
 from mjstack.errors import FolderError
 from mjstack.files import write_atomic
@@ -25,6 +23,7 @@ from mjstack.policy.checkpoint import policy_facts
 from mjstack.policy.lerobot import lerobot_files
 from mjstack.policy.onnx import require_onnx, to_onnx
 from mjstack.report.record import GateResult, Status
+from mjstack.version import __version__
 
 NAME = "export"
 POLICY = "policy.onnx"
@@ -35,7 +34,7 @@ def check_export(cfg: Config) -> CheckedJob:
     """Raise for what cannot be exported, before anything is written."""
     if cfg.job.format == "onnx":
         require_onnx()
-    stage = Stage(replace(cfg, controller=replace(cfg.controller, name=DRIVER)))
+    stage = Stage(with_controller(cfg, "policy"))
     check_task(stage)
     return CheckedJob(
         stage=stage,
@@ -92,7 +91,7 @@ def export_facts(stage: Stage) -> dict[str, Any]:
     network = policy.network
     return policy_facts(policy) | {
         "versions": policy.versions,
-        "exported_with": {"mjstack": mjstack.__version__, "mujoco": mujoco.__version__},
+        "exported_with": {"mjstack": __version__, "mujoco": mujoco.__version__},
         "columns": {"names": columns.names, "units": columns.units},
         "normalization": {
             name: network.get_buffer(name).tolist() for name, _ in network.named_buffers()

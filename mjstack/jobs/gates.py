@@ -8,18 +8,20 @@ import torch
 
 from mjstack.config.fingerprint import config_content, differences
 from mjstack.config.schema import Backend, Config
+from mjstack.drivers.driver import check_driver
 from mjstack.envs import driven_config
 from mjstack.episodes.earlier_run import EarlierRun
 from mjstack.episodes.record import STEMS
-from mjstack.episodes.rollout import CLOSED_LOOP, POLICY, STATE_BASED
 from mjstack.episodes.stage import Stage
-from mjstack.errors import ConfigError, FolderError, Unreachable, renamed_keys
+from mjstack.errors import ConfigError, FolderError, MjstackError, Unreachable, renamed_keys
 from mjstack.gates.images import load_images
 from mjstack.gates.runner import find_gates, run_gates
 from mjstack.gates.success import success_config
 from mjstack.jobs.runner import VIEWS, CheckedJob, Job, count_devices, run_provenance
 from mjstack.jobs.showing import check_showing
 from mjstack.managers.episode import required_fields
+from mjstack.managers.term import blamed
+from mjstack.math import describe_tensor
 from mjstack.report.gl import require_offscreen
 from mjstack.scene.index import turn_sign
 from mjstack.sim import resolve_backend
@@ -85,30 +87,44 @@ def check_task(stage: Stage) -> None:
     """Raise if the task cannot be played as configured, on this machine."""
     cfg = stage.cfg
     resolve_backend(cfg)
+    keys = {} if stage.policy else {"action": "controller.action"}
     if cfg.task.check is not None:
-        _ = stage.check  # reads its thresholds
+        with renamed_keys(keys):
+            _try_check(stage)
     check_env(stage, cfg)
     check_cameras(stage)
-    name = cfg.controller.name
-    if name == POLICY:
-        check_env(stage, stage.driven({}), drives=True)
-        return
-    if not cfg.controller.phases:
-        return
-    phases = stage.planner.phases  # reads the robot, and reaches every nominal target
-    if phases[-1].stop > cfg.task.episode_steps:
-        expected = f"at least the steps of the phases, {phases[-1].stop}"
-        raise ConfigError("task.episode_steps", cfg.task.episode_steps, expected)
-    if cfg.controller.approach_gain > 0.0:
-        turn_sign(stage.model, cfg.robot)
-    drives = name == STATE_BASED and cfg.task.check is not None
-    check_env(stage, stage.driven({}), drives=drives, action="controller.action")
-    judged = success_config(cfg).controller.name
-    if judged == CLOSED_LOOP and (name == CLOSED_LOOP or "success" in cfg.gates):
-        # Loads Warp, which a native open-loop run does not need.
-        from mjstack.kinematics.batched_ik import build_chain
+    driver = stage.driver_class
+    if driver.needs_phases:
+        if not cfg.controller.phases:
+            return
+        phases = stage.planner.phases  # reads the robot, and reaches every nominal target
+        if phases[-1].stop > cfg.task.episode_steps:
+            expected = f"at least the steps of the phases, {phases[-1].stop}"
+            raise ConfigError("task.episode_steps", cfg.task.episode_steps, expected)
+        if cfg.controller.approach_gain > 0.0:
+            turn_sign(stage.model, cfg.robot)
+    # Two worlds show a driver that answers for one.
+    with renamed_keys(keys), stage.native_env(stage.driven({}), nworld=2) as env:
+        if cfg.task.check is not None or not driver.needs_phases:
+            env.reset()
+            check_driver(env, cfg, stage.assets)
+    if "success" in cfg.gates and driver.planned:  # the closed-loop expert plays
+        from mjstack.kinematics.batched_ik import build_chain  # loads Warp
 
         build_chain(stage.model, cfg.robot)
+
+
+def _try_check(stage: Stage) -> None:
+    """Raise if the task's check cannot judge a step of two worlds."""
+    check = stage.check
+    with stage.native_env(stage.driven({}), nworld=2) as env, blamed("task.check.func"):
+        check.start(env, 1)
+        check.update()
+        check.result()
+        placed = check.placed(check.view(env).step())
+        expected = describe_tensor(torch.zeros((env.nworld, len(check.objects) or 1)) > 0)
+        if (actual := describe_tensor(placed)) != expected:
+            raise MjstackError(f"placed: {actual}, expected {expected}, of two worlds")
 
 
 def check_cameras(stage: Stage) -> None:
@@ -131,19 +147,16 @@ def check_cameras(stage: Stage) -> None:
         require_offscreen(stage.model)
 
 
-def check_env(stage: Stage, cfg: Config, *, drives: bool = False, **keys: str) -> None:
+def check_env(stage: Stage, cfg: Config, **keys: str) -> None:
     """Build an environment of the stage's scene, which checks every term.
 
     Args:
         stage: The stage.
         cfg: The environment's configuration.
-        drives: Whether the driver is built for it too, which a policy of other worlds does not fit.
         keys: The key of each group whose terms come from elsewhere.
     """
-    with renamed_keys(keys), stage.native_env(cfg) as env:
-        if drives:
-            env.reset()
-            stage.driver(env)
+    with renamed_keys(keys), stage.native_env(cfg):
+        pass
 
 
 def check_gates(cfg: Config) -> CheckedJob:

@@ -4,7 +4,6 @@ import re
 import time
 from collections import deque
 from collections.abc import Mapping
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,10 +12,10 @@ from typing_extensions import override
 
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
+from mjstack.episodes.motion import world_fields
 from mjstack.episodes.rollout import Observer
 from mjstack.episodes.stage import Stage
 from mjstack.interrupt import check_interrupt
-from mjstack.report.geometry import Shapes
 from mjstack.report.page import MOST_WORLDS, World
 from mjstack.report.web import Stage as SceneView
 from mjstack.sim import StateRenderer
@@ -43,11 +42,8 @@ class LiveView(Observer):
     """
 
     def __init__(self, server: Any, stage: Stage) -> None:
-        """Add the controls to a server.
-
-        Args:
-            server: Of `report.web.start_server`.
-            stage: The scene. Its cameras are rendered here where the environment does not.
+        """Add the controls to a server of `report.web.start_server`. The stage's cameras are
+        rendered here where the environment does not.
         """
         self._server = server
         self._stage = stage
@@ -55,6 +51,7 @@ class LiveView(Observer):
         self._view: SceneView | None = None
         self._nworld = 0
         self._numbers = [0]  # of the worlds in the picture
+        self._content: tuple[list[int], list[bytes]] = ([], [])  # these worlds and their fields
         self._part = ""
         self._choice = ("", 0)  # of the last picture: worlds and plotted world
         self._steps = 0  # that a click lets the run make
@@ -156,16 +153,19 @@ class LiveView(Observer):
         if not numbers:
             expected = f"numbers from 0 to {env.nworld - 1}, such as 0-15, 20"
             problem.append(f"Worlds: {text!r} names none, expected {expected}")
-        elif numbers != self._numbers:
-            self._numbers = numbers
+        self._numbers = numbers or self._numbers
+        fields = world_fields(self._stage, env, self._numbers)
+        content = [values.tobytes() for world in fields for values in world.values()]
+        if self._content != (self._numbers, content):  # an episode may draw its fields anew
+            self._content = (self._numbers, content)
             self._view = None
         index = torch.tensor(self._numbers, device=env.device)
         qpos = env.sim.qpos[index].double().cpu().numpy()
         if self._view is None:
             self._server.scene.reset()
-            places = zip(env.world[index].tolist(), qpos[:, None], strict=True)
-            worlds = [World(label=str(number), qpos=frames) for number, frames in places]
-            self._view = SceneView(self._server, self._shapes, worlds)
+            rows = zip(env.world[index].tolist(), qpos[:, None], fields, strict=True)
+            worlds = [World(label=str(n), qpos=frames, fields=values) for n, frames, values in rows]
+            self._view = SceneView(self._server, self._stage.assets.visual_model, worlds)
         self._view.update(np.nan_to_num(qpos))
         world = min(max(0, int(plotted)), env.nworld - 1)
         terms, lines = self._values(world)
@@ -184,11 +184,6 @@ class LiveView(Observer):
         title = f"{self._part}, step {step:,}, {env.nworld:,} worlds"
         lines_shown = [title, f"world {world}: {terms}", *problem]
         self._status.value = "\n".join(line[: 2 * _TEXT] for line in lines_shown)
-
-    @cached_property
-    def _shapes(self) -> Shapes:
-        """Geometry of the scene."""
-        return Shapes(self._stage.assets.visual_model)
 
     def _values(self, world: int) -> tuple[str, dict[str, dict[str, float]]]:
         """A world's state in words, and the lines of the plots by title."""

@@ -6,14 +6,14 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from mjstack.config.schema import Config, PlayJobCfg
-from mjstack.episodes.motion import draw_seen
+from mjstack.drivers.driver import find_driver, with_controller
+from mjstack.episodes.motion import draw_seen, world_fields
 from mjstack.episodes.recorder import WorldRecorder
 from mjstack.episodes.replay import simulate_alone
-from mjstack.episodes.rollout import POLICY, play_episode, rollout
+from mjstack.episodes.rollout import play_episode, rollout
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError
@@ -22,6 +22,7 @@ from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import VIEWS, CheckedJob, Job
 from mjstack.jobs.showing import check_showing
 from mjstack.report.gl import require_offscreen
+from mjstack.report.page import World
 from mjstack.report.picture import save_video
 from mjstack.report.record import GateResult, Status
 from mjstack.report.write import safely_write
@@ -33,11 +34,12 @@ _MOST = 64  # worlds of a video
 def check_play(cfg: Config) -> CheckedJob:
     """Raise for what cannot be shown, before anything is written."""
     if cfg.policy is not None:
-        cfg = replace(cfg, controller=replace(cfg.controller, name=POLICY))
+        cfg = with_controller(cfg, "policy")
     cfg = replace(cfg, video=cfg.video or cfg.view == "false")
     if cfg.video and cfg.nworld > _MOST:
         raise ConfigError("nworld", cfg.nworld, f"at most {_MOST} worlds, as a video has room for")
-    if not cfg.controller.phases and cfg.controller.name != POLICY:
+    driver = find_driver(cfg)
+    if not cfg.controller.phases and driver.needs_phases:
         expected = "a task with phases, which the expert follows"
         raise ConfigError("task", cfg.task.name, expected, "Name a policy: policy=FOLDER")
     job: PlayJobCfg = cfg.job
@@ -50,10 +52,9 @@ def check_play(cfg: Config) -> CheckedJob:
     check_showing(cfg, f".{job.format}")
     if cfg.video and job.camera is None:  # cameras have been checked with the task
         require_offscreen(stage.model)
-    driver = "a policy" if cfg.controller.name == POLICY else "the expert"
     return CheckedJob(
         stage=stage,
-        title=f"task {cfg.task.name}, {cfg.nworld} worlds with {driver}",
+        title=f"task {cfg.task.name}, {cfg.nworld} worlds with the {driver.noun}",
         work=lambda run, folder: run_guarded(run, NAME, play_worlds),
     )
 
@@ -66,9 +67,8 @@ def play_worlds(run: Run) -> list[GateResult]:
     cfg = stage.cfg
     advance = stage.progress.advance
     job: PlayJobCfg = cfg.job
-    positions = []
-    seen = []
-    fields = []
+    worlds: list[World] = []
+    looks = []
     details = []
     succeeded = 0
     with closing(simulate_alone(stage, *stage.backend)) as sim:
@@ -87,11 +87,12 @@ def play_worlds(run: Run) -> list[GateResult]:
                 status, outcome, metrics, _ = run.judge_one(episode)
                 succeeded += status is Status.passed
                 outcome = outcome or f"succeeded, {stage.check.headline(metrics)}"
-            positions.append(recorder.qpos)
-            if cfg.video and job.camera is None:
-                seen.append(draw_seen(stage, recorder.qpos, sim))
-            fields.append({name: value.clone() for name, value in sim.fields.items()})
-            run.show_world(f"{NAME}_{world}", str(world), recorder.qpos, status, sim)
+            qpos = recorder.qpos
+            seen = draw_seen(stage, qpos, sim) if cfg.video and job.camera is None else {}
+            (fields,) = world_fields(stage, env, [0])
+            worlds.append(World(label=str(world), qpos=qpos, images=seen, fields=fields))
+            looks.append({name: value.clone() for name, value in sim.fields.items()})
+            run.show_world(f"{NAME}_{world}", str(world), qpos, status, env)
             details.append(f"world {world}: {outcome}")
             run.print_line(details[-1])
     result = GateResult(
@@ -103,18 +104,19 @@ def play_worlds(run: Run) -> list[GateResult]:
         details=details,
     )
     if cfg.video:
-        _save(run, np.stack(positions), fields, seen, result)
+        _save(run, worlds, looks, result)
     return [result]
 
 
 def _save(
     run: Run,
-    qpos: np.ndarray,
+    worlds: Sequence[World],
     fields: Sequence[Mapping[str, torch.Tensor]],
-    seen: Sequence[Mapping[str, np.ndarray]],
     result: GateResult,
 ) -> None:
-    """Write the video; without one there is nothing to look at, and the job fails."""
+    """Write the video of worlds with these model fields; without one there is nothing to look at,
+    and the job fails.
+    """
     assert run.folder is not None
     stage = run.stage
     job: PlayJobCfg = stage.cfg.job
@@ -123,17 +125,14 @@ def _save(
     def write(path: Path) -> None:
         """Write it as seen from the side, or by a camera with each world in its own looks."""
         model = stage.assets.visual_model
-        step_dt = stage.cfg.timing.step_dt
-        advance = stage.progress.advance
-        save = partial(
-            save_video, path, model, qpos, step_dt, advance, fps=job.fps, width=job.width
-        )
+        scene = (model, worlds, stage.cfg.timing.step_dt, stage.progress.advance)
+        save = partial(save_video, path, *scene, fps=job.fps, width=job.width)
         if job.camera is None:
-            save(seen=seen)
+            save()
             return
         looks = {field: torch.cat([world[field] for world in fields]) for field in fields[0]}
         name = f"images.{job.camera}"
-        with closing(stage.color_renderer(len(qpos), list(looks), [job.camera])) as renderer:
+        with closing(stage.color_renderer(len(worlds), list(looks), [job.camera])) as renderer:
             save(draw=lambda q: renderer.draw(torch.from_numpy(q), looks)[name].cpu().numpy())
 
     if problem := safely_write(path, write):

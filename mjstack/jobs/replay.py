@@ -21,7 +21,7 @@ from mjstack.episodes.rollout import Episode, require_episode
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
 from mjstack.episodes.tally import rate_cells
-from mjstack.errors import ConfigError, DeviceError, FolderError
+from mjstack.errors import ConfigError, DeviceError, FolderError, shorten
 from mjstack.files import to_csv, write_atomic, write_npz
 from mjstack.gates.runner import run_guarded
 from mjstack.gates.success import success_config
@@ -43,34 +43,22 @@ _NATIVE = (Backend.native, "cpu")
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReplayPlan:
-    """One world, or all failing ones, to be played again.
-
-    Attributes:
-        run: The earlier run.
-        gate: Whose worlds they are, ``batch`` or ``success``.
-        failing: Whether they are all failing ones.
-        bits: Bits of the rules that each world broke, by seed and world.
-        seed: The first seed.
-        world: Its first world.
-        record: The results of the first seed.
-        where: Backend and device, each played once; the first is the earlier run's unless ``sim``
-            says otherwise.
-        stage: The configuration that the gate played under, on the first backend here.
-    """
+class _Plan:
+    """One world, or all failing ones, to be played again."""
 
     run: EarlierRun
-    gate: str
-    failing: bool
-    bits: dict[int, dict[int, int]]
-    seed: int
-    world: int
-    record: EpisodeRecord
+    gate: str  # whose worlds they are, ``batch`` or ``success``
+    failing: bool  # whether they are all failing ones
+    bits: dict[int, dict[int, int]]  # of the rules that each world broke, by seed and world
+    seed: int  # the first one
+    world: int  # its first one
+    record: EpisodeRecord  # of the first seed
+    # Backend and device, each played once; the first is the run's unless ``sim`` says otherwise.
     where: list[tuple[Backend, str]]
-    stage: Stage
+    stage: Stage  # with the configuration that the gate played under, on the first backend here
 
 
-def _plan_replay(cfg: Config) -> ReplayPlan:
+def _plan_replay(cfg: Config) -> _Plan:
     """Read what ``run`` and ``world`` name.
 
     Raises:
@@ -79,7 +67,7 @@ def _plan_replay(cfg: Config) -> ReplayPlan:
     """
     for key, expected in (("run", "the folder of an earlier run"), ("world", "one of its worlds")):
         if getattr(cfg, key) is None:
-            fix = "Write job=replay run=outputs/<date>/<time> world=17"
+            fix = "Write mjstack job=replay run=outputs/DATE/TIME world=17"
             raise ConfigError(key, "null", f"{expected}, because job=replay plays one again", fix)
     resolve_backend(cfg)  # what this command line asks for must be there
     run = EarlierRun.read(str(cfg.run))
@@ -125,7 +113,7 @@ def _plan_replay(cfg: Config) -> ReplayPlan:
     sim = SimCfg(backend=backend, device=device, step=cfg.sim.step)
     # The folder may be a stranger's: what a replay does not play is not built.
     played = replace(driven_config(played), sim=sim, view=cfg.view, video=cfg.video, web=cfg.web)
-    return ReplayPlan(
+    return _Plan(
         run=run,
         gate=gate,
         failing=failing,
@@ -151,7 +139,7 @@ def _choose(requested: SimCfg, record: EpisodeRecord) -> list[tuple[Backend, str
     return [(backend, device), *([_NATIVE] if auto else [])]
 
 
-def _check_start(plan: ReplayPlan) -> None:
+def _check_start(plan: _Plan) -> None:
     """Check that the first world would start where it did in that run.
 
     Raises:
@@ -195,7 +183,7 @@ def check_replay(cfg: Config) -> CheckedJob:
     )
 
 
-def _replay_all(plan: ReplayPlan, run: Run, folder: Path) -> None:
+def _replay_all(plan: _Plan, run: Run, folder: Path) -> None:
     """Play on the run's backend and, where that was MJWarp, on native MuJoCo too."""
     rows: dict[tuple[int, int], dict[str, Any]] = {}
     changes: list[str] = []
@@ -219,7 +207,7 @@ def _changes(recorded: dict, current: dict) -> list[str]:
         for facts in (recorded, current)
     )
     lines = [
-        f"{name} was {before[name]} in that run and is {value} now"
+        f"{name} was {shorten(str(before[name]), 100)} in that run and is {value} now"
         for name, value in now.items()
         if name in before and before[name] != value
     ]
@@ -231,7 +219,7 @@ def _changes(recorded: dict, current: dict) -> list[str]:
 
 
 def _replay(
-    plan: ReplayPlan, number: int, changes: list[str], folder: Path, run: Run
+    plan: _Plan, number: int, changes: list[str], folder: Path, run: Run
 ) -> list[GateResult]:
     """Play the world on one backend, and compare the result with the recorded one."""
     first = number == 0
@@ -248,7 +236,8 @@ def _replay(
         qpos = trace.arrays["qpos"]
         status, reason, metrics, beyond = run.judge_one(episode)
         title = f"world {plan.world} of seed {plan.seed}, replayed ({backend})" if first else ""
-        run.show_world(f"replay_{backend}", f"{plan.world}, {backend}", qpos, status, sim, title)
+        label = f"{plan.world}, {backend}"
+        run.show_world(f"replay_{backend}", label, qpos, status, trace.env, title)
     agrees, comparison = _compare(plan, number, episode, qpos[-1], changes, run)
     lines += [_first_sign(monitor, episode) for monitor in monitors]
     for line in lines:
@@ -283,7 +272,7 @@ def _first_sign(monitor: FailureMonitor, episode: Episode) -> str:
 
 
 def _compare(
-    plan: ReplayPlan, number: int, episode: Episode, end: np.ndarray, changes: list[str], run: Run
+    plan: _Plan, number: int, episode: Episode, end: np.ndarray, changes: list[str], run: Run
 ) -> tuple[bool, str]:
     """Whether the world did as promised, and how it, at ``end``, compares with its record."""
     backend, device = plan.where[number]
@@ -320,7 +309,7 @@ def _compare(
 
 
 def _play_failing(
-    plan: ReplayPlan, number: int, rows: dict[tuple[int, int], dict], folder: Path, run: Run
+    plan: _Plan, number: int, rows: dict[tuple[int, int], dict], folder: Path, run: Run
 ) -> list[GateResult]:
     """Play the failing worlds of each seed together, on one backend; ranks share the seeds."""
     backend, device = plan.where[number]

@@ -20,9 +20,10 @@ import numpy as np
 import torch
 from rich.markup import escape
 
-from mjstack.config import load_config
+from mjstack.config.explain import command
 from mjstack.config.fingerprint import config_content, config_hash, differences
 from mjstack.config.functions import find_object
+from mjstack.config.load import configured
 from mjstack.config.schema import Backend, Config
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.run import Run
@@ -117,7 +118,9 @@ class CheckedJob:
         console = Console(highlight=False, soft_wrap=True)
         cfg = self.stage.cfg
         page = Page(
-            title=f"{cfg.robot.title}, {self.title}", motion=cfg.web.episode and not lacks_viser()
+            title=f"{cfg.robot.title}, {self.title}",
+            command=command(*overrides),
+            motion=cfg.web.episode and not lacks_viser(),
         )
         report = Report(
             folder=folder,
@@ -185,8 +188,8 @@ class CheckedJob:
             self.work(run, folder)
         report.conclude()
         write_formats(report, page)
-        showing.draw_episode(self.stage, folder, run.artifacts.pictured, run.draw)
-        page.note = showing.save_page(self.stage, folder, page)
+        showing.draw_episode(self.stage, folder, run.artifacts.pictured, page, run.draw)
+        showing.save_page(self.stage, folder, page)
 
     def _load(self, *, warp: bool) -> None:
         """Load MuJoCo Warp, if asked to, and have the collector, which gates call often, pass over
@@ -324,10 +327,11 @@ def verify(
     Raises:
         MjstackError: An override cannot be used, or this machine cannot do what is asked for.
     """
-    checked = check_job(load_config(overrides, config_dir=config_dir))
     report = Report(folder=Path())
-    run = Run(checked.stage, record=report.gates.append)
-    with tempfile.TemporaryDirectory() as folder:  # a file of starts is copied before it is read
+    # A file of starts is copied into a folder before it is read.
+    with configured(overrides, config_dir) as cfg, tempfile.TemporaryDirectory() as folder:
+        checked = check_job(cfg)
+        run = Run(checked.stage, record=report.gates.append)
         checked.work(run, Path(folder))
     report.conclude()
     gates = {gate.name: gate for gate in report.gates}

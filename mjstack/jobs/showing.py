@@ -1,8 +1,8 @@
 """Shows a job's worlds: pictures, the 3-D page, the live view and MuJoCo's viewer."""
 
+import copy
 import os
 import secrets
-import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from importlib import import_module
@@ -11,16 +11,20 @@ from pathlib import Path
 import numpy as np
 
 from mjstack.config.schema import Config
+from mjstack.episodes.motion import world_fields
 from mjstack.episodes.rollout import Hook, Observer
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError
 from mjstack.jobs.live import LiveView
 from mjstack.report import picture, web
-from mjstack.report.page import Page, frame_stride
+from mjstack.report.geometry import geom_colors, with_fields, write_fields
+from mjstack.report.page import Page, World, frame_stride
 from mjstack.report.table import Console
 from mjstack.report.write import safely_write
 from mjstack.scene.index import geom_corners
 from mjstack.sim import Simulation
+
+_STILL = 1e-3  # m
 
 
 def check_showing(cfg: Config, ending: str = ".mp4") -> None:
@@ -45,45 +49,59 @@ def load_drawing() -> None:
 
 
 def draw_episode(
-    stage: Stage, folder: Path, pictured: tuple[str, np.ndarray] | None, draw: Callable[..., None]
+    stage: Stage, folder: Path, pictured: World | None, page: Page, draw: Callable[..., None]
 ) -> None:
     """Draw the one-world episode, if there was one, with `Run.draw`."""
     if pictured is None:
         return
-    world, qpos = pictured
     cfg = stage.cfg
-    model = stage.assets.visual_model
-    objects = {name: (thing.half, thing.color) for name, thing in cfg.scene.free.items()}
-    positions = np.stack([qpos[:, a : a + 3] for a in stage.index.object_qpos], axis=1)
-    title = f"{cfg.robot.title}, {cfg.task.name}: {world}"
+    qpos = pictured.qpos
+    model = with_fields(stage.assets.visual_model, pictured.fields)
+    colors = geom_colors(model)
+    objects = {}
+    for name in stage.index.objects:
+        geoms = np.flatnonzero(model.geom_bodyid == model.body(name).id)
+        objects[name] = (0.5 * np.ptp(geom_corners(model, geoms), (0, 1)), colors[geoms[0]])
+    title = f"{cfg.robot.title}, {cfg.task.name}: {pictured.label}"
     draw("scene.png", picture.save_scene, model, qpos[-1])
     bodies = [stage.index.bodies[name] for name in stage.index.fixed]
     geoms = np.flatnonzero(np.isin(model.body_rootid[model.geom_bodyid], bodies))
     fixed = geom_corners(model, geoms)
-    places = {name: (place.xy, place.random_xy) for name, place in cfg.scene.places.items()}
-    draw("trajectories.png", picture.save_trajectories, positions, objects, fixed, places, title)
+    places = {
+        name: (model.geom(f"place/{name}").pos[:2], place.xy, place.random_xy)
+        for name, place in cfg.scene.places.items()
+    }
+    columns = [at + axis for at in stage.index.object_qpos for axis in range(3)]
+    ways = qpos[:, columns].reshape(len(qpos), -1, 3)
+    if np.nanmax(np.abs(ways - ways[0]), initial=0.0) > _STILL:
+        draw("trajectories.png", picture.save_trajectories, ways, objects, fixed, places, title)
+    else:
+        page.notes.append("trajectories.png is not drawn: no object has moved")
     if cfg.video:
         path = folder / "episode.mp4"
-        problem = safely_write(path, picture.save_video, model, qpos[None], cfg.timing.step_dt)
+        problem = safely_write(path, picture.save_video, model, [pictured], cfg.timing.step_dt)
         stage.progress.print_line(problem or f"video: {path}")
 
 
-def save_page(stage: Stage, folder: Path, page: Page) -> str:
-    """Write the 3-D page of the run's worlds, if there were any; return why there is none."""
+def save_page(stage: Stage, folder: Path, page: Page) -> None:
+    """Write the 3-D page of the run's worlds, if there were any."""
     cfg = stage.cfg
     if not cfg.web.episode:
-        return "web.episode=false: no 3-D page"
+        page.notes.append("web.episode=false: no 3-D page")
+        return
     path = folder / web.EPISODE
     worlds = web.choose_worlds(page.worlds3d)
     problem = web.lacks_viser()
     if worlds and not problem:
         frame_dt = frame_stride(cfg.timing.step_dt) * cfg.timing.step_dt
-        problem = safely_write(path, web.save_episode, stage.assets.visual_model, worlds, frame_dt)
+        model = stage.assets.visual_model
+        problem = safely_write(path, web.save_episode, model, worlds, frame_dt)
+        page.notes += [] if problem else web.not_shown(model, worlds)
     if path.exists():  # perhaps an earlier call's, of seeds that were read back
         page.episode = web.EPISODE
     if problem:
+        page.notes.append(problem)
         stage.progress.print_line(problem)
-    return problem
 
 
 @contextmanager
@@ -109,19 +127,12 @@ def find_viewers(stage: Stage) -> list[Observer]:
     """
     if stage.cfg.view != "true":
         return []
-    import mujoco.viewer
-
-    model = stage.assets.visual_model
-    data = mujoco.MjData(model)
-    handle = mujoco.viewer.launch_passive(model, data)
+    model = copy.copy(stage.assets.visual_model)
+    window = picture.Window(model, stage.cfg.timing.step_dt)
 
     def show(step: int, sim: Simulation) -> None:
-        if not handle.is_running():
-            return
-        began = time.perf_counter()
-        data.qpos[:] = sim.qpos[0].cpu().numpy()
-        mujoco.mj_forward(model, data)
-        handle.sync()
-        time.sleep(max(0.0, stage.cfg.timing.step_dt - (time.perf_counter() - began)))
+        write_fields(model, *world_fields(stage, hook.env, [0]))
+        window.show(sim.qpos[0].cpu().numpy())
 
-    return [Hook(show)]
+    hook = Hook(show)
+    return [hook]

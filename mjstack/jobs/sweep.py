@@ -15,8 +15,9 @@ import torch
 
 from mjstack.config import spec
 from mjstack.config.complete import typed
-from mjstack.config.session import quoted, search_path_args
-from mjstack.errors import ConfigError, FolderError
+from mjstack.config.explain import assign
+from mjstack.config.session import search_path_args
+from mjstack.errors import ConfigError, FolderError, first_line
 from mjstack.files import check_unused, lock, move_aside, refuse_links, write_atomic
 from mjstack.interrupt import interrupted
 from mjstack.process import POLL, Child, stop_all
@@ -50,11 +51,12 @@ class SweepJob:
         """Make room for a run: move what an earlier one has left into a folder beside this one,
         unless the job goes on with it. Return whether the job goes on where ``resume`` says so.
         """
-        earlier = self.report()  # without one, the run refuses other files
-        if earlier is not None and not earlier.resumes:
-            move_aside(self.folder)
+        earlier = self.report()
+        if earlier is None:  # the run refuses other files
             return False
-        return earlier is not None and earlier.resumes == "gates"
+        if not earlier.resumes:
+            move_aside(self.folder)
+        return earlier.resumes == "gates"
 
 
 def number_jobs(folder: Path, jobs: Iterable[Sequence[str]], first: int = 0) -> list[SweepJob]:
@@ -69,8 +71,8 @@ def add_jobs(folder: Path, jobs: Sequence[SweepJob]) -> None:
         FolderError: The list has another job of one of these numbers, or a job's folder has other
             files than those of its run.
     """
-    before = {job.number: job for job in list_jobs(folder)}
-    listed = dict(before)
+    listed = {job.number: job for job in list_jobs(folder)}
+    before = set(listed)
     for job in jobs:
         earlier = listed.setdefault(job.number, job).overrides
         if earlier != job.overrides:
@@ -153,11 +155,13 @@ class Queueing:
                 raise ConfigError("hydra.launcher.jobs", count, f"at most {gpus}, a GPU for each")
             visible = os.environ.get("CUDA_VISIBLE_DEVICES") or ",".join(map(str, range(gpus)))
             # Below the home: in a shared folder, others could hold a lock for ever.
-            locks = Path.home() / ".cache/mjstack/gpus" / socket.gethostname()
+            locks = Path("~/.cache/mjstack/gpus", socket.gethostname())
             try:
+                locks = locks.expanduser()
                 locks.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                problem = f"{locks}: {error.strerror}, expected a folder for the GPUs' locks"
+            except (OSError, RuntimeError) as error:  # the other one: there is no home folder
+                reason = getattr(error, "strerror", None) or first_line(error)
+                problem = f"{locks}: {reason}, expected a folder for the GPUs' locks"
                 raise FolderError(problem, "Set HOME to a folder of yours") from error
             return [
                 Slot(f"GPU {name}", {"CUDA_VISIBLE_DEVICES": name}, lock=locks / name)
@@ -209,13 +213,8 @@ def run_jobs(
     """Run jobs, as many at once as there are GPUs, and return their reports in order.
 
     A job that has a result in its folder is not repeated. One that another command is running is
-    waited for. One that was stopped goes on, if it is of a kind that can.
-
-    Args:
-        folder: The sweep's folder.
-        jobs: The jobs, all or some of the sweep's.
-        queueing: How they run.
-        finish: Called with the reports so far, by the jobs' numbers, when a job has ended.
+    waited for. One that was stopped goes on, if it is of a kind that can. ``finish`` gets the
+    reports so far, by the jobs' numbers, when a job has ended.
 
     Raises:
         ConfigError: There are not as many GPUs.
@@ -246,16 +245,11 @@ def run_jobs(
 
 
 class _Queue:
-    """Jobs that wait for a slot, those that run, and the reports of the rest.
-
-    Attributes:
-        running: Processes of jobs, by slot.
-        reports: Reports, by the number of the job.
-    """
+    """Jobs that wait for a slot, those that run, and the reports of the rest."""
 
     def __init__(self, jobs: Sequence[SweepJob], queueing: Queueing) -> None:
         self.running: dict[Slot, _Running] = {}
-        self.reports: dict[int, Report] = {}
+        self.reports: dict[int, Report] = {}  # by the number of the job
         self._waiting = list(jobs)
         self._slots = queueing.slots()
         self._limit = math.inf if queueing.minutes is None else 60.0 * queueing.minutes
@@ -305,7 +299,7 @@ class _Queue:
                     return False
                 locks.enter_context(gpu)
             key = "resume" if job.set_aside() else "hydra.run.dir"
-            args = [*job.overrides, f"{key}={quoted(job.folder)}", *search_path_args()]
+            args = [*job.overrides, assign(key, job.folder), *search_path_args()]
             logged = log.tell()
             child = Child(args, log, env=slot.env, cores=slot.cores)
             self.running[slot] = _Running(job, child, logged, locks.pop_all())

@@ -1,5 +1,6 @@
 """The table and the picture of a sweep, made from what its jobs have left in their folders."""
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -41,17 +42,13 @@ def update_summary(folder: Path, master: DictConfig, reports: Mapping[int, Repor
 def write_summary(
     folder: Path, sweep: SweepCfg, reports: Mapping[int, Report], *, draw: bool = False
 ) -> tuple[Table, str]:
-    """Write summary.csv and summary.md into the folder of a sweep, and summary.png if it is drawn.
-
-    Args:
-        folder: The folder.
-        sweep: What is shown.
-        reports: Reports of jobs that have ended, by their numbers. Those of the jobs in the
-            folder's list are read if they are not here.
-        draw: Whether the picture is drawn anew.
+    """Write summary.csv and summary.md into the folder of a sweep, and summary.png if it is drawn
+    anew. ``reports`` are those of jobs that have ended, by their numbers; of other jobs in the
+    folder's list they are read.
 
     Returns:
-        The table, and why there is no picture; empty if there is one, or none is to be drawn.
+        The table, its results without details, and why there is no picture; empty if there is one,
+        or none is to be drawn.
 
     Raises:
         OSError: A file cannot be written.
@@ -79,7 +76,8 @@ def write_summary(
     write_atomic(folder / "summary.csv", to_csv(rows))
     parts: list[Part] = [table, *([picture] if picture.exists() else []), notes]
     write_atomic(folder / "summary.md", to_markdown([Section(title=title, parts=parts, level=1)]))
-    return replace(table, title=title), problem
+    rows_shown = [[_first_words(cell) for cell in row] for row in table.rows]
+    return replace(table, title=title, rows=rows_shown), problem
 
 
 def sweep_rows(folder: Path, reports: Mapping[int, Report]) -> list[Row]:
@@ -142,6 +140,11 @@ def _columns(rows: Sequence[Row], swept: Sequence[str]) -> dict[str, str]:
 def _is_result(value: object) -> bool:
     """Whether a value is a gate's result in words."""
     return isinstance(value, str) and value.split(": ")[0] in {*Status} and ": " in value
+
+
+def _first_words(cell: str) -> str:
+    """A gate's result up to its first detail; any other cell as it is."""
+    return re.split(r" \(|[;,] ", cell)[0] if _is_result(cell) else cell
 
 
 def _headlines(rows: Sequence[Row]) -> list[str]:

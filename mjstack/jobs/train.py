@@ -12,7 +12,8 @@ from pathlib import Path
 from mjstack.config.fingerprint import WITHOUT_EFFECT, config_content, config_hash, differences
 from mjstack.config.functions import find_object
 from mjstack.config.schema import Config, TrainJobCfg
-from mjstack.episodes.rollout import POLICY, require_episode
+from mjstack.drivers.driver import with_controller
+from mjstack.episodes.rollout import require_episode
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Assets, Stage
 from mjstack.errors import ConfigError, FolderError
@@ -110,11 +111,7 @@ def judged_stage(stage: Stage, policy: Path) -> Stage:
     gate = copy.copy(cfg.gate)
     gate.success = replace(gate.success, reset=whole_starts(gate.success.reset))
     judged = replace(
-        cfg,
-        seed=cfg.job.test_seed,
-        policy=str(policy),
-        controller=replace(cfg.controller, name=POLICY),
-        gate=gate,
+        with_controller(cfg, "policy"), seed=cfg.job.test_seed, policy=str(policy), gate=gate
     )
     assets = Assets(judged)
     assets.model = stage.model

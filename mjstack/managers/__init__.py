@@ -17,7 +17,6 @@ from mjstack.managers.view import (
     ignores_success,
     offers,
     random_uniform,
-    repeatable,
     uses_fields,
 )
 
@@ -33,7 +32,6 @@ __all__ = [
     "ignores_success",
     "offers",
     "random_uniform",
-    "repeatable",
     "required_fields",
     "uses_fields",
 ]

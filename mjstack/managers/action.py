@@ -23,14 +23,14 @@ class ActionTerm(ABC):
         dim: Width of the slice.
         low: Smallest meaningful action, shape ``(dim,)``.
         high: Largest, shape ``(dim,)``.
-        unit: Unit of the action, for tables.
+        unit: Unit of the action, for tables; empty for numbers without one.
         actuators: Columns of ctrl that it writes; no two terms may share one.
     """
 
     dim: int
     low: Tensor
     high: Tensor
-    unit: str = "-1 to 1"
+    unit: str = ""
     term_kind = "action term"  # as of `offers`
     actuators: tuple[int, ...] = ()
 
@@ -130,7 +130,7 @@ class ActionManager:
             or action.device != self.action.device
         ):
             shape = tuple(self.action.shape)
-            expected = f"a float32 tensor of shape {shape} on {self.action.device}"
+            expected = f"a float32 or float64 tensor of shape {shape} on {self.action.device}"
             raise ArgumentError("action", describe_tensor(action), expected)
 
     def reset(self, mask: Tensor) -> None:
@@ -138,6 +138,10 @@ class ActionManager:
         zero_rows(mask, self._last_two)
 
     def __str__(self) -> str:
-        terms = self.terms.items()
-        rows = [(name, term.dim, term.unit, self._cfg[name].params) for name, term in terms]
-        return render_table(f"action: {self.action_dim} numbers", ("term", "dim", "range"), rows)
+        rows = []
+        for name, term in self.terms.items():
+            bounds = zip(term.low.tolist(), term.high.tolist(), strict=True)
+            ranges = ", ".join(dict.fromkeys(f"{low:.4g} to {high:.4g}" for low, high in bounds))
+            rows.append((name, term.dim, ranges, term.unit, self._cfg[name].params))
+        columns = ("term", "dim", "range", "unit")
+        return render_table(f"action: {self.action_dim} numbers", columns, rows)

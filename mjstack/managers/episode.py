@@ -27,7 +27,6 @@ class ResetManager:
         self._terms = {
             name: Term(f"reset.{name}", term, env, masked=True) for name, term in cfg.items()
         }
-        self.terms = self._terms.values()
 
     def reset(self, mask: Tensor) -> None:
         """Reset the worlds of a ``(nworld,)`` bool mask: qpos0 first, then every term."""

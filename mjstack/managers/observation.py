@@ -14,7 +14,7 @@ from mjstack.config.schema import ObservationGroupCfg, ObservationTermCfg
 from mjstack.errors import TermError
 from mjstack.managers.term import Term, first_value, render_table
 from mjstack.managers.view import EnvView, random_uniform
-from mjstack.scene.index import Columns
+from mjstack.sim.simulation import Columns
 
 _SLIDE = 0.1  # m: as much noise for a sliding joint as 1 rad for another
 
@@ -144,8 +144,6 @@ class ObservationManager:
         term_dims: Width of each term, history included, by group and name, in the order of the
             columns.
         groups: The tensors, by group. They are written anew at every step.
-        buffers: All that the manager writes, each ``(nworld, n)``.
-        terms: All terms.
         remembers: Whether a term has a history, which needs every control step.
         ignores_success: Whether all terms are marked as such.
     """
@@ -170,9 +168,7 @@ class ObservationManager:
         empty = torch.full((env.nworld, 1), math.nan, dtype=torch.float32, device=env.device)
         self.groups = {name: empty.repeat(1, dim) for name, dim in self.group_dims.items()}
         self._parts = [p for group in self._groups.values() for p in group.parts.values()]
-        self.terms = [part.term for part in self._parts]
-        self.buffers = [*self.groups.values(), *(group.past for group in self._groups.values())]
-        self.ignores_success = all(term.ignores_success for term in self.terms)
+        self.ignores_success = all(part.term.ignores_success for part in self._parts)
         self._clips = any(part.cfg.clip for part in self._parts)
         self._scales = any(part.cfg.scale != 1.0 for part in self._parts)
         # Limits and scale of each column of one step

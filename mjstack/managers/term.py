@@ -5,7 +5,7 @@ import io
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar, copy_context
-from functools import partial
+from functools import partial, wraps
 from types import SimpleNamespace, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -154,17 +154,20 @@ def known_values() -> dict[Any, Any]:
     return {} if values is None else values
 
 
-def shared(key: Any, compute: Callable[[], Tensor]) -> Tensor:
-    """A value that others may want in the same pass too. No term may write into it.
-
-    Args:
-        key: What it is, the environment included.
-        compute: Computes it.
+def shared(compute: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """Make a function of an environment, and perhaps of names, compute a value once in a pass. No
+    term may write into it.
     """
-    values = known_values()
-    if key not in values:
-        values[key] = compute()
-    return values[key]
+
+    @wraps(compute)
+    def value(env: EnvView, *names: str, **named: str) -> Tensor:
+        values = known_values()
+        key = (id(env), compute, *names, *named.items())
+        if key not in values:
+            values[key] = compute(env, *names, **named)
+        return values[key]
+
+    return value
 
 
 class Term:
@@ -178,7 +181,6 @@ class Term:
         model_fields: Per-world model fields that it writes.
         has_memory: Whether it keeps something from step to step.
         ignores_success: Whether it is marked as such.
-        repeatable: Whether it is marked as such; all terms of mjstack are.
     """
 
     def __init__(
@@ -211,8 +213,6 @@ class Term:
         check_params(label, func, self.params, 1 if is_class or not masked else 2)
         self.model_fields: Sequence[str] = getattr(func, "model_fields", ())
         self.ignores_success = getattr(func, "ignores_success", None) is func
-        known = str(func.__module__).startswith("mjstack.") and not hasattr(func, "__wrapped__")
-        self.repeatable = known or getattr(func, "repeatable", None) is func
         self.call: Any = partial(func, **self.params)
         if is_class:
             with blamed(label):
@@ -230,7 +230,7 @@ class Term:
         current_term.label = self.label
         if self._key is None:
             return self.call(*args)
-        values = known_values()  # `shared`, without a partial at every call
+        values = known_values()
         if self._key not in values:
             values[self._key] = self.call(*args)
         return values[self._key]

@@ -89,15 +89,6 @@ def ignores_success(term: Any) -> Any:
     return term
 
 
-def repeatable(term: Any) -> Any:
-    """Mark a reset or observation term that reads of the simulation what a reset writes, the last
-    action, `random_uniform` and what never changes: native MuJoCo may call it for an episode that
-    has not begun.
-    """
-    term.repeatable = term
-    return term
-
-
 def uses_fields(*names: str) -> Callable[[Any], Any]:
     """Mark a reset term that writes per-world model fields, so that the simulation is built with
     them.

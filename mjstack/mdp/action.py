@@ -5,13 +5,13 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from mjstack.config.fields import Count, Fraction, NotNegative, Positive
+from mjstack.config.fields import Fraction, NotNegative, Positive, Repeats
 from mjstack.errors import ParameterError, UnknownName
 from mjstack.managers.action import ActionTerm
 from mjstack.managers.view import EnvView
 from mjstack.math import atan2, norm
 from mjstack.mdp.geometry import Pose, robot
-from mjstack.scene.index import Columns
+from mjstack.sim.simulation import Columns
 
 _TILT_STEP = 0.03  # rad: how far `EndEffectorDelta` tilts the gripper in a step at most
 
@@ -146,7 +146,7 @@ class EndEffectorDelta(_Commands):
         env: EnvView,
         *,
         scale: Positive,
-        iterations: Count = 8,
+        iterations: Repeats = 8,
         roll: NotNegative = 0.0,
         upright: Fraction = 0.0,
         tilt: NotNegative = 0.0,

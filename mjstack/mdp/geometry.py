@@ -37,37 +37,38 @@ def gripper_opening(env: EnvView) -> Tensor:
 
 
 def pose_w(env: EnvView, name: str) -> Tensor:
-    """Position [m] and quaternion (wxyz) of an object, never stale, shape ``(nworld, 7)``."""
-    if name in env.index.fixed:
-        return env.index.constant(env.index.fixed[name], env.sim.qpos).expand(env.nworld, -1)
-    return env.sim.part("qpos", env.index.object_columns(name)[0])
+    """Position [m] and quaternion (wxyz) of an object, never stale, shape ``(nworld, 7)``. A fixed
+    object is where the world's model fields have it.
+    """
+    if name not in env.index.fixed:
+        return env.sim.part("qpos", env.index.object_columns(name)[0])
+    pose = env.index.constant(env.index.fixed[name], env.sim.qpos).expand(env.nworld, -1)
+    body = env.index.bodies[name]
+    parts = {"body_pos": pose[:, :3], "body_quat": pose[:, 3:]}
+    moved = [env.sim.fields[f][:, body] if f in env.sim.fields else parts[f] for f in parts]
+    return pose if parts.keys().isdisjoint(env.sim.fields) else torch.cat(moved, dim=1)
 
 
+@shared
 def lost_state(env: EnvView) -> Tensor:
     """Whether a state is not finite, shape ``(nworld,)``, bool; ``sim.no_worlds`` where the host
     can see that none is. Do not write into it.
     """
     sim = env.sim
-
-    def compute() -> Tensor:
-        fine = all_finite(sim.qpos, sim.qvel)
-        return sim.no_worlds if fine else not_finite(sim.qpos, sim.qvel)
-
-    return shared((id(env), lost_state), compute)
+    fine = all_finite(sim.qpos, sim.qvel)
+    return sim.no_worlds if fine else not_finite(sim.qpos, sim.qvel)
 
 
+@shared
 def above_table(env: EnvView, name: str) -> Tensor:
     """Height of an object's lowest point over the table [m], ``(nworld,)``; only to be read."""
-
-    def compute() -> Tensor:
-        pose = pose_w(env, name)
-        thing = env.cfg.scene.objects[name]
-        low = lowest_point(pose[:, :3], pose[:, 3:], thing.shape, thing.size)
-        return low - env.cfg.scene.table_top
-
-    return shared((id(env), above_table, name), compute)
+    pose = pose_w(env, name)
+    thing = env.cfg.scene.objects[name]
+    low = lowest_point(pose[:, :3], pose[:, 3:], thing.shape, thing.size)
+    return low - env.cfg.scene.table_top
 
 
+@shared
 def place_xy(env: EnvView, name: str) -> Tensor:
     """Position of a place [m], drawn anew in each episode if it has ``random_xy``, shape ``(nworld,
     2)``. Not to be written into.
@@ -82,13 +83,9 @@ def place_xy(env: EnvView, name: str) -> Tensor:
     place = places[name]
     if not any(place.random_xy):
         return env.index.constant(place.xy, env.sim.qpos).expand(env.nworld, -1)
-
-    def compute() -> Tensor:
-        draw = episode_draw(env, name, 2)
-        constant = env.index.constant
-        return constant(place.xy, draw) + constant(place.random_xy, draw) * draw
-
-    return shared((id(env), place_xy, name), compute)
+    draw = episode_draw(env, name, 2)
+    constant = env.index.constant
+    return constant(place.xy, draw) + constant(place.random_xy, draw) * draw
 
 
 def source_xy(env: EnvView) -> Tensor:

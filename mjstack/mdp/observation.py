@@ -39,14 +39,11 @@ def joint_vel(env: EnvView) -> Tensor:
 
 
 @_in_metres
+@shared
 def grasp_point_pos(env: EnvView) -> Tensor:
     """Midpoint between the jaws [m], world frame, shape ``(nworld, 3)``. Not to be written into."""
-
-    def compute() -> Tensor:
-        first, second = (env.sim.part("site_xpos", site) for site in env.index.grasp_sites)
-        return 0.5 * (first + second)
-
-    return shared((id(env), grasp_point_pos), compute)
+    first, second = (env.sim.part("site_xpos", site) for site in env.index.grasp_sites)
+    return 0.5 * (first + second)
 
 
 @_in_metres
@@ -71,12 +68,17 @@ def object_to_object(env: EnvView, *, a: str, b: str) -> Tensor:
 
 
 @_in_metres
-def object_to_place(env: EnvView, *, object: str, place: str) -> Tensor:
-    """From an object's centre to where it is when it stands at a place on the table [m], shape
-    ``(nworld, 3)``.
+def object_to_place(env: EnvView, *, object: str, place: str, height: float = 0.0) -> Tensor:
+    """From an object's centre to where it is when it stands at a place [m], shape ``(nworld, 3)``.
+
+    Args:
+        env: The environment.
+        object: Scene object.
+        place: Scene place.
+        height: Of the place above the table, such as a box's floor [m].
     """
     at = pose_w(env, object)[:, :3]
-    height = env.cfg.scene.table_top + env.cfg.scene.objects[object].half_height
+    height += env.cfg.scene.table_top + env.cfg.scene.objects[object].half_height
     return torch.cat((place_xy(env, place) - at[:, :2], height - at[:, 2:]), dim=1)
 
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from mjstack.config.fields import Count, NotNegative
+from mjstack.config.fields import NotNegative, Repeats
 from mjstack.config.functions import offered
 from mjstack.errors import ParameterError
 from mjstack.managers.view import EnvView, offers, random_uniform, uses_fields, zero_rows
@@ -15,7 +15,8 @@ from mjstack.math import quat_from_yaw, quat_mul
 from mjstack.mdp.geometry import Pose, robot, write_robot
 from mjstack.mdp.starts.placement import GAP, Placement, may_meet, require_reach
 from mjstack.mdp.starts.randomization import Elements, Randomized, bounds
-from mjstack.scene.index import Columns, joint_limits
+from mjstack.scene.index import joint_limits
+from mjstack.sim.simulation import Columns
 
 
 @offers("reset term")
@@ -120,7 +121,7 @@ class RandomizeObjects:
         xy: Sequence[NotNegative],
         yaw: NotNegative = math.pi,
         gap: NotNegative = GAP,
-        candidates: Count = 16,
+        candidates: Repeats = 16,
     ) -> None:
         """Check that the region has room.
 

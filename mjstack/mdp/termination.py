@@ -9,8 +9,8 @@ from mjstack.config.fields import Count, NotNegative
 from mjstack.managers.view import EnvView, ignores_success, offers
 from mjstack.mdp.geometry import lost_state, robot
 from mjstack.mdp.observation import joint_pos
-from mjstack.scene.index import Columns
 from mjstack.sim import LOST_PHYSICS
+from mjstack.sim.simulation import Columns
 
 
 @ignores_success

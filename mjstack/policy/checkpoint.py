@@ -5,9 +5,10 @@ policy that was there before.
 """
 
 import json
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from hashlib import sha256
@@ -20,14 +21,14 @@ from safetensors import safe_open
 from safetensors.torch import load, save
 from torch import Tensor
 
-import mjstack
 from mjstack.config.complete import typed
 from mjstack.config.fingerprint import POLICY_FILE, config_content, policy_folder, shipped_policies
 from mjstack.config.schema import Config, ObservationGroupCfg, ObservationTermCfg, TermCfg
-from mjstack.config.session import check_term
+from mjstack.config.session import check_term, search_path
 from mjstack.errors import FolderError
-from mjstack.files import read_inside, reading, write_atomic
+from mjstack.files import read_inside, read_json, reading, write_atomic
 from mjstack.policy.network import PolicyNetwork, Vision
+from mjstack.version import __version__
 
 Facts = dict[str, Any]
 """Values in JSON's types, by name."""
@@ -37,8 +38,8 @@ _NAME_ANOTHER = ", or ".join(
 )
 _FLOATS = (torch.float32, torch.float16)  # of weights in a file
 # A stranger's files may ask for more than this.
+_MOST_WEIGHTS = 2**28  # bytes
 _MOST_COUNT = 1_000_000
-_MOST_LAYERS = 100
 _MOST_TERMS = 100
 _MOST_PIXELS = 4096  # along a side
 _MOST_STEPS = 1000  # control steps between two queries
@@ -80,10 +81,7 @@ class Policy:
 
     def check_fit(self, cfg: Config) -> None:
         """Check that the policy was trained for the robot, task, objects, step and cameras of a
-        configuration.
-
-        Raises:
-            FolderError: It was trained for something else; names the first difference.
+        configuration; a FolderError names the first difference.
         """
         cameras = list(self.network.vision.sizes)
         trained = _requirements(self.config, cameras)
@@ -91,10 +89,7 @@ class Policy:
 
     def check_widths(self, widths: Mapping[str, int], action: int) -> None:
         """Check how many numbers an action and each term of its group have in the worlds that it
-        is to drive.
-
-        Raises:
-            FolderError: One has another number.
+        is to drive; another number is a FolderError.
         """
         self._compare({"action.width": self.network.width}, {"action.width": action})
         key = f"observation.{self.group}.terms.{{}}.width"
@@ -138,16 +133,15 @@ def _requirements(config: Facts, cameras: Sequence[str]) -> Facts:
 
 
 def save_policy(folder: Path, policy: Policy) -> None:
-    """Write a policy's folder; an earlier policy in it is replaced at once or not at all.
-
-    Raises:
-        FolderError: It cannot be written; an earlier policy is intact.
+    """Write a policy's folder; an earlier policy in it is replaced at once or not at all, such as
+    where a FolderError says that it cannot be written.
     """
     weights = save({k: v.contiguous() for k, v in policy.network.state_dict().items()})
     digest = sha256(weights).hexdigest()
     facts = {
         **policy_facts(policy),
-        "versions": {module.__name__: module.__version__ for module in (mjstack, mujoco, torch)},
+        "versions": {"mjstack": __version__}
+        | {module.__name__: module.__version__ for module in (mujoco, torch)},
         "weights_sha256": digest,
         "config": policy.config,
     }
@@ -196,26 +190,40 @@ def policy_facts(policy: Policy) -> Facts:
     }
 
 
-def load_policy(folder: Path) -> Policy:
+def load_policy(
+    folder: str | os.PathLike, *, config_dir: str | os.PathLike | None = None
+) -> Policy:
     """Read a policy's folder, which may be a stranger's, or a shipped policy by its name. Weights
     in float16 become float32.
+
+    Args:
+        folder: The folder, such as ``outputs/mine/last``.
+        config_dir: A folder as of `mjstack.make_env`: the policy may name terms beside it.
 
     Raises:
         FolderError: It is no policy, of another version, damaged, or names functions that are not
             in the search path.
     """
-    folder = policy_folder(folder)
+    with search_path([] if config_dir is None else [config_dir]):
+        folder = policy_folder(Path(folder))
+        with suppress(FolderError):
+            return _load_policy(folder)
+        return _load_policy(folder)  # a training may have saved the next one meanwhile
+
+
+def _load_policy(folder: Path) -> Policy:
+    """The policy of a folder, on the current search path."""
     path = folder / POLICY_FILE
     if not path.is_file():
         reason = f"has no {POLICY_FILE}, expected the folder of a policy"
         raise FolderError(f"policy={folder}: {reason}", _NAME_ANOTHER)
     with reading(path, _NAME_ANOTHER):
-        facts = json.loads(read_inside(path))
+        facts = read_json(path)
         if facts["format"] != FORMAT:
             of = " of version 0.1" if facts["format"] in (3, 4) else ""
             raise FolderError(
                 f"policy={folder}: has format {facts['format']}{of}, expected {FORMAT}, which"
-                f" mjstack {mjstack.__version__} reads",
+                f" mjstack {__version__} reads",
                 "Use the mjstack that wrote it, or train it again",
             )
         policy = _from_facts(facts, path)
@@ -223,22 +231,17 @@ def load_policy(folder: Path) -> Policy:
         if not re.fullmatch("[0-9a-f]{64}", digest):
             raise ValueError("weights_sha256 is no SHA-256")
     weights = folder / _weights_name(digest)
-    try:
-        with reading(weights, "Copy the whole folder again, or train the policy again"):
-            numbers = sum(value.numel() for value in policy.network.state_dict().values())
-            content = read_inside(weights, 4 * numbers + 2**20)  # and names
-            if sha256(content).hexdigest() != digest:
-                raise ValueError(f"its content is not that of {POLICY_FILE}")
-            tensors = load(content)
-            for name, value in tensors.items():
-                if value.dtype not in _FLOATS or not bool(value.isfinite().all()):
-                    raise ValueError(f"{name} has other values than finite ones in float32")
-            policy.network.load_state_dict(tensors, assign=True)
-            policy.network.float()
-    except FolderError:
-        if digest in path.read_text():
-            raise
-        return load_policy(folder)  # a training has saved the next one since
+    with reading(weights, "Copy the whole folder again, or train the policy again"):
+        numbers = sum(value.numel() for value in policy.network.state_dict().values())
+        content = read_inside(weights, min(4 * numbers, _MOST_WEIGHTS) + 2**20)  # and names
+        if sha256(content).hexdigest() != digest:
+            raise ValueError(f"its content is not that of {POLICY_FILE}")
+        tensors = load(content)
+        for name, value in tensors.items():
+            if value.dtype not in _FLOATS or not bool(value.isfinite().all()):
+                raise ValueError(f"{name} has other values than finite ones in float32")
+        policy.network.load_state_dict(tensors, assign=True)
+        policy.network.float()
     policy.network.requires_grad_(False)
     return policy
 
@@ -258,7 +261,7 @@ def _from_facts(facts: Facts, path: Path) -> Policy:
             sum(widths.values()),
             _whole("action.width", action["width"]),
             _whole("action.chunk", action["chunk"]),
-            _layers("network.hidden", facts["network"]["hidden"], least=0),
+            [_whole("network.hidden", width) for width in facts["network"]["hidden"]],
             vision,
         )
     policy = Policy(
@@ -288,18 +291,14 @@ def _read_vision(facts: Facts) -> Vision:
     if not images:
         return Vision()
     network = facts["network"]
+    if not network["channels"]:
+        raise ValueError("network.channels has 0 layers, expected at least 1")
     side = partial(_whole, "observation.images", most=_MOST_PIXELS)
     return Vision(
         sizes={name: (side(height), side(width)) for name, (height, width) in images.items()},
-        channels=_layers("network.channels", network["channels"], least=1),
+        channels=[_whole("network.channels", width) for width in network["channels"]],
         features=_whole("network.features", network["features"]),
     )
-
-
-def _layers(name: str, widths: Sequence[object], least: int) -> list[int]:
-    if not least <= len(widths) <= _MOST_LAYERS:
-        raise ValueError(f"{name} has {len(widths)} layers, expected {least} to {_MOST_LAYERS}")
-    return [_whole(name, width) for width in widths]
 
 
 def _whole(name: str, value: object, least: int = 1, most: int = _MOST_COUNT) -> int:
@@ -336,10 +335,8 @@ def _writing(path: Path) -> Iterator[None]:
 
 
 def write_state(path: Path, tensors: Mapping[str, Tensor], facts: Facts) -> None:
-    """Write tensors and facts in JSON's types as one file, at once or not at all.
-
-    Raises:
-        FolderError: It cannot be written; an earlier file is intact.
+    """Write tensors and facts in JSON's types as one file, at once or not at all, such as where a
+    FolderError says that it cannot be written.
     """
     plain = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     with _writing(path):
@@ -347,10 +344,8 @@ def write_state(path: Path, tensors: Mapping[str, Tensor], facts: Facts) -> None
 
 
 def read_state(path: Path) -> tuple[dict[str, Tensor], Facts]:
-    """Tensors and facts of `write_state`.
-
-    Raises:
-        FolderError: The file cannot be read, or has numbers that are not finite.
+    """Tensors and facts of `write_state`; a FolderError if they cannot be read or a number of a
+    tensor is not finite.
     """
     with reading(path, "Remove it to train anew"), safe_open(path, "pt") as file:
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118

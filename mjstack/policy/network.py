@@ -127,17 +127,10 @@ class PolicyNetwork(nn.Module):
         return self.layers(scaled).unflatten(1, (self.chunk, self.width))
 
     def forward(self, observation: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
-        """Actions, in the units of the policy's action terms.
-
-        Args:
-            observation: Shape ``(n, inputs)``.
-            images: Those of each camera of ``vision``, shape ``(n, height, width, 3)``, 0 to 255,
-                in the network's type.
-
-        Returns:
-            Shape ``(n, chunk, width)``.
+        """Actions, ``(n, chunk, width)``, in the units of the policy's action terms, from an
+        observation, ``(n, inputs)``, and the images of each camera of ``vision``, ``(n, height,
+        width, 3)``, 0 to 255, in the network's type.
         """
-        actions = self.action_mean + self.action_std * self.normalized(
-            observation, self.encode(images)
-        )
+        normalized = self.normalized(observation, self.encode(images))
+        actions = self.action_mean + self.action_std * normalized
         return torch.minimum(torch.maximum(actions, self.action_low), self.action_high)

@@ -17,11 +17,7 @@ _OPSET = 17  # runtimes since 2022 read it
 
 
 def require_onnx() -> Any:
-    """The package.
-
-    Raises:
-        MissingExtra: It is not installed.
-    """
+    """The package; a MissingExtra where it is not installed."""
     try:
         import onnx
     except ImportError as error:
@@ -32,11 +28,8 @@ def require_onnx() -> Any:
 def to_onnx(network: PolicyNetwork, facts: Mapping[str, Any]) -> bytes:
     """Write a network as ONNX: input ``observation``, shape ``(n, inputs)``, and output ``action``,
     shape ``(n, chunk, width)``, both float32 for any n. Each camera that it sees is one more input,
-    ``images.CAMERA``, shape ``(n, height, width, 3)``, uint8.
-
-    Args:
-        network: The network; observations and actions are scaled inside, as it does itself.
-        facts: Metadata by name, each written as JSON.
+    ``images.CAMERA``, shape ``(n, height, width, 3)``, uint8. Observations and actions are scaled
+    inside, as the network does itself. The facts are its metadata by name, each written as JSON.
     """
     onnx = require_onnx()
     images = {

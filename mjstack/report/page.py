@@ -10,20 +10,22 @@ MOST_WORLDS = 64  # in motion, of a page
 
 @dataclass(kw_only=True, slots=True)
 class Map:
-    """Where an object stood at the starts and went, seen from above.
+    """Where an object or a place was at the starts, and an object went, seen from above.
 
     Attributes:
-        title: The object.
+        title: Its name.
         xy: Positions [m], shape ``(n, 2)``.
         table: Centre and half size of the table in x and y [m].
         ways: Its ways in some episodes: a label, whether that failed, and positions [m], shape
             ``(frames, 2)``.
+        marks: Positions [m] of what is the same in every episode, by name.
     """
 
     title: str
     xy: np.ndarray
     table: tuple[Sequence[float], Sequence[float]]
     ways: Sequence[tuple[str, bool, np.ndarray]] = ()
+    marks: Mapping[str, Sequence[float]] = field(default_factory=dict)
 
 
 @dataclass(kw_only=True, slots=True)
@@ -35,7 +37,9 @@ class Worlds:
         broken: The rules that each episode broke; empty where it succeeded.
         rules: The rules in words, by name.
         values: Measurements by name with unit, each of shape ``(n,)``.
-        maps: Where the objects stood.
+        maps: Where judged objects, moved bodies and drawn places were.
+        unjudged: Names of objects that have no map, because the task's check does not read them.
+        limits: The least and the largest of measurements for which a rule holds, by name.
     """
 
     names: Sequence[str]
@@ -43,6 +47,8 @@ class Worlds:
     rules: Mapping[str, str]
     values: Mapping[str, np.ndarray]
     maps: list[Map] = field(default_factory=list)
+    unjudged: list[str] = field(default_factory=list)
+    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,12 +60,14 @@ class World:
         qpos: Positions at frames, shape ``(frames, nq)``; NaN where it was not played.
         failed: Whether it failed, which colours its table.
         images: What its driver saw, by camera, each ``(frames, height, width, 3)``, uint8.
+        fields: Its model fields that pictures show, those of the model with visuals, by name.
     """
 
     label: str
     qpos: np.ndarray
     failed: bool = False
     images: Mapping[str, np.ndarray] = field(default_factory=dict)
+    fields: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
 @dataclass(kw_only=True, slots=True)
@@ -68,21 +76,23 @@ class Page:
 
     Attributes:
         title: Robot and task.
+        command: The command that runs it again.
         motion: Whether it shows worlds in motion.
         worlds: Episodes by gate.
         worlds3d: Worlds in motion, by the part of the run that played them.
         pictures: Files that parts of the run have drawn.
         episode: Name of the file with the episode in 3-D; empty without one.
-        note: Why there is none.
+        notes: What it does not show, and why.
     """
 
     title: str = "mjstack run"
+    command: str = ""
     motion: bool = False
     worlds: dict[str, Worlds] = field(default_factory=dict)
     worlds3d: dict[str, list[World]] = field(default_factory=dict)
     pictures: list[str] = field(default_factory=list)
     episode: str = ""
-    note: str = ""
+    notes: list[str] = field(default_factory=list)
 
 
 def frame_stride(step_dt: float, rate: float = 25.0) -> int:

@@ -1,10 +1,12 @@
 """Pictures of a run: the final scene, the objects' way there, and a video."""
 
+import copy
 import itertools
 import math
+import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -16,8 +18,9 @@ from PIL import Image
 
 from mjstack.errors import MissingExtra
 from mjstack.interrupt import check_interrupt
+from mjstack.report.geometry import Fields, write_fields
 from mjstack.report.gl import open_renderer
-from mjstack.report.page import frame_stride
+from mjstack.report.page import World, frame_stride
 
 _FACES = [[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]]
 """Corners of a box in the order of their signs, by its faces."""
@@ -58,13 +61,19 @@ def outline(centre: Sequence[float], half: Sequence[float], **style: Any) -> Any
 
 
 def _render(
-    model: mujoco.MjModel, states: np.ndarray, width: int, height: int
+    model: mujoco.MjModel,
+    states: np.ndarray,
+    width: int,
+    height: int,
+    fields: Sequence[Fields] = ({},),
 ) -> Iterator[np.ndarray]:
-    """Draw states offscreen, shape ``(n, nq)``: images of shape ``(height, width, 3)``, uint8.
+    """Draw states offscreen, shape ``(n, nq)``, of worlds with these model fields in turn: images
+    of shape ``(height, width, 3)``, uint8.
 
     Raises:
         MjstackError: This machine cannot draw offscreen.
     """
+    model = copy.copy(model)
     data = mujoco.MjData(model)
     renderer = open_renderer(model, height, width)
     x, _, z = model.geom_pos[model.geom("table").id].tolist()
@@ -75,8 +84,9 @@ def _render(
     camera.azimuth = 140.0
     camera.elevation = -24.0
     with renderer:
-        for state in states:
+        for state, values in zip(states, itertools.cycle(fields), strict=False):
             check_interrupt()
+            write_fields(model, values)
             data.qpos[:] = state
             mujoco.mj_forward(model, data)
             renderer.update_scene(data, camera)
@@ -96,14 +106,13 @@ def save_scene(path: Path, model: mujoco.MjModel, qpos: np.ndarray) -> None:
 def save_video(
     path: Path,
     model: mujoco.MjModel,
-    qpos: np.ndarray,
+    worlds: Sequence[World],
     step_dt: float,
     advance: Callable[[str, int, int], None] = lambda what, done, total: None,
     *,
     fps: float = 25.0,
     width: int | None = None,
     draw: Draw | None = None,
-    seen: Sequence[Mapping[str, np.ndarray]] = (),
 ) -> None:
     """Write a video of episodes in real time, side by side: an mp4, or a GIF or WebP that loops, by
     the file's ending.
@@ -111,43 +120,43 @@ def save_video(
     Args:
         path: The file.
         model: The scene.
-        qpos: States at the ends of steps, shape ``(worlds, steps, nq)``.
-        step_dt: Time between two of them [s].
+        worlds: The worlds with positions, and perhaps images that stand in their corners, at the
+            ends of equally many steps.
+        step_dt: Time of a step [s].
         advance: Reports progress.
         fps: Frames per second [Hz], as near as whole steps allow.
         width: Of the video [pixels]; 640 by default with one world, 960 with several.
         draw: Draws a state of every world, shape ``(worlds, nq)``, as images ``(height, width,
             3)``, uint8. By default the scene is seen from the side.
-        seen: Images of each world by camera, each ``(steps, height, width, 3)``, that stand in its
-            corner.
 
     Raises:
         MjstackError: This machine cannot draw offscreen, or lacks what writes the format.
     """
     write = require_video(path.suffix)
     skip = frame_stride(step_dt, fps)
-    states = qpos[:, ::skip].swapaxes(0, 1)
-    count, worlds, nq = states.shape
-    columns = math.ceil(math.sqrt(worlds))
-    wide = (width or (640 if worlds == 1 else 960)) // columns
+    states = np.stack([world.qpos[::skip] for world in worlds], 1)
+    count, nworld, nq = states.shape
+    columns = math.ceil(math.sqrt(nworld))
+    wide = (width or (640 if nworld == 1 else 960)) // columns
 
     images: Iterator[np.ndarray]
     if draw is None:
-        images = _render(model, states.reshape(-1, nq), wide, 3 * wide // 4)
+        fields = [world.fields for world in worlds]
+        images = _render(model, states.reshape(-1, nq), wide, 3 * wide // 4, fields)
     else:
         images = (image for frame in states for image in draw(frame))
-    if seen:
+    if any(world.images for world in worlds):
         corners = (
-            [rows[number * skip] for rows in cameras.values()]
+            [rows[number * skip] for rows in world.images.values()]
             for number in range(count)
-            for cameras in seen
+            for world in worlds
         )
         images = map(_with_corner, images, corners)
 
     def frames() -> Iterator[Image.Image]:
         for done in range(1, count + 1):
             check_interrupt()
-            yield _side_by_side(list(itertools.islice(images, worlds)), columns, wide)
+            yield _side_by_side(list(itertools.islice(images, nworld)), columns, wide)
             advance("pictures of the video", done, count)
 
     write(path, frames(), count, step_dt * skip)
@@ -228,10 +237,38 @@ def _write_loop(path: Path, frames: Iterator[Image.Image], count: int, dt: float
 
 def opens_windows() -> bool:
     """Whether MuJoCo's viewer can open one; where it cannot, it ends the process."""
-    import glfw
+    with warnings.catch_warnings(action="ignore"), suppress(ImportError):
+        import glfw
 
-    with warnings.catch_warnings(action="ignore"):
         return bool(glfw.init())
+    return False
+
+
+class Window:
+    """MuJoCo's viewer of states in real time; what shows them goes on when it is closed."""
+
+    def __init__(self, model: mujoco.MjModel, step_dt: float) -> None:
+        """Open it for states of a model that are ``step_dt`` [s] apart."""
+        import mujoco.viewer
+
+        self._model = model
+        self._data = mujoco.MjData(model)
+        self._step_dt = step_dt
+        self._handle = mujoco.viewer.launch_passive(model, self._data)
+
+    def show(self, qpos: np.ndarray) -> None:
+        """Show a state, shape ``(nq,)``, until the next one is due."""
+        if not self._handle.is_running():
+            return
+        began = time.perf_counter()
+        self._data.qpos[:] = qpos
+        mujoco.mj_forward(self._model, self._data)
+        self._handle.sync()
+        time.sleep(max(0.0, self._step_dt - (time.perf_counter() - began)))
+
+    def close(self) -> None:
+        """Close it."""
+        self._handle.close()
 
 
 def save_trajectories(
@@ -239,7 +276,7 @@ def save_trajectories(
     positions: np.ndarray,
     objects: Mapping[str, tuple[Sequence[float], Sequence[float]]],
     fixed: np.ndarray,
-    places: Mapping[str, tuple[Sequence[float], Sequence[float]]],
+    places: Mapping[str, Sequence[Sequence[float]]],
     title: str,
 ) -> None:
     """Plot the objects' way among what does not move.
@@ -250,7 +287,7 @@ def save_trajectories(
         objects: Half sizes [m] and colour of each object by name.
         fixed: Corners of the boxes that hold fixed things [m], shape ``(n, 8, 3)``, in the order of
             their signs.
-        places: Position and half-widths of the region [m] of each place by name.
+        places: Position of each place by name, and middle and half-widths of its region [m].
         title: The picture's.
     """
     with figure(path, title, 3, figsize=(13, 4)) as (_, (side, above, height)):
@@ -259,10 +296,10 @@ def save_trajectories(
                 for face in box[_FACES][..., [1, row]]:
                     axes.fill(*face.T, color="0.75", zorder=0)
         for name, place in places.items():
-            at, half = 1e3 * np.fliplr(place)
+            at, middle, half = 1e3 * np.fliplr(place)
             above.plot(*at, "x", color="0.3")
             above.annotate(name, at, color="0.3")
-            above.add_patch(outline(at, half, linestyle=":"))
+            above.add_patch(outline(middle, half, linestyle=":"))
         for number, (name, (half, color)) in enumerate(objects.items()):
             mm = 1e3 * positions[:, number]
             for axes, row in ((side, 2), (above, 0)):

@@ -8,15 +8,15 @@ from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
 
-import mjstack
 from mjstack.report.record import Provenance
+from mjstack.version import __version__
 
 PACKAGES = ("mujoco", "mujoco-warp", "warp-lang", "torch", "mink", "hydra-core", "numpy")
 
 
 def collect_provenance() -> Provenance:
     """Date, versions, processor and commit."""
-    versions = {"python": platform.python_version(), "mjstack": mjstack.__version__}
+    versions = {"python": platform.python_version(), "mjstack": __version__}
     versions |= {name: metadata.version(name) for name in PACKAGES}
     return {
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC"),

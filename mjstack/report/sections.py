@@ -3,6 +3,7 @@ plots as SVG: histograms, and maps of the table.
 """
 
 import itertools
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -73,15 +74,13 @@ class Section:
 def make_sections(report: Report, page: Page) -> list[Section]:
     """The whole run: summary, pictures, then every gate, and the provenance."""
     facts = report.provenance
-    episode = page.note
-    if page.episode:
-        text = f"Play it in 3-D: {page.episode} (red tables: failed worlds)"
-        episode = Marked(text, link=page.episode)
+    text = f"Play it in 3-D: {page.episode} (red tables: failed worlds)"
     head: list[Part] = [
         ", ".join(str(facts[name]) for name in ("date", "device") if name in facts),
-        " ".join(report.overrides),
+        page.command,
         summarize(report.gates),
-        episode,
+        Marked(text, link=page.episode) if page.episode else "",
+        page.notes,
         *(report.folder / name for name in report.pictures),
     ]
     sections = [Section(title=page.title, status=report.status, parts=head, level=1)]
@@ -224,22 +223,27 @@ def _episode_parts(worlds: Worlds, thresholds: Mapping[str, float]) -> Iterator[
         rows.append([outcome, worlds.rules.get(outcome, ""), f"{len(names):,}", bar, listed])
     header = ["outcome", "meaning", "episodes", "share", "which"]
     yield Table(title="Outcomes", header=header, rows=rows)
-    histograms = [
-        histogram(name, values, failed, [thresholds[end] for end in _limits_of(name, thresholds)])
-        for name, values in worlds.values.items()
-    ]
+    histograms = []
+    for name, values in worlds.values.items():
+        ends = {float(thresholds[end]) for end in _limits_of(name, thresholds)}
+        low, high = worlds.limits.get(name, (0.0, math.inf))
+        ends |= {end for end in (low or math.inf, high) if math.isfinite(end)}
+        histograms.append(histogram(name, values, failed, sorted(ends)))
     if any(histograms):
         text = "Number of episodes; failed ones in red on top, thresholds dashed."
         yield Plots(title="Over the worlds", text=text, figures=histograms)
     if worlds.maps:
         text = (
-            "Where the objects started, seen from above, the arm's base at the triangle; failed"
-            " episodes as red crosses."
+            "Where the objects started that the check judges, and where moved bodies and drawn"
+            " places were, seen from above, the arm's base at the triangle; failed episodes as red"
+            " crosses."
         )
+        if worlds.unjudged:
+            text += f" The check does not judge {', '.join(worlds.unjudged)}."
         on_map = np.sort(np.argsort(~failed, kind="stable")[:_POINTS]).tolist()
         if count > _POINTS:
             text += f" {_POINTS:,} of {count:,} are drawn, failed ones first."
-        if ways := len(worlds.maps[0].ways):
+        if ways := max(len(plan.ways) for plan in worlds.maps):
             text += f" Lines are the objects' ways in {ways} of the episodes."
         figures = [table_map(plan, worlds.names, worlds.broken, on_map) for plan in worlds.maps]
         yield Plots(title="Over the table", text=text, figures=figures)
@@ -311,6 +315,10 @@ def table_map(
         css = "'w x'" if failed else "w"
         if line:
             marks.append(f"<path class={css} d='M{line}'>{_tip(text)}</path>")
+    for name, at in plan.marks.items():
+        for x, y in place(np.array([at])):
+            marks.append(f"<path class=axis d='M{x - 4:.1f} {y:.1f}h8m-4 -4v8' />")
+            marks.append(f"<text x={x + 6:.1f} y={y + 4:.1f}>{escape(name)}</text>")
     for row in sorted(rows, key=lambda row: bool(broken[row])):  # failed ones on top
         rules = " ".join(broken[row])
         tip = _tip(f"{names[row]}: broke {rules}" if rules else names[row])

@@ -101,6 +101,13 @@ def _value(row: Row, metric: str) -> float:
     return value * float(number) if operator == "*" else value / float(number)
 
 
+def _is_rate(curves: Mapping[str, str]) -> bool:
+    """Whether a panel shows rates of success alone, which end at 1."""
+    return all(
+        metric.startswith("success_rate") and " " not in metric for metric in curves.values()
+    )
+
+
 def _draw_curves(path: Path, plot: Plot, rows: Sequence[Row]) -> None:
     crossing = crossover(plot, rows)
     ticks = sorted({row[plot.over] for row in rows})
@@ -133,8 +140,10 @@ def _draw_curves(path: Path, plot: Plot, rows: Sequence[Row]) -> None:
             if crossing is not None:
                 text = f"crossover, {crossing:,.0f}"
                 axes.axvline(crossing, color="0.4", linestyle=":", label=text)
+            if _is_rate(curves):
+                axes.set_ylim(top=1.0)
             if axes.get_legend_handles_labels()[0]:
-                axes.legend(frameon=False, fontsize=8)
+                axes.legend(title=", ".join(plot.lines), frameon=False, fontsize=8)
 
 
 def _draw_bars(path: Path, plot: Plot, rows: Sequence[Row]) -> None:
@@ -161,9 +170,10 @@ def _draw_bars(path: Path, plot: Plot, rows: Sequence[Row]) -> None:
             whiskers = np.array((middle - low, high - middle))
             style = {} if np.isnan(whiskers).all() else {"xerr": np.nan_to_num(whiskers)}
             axes.barh(places, middle, color=colors, ecolor="0.4", capsize=2, **style)
-            if metric.endswith("ratio"):
-                axes.axvline(1.0, color="0.3", linewidth=1.0)
+            if _is_rate(curves):
+                axes.set_xlim(right=1.0)
             axes.set(xlabel=label)
             axes.grid(alpha=0.3, axis="x")
+        panels[0].set(ylabel=", ".join(keys))
         panels[0].set_yticks(places, names)
         panels[0].invert_yaxis()

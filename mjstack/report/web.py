@@ -8,6 +8,7 @@ import io
 import logging
 import math
 import os
+import re
 import secrets
 import socket
 from collections.abc import Callable, Mapping, Sequence
@@ -23,15 +24,17 @@ import numpy as np
 
 from mjstack.errors import ConfigError, MissingExtra, MjstackError
 from mjstack.interrupt import check_interrupt
-from mjstack.report.geometry import Shapes
+from mjstack.report.geometry import Shape, Shapes
 from mjstack.report.page import MOST_WORLDS, World
 
 EPISODE = "episode.html"
 _LENGTH = 4.0 / 2**15  # m, to which positions are rounded
 _TURN = 1.0 / 2**12  # of quaternions
-_LOOPBACK = ("127.0.0.1", "::1", "localhost")
+_LOOPBACK = ("127.0.0.1", "::1", "[::1]", "localhost")
+_PORT = re.compile(r":\d+$")
 _MESSAGE = 2**16  # bytes, the largest of a browser
 _MARGIN = 0.12  # m between worlds
+_UNSEEN = ("site_", "cam_", "light_", "mat_")  # beginnings of model fields that it does not show
 _FAILED = np.array([0.86, 0.35, 0.32])
 _IMAGE = 0.16  # m, height of what a driver saw
 _UPRIGHT = (0.5, -0.5, -0.5, 0.5)  # it faces the viewer
@@ -47,37 +50,37 @@ def lacks_viser() -> str:
 class Stage:
     """Worlds side by side in a viser server's scene."""
 
-    def __init__(self, server: Any, shapes: Shapes, worlds: Sequence[World]) -> None:
-        """Add the worlds, in the model's own state.
+    def __init__(self, server: Any, model: mujoco.MjModel, worlds: Sequence[World]) -> None:
+        """Add the worlds to a ``viser.ViserServer``, in the state of their model with visuals.
 
-        Args:
-            server: A ``viser.ViserServer``.
-            shapes: The geometry of each world.
-            worlds: Their texts, and their images, which stand behind the table. In those that
-                failed, what does not move is red.
+        Images stand behind the table. In worlds that failed, the table and what stands still in
+        all worlds alike are red.
         """
-        self._shapes = shapes
-        count = len(worlds)
-        low, high = shapes.box
-        self._offsets = _grid(count, high[:2] - low[:2] + _MARGIN)
-        self._handles: list[tuple[int, Any]] = []
-        places, turns = self._round(*shapes.poses(np.repeat(shapes.model.qpos0[None], count, 0)))
+        self._shapes = shapes = Shapes(model, [world.fields for world in worlds])
+        low, high = shapes.box()
+        self._offsets = _grid(len(worlds), high[:2] - low[:2] + _MARGIN)
+        self._handles: list[tuple[Shape, Any]] = []
+        places, turns = self._round(*shapes.poses(shapes.rest))
         self._last = (places, turns)
-        for number, (body, rgba, (vertices, faces)) in enumerate(shapes.meshes):
-            colors = [_FAILED if world.failed and not body else rgba[:3] for world in worlds]
+        failed = np.array([world.failed for world in worlds])
+        for number, shape in enumerate(shapes.meshes):
+            rgba = shape.rgba.copy()
+            rgba[failed[shape.worlds] & shape.table, :3] = _FAILED
+            alpha = rgba[:, 3]
             handle = server.scene.add_batched_meshes_simple(
                 f"/{number}",
-                vertices.astype(np.float32),
-                faces,
-                turns[:, body],
-                places[:, body],
-                batched_colors=np.round(255.0 * np.array(colors)).astype(np.uint8),
-                opacity=None if rgba[3] == 1.0 else rgba[3],
+                shape.mesh[0].astype(np.float32),
+                shape.mesh[1],
+                turns[shape.worlds, shape.pose],
+                places[shape.worlds, shape.pose],
+                batched_colors=np.round(255.0 * rgba[:, :3]).astype(np.uint8),
+                batched_opacities=None if np.ptp(alpha) == 0.0 else alpha / alpha.max(),
+                opacity=None if alpha.min() == 1.0 else float(alpha.max()),
                 flat_shading=True,
-                cast_shadow=body > 0,
+                cast_shadow=shape.pose > 0,
                 lod="off",
             )
-            self._handles.append((body, handle))
+            self._handles.append((shape, handle))
 
         # Texts, images, the floor, and where one looks from
         self._images: list[tuple[np.ndarray, Any]] = []
@@ -106,8 +109,10 @@ class Stage:
                 )
                 left += wide + 0.02
                 self._images.append((images, handle))
-        span = np.ptp(self._offsets, 0) + (high - low)[:2]
-        centre = np.array([*self._offsets.mean(0) + 0.5 * (low + high)[:2], 0.0])
+        size = (high - low)[:2]
+        span = np.ptp(self._offsets, 0) + size
+        middle = 0.5 * (low + high)[:2]
+        centre = np.array([*self._offsets.mean(0) + middle, 0.0])
         server.scene.add_grid(
             "/floor",
             width=float(span[0] + 2.0),
@@ -116,7 +121,6 @@ class Stage:
             section_size=1.0,
             position=[centre[0], centre[1], low[2] - 1e-3],
         )
-        reach = 0.3 + 0.56 * float(np.linalg.norm(span))
         server.scene.set_up_direction("+z")
         server.scene.configure_environment_map(None)
         server.scene.configure_default_lights(False)
@@ -124,6 +128,10 @@ class Stage:
         server.scene.add_light_directional(
             "/sun", position=centre + np.array([1.0, -1.5, 3.0]), intensity=1.6, cast_shadow=True
         )
+        if failed.any():  # one looks at the first of these
+            centre[:2] = self._offsets[failed.argmax()] + middle
+            span = size
+        reach = 0.3 + 0.56 * float(np.linalg.norm(span))
         server.initial_camera.position = centre + reach * np.array([0.75, -0.45, 0.6])
         server.initial_camera.look_at = centre + reach * np.array([0.1, -0.06, 0.0])
 
@@ -137,11 +145,12 @@ class Stage:
                 handle.image = image
         places, turns = self._round(*self._shapes.poses(qpos))
         old_places, old_turns = self._last
-        for body, handle in self._handles:
-            if not np.array_equal(old_places[:, body], places[:, body]):
-                handle.batched_positions = places[:, body]
-            if not np.array_equal(old_turns[:, body], turns[:, body]):
-                handle.batched_wxyzs = turns[:, body]
+        for shape, handle in self._handles:
+            at = (shape.worlds, shape.pose)
+            if not np.array_equal(old_places[at], places[at]):
+                handle.batched_positions = places[at]
+            if not np.array_equal(old_turns[at], turns[at]):
+                handle.batched_wxyzs = turns[at]
         self._last = (places, turns)
 
     def _round(self, places: np.ndarray, turns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -160,23 +169,32 @@ def choose_worlds(parts: Mapping[str, Sequence[World]]) -> list[World]:
     return [*(world for part in batches for world in part[: share - share % 2]), *alone]
 
 
+def not_shown(model: mujoco.MjModel, worlds: Sequence[World]) -> list[str]:
+    """What differs from world to world and a page does not show, in a line; none if there is
+    nothing.
+    """
+    fields = {
+        name
+        for world in worlds
+        for name, values in world.fields.items()
+        if name.startswith(_UNSEEN) and not np.allclose(values, getattr(model, name))
+    }
+    names = [*sorted(fields - {"mat_rgba"}), *Shapes(model, [w.fields for w in worlds]).missing]
+    return [f"{EPISODE} does not show how worlds differ in {', '.join(names)}"] * bool(names)
+
+
 def save_episode(
     path: Path, model: mujoco.MjModel, worlds: Sequence[World], frame_dt: float
 ) -> None:
-    """Write worlds in motion as one HTML file, which plays without a server.
-
-    Args:
-        path: The file.
-        model: The scene with its visuals.
-        worlds: They stand side by side; one that ends earlier stays.
-        frame_dt: Time between two frames [s].
+    """Write worlds in motion, side by side, as one HTML file, which plays without a server. A world
+    that ends earlier stays. ``model`` has visuals, ``frame_dt`` is the time between frames [s].
 
     Raises:
         OSError: The file cannot be written.
     """
     server = start_server("127.0.0.1", 0)
     try:
-        stage = Stage(server, Shapes(model), worlds)
+        stage = Stage(server, model, worlds)
         qpos = np.stack([_fill(world, worlds) for world in worlds], axis=1)
         stage.update(qpos[0])
         scene = server.get_scene_serializer()
@@ -255,18 +273,18 @@ def _answer(
     """Answer a request of a browser, HTTP or the start of a websocket.
 
     The page's address has the token. Its answer makes it a cookie, which the page's websocket
-    brings; a page of another site cannot send it (SameSite=Strict), nor can a script read it. On
-    this machine alone (``local``) another port is the same site, so that Origin and Host count too.
+    brings; a page of another site cannot send it (SameSite=Strict), nor can a script read it.
+    Another port of this host is the same site, so that Origin has to be Host. On this machine alone
+    (``local``) Host counts too: another name may lead here.
     """
-    headers = request.headers
-    host = headers.get("Host", "")
+    hosts = request.headers.get_all("Host")
     cookie = f"mjstack-{token}=1"
+    cookies = "; ".join(request.headers.get_all("Cookie")).split("; ")
     fresh = token in parse_qs(urlsplit(request.path).query).get("token", [])
-    known = cookie in (text.strip() for text in headers.get("Cookie", "").split(";"))
-    refused = not (fresh or known)
-    if local:
-        origin = headers.get("Origin", f"http://{host}")  # a browser sends that of a websocket
-        refused |= urlsplit(f"//{host}").hostname not in _LOOPBACK or origin != f"http://{host}"
+    origins = request.headers.get_all("Origin")  # a browser sends that of a websocket
+    refused = not (fresh or cookie in cookies) or len(hosts) != 1
+    refused |= any(origin != f"http://{host}" for origin in origins for host in hosts)
+    refused |= local and not all(_PORT.sub("", host) in _LOOPBACK for host in hosts)
     if refused:
         text = "Open the whole address that the run has printed, with its token.\n"
         return connection.respond(403, text)

@@ -57,7 +57,7 @@ def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> m
         spec: The robot; it is changed in place.
         cfg: Table, objects and perhaps a box, the physics timestep, the solver's settings (``None``
             keeps the robot file's own), and the jaws, whose force on each object a sensor measures.
-        visuals: Keep geoms that only pictures need.
+        visuals: Keep geoms that only pictures need, and add a disc for each place.
 
     Returns:
         The compiled model; its ``qpos0`` has the objects at their nominal positions.
@@ -108,6 +108,12 @@ def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> m
         )
 
     # Cameras, and what only pictures need
+    if visuals:
+        for name, place in scene.places.items():
+            disc = _add_geom(world, f"place/{name}", "cylinder", size=[0.012, 5e-4, 0.0])
+            disc.pos = [*place.xy, scene.table_top]
+            disc.rgba = [0.2, 0.2, 0.2, 1.0]
+            disc.contype = disc.conaffinity = 0
     for name, camera in scene.cameras.items():
         _add_camera(spec, name, camera, scene)
     if visuals or scene.cameras:

@@ -1,29 +1,17 @@
-"""Kernels of a physics step, compiled at the same time instead of one after the other; those of
-`mujoco_warp.step` beside other work.
-"""
+"""Kernels of a physics step, compiled at the same time instead of one after the other."""
 
 import logging
-import pickle
-import subprocess
-import sys
-import tempfile
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 
 import mujoco
 
-from mjstack.config.schema import Config, GateCfg
-from mjstack.errors import first_line
-from mjstack.interrupt import check_interrupt
-from mjstack.process import POLL, available_cores, own_command
+from mjstack.process import available_cores
 from mjstack.sim.fused import constraints, smooth
 from mjstack.sim.fused.step import StepPlan
 from mjstack.sim.mujoco_warp import mjw, wp
-from mjstack.sim.sizes import BatchSizes, resolve_sizes
+from mjstack.sim.sizes import BatchSizes
 
 log = logging.getLogger(__name__)
 
@@ -32,10 +20,7 @@ Stage = Callable[[mjw.Model, mjw.Data], object]
 # Modules of which several stages of `mujoco_warp.step` launch kernels, the slowest first
 SHARED = ("forward", "passive", "sensor", "smooth", "solver", "support", "constraint")
 _SILENT = 3.0  # s: from the cache it takes less
-_LONGEST = 120.0  # s, to wait for a process: on an H100 with 16 cores it takes half a minute
 _done: set[tuple] = set()
-_planned: list[Callable[[str], subprocess.Popen[bytes]]] = []  # compilers, by the device
-_running: list[subprocess.Popen[bytes]] = []
 
 
 def compile_step(
@@ -66,8 +51,6 @@ def compile_step(
         futures += [pool.submit(stage) for stage in later]
         if wait(futures, timeout=_SILENT).not_done:
             log.info("compiling MJWarp's kernels; later runs on this machine load them")
-            if device.is_cuda:
-                _compile_planned(str(device))
     wp.synchronize_device(device)
 
 
@@ -87,66 +70,3 @@ def _stages(m: mjw.Model, plan: StepPlan) -> list[Stage]:
 
 def _reset(m: mjw.Model, d: mjw.Data) -> None:
     mjw.reset_data(m, d, reset=wp.zeros(1, dtype=bool))
-
-
-@contextmanager
-def stock_step_beside(stage: Callable[[], tuple[mujoco.MjModel, Config]]) -> Iterator[None]:
-    """Compile what `mujoco_warp.step` launches in another process. It starts when a CUDA kernel of
-    this process is not in the cache, and ends with the context. A thread would not do: a graph
-    cannot be captured while a thread loads a module.
-
-    Args:
-        stage: Gives the scene and the configuration, asked when that process starts.
-    """
-    _planned.append(lambda device: compile_apart(*stage(), device))
-    try:
-        yield
-    finally:
-        _end_processes()
-
-
-def _compile_planned(device: str) -> None:
-    while _planned:
-        try:
-            _running.append(_planned.pop()(device))
-        except Exception as error:  # the kernels compile when they are needed
-            log.info("mujoco_warp.step is not compiled apart: %s", first_line(error))
-
-
-def wait_for_stock_step() -> None:
-    """Return when no process is compiling any more, and start none: what follows is timed. One that
-    takes too long is ended.
-    """
-    _planned.clear()
-    last = time.monotonic() + _LONGEST
-    while any(process.poll() is None for process in _running) and time.monotonic() < last:
-        check_interrupt()
-        time.sleep(POLL)
-    _end_processes()
-
-
-def _end_processes() -> None:
-    _planned.clear()
-    while _running:
-        process = _running.pop()
-        process.kill()
-        process.wait()
-
-
-def compile_apart(model: mujoco.MjModel, cfg: Config, device: str) -> subprocess.Popen[bytes]:
-    """Start the process of `stock_step_beside`, which ends with this one."""
-    # Gates of the search path may have classes that the process does not find
-    cfg = replace(cfg, sim=replace(cfg.sim, step="stock"), gate=GateCfg())
-    silent = subprocess.DEVNULL
-    with tempfile.TemporaryFile() as worlds:
-        pickle.dump((model, cfg, 1, resolve_sizes(cfg), device, ()), worlds)
-        worlds.seek(0)
-        command = own_command([], "mjstack.sim.compiling")
-        return subprocess.Popen(command, stdin=worlds, stdout=silent, stderr=silent)
-
-
-def main() -> None:
-    """The process that `compile_apart` starts."""
-    from mjstack.sim.mjwarp import MjwarpSimulation
-
-    MjwarpSimulation(*pickle.load(sys.stdin.buffer)).close()

@@ -141,8 +141,7 @@ class MjwarpSimulation(Simulation):
         self._selected = wp.from_torch(self._mask)
 
         # Compile and load every kernel, then leave the worlds as new
-        self._compile = partial(compile_step, model, self._m, sizes, self._device)
-        self._compile(self.plan)
+        compile_step(model, self._m, sizes, self._device, self.plan)
         with torch_stream_scope(self._device):
             self._decimation(1, kinematics=True)
         self.synchronize()
@@ -198,18 +197,6 @@ class MjwarpSimulation(Simulation):
     @override
     def make_cameras(self, cameras: Mapping[str, CameraCfg]) -> Cameras:
         return MjwarpCameras(self.model, self._m, self._d, self.fields, cameras)
-
-    def bare_step(self) -> StepGraph:
-        """One plain ``mujoco_warp.step``, captured and replayed with nothing else: what the rest is
-        measured by.
-        """
-        self._compile(StepPlan())
-
-        def work() -> None:
-            with torch_stream_scope(self._device):
-                mjw.step(self._m, self._d)
-
-        return StepGraph(work, self.device, self._graph_mode, name="a bare step", scratch=False)
 
     @override
     def graph_of(self, n: int = 1, *, kinematics: bool = False) -> StepGraph:

@@ -123,8 +123,6 @@ class NativeSimulation(Simulation):
         self.fields = Fields(
             {name: torch.from_numpy(values) for name, values in self._fields.items()}
         )
-        derived = (*self._poses, self._copies["sensordata"], self._counts, self._steps)
-        self.rows = [batch.state, *derived, *self._fields.values()]
         self._derive: Callable[[], None] | None = None
         if not self._fields.keys().isdisjoint(SIMPLE_FIELDS):
             self._derive = simple_inertia(m, self._fields, batch.expand("dof_M0"))

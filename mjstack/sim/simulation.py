@@ -1,18 +1,18 @@
 """The base of every physics backend: torch views of batched state, and how to step it."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from enum import IntFlag
 from functools import cached_property
 
 import mujoco
+import numpy as np
 import torch
 from torch import Tensor
 
 from mjstack.config.schema import CameraCfg
 from mjstack.errors import ArgumentError, MjstackError
 from mjstack.math import describe_tensor
-from mjstack.scene.index import Columns
 from mjstack.sim.cameras import Cameras
 from mjstack.sim.graph import StepGraph
 from mjstack.sim.model_fields import REBOUND, Fields
@@ -51,6 +51,45 @@ def describe_overflow(bits: int) -> str:
 
 
 LOST_PHYSICS = sum(Overflow)
+
+
+class Columns:
+    """Some columns of a batched view. Where they lie side by side, reading them costs nothing and
+    writing is one copy.
+
+    Attributes:
+        indices: The columns, in the order in which values are given.
+        at: They as a slice where they lie side by side, else as a tensor.
+    """
+
+    def __init__(self, indices: Sequence[int] | np.ndarray, device: torch.device) -> None:
+        """Take the columns."""
+        self.indices = tuple(map(int, indices))
+        first = min(self.indices, default=0)
+        stop = first + len(self.indices)
+        self.at: Tensor | slice = slice(first, stop)
+        if self.indices != tuple(range(first, stop)):
+            self.at = torch.tensor(self.indices, dtype=torch.int64, device=device)
+
+    def read(self, view: Tensor) -> Tensor:
+        """The columns, shape ``(nworld, n, ...)``, perhaps the view's memory: only read it."""
+        if isinstance(self.at, slice):
+            return view[:, self.at]
+        return view.index_select(1, self.at)
+
+    def write(self, view: Tensor, value: Tensor) -> None:
+        """Write all worlds."""
+        view[:, self.at] = value
+
+    def write_masked(self, view: Tensor, mask: Tensor, value: Tensor) -> None:
+        """Write the worlds of a ``(nworld,)`` bool mask."""
+        value = value.to(view.dtype)
+        rows = mask.view(-1, *[1] * (view.dim() - 1))
+        part = self.read(view)
+        if isinstance(self.at, slice):
+            torch.where(rows, value, part, out=part)
+        else:
+            view[:, self.at] = torch.where(rows, value, part)
 
 
 class Simulation(ABC):

@@ -43,8 +43,8 @@ class BatchSizes:
 
 def resolve_sizes(cfg: Config) -> BatchSizes:
     """The configured sizes, with the defaults of this robot and scene where they are null."""
-    placements = _placements(cfg)
-    return apply_configured(cfg, BatchSizes(nconmax=placements.nconmax, njmax=placements.njmax))
+    sizes = _placements(cfg)
+    return apply_configured(cfg, BatchSizes(nconmax=sizes.nconmax, njmax=sizes.njmax))
 
 
 def resolve_env_sizes(cfg: Config) -> BatchSizes:

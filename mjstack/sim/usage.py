@@ -87,11 +87,6 @@ def data_bytes(model: mujoco.MjModel, nworld: int, sizes: BatchSizes) -> int:
 
     Every array is as long as nworld, as the contact pool, or constant. So two small ones on the CPU
     tell the rest.
-
-    Args:
-        model: The compiled model.
-        nworld: Number of worlds.
-        sizes: Buffer sizes.
     """
     with wp.ScopedDevice("cpu"):
         single, double = (

@@ -49,13 +49,13 @@ class BoxCheck(EpisodeCheck):
         """The place of each in the box."""
         force: float = spec(unit="N", gt=0.0)
         """A jaw, or a support, that presses with more than this touches."""
-        grasp_steps: int = spec(unit="steps", ge=1)
+        grasp_steps: int = spec(unit="steps", ge=1, le=1_000_000)
         """Consecutive steps, while closing, in which both jaws press."""
         lift_height: float = spec(unit="m", gt=0.0)
         """Height of the lowest corner above the table."""
-        lift_steps: int = spec(unit="steps", ge=1)
+        lift_steps: int = spec(unit="steps", ge=1, le=1_000_000)
         """Consecutive steps with both jaws pressing and no support touched."""
-        carry_steps: int = spec(unit="steps", ge=1)
+        carry_steps: int = spec(unit="steps", ge=1, le=1_000_000)
         """Least number of such steps in a row of a carry."""
         carry_distance: float = spec(unit="m", gt=0.0)
         """Horizontal distance from where those steps began."""
@@ -68,7 +68,7 @@ class BoxCheck(EpisodeCheck):
         """How far a corner may be beyond the inside of the box."""
         rest_speed: float = spec(unit="m/s", gt=0.0)
         """Speed of the fastest corner."""
-        window: int = spec(unit="steps", ge=1)
+        window: int = spec(unit="steps", ge=1, le=10_000)
         """Last steps without contact to a jaw, in which an object must be inside and slow."""
         jaw_clearance: float = spec(unit="m", gt=0.0)
         """Lowest jaw geometry above the box's rim at the end."""
@@ -92,24 +92,24 @@ class BoxCheck(EpisodeCheck):
                 f"settled_steps_{name}_min": (f"settled_steps_{name}", "min"),
             }
 
+        self.resting = AllOf(
+            ("untouched", "inside", "rest_speed"),
+            lambda step: (step.untouched, self.placed(step), step.corner_speed < t.rest_speed),
+        )
+        hold = parts.in_hand(*self.objects)
         grasp = parts.Streak(
-            *("GRASP", "{object} not grasped", self.objects),
-            parts.in_hand(*self.objects),
-            t.grasp_steps,
+            *("GRASP", "{object} not grasped", self.objects, hold, t.grasp_steps),
             phases=self._during("close"),
             anew=self._during("approach"),
         )
         lift = parts.Streak(
-            *("LIFT", "{object} not lifted", self.objects),
-            self.airborne,
-            t.lift_steps,
+            *("LIFT", "{object} not lifted", self.objects, self.airborne, t.lift_steps),
             phases=self._during("lift", "carry"),
             after=grasp,
         )
+        text = "{object} not carried over the box"
         carry = _CarriedOver(
-            *("CARRY", "{object} not carried over the box", self.objects),
-            self.airborne,
-            t.carry_steps,
+            *("CARRY", text, self.objects, self.airborne, t.carry_steps),
             distance=t.carry_distance,
             phases=self._during("carry"),
             after=lift,
@@ -117,9 +117,7 @@ class BoxCheck(EpisodeCheck):
             hold=self._during("hold"),
         )
         drop = _Drop(
-            *("DROP", "{object} dropped", self.objects),
-            parts.in_hand(*self.objects),
-            0,
+            *("DROP", "{object} dropped", self.objects, hold, 0),
             value="unloaded_steps{}",
             phases=self._during("close", "lift", "carry", "hold"),
             grasp=grasp,
@@ -135,19 +133,17 @@ class BoxCheck(EpisodeCheck):
             phases=self._during("open", "retreat", "settle"),
             after=carry,
         )
+        text = "{object} not at rest in the box after its release"
         settled = _Settled(
-            *("SETTLED", "{object} not at rest in the box after its release", self.objects),
-            self.resting,
-            t.window,
+            *("SETTLED", text, self.objects, self.resting, t.window),
             phases=self._during("settle"),
             after=release,
         )
         text = "an object not at rest in the box at the end"
-        rests = AllOf(("untouched", "inside", "rest_speed"), self.rests)
         return [
             *(grasp, lift, carry, drop, release, settled),
             _Order(self.objects, release),
-            parts.InWindow("INSIDE", text, rests, t.window, measure=self.trace),
+            parts.InWindow("INSIDE", text, self.resting, t.window, measure=self.trace),
             _JawClear(self.cfg.robot.jaw_bodies, self._high[2], t.jaw_clearance),
         ]
 
@@ -184,17 +180,6 @@ class BoxCheck(EpisodeCheck):
         return step.in_hand & up & ~step.supported
 
     @once_per_step
-    def resting(self, step: Step) -> Tensor:
-        """Whether each object is let go of, inside and slow, ``(nworld, objects)``, bool."""
-        return self.rests(step).all(-1)
-
-    @once_per_step
-    def rests(self, step: Step) -> Tensor:
-        """The same for each of these three, shape ``(nworld, objects, 3)``, bool."""
-        slow = step.corner_speed < self.t.rest_speed
-        return torch.stack((step.untouched, self.placed(step), slow), dim=-1)
-
-    @once_per_step
     def outside(self, step: Step) -> Tensor:
         """How far the outermost corner is beyond the inside of the box along each axis [m],
         negative inside, shape ``(nworld, objects, 3)``.
@@ -228,11 +213,9 @@ class BoxCheck(EpisodeCheck):
 
     @override
     def trace(self, step: Step) -> dict[str, Tensor]:
+        slots = self.slots.items()
         return {
-            **{
-                f"slot_err_{name}_m": parts.away(step, name, slot)
-                for name, slot in self.slots.items()
-            },
+            **{f"slot_err_{name}_m": parts.away(step, name, slot) for name, slot in slots},
             "beyond_m": self.outside(step).amax((1, 2)),
             "corner_speed_m_per_s": step.corner_speed.amax(1),
         }

@@ -1,26 +1,4 @@
-"""Episode checks: how a task judges an episode.
-
-A check is data and rules. Its thresholds are a dataclass, composed from ``task.check``; its rules
-are parts, most of them from `mjstack.tasks.parts`, which look at every step of every world on the
-device.
-
-Example:
-    >>> class LiftCheck(EpisodeCheck):
-    ...     @dataclass(kw_only=True, slots=True)
-    ...     class Thresholds:
-    ...         object: str = spec()
-    ...         height: float = spec(unit="m", gt=0.0)
-    ...         window: int = spec(unit="steps", ge=1)
-    ...
-    ...     def build(self) -> list[Rule]:
-    ...         t = self.t
-    ...         self.objects = [t.object]
-    ...         self.up = airborne(t.object, height=t.height)
-    ...         return [InWindow("UP", f"{t.object} not in the air", self.up, t.window)]
-    ...
-    ...     def placed(self, step: Step) -> Tensor:
-    ...         return self.up(step)
-"""
+"""Episode checks: how a task judges an episode. `mjstack new task NAME` writes one."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -40,9 +18,8 @@ from mjstack.errors import ConfigError, TermError, require_names
 from mjstack.managers.view import EnvView
 from mjstack.math import not_finite
 from mjstack.mdp.geometry import LOADED
-from mjstack.scene.index import Columns
 from mjstack.scene.phases import Phase
-from mjstack.sim.simulation import LOST_PHYSICS
+from mjstack.sim.simulation import LOST_PHYSICS, Columns
 from mjstack.tasks.view import PhaseNames, Step, TaskView
 
 _EVERY_TASK = {
@@ -176,8 +153,8 @@ class EpisodeCheck(ABC):
     """Judges an episode of every world at once, on the device.
 
     A subclass has a dataclass ``Thresholds``, whose values are those of ``task.check``, and builds
-    its rules. Memory does not grow with the episode. The step is counted on the device, so that a
-    captured graph can hold `update`.
+    its rules, most of them of `mjstack.tasks.parts`. They look at every step. Memory does not grow
+    with the episode. The step is counted on the device, so that a captured graph can hold `update`.
 
     With a driver that has phases, rules count in the phases that they name. Without, they count at
     any time before the settled window, each once the one before it holds.
@@ -187,7 +164,7 @@ class EpisodeCheck(ABC):
         t: The thresholds.
         key: That of every check of its class with these thresholds; see `once_per_step`.
         rules: Names, bits and words of the rules.
-        objects: The objects that the task is about, which the rules read.
+        objects: The objects that the task is about, which the rules read; perhaps none.
         summaries: Metrics of a batch: by name, a measured value and which of its worlds' counts,
             ``min`` or ``max``.
     """
@@ -320,10 +297,16 @@ class EpisodeCheck(ABC):
                 broken[name] = f" ({', '.join(words)})"
         return broken, beyond
 
+    @property
+    def limits(self) -> dict[str, tuple[float, float]]:
+        """The least and the largest of each measured value for which its rule holds, by name."""
+        return dict(chain(*(limits.items() for r in self._rules for limits in r.limits)))
+
     @abstractmethod
     def placed(self, step: Step) -> Tensor:
         """Whether each object is where it belongs, in the order of ``objects``, shape ``(nworld,
-        objects)``, bool. No host read.
+        objects)``, bool; of a check without objects, whether all is done, shape ``(nworld, 1)``. No
+        host read.
         """
 
     def placed_of(self, step: Step, carried: Columns) -> Tensor:

@@ -5,15 +5,15 @@ A condition is a function of a `Step` that returns a bool tensor, shape ``(nworl
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 
 import torch
 from torch import Tensor
 from typing_extensions import override
 
-from mjstack.math import norm, quat_angle
-from mjstack.mdp.geometry import place_xy
+from mjstack.math import norm, quat_angle, quat_to_matrix
+from mjstack.mdp.geometry import place_xy, pose_w
 from mjstack.tasks.check import Judgement, Rule
 from mjstack.tasks.view import AllOf, PhaseNames, Step, TaskView
 
@@ -41,19 +41,20 @@ def in_hand(*objects: str) -> Condition:
     return lambda step: step.view.columns(objects).read(step.in_hand)
 
 
-def released(*objects: str, open_fraction: float) -> Condition:
+def released(*objects: str, open_fraction: float) -> AllOf:
     """Objects that no jaw touches while the gripper is open by at least that fraction as measured,
-    from 0 (closed) to 1 (open).
+    from 0 (any opening will do) to 1 (open).
     """
+    least = open_fraction or -math.inf
 
     def parts(step: Step) -> tuple[Tensor, ...]:
-        untouched = step.view.columns(objects).read(step.untouched)
-        return untouched, step.narrowest >= open_fraction
+        wide = step.narrowest >= least
+        return step.view.columns(objects).read(step.untouched) if objects else wide, wide
 
     return AllOf(("untouched", "open_fraction"), parts)
 
 
-def on_top(object: str, onto: str, *, xy_err: float, dz_min: float, dz_max: float) -> Condition:
+def on_top(object: str, onto: str, *, xy_err: float, dz_min: float, dz_max: float) -> AllOf:
     """An object above another one: horizontal distance of the centres and difference of their
     heights [m].
     """
@@ -80,9 +81,9 @@ def on_top_of(step: Step, onto: str, object: str) -> Tensor:
     return step.center(onto) + step.view.constant(0.0, 0.0, height)
 
 
-def at_place(object: str, place: str, *, distance: float) -> Condition:
+def at_place(object: str, place: str, *, distance: float) -> AllOf:
     """An object whose centre is within a horizontal distance of a place [m]."""
-    return lambda step: away(step, object, place) <= distance
+    return AllOf(("distance",), lambda step: (away(step, object, place) <= distance,))
 
 
 def away(step: Step, object: str, place: str) -> Tensor:
@@ -91,9 +92,9 @@ def away(step: Step, object: str, place: str) -> Tensor:
     return norm(apart)
 
 
-def on_table(object: str, *, gap: float) -> Condition:
-    """An object that stands on the table: its lowest point within ``gap`` of the top [m], its
-    centre at least half its size from the edges.
+def on_table(object: str, *, gap: float) -> AllOf:
+    """An object that stands on the table, however it is turned: its lowest point within ``gap`` of
+    the top [m], its centre at least half its size from the edges.
     """
 
     def parts(step: Step) -> Tensor:
@@ -106,6 +107,37 @@ def on_table(object: str, *, gap: float) -> Condition:
         return (at - center).abs() <= room
 
     return AllOf(("x", "y", "gap"), parts)
+
+
+def upright(object: str, *, tilt_deg: float, axis: str = "z", either_end: bool = True) -> AllOf:
+    """An object whose axis is within an angle of the vertical. Either end of it may be up, unless
+    ``either_end`` is false.
+    """
+
+    def parts(step: Step) -> tuple[Tensor, ...]:
+        return (step.tilt(object, axis, either_end=either_end) <= tilt_deg,)
+
+    return AllOf(("tilt_deg",), parts)
+
+
+def flat(object: str, *, tilt_deg: float) -> AllOf:
+    """A box on any of its faces, or a cylinder on either end, within an angle."""
+    return upright(object, tilt_deg=tilt_deg, axis="face")
+
+
+def in_zone(object: str, frame: str, *, low: Sequence[float], high: Sequence[float]) -> AllOf:
+    """An object whose centre is between two corners, in the frame of another one such as a fixture:
+    least and largest x, y and perhaps z [m].
+    """
+
+    def parts(step: Step) -> Tensor:
+        pose = pose_w(step.view.env, frame).float()
+        apart = step.center(object) - pose[:, :3]
+        at = (quat_to_matrix(pose[:, 3:]) * apart[..., None]).sum(-2)[:, : len(low)]
+        constant = step.view.constant
+        return at.clamp(constant(*low), constant(*high)) == at
+
+    return AllOf(("along_x", "along_y", "along_z")[: len(low)], parts)
 
 
 # Rules
@@ -259,7 +291,9 @@ class InWindow(Rule):
     def __post_init__(self) -> None:
         super().__init__(self.name, self.text, expected=f"at least {self.window}")
         self._total = f"{self.name.lower()}_steps"
-        names = self.condition.names if isinstance(self.condition, AllOf) else ()
+        rule = self.condition
+        self._rule = rule if isinstance(rule, AllOf) else AllOf(("",), lambda step: (rule(step),))
+        names = self._rule.names if len(self._rule.names) > 1 else ()
         self._values = [f"{self._total}.{name}" for name in names]
         self.limits = [dict.fromkeys(self._values or [self._total], (self.window, math.inf))]
 
@@ -269,9 +303,7 @@ class InWindow(Rule):
 
     @override
     def update(self, step: Step) -> None:
-        rule = self.condition
-        holds = rule.apart(step) if isinstance(rule, AllOf) else rule(step)[..., None]
-        self.length.add_(1.0).mul_(holds if holds.dim() == 2 else holds.all(1))
+        self.length.add_(1.0).mul_(self._rule.apart(step))
 
     @override
     def judge(self, end: Step) -> Judgement:
@@ -306,14 +338,11 @@ class AtRest(Rule):
             "REST_POSITION": "object drifting",
             "REST_ROTATION": "object turning",
         }
-        limits = {
-            "speed_m_per_s": self.speed,
-            "position_m": self.position,
-            "rotation_deg": self.rotation_deg,
-        }
-        self.suffixes = [*limits]
-        self.expected = [f"at most {limit:g}" for limit in limits.values()]
-        self.limits = [{f"rest_{name}": (0.0, limit)} for name, limit in limits.items()]
+        self.suffixes = ["speed_m_per_s", "position_m", "rotation_deg"]
+        limits = (self.speed, self.position, self.rotation_deg)
+        self.expected = [f"at most {limit:g}" for limit in limits]
+        named = zip(self.suffixes, limits, strict=True)
+        self.limits = [{f"rest_{name}": (0.0, limit)} for name, limit in named]
 
     @override
     def start(self, view: TaskView) -> None:

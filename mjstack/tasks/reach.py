@@ -27,7 +27,7 @@ class ReachCheck(EpisodeCheck):
         """Height of the point above its centre."""
         distance: float = spec(unit="m", gt=0.0)
         """Largest distance that counts as near."""
-        window: int = spec(unit="steps", ge=1)
+        window: int = spec(unit="steps", ge=1, le=10_000)
         """Last steps, in which the grasp point is near."""
 
     t: Thresholds

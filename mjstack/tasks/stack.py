@@ -12,8 +12,8 @@ from typing_extensions import override
 from mjstack.config.fields import spec
 from mjstack.managers.term import branches
 from mjstack.managers.view import EnvView
-from mjstack.scene.index import Columns
 from mjstack.sim.graph import where_any
+from mjstack.sim.simulation import Columns
 from mjstack.tasks import parts
 from mjstack.tasks.check import EpisodeCheck, Rule
 from mjstack.tasks.placed import HeldSuccess
@@ -42,13 +42,13 @@ class StackCheck(EpisodeCheck):
         """Phase in which carrying counts, if the driver has phases."""
         airborne_height: float = spec(unit="m", ge=0.0)
         """Height of its lowest point above the table from which the object is in the air."""
-        lift_steps: int = spec(unit="steps", ge=1)
+        lift_steps: int = spec(unit="steps", ge=1, le=1_000_000)
         """Consecutive steps in the air that make a lift."""
-        carry_steps: int = spec(unit="steps", ge=1)
+        carry_steps: int = spec(unit="steps", ge=1, le=1_000_000)
         """Least number of consecutive steps in the air of a carry."""
         carry_distance: float = spec(unit="m", gt=0.0)
         """Horizontal distance from where those steps began."""
-        window: int = spec(unit="steps", ge=2)
+        window: int = spec(unit="steps", ge=2, le=10_000)
         """Last steps of the episode, in which everything below must hold."""
         xy_err: float = spec(unit="m", gt=0.0)
         """Largest horizontal distance of the centres."""
@@ -109,16 +109,12 @@ class StackCheck(EpisodeCheck):
     @override
     def placed(self, step: Step) -> Tensor:
         """Whether the object is on the other one, and that one on the table."""
-        return torch.cat((self.on_top(step), self.on_table(step)), dim=1)
+        return torch.cat((self.on_top(step), self.supported(step)[:, None]), dim=1)
 
     @once_per_step
     def on_top(self, step: Step) -> Tensor:
         """Whether the object is on the other one, shape ``(nworld, 1)``, bool."""
         return self.stacked(step)[:, None]
-
-    def on_table(self, step: Step) -> Tensor:
-        """Whether the other one is on the table, shape ``(nworld, 1)``, bool."""
-        return self.supported(step)[:, None]
 
     @override
     def placed_of(self, step: Step, carried: Columns) -> Tensor:
@@ -157,7 +153,8 @@ class StackSuccess(HeldSuccess):
         check = StackCheck(env.cfg)
         view = check.view(env)
         # The host can mostly tell by the first. On CUDA a branch of a graph shares no value.
-        placed = [check.placed] if env.device.type == "cuda" else [check.on_top, check.on_table]
+        apart = [check.on_top, check.supported.apart]
+        placed = [check.placed] if env.device.type == "cuda" else apart
         super().__init__(env, view, [*placed, check.released], check.t.window)
         ring = (check.t.window, len(view.objects))
         # Where the oldest step is, in every world.

@@ -12,14 +12,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mjstack.errors import require_names
+from mjstack.errors import ConfigError, MjstackError, require_names
 from mjstack.managers.term import known_values
 from mjstack.managers.view import EnvView
-from mjstack.math import lowest_point, norm, quat_to_matrix
+from mjstack.math import atan2, lowest_point, norm, quat_to_matrix
 from mjstack.mdp.geometry import LOADED, gripper_opening, pose_w
 from mjstack.mdp.observation import object_velocity
-from mjstack.scene.index import Columns
 from mjstack.scene.phases import Phase
+from mjstack.sim.simulation import Columns
 
 PhaseNames = Sequence[Sequence[str]]
 """For each object, names of phases."""
@@ -71,14 +71,8 @@ class TaskView:
         stop: int = 0,
         force: float = LOADED,
     ) -> None:
-        """Read addresses and sizes.
-
-        Args:
-            env: The environment.
-            objects: Names of objects of the scene.
-            phases: Those of the driver.
-            stop: Steps from this one on count for no rule that names phases.
-            force: A jaw or a support that presses with more touches an object [N].
+        """Read addresses and sizes. ``phases`` are those of the driver. A jaw or a support that
+        presses with more than ``force`` touches an object [N].
         """
         self.env = env
         self.objects = list(objects)
@@ -174,8 +168,7 @@ class Step:
     @step_value
     def pose(self) -> Tensor:
         """Position [m] and quaternion (wxyz), shape ``(nworld, objects, 7)``."""
-        poses = [pose_w(self.view.env, name) for name in self.view.objects]
-        return torch.stack(poses, dim=1).float()
+        return self._of_each([pose_w(self.view.env, name) for name in self.view.objects])
 
     @step_value
     def pos(self) -> Tensor:
@@ -192,8 +185,8 @@ class Step:
         """Velocity as MuJoCo has it: linear [m/s] in the world, angular [rad/s] in the object's
         frame, shape ``(nworld, objects, 6)``.
         """
-        velocities = [object_velocity(self.view.env, object=name) for name in self.view.objects]
-        return torch.stack(velocities, dim=1).float()
+        env = self.view.env
+        return self._of_each([object_velocity(env, object=name) for name in self.view.objects])
 
     @step_value
     def turn(self) -> Tensor:
@@ -204,7 +197,7 @@ class Step:
     def height(self) -> Tensor:
         """Height of the lowest point above the table [m], shape ``(nworld, objects)``."""
         forms = [(thing.shape, thing.size) for thing in self.view.things]
-        if forms.count(forms[0]) == len(forms):
+        if forms[1:] == forms[:-1]:  # all alike
             return lowest_point(self.pos, self.quat, *forms[0]) - self.view.top
         poses = zip(self.pos.unbind(1), self.quat.unbind(1), forms, strict=True)
         lowest = [lowest_point(pos, quat, *form) for pos, quat, form in poses]
@@ -249,6 +242,19 @@ class Step:
             return pose_w(view.env, name)[:, :3].float()
         return self.pos[:, view.objects.index(name)]
 
+    def tilt(self, name: str, axis: str = "z", *, either_end: bool = True) -> Tensor:
+        """Angle of an object's axis from the vertical, at most 90 unless ``either_end`` is false
+        [deg], shape ``(nworld,)``. Axis ``face``: of the face that a box or a cylinder lies on.
+        """
+        shape = self.view.env.cfg.scene.objects[name].shape
+        faces = {"box": "xyz", "cylinder": "z"}
+        require_names(f"axis of {shape} {name}", [axis], [*"xyz", *["face"] * (shape in faces)])
+        axis = faces[shape] if axis == "face" else axis
+        cosines = self.turn[:, self.view.number(name), 2]  # of each axis
+        cosines = cosines.abs() if either_end or axis == "xyz" else cosines
+        ordered = cosines.sort(-1).values if axis == "xyz" else cosines.roll("zyx".index(axis), -1)
+        return atan2(norm(ordered[:, :2]), ordered[:, 2]).rad2deg()
+
     @step_value
     def in_hand(self) -> Tensor:
         """Whether all jaws press on each object, shape ``(nworld, objects)``, bool."""
@@ -270,6 +276,9 @@ class Step:
         """Whether anything but a jaw presses on each object, shape ``(nworld, objects)``, bool;
         needs ``scene.support_sensors``.
         """
+        if not self.view.env.cfg.scene.support_sensors:
+            expected = "true: the check asks what an object rests on"
+            raise ConfigError("scene.support_sensors", False, expected)
         return self._sensed(self.view.supports).any(-1)
 
     def judged(self, key: slice) -> Tensor:
@@ -285,8 +294,16 @@ class Step:
             return going
         return view.table.index_select(0, self._phase) & going
 
+    def _of_each(self, values: list[Tensor]) -> Tensor:
+        if not values:
+            raise MjstackError(
+                "task.check: a rule asks how objects are, but self.objects names none"
+            )
+        return torch.stack(values, dim=1).float()
+
     def _sensed(self, columns: Columns) -> Tensor:
-        shape = (len(self.view.objects), -1, 3)
+        count = len(self.view.objects)
+        shape = (count, len(columns.indices) // (3 * count or 1), 3)
         forces = self.view.env.sim.part("sensordata", columns, *shape)
         return norm(forces) > self.view.force
 
@@ -310,8 +327,16 @@ class AllOf:
         return holds.all(-1) if isinstance(holds, Tensor) else reduce(and_, holds)
 
     def apart(self, step: Step) -> Tensor:
-        """Whether each part holds, shape ``(nworld, n, parts)`` or ``(nworld, parts)``, bool."""
+        """Whether each part holds for all objects, shape ``(nworld, parts)``, bool."""
         holds = self.parts(step)
-        if isinstance(holds, Tensor):
-            return holds
-        return torch.stack(torch.broadcast_tensors(*holds), dim=-1)
+        if not isinstance(holds, Tensor):
+            holds = torch.stack(torch.broadcast_tensors(*holds), dim=-1)
+        return holds if holds.dim() == 2 else holds.all(1)
+
+    def __and__(self, condition: "AllOf") -> "AllOf":
+        """A condition of the parts of both, each for all its objects, shape ``(nworld,)``, bool."""
+
+        def parts(step: Step) -> Tensor:
+            return torch.cat((self.apart(step), condition.apart(step)), dim=-1)
+
+        return AllOf((*self.names, *condition.names), parts)

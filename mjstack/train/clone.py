@@ -10,7 +10,6 @@ from pathlib import Path
 import torch
 
 from mjstack.config.schema import CloneJobCfg
-from mjstack.episodes.rollout import STATE_BASED
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, MjstackError, require_names
 from mjstack.math import rate_interval
@@ -46,7 +45,7 @@ def check_clone(stage: Stage) -> range:
 def _check_rounds(stage: Stage, job: CloneJobCfg) -> None:
     """Refuse what cannot be learned in rounds."""
     name = stage.cfg.controller.name
-    if name != STATE_BASED:
+    if not stage.driver_class.stateless:
         expected = "state_based, because trainer=dagger asks the expert in the policy's states"
         fix = "Set trainer=clone, which learns from any expert, or controller=state_based"
         raise ConfigError("controller", name, expected, fix)

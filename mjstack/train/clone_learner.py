@@ -86,7 +86,8 @@ class CloneLearner(Learner):
         self._replaced = torch.zeros((), device=device)  # share of the average, by a batch
         self._chosen = torch.zeros(size, dtype=torch.int64, device=device)
         self._noise = torch.zeros((size, self._seen.shape[1]), device=device)
-        self._widest = input_noise(cfg, stage.model, demonstrations.widths).to(device)
+        spread = self._network.observation_std.cpu()
+        self._widest = input_noise(cfg, stage.model, demonstrations.widths, spread).to(device)
         self._generator = torch.Generator(device)
         self._augment = Augmentation(job.vision, len(job.vision.cameras), size, device)
         facts = (demonstrations.widths, job.execute, config_content(cfg), cfg.controller.action)

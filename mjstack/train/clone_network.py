@@ -14,6 +14,7 @@ from mjstack.policy import PolicyNetwork, Vision
 from mjstack.train.demonstrations import Demonstrations
 
 _LEAST = 0.1  # scale of a column, of the largest one of its term
+_NOISE = 0.02  # of the standard deviation of a column, where its term has no noise
 _CONSTANT = 1e-3  # a column of what is estimated that varies less has no scale
 
 
@@ -66,17 +67,29 @@ class Estimator(nn.Module):
         return self.layer(torch.cat(list(features), dim=1)), (truth - self.mean) / self.std
 
 
-def input_noise(cfg: Config, model: mujoco.MjModel, widths: Mapping[str, int]) -> Tensor:
+def input_noise(
+    cfg: Config, model: mujoco.MjModel, widths: Mapping[str, int], std: Tensor
+) -> Tensor:
     """Half-width of the noise on each column of the observation in a training, shape ``(n,)``.
-    ``widths`` are the numbers of each term.
+
+    Args:
+        cfg: The configuration.
+        model: The scene.
+        widths: Numbers of each term, by name.
+        std: Standard deviation of each column in the demonstrations, shape ``(n,)``, from which the
+            noise of terms without some follows. A policy that learned without any leaves the
+            expert's path and does not come back.
     """
     job: CloneJobCfg = cfg.job
     slides = slide_joints(model, cfg.robot.joints)
     widest: list[float] = []
-    for name, width in widths.items():
+    for (name, width), spread in zip(widths.items(), std.split([*widths.values()]), strict=True):
         term = cast(ObservationTermCfg, cfg.observation[job.group].terms[name])
-        columns = column_noise(term, width // term.history, slides)
-        widest += [job.input_noise * term.scale * column for column in term.history * columns]
+        if term.noise:
+            columns = column_noise(term, width // term.history, slides)
+            widest += [job.input_noise * term.scale * column for column in term.history * columns]
+        else:
+            widest += (job.input_noise * _NOISE * spread).tolist()
     return torch.tensor(widest)
 
 

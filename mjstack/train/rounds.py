@@ -34,7 +34,7 @@ class MixedDriver(Driver):
     policy drives alone. Phases, errors and retries are the expert's.
 
     Attributes:
-        label: The expert's joint targets of the last step, shape ``(nworld, nu)``.
+        label: The expert's joint targets of the last step, shape ``(nworld, action_dim)``.
         driven: Where the expert drives this step, shape ``(nworld,)``, int8.
         query_images: The policy's images.
     """
@@ -71,7 +71,7 @@ class MixedDriver(Driver):
         self._beta = beta
         # Whole answers: the policy takes over where it is queried.
         self._spell = job.execute * max(1, round(job.spell / env.cfg.timing.step_dt / job.execute))
-        self.label = torch.zeros((env.nworld, len(env.index.ctrl)), device=env.device)
+        self.label = torch.zeros((env.nworld, env.action_manager.action_dim), device=env.device)
         self.driven = torch.ones(env.nworld, dtype=torch.int8, device=env.device)
         self._alone = env.world < alone
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from mjstack.episodes.stage import Stage
 from mjstack.errors import ArgumentError, ConfigError
 from mjstack.policy import load_policy
 from mjstack.policy.lerobot import IMAGES, SEEN, STATE
+from mjstack.rng import check_seed
 from mjstack.robots.units import LEROBOT
 from mjstack.sim import StateRenderer
 from mjstack.sim.cameras import with_outputs
@@ -84,7 +84,7 @@ class MjstackEnv(EnvConfig):
         """Make one vector environment of all worlds, and describe its features."""
         cfg = self.compose()
         if self.policy is not None:
-            policy = load_policy(Path(self.policy))
+            policy = load_policy(self.policy, config_dir=self.config_dir)
             policy.check_fit(cfg)
             cfg = replace(cfg, observation={GROUP: policy.observation})
         worlds = LerobotVectorEnv(cfg, n_envs, self.cameras, self.units)
@@ -146,12 +146,17 @@ class LerobotVectorEnv(VectorEnv):
     def reset(self, *, seed: Any = None, options: Info | None = None) -> tuple[Info, Info]:
         """Start an episode in every world. World k starts as world ``seed[k]`` of any batch of
         mjstack does under the configured seed: the same number is the same start, wherever it
-        stands. Without numbers every world goes on to its next episode.
+        stands. One number is that of the first world, and the others follow. Without numbers every
+        world goes on to its next episode.
         """
         env = self.inner
-        if seed is not None and len(seed) != env.nworld:
-            expected = f"one for each of {env.nworld} worlds"
-            raise ArgumentError("seed", f"{len(seed)} numbers", expected)
+        if seed is not None:
+            if np.ndim(seed) == 0:
+                seed = check_seed(seed) + np.arange(env.nworld)
+            seed = [*map(check_seed, seed)]
+            if len(seed) != env.nworld:
+                expected = f"one for each of {env.nworld} worlds"
+                raise ArgumentError("seed", f"{len(seed)} numbers", expected)
         reset_worlds(env, None if seed is None else env.cfg.seed, seed)
         self._left = self._max_episode_steps
         self._check.start(env, self._left, [])

@@ -160,7 +160,8 @@ class CloneJobCfg(TrainJobCfg):
     save_every: int = spec(unit="batches", ge=1)
     """Batches between two saved policies."""
     input_noise: float = spec(ge=0.0)
-    """Noise on the observations that training sees, in multiples of their terms' ``noise``."""
+    """Noise on the observations that training sees, in multiples of their terms' ``noise``, or of
+    2 % of their standard deviation where a term has none."""
     weight_decay: float = spec(ge=0.0)
     """Of AdamW."""
     vision: VisionCfg = field(default_factory=VisionCfg)
@@ -179,7 +180,7 @@ class PpoJobCfg(TrainJobCfg):
     """Time budget of a call; the next one goes on. null: unlimited."""
     save_every: int = spec(unit="iterations", ge=1)
     """Iterations between two saved policies."""
-    expert_worlds: int = spec(unit="worlds", ge=1)
+    expert_worlds: int = spec(unit="worlds", ge=1, le=4096)
     """reset=expert_states: worlds in which the expert plays at the beginning."""
     horizon: int = spec(unit="decisions", ge=1)
     """Decisions of every world per iteration."""

@@ -1,6 +1,7 @@
 """The robot: names in its MJCF file, servos, and where each scene's objects stand for it."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from omegaconf import MISSING
 
@@ -24,9 +25,9 @@ class PlacementsCfg:
     """Centre of the table."""
     table_half: list[float] = spec(unit="m", length=3, gt=0.0)
     """Half sizes of the table."""
-    objects: dict[str, list[float]] = spec({}, unit="m", length=2)
+    objects: dict[str, Any] = spec({}, vectors=True, unit="m", length=2)
     """Nominal x and y of each object."""
-    places: dict[str, list[float]] = spec({}, unit="m", length=2)
+    places: dict[str, Any] = spec({}, vectors=True, unit="m", length=2)
     """x and y of each place."""
     random_xy: list[float] = spec(unit="m", length=2, ge=0.0)
     """How far ``reset=randomized`` moves each object, plus or minus."""
@@ -36,13 +37,13 @@ class PlacementsCfg:
     """How far above an object's centre it is held."""
     home: list[float] | None = spec(None, unit="rad, m")
     """Joint values at which this scene's task begins, where ``robot.home`` would collide."""
-    nconmax: int = spec(128, ge=1)
+    nconmax: int = spec(128, ge=1, le=100_000)
     """Contacts per world while a driver does the task."""
-    njmax: int = spec(300, ge=1)
+    njmax: int = spec(300, ge=1, le=100_000)
     """Constraint rows per world while a driver does the task."""
-    env_nconmax: int = spec(128, ge=1)
+    env_nconmax: int = spec(128, ge=1, le=100_000)
     """Contacts per world under random actions."""
-    env_njmax: int = spec(768, ge=1)
+    env_njmax: int = spec(768, ge=1, le=100_000)
     """Constraint rows per world under random actions."""
 
 
@@ -112,7 +113,7 @@ class RobotCfg:
     """Two sites, one on each jaw. Their midpoint is the grasp point."""
     grasp_parts: dict[str, list[str]] = spec({})
     """Where a grasp site goes that the file lacks: the mean of these geoms or bodies of one jaw."""
-    grasp_pos: dict[str, list[float]] = spec({}, unit="m", length=3)
+    grasp_pos: dict[str, Any] = spec({}, vectors=True, unit="m", length=3)
     """Where such a site lies in the frame of the body that ``grasp_parts`` names; its origin."""
     home: list[float] = spec(unit="rad, m")
     """Joint values at which a driven episode begins."""

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
-from mjstack.config.fields import spec
+from mjstack.config.fields import MOST_COUNT, MOST_WORLDS, spec
 
 
 class Backend(StrEnum):
@@ -48,9 +48,9 @@ class TimingCfg:
 class SolverCfg:
     """Constraint solver. null keeps the model file's own value."""
 
-    iterations: int | None = spec(None, ge=1)
+    iterations: int | None = spec(None, ge=1, le=1000)
     """Most iterations of the solver."""
-    ls_iterations: int | None = spec(None, ge=1)
+    ls_iterations: int | None = spec(None, ge=1, le=1000)
     """Most iterations of its line search."""
     impratio: float | None = spec(None, gt=0.0)
     """Ratio of frictional to normal constraint impedance."""
@@ -70,11 +70,11 @@ class BatchCfg:
 
     auto: bool = False
     """Whether sizes that are null are measured first, as ``gate.capacity`` says."""
-    nconmax: int | None = spec(None, unit="contacts per world", ge=1)
+    nconmax: int | None = spec(None, unit="contacts per world", ge=1, le=100_000)
     """Contacts, as a mean over the worlds."""
-    njmax: int | None = spec(None, unit="rows per world", ge=1)
+    njmax: int | None = spec(None, unit="rows per world", ge=1, le=100_000)
     """Constraint rows."""
-    nccdmax: int | None = spec(None, unit="pairs per world", ge=1)
+    nccdmax: int | None = spec(None, unit="pairs per world", ge=1, le=100_000)
     """Pairs of convex geoms in collision, as a mean over the worlds."""
 
 
@@ -159,13 +159,13 @@ class ParityCfg(GateFuncCfg):
     images: str | None = None
     """With cameras: ``parity_images.npz`` of a run elsewhere, whose images are compared with native
     MuJoCo's instead of images that MJWarp draws here."""
-    image_states: int = spec(unit="states", ge=1)
+    image_states: int = spec(unit="states", ge=1, le=10_000)
     """With cameras: states of the reference episode that both backends draw."""
     image_same: float = spec(ge=0.0, le=1.0)
     """Smallest share of the pixels in which both backends show the same thing."""
     image_iou: float = spec(ge=0.0, le=1.0)
     """Smallest intersection over union of a thing in the images of both backends."""
-    image_pixels: int = spec(unit="pixels", ge=1)
+    image_pixels: int = spec(unit="pixels", ge=1, le=MOST_COUNT)
     """Things with fewer pixels in all images of a camera are not compared. A camera in which only
     the background has as many fails."""
     image_color: float = spec(unit="of 255", ge=0.0)
@@ -178,15 +178,15 @@ class ParityCfg(GateFuncCfg):
 class CapacityCfg(GateFuncCfg):
     """How buffers are sized."""
 
-    cpu_nworld: int = spec(unit="worlds", ge=1)
+    cpu_nworld: int = spec(unit="worlds", ge=1, le=MOST_WORLDS)
     """Worlds that size the buffers on a CPU; on CUDA all nworld do."""
     margin: float = spec(ge=1.0)
     """Recommended sizes over the peaks."""
-    random_steps: int | None = spec(None, unit="steps", ge=1)
+    random_steps: int | None = spec(None, unit="steps", ge=1, le=MOST_COUNT)
     """Steps of random actions; null: one whole episode, on CUDA 200 steps at most."""
-    probe_nworld: int = spec(unit="worlds", ge=1)
+    probe_nworld: int = spec(unit="worlds", ge=1, le=MOST_WORLDS)
     """Most worlds that size an environment with ``batch=auto`` on CUDA; on a CPU, cpu_nworld."""
-    probe_steps: int = spec(unit="steps", ge=1)
+    probe_steps: int = spec(unit="steps", ge=1, le=MOST_COUNT)
     """Steps of random actions that size an environment with ``batch=auto``."""
     reset: dict[str, Any] = spec({})
     """Reset terms of the workload with randomised starts."""
@@ -196,9 +196,9 @@ class CapacityCfg(GateFuncCfg):
 class BatchGateCfg(GateFuncCfg):
     """The batch gate plays every world of some seeds and judges them together."""
 
-    seeds: int = spec(unit="seeds", ge=1)
+    seeds: int = spec(unit="seeds", ge=1, le=100_000)
     """Seeds that are played: the configured one and those after it."""
-    failed_worlds: int = spec(unit="worlds", ge=0)
+    failed_worlds: int = spec(unit="worlds", ge=0, le=MOST_WORLDS)
     """Worlds that may fail, over all seeds."""
     distinct_fraction: float = spec(ge=0.0, le=1.0)
     """Smallest share of distinct starts, or of distinct final states."""
@@ -210,16 +210,16 @@ class ThroughputCfg(GateFuncCfg):
 
     measurements: list[str] = spec(choices=("physics", "episode", "env_step", "cameras"))
     """Measurements that are made; ``cameras`` where there are some."""
-    repetitions: int = spec(ge=1)
+    repetitions: int = spec(ge=1, le=1000)
     """Repetitions of each measurement, at most."""
     precision: float = spec(0.01, ge=0.0)
     """Repetitions end, from two on, as soon as half the range of their times is less, relative to
     the median (env_step, cameras: of the time over that of physics)."""
-    episodes: int = spec(ge=1)
+    episodes: int = spec(ge=1, le=MOST_COUNT)
     """episode: repetitions at most."""
-    steps: int = spec(unit="steps", ge=1)
+    steps: int = spec(unit="steps", ge=1, le=MOST_COUNT)
     """physics: control steps per repetition."""
-    env_steps: int = spec(unit="steps", ge=1)
+    env_steps: int = spec(unit="steps", ge=1, le=MOST_COUNT)
     """env_step and cameras: steps per repetition."""
     action_share: float = spec(gt=0.0, le=1.0)
     """env_step and cameras: share of the action range, about its middle, that actions come from."""
@@ -230,7 +230,7 @@ class ThroughputCfg(GateFuncCfg):
     from_phase: str = spec()
     """Phase at whose start physics begins; it holds the joint target from there. Empty: the one
     after the first grasp, or without grasps after the last phase with a closed gripper."""
-    start_worlds: int = spec(unit="worlds", ge=1)
+    start_worlds: int = spec(unit="worlds", ge=1, le=MOST_WORLDS)
     """Worlds that are played to that phase where the batch gate has not; the others are copies."""
     native_baseline: bool = spec()
     """Whether native MuJoCo is measured too on CUDA machines."""
@@ -240,7 +240,7 @@ class ThroughputCfg(GateFuncCfg):
 class SuccessGateCfg(GateFuncCfg):
     """The success gate plays episodes from randomised starts and needs a success rate."""
 
-    seeds: int = spec(unit="seeds", ge=1)
+    seeds: int = spec(unit="seeds", ge=1, le=100_000)
     """Seeds of nworld episodes each: the configured one and those after it."""
     rate: float = spec(ge=0.0, le=1.0)
     """Share of the episodes that must succeed."""
@@ -250,9 +250,9 @@ class SuccessGateCfg(GateFuncCfg):
     """Width of the cells in which start positions are counted, in x and y."""
     yaw_cell_deg: float = spec(unit="deg", gt=0.0, le=90.0)
     """Width of the bins of an object's yaw relative to its direction as seen from the base."""
-    cell_episodes: int = spec(unit="episodes", ge=1)
+    cell_episodes: int = spec(unit="episodes", ge=1, le=MOST_COUNT)
     """Episodes below which a cell has no rate."""
-    worst_regions: int = spec(unit="cells", ge=1)
+    worst_regions: int = spec(unit="cells", ge=1, le=MOST_COUNT)
     """Worst cells in report.md."""
     reset: dict[str, Any] = spec({})
     """Reset terms, unless ``reset=starts_file`` names a file: what they add to the task's own terms

@@ -122,10 +122,14 @@ class PhaseCfg:
 
 @dataclass(slots=True)
 class ControllerCfg:
-    """The phases of the expert. Its joint targets go through the action terms of ``action``."""
+    """Drives the worlds. Its actions go through the action terms of ``action``."""
 
     name: str = spec()
-    """open_loop, closed_loop, state_based or policy."""
+    """open_loop, closed_loop, state_based, policy, custom, or one of your own."""
+    func: str = spec()
+    """Its driver: a subclass of ``mjstack.drivers.driver.Driver``."""
+    params: dict[str, Any] = spec({})
+    """Parameters of a driver of your own, by name."""
     action: dict[str, Any] = spec()
     """Its action terms, by name."""
     phases: dict[str, PhaseCfg] = spec({})

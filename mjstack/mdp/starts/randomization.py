@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mjstack.errors import ParameterError
 from mjstack.managers.view import EnvView, random_uniform
-from mjstack.scene.index import Columns
+from mjstack.sim.simulation import Columns
 
 
 class Randomized(ABC):

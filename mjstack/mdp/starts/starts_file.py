@@ -87,7 +87,8 @@ class StartsTable:
             slack = 1e-6 * np.maximum(abs(low), abs(high))  # float32 does not hold the ends exactly
             # A joint may have no limit
             fits = np.isfinite(values) & (values >= low - slack) & (values <= high + slack)
-            for world, *at in np.argwhere(~fits).tolist():
+            if not fits.all():
+                world, *at = (int(n) for n in np.unravel_index(fits.argmin(), fits.shape))
                 expected = f"{low[*at]:.6g} to {high[*at]:.6g}, it is {values[world, *at]:.6g}"
                 fix = "Correct it; ranges of mass, friction and gain are in reset.starts.params"
                 raise self.wrong(expected, fix, world, [name])
@@ -126,7 +127,7 @@ class FromStartsFile:
         friction: Sequence[float] = (0.8, 1.4),
         gain: Sequence[float] = (0.9, 1.1),
     ) -> None:
-        """Read the file and check every world in it.
+        """Read the file and check every number in it, and every world that is played.
 
         Args:
             env: The environment.
@@ -178,9 +179,9 @@ class FromStartsFile:
         fallback = getattr(robot(env), pose).double().cpu().numpy()
         command = np.where(np.isnan(values), fallback, values)
         starts = table.take(poses).reshape(table.worlds, len(objects), 6)
-        _check_worlds(env, table, starts, command)
+        _check_worlds(env, table, starts[:needed], command[:needed])  # those that are played
         for number, name in enumerate(objects):
-            if failure := out_of_reach(env, name, starts[:, number, :2]):
+            if failure := out_of_reach(env, name, starts[:needed, number, :2]):
                 world, problem = failure
                 fix = "Move it closer; tools/reachability.py draws a map"
                 expected = f"a place that the arm reaches; {problem}"
