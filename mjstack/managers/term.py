@@ -115,18 +115,13 @@ _pass_values: ContextVar[dict[Any, Any] | None] = ContextVar("_pass_values", def
 
 
 def in_one_pass(work: Callable[[], Result]) -> Result:
-    """Do work that does not change the state: a value that several terms need is computed once.
+    """The result of work that does not change the state: a value that several terms need is
+    computed once.
 
     An inner pass knows what the outer one has computed so far, and keeps the rest to itself,
     because it may be a branch of a captured graph. The values belong to a context, which Python
     leaves however the work ends: a ``finally`` clause that Ctrl-C cuts short would leave old values
     to every later step of the process.
-
-    Args:
-        work: What to do.
-
-    Returns:
-        The result of the work.
     """
     context = copy_context()
     context.run(_pass_values.set, dict(_pass_values.get() or {}))
@@ -139,19 +134,27 @@ def branches(device: torch.device, *works: Callable[[], Any]) -> list[Any]:
     """
     if device.type != "cuda":
         return [work() for work in works]
-    results: dict[int, Any] = {}
+    results: list[Any] = [None] * len(works)
 
     def keep(number: int, work: Callable[[], Any]) -> None:
         results[number] = in_one_pass(work)
 
     side_by_side(device, *(partial(keep, *pair) for pair in enumerate(works)))
-    return [results[number] for number in range(len(works))]
+    return results
 
 
 def known_values() -> dict[Any, Any]:
     """What the current pass has computed, to read and to add to; outside a pass a new dict."""
     values = _pass_values.get()
     return {} if values is None else values
+
+
+def pass_value(key: Any, compute: Callable[..., Any], /, *args: Any, **named: Any) -> Any:
+    """The value of this key in the current pass, computed where it is asked for first."""
+    values = known_values()
+    if key not in values:
+        values[key] = compute(*args, **named)
+    return values[key]
 
 
 def shared(compute: Callable[..., Tensor]) -> Callable[..., Tensor]:
@@ -161,11 +164,8 @@ def shared(compute: Callable[..., Tensor]) -> Callable[..., Tensor]:
 
     @wraps(compute)
     def value(env: EnvView, *names: str, **named: str) -> Tensor:
-        values = known_values()
         key = (id(env), compute, *names, *named.items())
-        if key not in values:
-            values[key] = compute(env, *names, **named)
-        return values[key]
+        return pass_value(key, compute, env, *names, **named)
 
     return value
 
@@ -192,14 +192,8 @@ class Term:
         masked: bool = False,
         base: type | None = None,
     ) -> None:
-        """Find the function or class and check its parameters.
-
-        Args:
-            label: Dotted configuration key, for errors.
-            cfg: Dotted name and parameters.
-            env: What the term is built on.
-            masked: The term takes a mask after the environment, as reset terms do.
-            base: The class that it must be a subclass of.
+        """Find the function or class, which may have to be a subclass of ``base``, and check its
+        parameters. A ``masked`` term takes a mask after the environment, as reset terms do.
 
         Raises:
             ConfigError: One of its parameters has a value that it cannot use.
@@ -228,12 +222,7 @@ class Term:
     def __call__(self, *args: Any) -> Any:
         """Call the term with the environment, and a mask if it takes one."""
         current_term.label = self.label
-        if self._key is None:
-            return self.call(*args)
-        values = known_values()
-        if self._key not in values:
-            values[self._key] = self.call(*args)
-        return values[self._key]
+        return self.call(*args) if self._key is None else pass_value(self._key, self.call, *args)
 
     def reset(self, mask: Tensor) -> None:
         """Let a term with a memory forget the masked worlds."""
@@ -244,13 +233,8 @@ class Term:
 def first_value(
     term: Term, env: EnvView, *, dims: tuple[int, ...] = (1,), boolean: bool = False
 ) -> Tensor:
-    """Call a value term for the first time and check what it returns.
-
-    Args:
-        term: The term.
-        env: Whose worlds they are.
-        dims: Allowed numbers of dimensions.
-        boolean: Whether truth values are expected, not numbers.
+    """Call a value term for the first time and check what it returns: numbers, or truth values if
+    ``boolean``, of one of the numbers of dimensions ``dims``.
 
     Raises:
         TermError: It raised an error, or returned no tensor, or one of a wrong shape,
