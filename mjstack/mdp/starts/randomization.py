@@ -19,19 +19,13 @@ class Randomized(ABC):
 
     All that follows from a value is computed in float64 from the value that the field holds, so
     that writing what was read changes nothing.
-
-    Attributes:
-        model_fields: The model fields that it needs.
-        ends: Smallest and largest value, over the nominal one.
-        columns: Names of its numbers in a file of starts.
-        nominal: The numbers that the ends are relative to, shape ``(n,)``, float64.
     """
 
     label = "reset.model"
-    model_fields: ClassVar[tuple[str, ...]]
-    ends: tuple[float, float]
-    columns: list[str]
-    nominal: Tensor
+    model_fields: ClassVar[tuple[str, ...]]  # that it needs
+    ends: tuple[float, float]  # smallest and largest value, over the nominal one
+    columns: list[str]  # names of its numbers in a file of starts
+    nominal: Tensor  # numbers that the ends are relative to, shape ``(n,)``, float64
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write the model fields."""
