@@ -89,18 +89,14 @@ def read_demonstrations(stage: Stage, widths: dict[str, int]) -> Demonstrations:
         return torch.as_tensor(columns[name][keep].astype(np.float32), device=device)
 
     played = len(ends[ranks.rank :: ranks.size])
-    done = (
-        "succeeded in" if _SUCCESS in columns else f"(none has {_SUCCESS}) are taken to succeed in"
-    )
-    stage.progress.print_line(
-        f"train: {len(episodes)} of {played} episodes of {folder} {done} the task"
-    )
+    counts = f"{len(episodes)} of {played} episodes of {folder}"
+    result = "succeeded" if _SUCCESS in columns else f"(none has {_SUCCESS}) are taken to succeed"
+    stage.progress.print_line(f"train: {counts} {result} in the task")
+    joined = np.cumsum([stop - start for start, stop in episodes], dtype=np.int64)
     return Demonstrations(
         seen=on_device("observation"),
         labels=on_device(_ACTION),
-        ends=torch.as_tensor(
-            np.cumsum([b - a for a, b in episodes]), dtype=torch.int64, device=device
-        ),
+        ends=torch.as_tensor(joined, device=device),
         widths=widths,
         played=played,
         seconds=time.perf_counter() - began,

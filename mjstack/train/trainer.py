@@ -25,23 +25,14 @@ FAILED = "failed."  # a column of the curve: judged episodes that broke the rule
 
 @dataclass(kw_only=True, slots=True)
 class Trained:
-    """The result of a training.
+    """The result of a training."""
 
-    Attributes:
-        metrics: Figures, by name with unit.
-        notes: Facts in words, by name.
-        curve: Rows of the training curve: values by column.
-        lines: Columns that are drawn.
-        abscissa: The column over which they are drawn.
-        scale: Of their axis, ``log`` or ``linear``.
-    """
-
-    metrics: dict[str, float]
-    notes: dict[str, str]
-    curve: list[Facts]
-    lines: list[str] = field(default_factory=lambda: ["success"])
-    abscissa: str = "batch"
-    scale: str = "linear"
+    metrics: dict[str, float]  # figures, by name with unit
+    notes: dict[str, str]  # facts in words, by name
+    curve: list[Facts]  # rows of the training curve: values by column
+    lines: list[str] = field(default_factory=lambda: ["success"])  # columns that are drawn
+    abscissa: str = "batch"  # the column over which they are drawn
+    scale: str = "linear"  # of their axis: log or linear
 
 
 @dataclass(frozen=True)
