@@ -27,9 +27,6 @@ class PointReach:
 
     Arm joints are hinges and slides. Those that are not ik joints stay at the robot's home, or
     where they are locked.
-
-    Attributes:
-        tip: The grasp point at home [m], shape ``(3,)``.
     """
 
     def __init__(self, model: mujoco.MjModel, robot: RobotCfg, gripper: Sequence[float]) -> None:
@@ -50,7 +47,7 @@ class PointReach:
         self._anchors = data.xanchor[joints].copy()
         self._axes = data.xaxis[joints].copy()
         sites = [model.site(name).id for name in robot.grasp_sites]
-        self.tip = data.site_xpos[sites].mean(axis=0)
+        self.tip = data.site_xpos[sites].mean(axis=0)  # the grasp point at home [m], ``(3,)``
         self._low, self._high = joint_limits(model, [model.joint(j).name for j in joints])
 
     def solve(self, points: ndarray) -> tuple[ndarray, ndarray]:

@@ -173,14 +173,6 @@ def shared(compute: Callable[..., Tensor]) -> Callable[..., Tensor]:
 class Term:
     """A term ready to be called: a function with its parameters, or an instance of a class built
     with them.
-
-    Attributes:
-        label: Dotted configuration key, for errors.
-        call: The function or instance.
-        params: Its parameters.
-        model_fields: Per-world model fields that it writes.
-        has_memory: Whether it keeps something from step to step.
-        ignores_success: Whether it is marked as such.
     """
 
     def __init__(
@@ -199,13 +191,13 @@ class Term:
             ConfigError: One of its parameters has a value that it cannot use.
             TermError: The name or a parameter is wrong, or the class raised an error.
         """
-        self.label = label
+        self.label = label  # dotted configuration key, for errors
         check_fields(label, cfg)
         func = resolve_func(label, cfg.func, base=base)
         self.params = dict(cfg.params)
         is_class = inspect.isclass(func)
         check_params(label, func, self.params, 1 if is_class or not masked else 2)
-        self.model_fields: Sequence[str] = getattr(func, "model_fields", ())
+        self.model_fields: Sequence[str] = getattr(func, "model_fields", ())  # that it writes
         self.ignores_success = getattr(func, "ignores_success", None) is func
         self.call: Any = partial(func, **self.params)
         if is_class:
@@ -213,7 +205,7 @@ class Term:
                 self.call = self.call(env)
             if hasattr(func, "label"):
                 self.call.label = label
-        self.has_memory = hasattr(self.call, "reset")
+        self.has_memory = hasattr(self.call, "reset")  # from step to step
         # Two groups may need the same: a function of the state gives both the same value, while
         # others may keep something.
         key = (id(env), func, repr(sorted(self.params.items())))

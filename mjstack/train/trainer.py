@@ -39,17 +39,14 @@ class Trained:
 class Trainer:
     """One way to train; ``conf/trainer/<name>.yaml`` names it.
 
-    Attributes:
-        check: Raises a `MjstackError` for what cannot be trained, before anything is written.
-            Returns the seeds of the starts that training uses.
-        train: Trains in a folder, in which it goes on with an earlier call's training, and leaves
-            the policies `LAST` and `BEST` there.
-        midway: Whether its worlds may start in the middle of an episode.
+    ``check`` raises a `MjstackError` for what cannot be trained, before anything is written, and
+    returns the seeds of the starts that training uses. ``train`` trains in a folder, in which it
+    goes on with an earlier call's training, and leaves the policies `LAST` and `BEST` there.
     """
 
     check: Callable[[Stage], range]
     train: Callable[[Stage, Path], Trained]
-    midway: bool = False
+    midway: bool = False  # whether its worlds may start in the middle of an episode
 
 
 def whole_starts(reset: dict[str, TermCfg]) -> dict[str, TermCfg]:
