@@ -88,9 +88,7 @@ def read_demonstrations(stage: Stage, widths: dict[str, int]) -> Demonstrations:
     return Demonstrations(
         seen=on_device("observation"),
         labels=on_device(_ACTION),
-        ends=torch.as_tensor(
-            np.cumsum([b - a for a, b in episodes]), dtype=torch.int64, device=device
-        ),
+        ends=torch.as_tensor(joined, device=device),
         widths=widths,
         played=played,
         seconds=time.perf_counter() - began,
