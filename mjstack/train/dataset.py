@@ -85,6 +85,7 @@ def read_demonstrations(stage: Stage, widths: dict[str, int]) -> Demonstrations:
     stage.progress.print_line(
         f"train: {len(episodes)} of {played} episodes of {stored.folder} {done} the task"
     )
+    joined = np.cumsum([stop - start for start, stop in episodes], dtype=np.int64)
     return Demonstrations(
         seen=on_device("observation"),
         labels=on_device(_ACTION),
