@@ -12,7 +12,6 @@ import torch
 
 from mjstack.datasets import DatasetSpec, EpisodeData
 from mjstack.datasets.part import Part, PartWriter
-from mjstack.datasets.spec import typed_episode
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.batches import Batch
@@ -114,14 +113,13 @@ class EpisodeSource:
                     name = f"rank{self._stage.ranks.rank:04d}-{len(files)}"
                     writer = PartWriter(self._folder, self._spec, name, images_gib=images_gib)
                 first_frame = frame + number * len(data.arrays[STATE])
-                typed = typed_episode(self._spec, data)
-                writer.write(data, task, *typed, episode + number, first_frame)
-                if writer.is_full():
+                writer.write(data, task, episode + number, first_frame)
+                if writer.is_full() or count == len(order):
                     files.append(writer.complete())
                     writer = None
                 label = f"episodes of seed {batch.plan.seed}"
                 self._stage.progress.advance(label, count, len(order))
-            return [*files, writer.complete()] if writer is not None else files
+            return files
         except BaseException:
             if writer is not None:
                 writer.abandon()
