@@ -50,16 +50,9 @@ class PartWriter:
     def __init__(
         self, folder: Path, spec: DatasetSpec, name: str, *, images_gib: float = IMAGES_GIB
     ) -> None:
-        """Begin files, whose name tells the processes apart.
-
-        Args:
-            folder: The dataset.
-            spec: Its columns and videos.
-            name: Part of the names.
-            images_gib: Images that may wait for being encoded [GiB].
-
-        Raises:
-            OSError: It cannot be written.
+        """Begin files of a dataset with columns and videos as of ``spec``. ``name`` tells those of
+        processes apart; ``images_gib`` is the most that images may take which wait for being
+        encoded. An OSError if they cannot be written.
         """
         self._spec = spec
         path = lerobot.shard_path(folder, lerobot.DATA, 0)
@@ -89,17 +82,9 @@ class PartWriter:
         return share * (1.0 + 1.0 / rows) > 1.0
 
     def write(self, episode: EpisodeData, task: int, number: int, start: int) -> None:
-        """Write an episode as a row group, so that it can be read without the others.
-
-        Args:
-            episode: The episode.
-            task: Number of its task in the dataset.
-            number: Its number in the dataset.
-            start: Number of its first frame there.
-
-        Raises:
-            FolderError: It does not fit the spec.
-            OSError: It cannot be written.
+        """Write an episode as a row group, so that it can be read without the others: its number,
+        that of its first frame (``start``) and of its task are those in the dataset. A FolderError
+        if it does not fit the spec, an OSError if it cannot be written.
         """
         row, columns = typed_episode(self._spec, episode)
         length = len(next(iter(columns.values())))

@@ -146,13 +146,8 @@ class EpisodeData:
 
 
 def term_columns(term: str, dim: int, history: int) -> list[str]:
-    """Names of the numbers of an observation term: ``red_pose.2``, and ``red_pose.2.t-1`` one step
-    before.
-
-    Args:
-        term: Its name.
-        dim: How many numbers it has, history included.
-        history: How many steps it has.
+    """Names of the ``dim`` numbers of an observation term, over all steps of its ``history``:
+    ``red_pose.2``, and ``red_pose.2.t-1`` one step before.
     """
     width = dim // history
     return [

@@ -13,14 +13,9 @@ def by_name(statistics: np.ndarray, count: int, *, video: bool = False) -> dict[
 
 
 def frame_statistics(frames: np.ndarray) -> np.ndarray:
-    """Statistics of every number over some frames.
-
-    Args:
-        frames: Shape ``(frames, dim)``.
-
-    Returns:
-        Shape ``(statistics, dim)``, in the order of `STATISTICS`; std is that of these frames
-        (divided by n), quantiles interpolate.
+    """Statistics of every number over some frames, shape ``(frames, dim)``; shape ``(statistics,
+    dim)``, in the order of `STATISTICS`. std is that of these frames (divided by n), quantiles
+    interpolate.
     """
     values = np.ascontiguousarray(frames.T, dtype=float)  # exact, but for int64 beyond 2^53
     quantiles = np.quantile(values, [*QUANTILES.values()], axis=1)

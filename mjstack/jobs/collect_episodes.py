@@ -88,18 +88,10 @@ class EpisodeSource:
     def write(
         self, batch: Batch, chosen: Sequence[int], episode: int, frame: int, task: int
     ) -> list[Part]:
-        """Write a batch's episodes into hidden files of the dataset.
-
-        Args:
-            batch: This rank's worlds.
-            chosen: Numbers of the worlds of all ranks whose episodes are kept.
-            episode: Number of the first of these episodes in the dataset.
-            frame: Number of its first frame.
-            task: Number of the task.
-
-        Raises:
-            FolderError: An episode does not fit the spec.
-            OSError: A file cannot be written.
+        """Write this rank's part of a batch into hidden files: of the worlds of all ranks those
+        that are ``chosen``. ``episode``, ``frame`` and ``task`` are numbers in the dataset: of the
+        first of these episodes, of its first frame, and of the task. A FolderError if an episode
+        does not fit the spec, an OSError if a file cannot be written.
         """
         worlds = batch.plan.worlds
         order = {world: number for number, world in enumerate(chosen) if world in worlds}
