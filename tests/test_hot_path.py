@@ -35,7 +35,7 @@ PATHS: dict[str, dict[str, str] | None] = {
         "_ValueManager": "begin _term_values",
     },
     "managers/view.py": {"": "random_uniform zero_rows"},
-    "managers/term.py": {"": "shared branches", "Term": "__call__ reset"},
+    "managers/term.py": {"": "pass_value shared branches", "Term": "__call__ reset"},
     "mdp/observation.py": None,
     "mdp/reward.py": None,
     "mdp/geometry.py": None,

@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
 from compositions import load_config, refusal
-from dataset_checker import contents, listed
+from dataset_checker import contents, listed, with_column
 from environments import SHORT_REACH, Patch, has_gl
 
 from mjstack.cli import run
@@ -100,19 +101,37 @@ def assert_quantiles(total: dict[str, Any], name: str, worlds: int, atol: float 
 
 
 def test_quantiles_are_kept_up_over_calls_and_versions(tmp_path: Path) -> None:
-    """An earlier version left no counts of pixels: those of the decoded images are taken."""
+    """An earlier version left no counts of pixels: those of the decoded images are taken, and its
+    files' columns stay the same.
+    """
     write(tmp_path, range(3))
     write(tmp_path, range(3, 4))
     total = json.loads((tmp_path / "meta/stats.json").read_text())
     for name in SIZES:
         assert_quantiles(total, name, 4)
-    path = tmp_path / "meta/episodes/chunk-000/file-000.parquet"
-    pq.write_table(pq.read_table(path).replace_schema_metadata(None), path)
+    rows = [tmp_path / f"meta/episodes/chunk-000/file-00{shard}.parquet" for shard in range(3)]
+    pixels = [f"pixels/{name}" for name in SIZES]
+    pq.write_table(pq.read_table(rows[0]).drop_columns(pixels), rows[0])
     (tmp_path / "meta/stats.json").unlink()
     DatasetWriter(tmp_path, SPEC).close()
     total = json.loads((tmp_path / "meta/stats.json").read_text())
     for name in SIZES:
         assert_quantiles(total, name, 4, atol=3.0 / 255.0)
+    pq.write_table(pq.read_table(rows[1]).drop_columns(pixels), rows[1])
+    write(tmp_path, range(4, 5))
+    assert len({tuple(sorted(pq.read_schema(path).names)) for path in rows}) == 1
+
+
+@pytest.mark.parametrize("value", [-1, 0, 2**40, 0.5, float("nan"), None])
+def test_strange_counts_of_pixels_are_one_line(value: Any, tmp_path: Path) -> None:
+    write(tmp_path, range(3))
+    path = tmp_path / "meta/episodes/chunk-000/file-000.parquet"
+    column = "pixels/observation.images.wrist"
+    table = pq.read_table(path)
+    pq.write_table(with_column(table, column, pa.array([[value] * 768] * len(table))), path)
+    for use in (read_dataset, lambda folder: DatasetWriter(folder, SPEC)):
+        with pytest.raises(FolderError, match=r"counts of pixels|not finite|without 768 numbers"):
+            use(tmp_path)
 
 
 def test_a_cut_video_is_one_line(tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ STATS = "meta/stats.json"
 TASKS = "meta/tasks.parquet"
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 STATISTICS = ("min", "max", "mean", "std", *QUANTILES)  # `count` stands beside them
-PIXELS = b"mjstack.pixels"  # key of an episodes file's counts of its videos' pixels, in JSON
+PIXELS = "pixels"  # columns of an episode's row: counts of its images' values, of each video
 # What pandas writes of a data frame of task indices whose index is the text
 _PANDAS = (
     '{"index_columns": ["task"], "column_indexes": [{"name": null, "field_name": null,'

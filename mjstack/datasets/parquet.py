@@ -55,15 +55,9 @@ def check_size(values: int, disk: int) -> None:
 
 
 def read_table(path: Path, widths: Mapping[str, int]) -> Any:
-    """Columns as an Arrow table. Texts are in dictionaries.
-
-    Args:
-        path: The file.
-        widths: Values that a row of each column has, at most.
-
-    Raises:
-        Exception: It cannot be read, is too large, or a column has other values than numbers and
-            texts.
+    """Columns as an Arrow table, whose rows have at most so many values of each as ``widths`` says.
+    Texts are in dictionaries. Raises if it cannot be read, is too large, or has other values than
+    numbers and texts.
     """
     file = open_file(path)
     disk = path.stat().st_size
@@ -98,14 +92,8 @@ def read_table(path: Path, widths: Mapping[str, int]) -> Any:
 
 
 def read_numbers(path: Path, widths: Mapping[str, int]) -> dict[str, np.ndarray]:
-    """Columns of numbers, each shape ``(rows, width)``, in the file's types.
-
-    Args:
-        path: The file.
-        widths: Numbers that a row of each column has.
-
-    Raises:
-        Exception: It cannot be read, is too large, or a row has not as many numbers.
+    """Columns of numbers, each shape ``(rows, width)``, in the file's types. Raises if it cannot be
+    read, is too large, or a row has not as many numbers as ``widths`` says.
     """
     table = read_table(path, widths)
     columns = {}

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mjstack.datasets import lerobot
-from mjstack.datasets.spec import INDICES, DatasetSpec, EpisodeData
+from mjstack.datasets.spec import INDICES, DatasetSpec, EpisodeData, typed_episode
 from mjstack.datasets.statistics import (
     by_name,
     count_pixels,
@@ -29,15 +29,13 @@ class Part:
     Attributes:
         path: The data file.
         videos: The file of each video.
-        rows: Rows of the episodes.
-        pixels: Of each video, as of `count_pixels`.
+        rows: Rows of the episodes, without their places.
         waited: Time for which the writer has waited for encoders [s].
     """
 
     path: Path
     videos: dict[str, Path] = field(default_factory=dict)
     rows: list[dict[str, Any]] = field(default_factory=list)
-    pixels: dict[str, np.ndarray] = field(default_factory=dict)
     waited: float = 0.0
 
 
@@ -52,16 +50,9 @@ class PartWriter:
     def __init__(
         self, folder: Path, spec: DatasetSpec, name: str, *, images_gib: float = IMAGES_GIB
     ) -> None:
-        """Begin files, whose name tells the processes apart.
-
-        Args:
-            folder: The dataset.
-            spec: Its columns and videos.
-            name: Part of the names.
-            images_gib: Images that may wait for being encoded [GiB].
-
-        Raises:
-            OSError: It cannot be written.
+        """Begin files of a dataset with columns and videos as of ``spec``. ``name`` tells those of
+        processes apart; ``images_gib`` is the most that images may take which wait for being
+        encoded. An OSError if they cannot be written.
         """
         self._spec = spec
         path = lerobot.shard_path(folder, lerobot.DATA, 0)
@@ -79,8 +70,7 @@ class PartWriter:
         for video in spec.videos:
             path = lerobot.shard_path(folder, lerobot.VIDEO, 0, video)
             self.part.videos[video] = path.with_name(f".file-{name}.mp4.part")
-        most = images_gib * 2**30
-        self._videos = VideoEncoder(spec.videos, spec.fps, self.part.videos, most)
+        self._videos = VideoEncoder(spec.videos, spec.fps, self.part.videos, images_gib * 2**30)
 
     def is_full(self) -> bool:
         """Whether one more episode like these would make the data file larger than
@@ -91,25 +81,12 @@ class PartWriter:
         share = max(data, self._videos.megabytes() / lerobot.VIDEO_MB, rows / lerobot.MOST_ROWS)
         return share * (1.0 + 1.0 / rows) > 1.0
 
-    def write(
-        self,
-        episode: EpisodeData,
-        task: int,
-        facts: dict[str, Any],
-        columns: dict[str, np.ndarray],
-        number: int,
-        start: int,
-    ) -> None:
-        """Write an episode as a row group, so that it can be read without the others.
-
-        Args:
-            episode: The episode.
-            task: Number of its task in the dataset.
-            facts: Values of its row.
-            columns: Its frames, as the spec has them.
-            number: Its number in the dataset.
-            start: Number of its first frame there.
+    def write(self, episode: EpisodeData, task: int, number: int, start: int) -> None:
+        """Write an episode as a row group, so that it can be read without the others: its number,
+        that of its first frame (``start``) and of its task are those in the dataset. A FolderError
+        if it does not fit the spec, an OSError if it cannot be written.
         """
+        row, columns = typed_episode(self._spec, episode)
         length = len(next(iter(columns.values())))
         frame = np.arange(length)
         indices: dict[str, np.ndarray] = {
@@ -130,23 +107,10 @@ class PartWriter:
         for name in self._spec.videos:
             pixels = count_pixels(episode.images[name][sampled])
             statistics[name] = by_name(image_statistics(pixels), len(sampled), video=True)
-            self.part.pixels[name] = self.part.pixels.get(name, 0) + pixels
-        rows = self.part.rows
-        first = rows[0]["dataset_from_index"] if rows else start
-        rows.append(
-            {
-                **lerobot.episode_columns(
-                    self._spec.videos, self._spec.fps, 0, number, first, start, start + length
-                ),
-                "tasks": [episode.task],
-                **facts,
-                **{
-                    f"stats/{name}/{kind}": values
-                    for name, kinds in statistics.items()
-                    for kind, values in kinds.items()
-                },
-            }
-        )
+            row[f"{lerobot.PIXELS}/{name}"] = pixels.ravel()
+        for name, kinds in statistics.items():
+            row |= {f"stats/{name}/{kind}": values for kind, values in kinds.items()}
+        self.part.rows.append({"length": length, "tasks": [episode.task], **row})
 
     def complete(self) -> Part:
         """Close the files; they are on the disk then."""

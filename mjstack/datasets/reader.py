@@ -12,7 +12,6 @@ from mjstack.config.fingerprint import differences
 from mjstack.datasets import lerobot, parquet, tables
 from mjstack.datasets.lerobot import STATISTICS, is_foreign, numeric_columns, videos_of
 from mjstack.datasets.spec import INDICES, DatasetSpec
-from mjstack.datasets.statistics import count_pixels, sampled_frames
 from mjstack.datasets.video import decode
 from mjstack.errors import FolderError, require_names
 from mjstack.files import refuse_links
@@ -83,24 +82,6 @@ class StoredDataset:
             with tables.readable(path):
                 columns.append(tables.read_columns(path, self.info, [name])[name])
         return np.concatenate(columns).reshape(-1, *shape)
-
-    def pixels(self, shard: int) -> dict[str, np.ndarray]:
-        """How many pixels of each video of a shard have each value, as of `count_pixels`: those
-        that its writer counted or, as an earlier version did not, those of the decoded images.
-
-        Raises:
-            FolderError: A file is missing or damaged.
-        """
-        path = lerobot.shard_path(self.folder, lerobot.EPISODES, shard)
-        with tables.readable(path):
-            if counts := tables.read_pixels(path, self.info):
-                return counts
-        counts = {name: np.zeros((3, 256), np.int64) for name in videos_of(self.info)}
-        for number, row in enumerate(self.episodes):
-            for name in counts if lerobot.shard_of(row) == shard else ():
-                images = self.images(name, number)
-                counts[name] += count_pixels(images[sampled_frames(row["length"])])
-        return counts
 
 
 def read_dataset(folder: Path | str, used: Iterable[str] = ()) -> StoredDataset:

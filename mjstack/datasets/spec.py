@@ -94,12 +94,13 @@ class DatasetSpec:
     def __post_init__(self) -> None:
         if not isinstance(self.fps, int) or self.fps < 1:
             raise ArgumentError("fps", self.fps, "a whole number of frames per second, at least 1")
+        names = [*INDICES, *self.features, *self.videos]
+        for name in names[len(INDICES) :]:
+            if "/" in name or names.count(name) > 1:
+                expected = f"a name without / that is not another column's or {', '.join(INDICES)}"
+                raise ArgumentError("columns", name, expected)
         for name, feature in self.features.items():
             label = f"features['{name}']"
-            if "/" in name or name in INDICES:
-                raise ArgumentError(
-                    label, name, f"a name without / other than {', '.join(INDICES)}"
-                )
             if feature.dtype not in DTYPES:
                 raise ArgumentError(f"{label}.dtype", feature.dtype, f"one of {', '.join(DTYPES)}")
             if not len(feature.names) == len(set(feature.names)) == len(feature.units) > 0:
@@ -108,8 +109,6 @@ class DatasetSpec:
                 )
         for name, video in self.videos.items():
             label = f"videos['{name}']"
-            if "/" in name or name in self.features or name in INDICES:
-                raise ArgumentError(label, name, "a name without / that no feature has")
             if video.codec not in CODECS:
                 raise ArgumentError(f"{label}.codec", video.codec, f"one of {', '.join(CODECS)}")
             if min(video.height, video.width) < 2 or video.height % 2 or video.width % 2:
@@ -147,13 +146,8 @@ class EpisodeData:
 
 
 def term_columns(term: str, dim: int, history: int) -> list[str]:
-    """Names of the numbers of an observation term: ``red_pose.2``, and ``red_pose.2.t-1`` one step
-    before.
-
-    Args:
-        term: Its name.
-        dim: How many numbers it has, history included.
-        history: How many steps it has.
+    """Names of the ``dim`` numbers of an observation term, over all steps of its ``history``:
+    ``red_pose.2``, and ``red_pose.2.t-1`` one step before.
     """
     width = dim // history
     return [

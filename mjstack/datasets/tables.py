@@ -5,6 +5,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping
 from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -109,25 +110,37 @@ def read_rows(folder: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
     """Rows of every episode."""
     rows: list[dict[str, Any]] = []
     videos = videos_of(info)
+    pixels = {f"{lerobot.PIXELS}/{name}" for name in videos}
     widths: dict[str, int] = {}
     for name, feature in info["features"].items():
         width = 3 if name in videos else math.prod(feature["shape"])
         widths |= {f"stats/{name}/{kind}": width for kind in STATISTICS}
         widths[f"stats/{name}/count"] = 1
-    names = {"tasks", *OWN_VALUES, *info["mjstack"]["values"]}
-    names |= lerobot.episode_columns(videos, 1.0, 0, 0, 0, 0, 0).keys()
+    types = {**OWN_VALUES, **info["mjstack"]["values"]}
+    place = partial(lerobot.episode_columns, videos, info["fps"])
+    names = {"tasks", *types, *place(0, 0, 0, 0, 0)}
     for shard, path in enumerate(data_files(folder, info, lerobot.EPISODES)):
         with readable(path):
-            parquet.check_names(path, names | widths.keys())
-            first = start = rows[-1]["dataset_to_index"] if rows else 0
-            for row in parquet.read_table(path, dict.fromkeys(names, 1)).to_pylist():
-                _check_row(info, row, shard, len(rows), start, first)
-                start = row["dataset_to_index"]
-                rows.append(row)
-            statistics = parquet.read_numbers(path, widths)
-            if not all(np.isfinite(values).all() for values in statistics.values()):
+            columns = dict(widths)
+            if not pixels.isdisjoint(parquet.open_file(path).schema_arrow.names):
+                columns |= dict.fromkeys(pixels, 3 * 256)  # an earlier version left none
+            parquet.check_names(path, names | columns.keys())
+            numbers = parquet.read_numbers(path, columns)
+            if not all(np.isfinite(values).all() for values in numbers.values()):
                 raise ValueError("statistics that are not finite")
-            read_pixels(path, info)
+            counts = {name: numbers[name] for name in pixels & columns.keys()}
+            for name, values in counts.items():
+                sums = values.reshape(-1, 256).sum(1, dtype=float)
+                possible = values.min() >= 0 and 1 <= sums.min() <= sums.max() < 2**40
+                if values.dtype != np.int64 or not possible:
+                    raise ValueError(f"{name} has other values than counts of pixels")
+            first = start = rows[-1]["dataset_to_index"] if rows else 0
+            table = parquet.read_table(path, dict.fromkeys(names, 1)).to_pylist()
+            for k, row in enumerate(table):
+                end = start + row["length"]
+                _check_row(row, place(shard, len(rows), first, start, end), types)
+                start = end
+                rows.append(row | {name: values[k] for name, values in counts.items()})
         for video in videos:
             path = lerobot.shard_path(folder, lerobot.VIDEO, shard, video)
             with readable(path):
@@ -135,37 +148,16 @@ def read_rows(folder: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
     return rows
 
 
-def _check_row(
-    info: Mapping[str, Any], row: dict[str, Any], shard: int, number: int, start: int, first: int
-) -> None:
-    """Raise an error of any kind where a row is not that of an episode of this number, whose first
-    frame is ``start``, in a shard whose first frame is ``first``.
+def _check_row(row: Mapping[str, Any], places: Mapping[str, Any], types: Mapping[str, str]) -> None:
+    """Raise an error of any kind where a row is not that of an episode at these places, or has
+    values of other types.
     """
-    end = start + row["length"]
-    expected = lerobot.episode_columns(
-        videos_of(info), info["fps"], shard, number, first, start, end
-    )
-    for name, value in expected.items():
+    number = places["episode_index"]
+    for name, value in places.items():
         if row[name] != value:
             raise ValueError(f"row {number}: {name} is {row[name]!r:.60}, expected {value}")
-    for name, dtype in {**OWN_VALUES, **info["mjstack"]["values"]}.items():
+    for name, dtype in types.items():
         if type(row[name]) is not VALUE_DTYPES[dtype][1]:
             raise ValueError(f"row {number}: {name} is {row[name]!r:.60}, expected {dtype}")
     if row["length"] < 1 or min(row["seed"], row["world"]) < 0 or len(row["tasks"]) != 1:
         raise ValueError(f"row {number} has no frames, no task, or a negative seed or world")
-
-
-def read_pixels(path: Path, info: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Counts of the pixels of a shard's videos; empty if its writer left none.
-
-    Raises:
-        Exception: They are damaged.
-    """
-    text = (parquet.open_file(path).schema_arrow.metadata or {}).get(lerobot.PIXELS)
-    if text is None:
-        return {}
-    pixels = {name: np.array(json.loads(text)[name], np.int64) for name in videos_of(info)}
-    for name, counts in pixels.items():
-        if counts.shape != (3, 256) or counts.min() < 0 or counts.sum(1).min() < 1:
-            raise ValueError(f"the counts of the pixels of {name} are damaged")
-    return pixels

@@ -29,16 +29,9 @@ _PIXELS = ["-f", "rawvideo", "-pix_fmt", "rgb24"]
 
 
 def encode(images: np.ndarray, fps: int, codec: str, path: Path | None = None) -> None:
-    """Write images as an mp4.
-
-    Args:
-        images: Shape ``(frames, height, width, 3)``, uint8.
-        fps: Images per second.
-        codec: One of `CODECS`.
-        path: The file; None to encode without keeping the result.
-
-    Raises:
-        OSError: The encoder has failed, such as on a full disk.
+    """Write images, shape ``(frames, height, width, 3)``, uint8, ``fps`` a second, as an mp4 with
+    one of `CODECS`; without a path the result is not kept. An OSError if the encoder fails, such as
+    on a full disk.
     """
     height, width = images.shape[1:3]
     size = ["-s", f"{width}x{height}", "-r", str(fps)]
@@ -61,20 +54,8 @@ def join(paths: Sequence[Path], path: Path) -> None:
 
 
 def decode(path: Path, video: Video, start: float, frames: int, fps: int) -> np.ndarray:
-    """Read images of a video.
-
-    Args:
-        path: The file.
-        video: What it holds.
-        start: Time of the first one [s].
-        frames: How many.
-        fps: Images per second.
-
-    Returns:
-        Shape ``(frames, height, width, 3)``, uint8.
-
-    Raises:
-        OSError: The file cannot be read.
+    """Read so many images of a video, ``fps`` a second from ``start`` [s] on, shape ``(frames,
+    height, width, 3)``, uint8. An OSError if the file cannot be read.
     """
     seek = ["-ss", f"{max(0.0, start - 0.5 / fps):.6f}"]
     content = _ffmpeg([*seek, "-i", str(path), "-frames:v", str(frames), *_PIXELS, "-"])
@@ -153,13 +134,9 @@ class VideoEncoder:
     def __init__(
         self, videos: Mapping[str, Video], fps: int, paths: Mapping[str, Path], most: float
     ) -> None:
-        """Begin.
-
-        Args:
-            videos: The videos by name.
-            fps: Images per second.
-            paths: The file of each. Files of its episodes lie beside it until they are joined.
-            most: Images that may wait for an encoder [bytes].
+        """Begin videos by name, ``fps`` images a second, with the file of each, beside which files
+        of its episodes lie until they are joined. ``most`` is how much images may take which wait
+        for an encoder [bytes].
         """
         self.waited = 0.0
         self._videos = videos

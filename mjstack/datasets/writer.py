@@ -4,11 +4,10 @@ committed.
 
 import contextlib
 import io
-import itertools
 import json
 import os
 import weakref
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +15,12 @@ import numpy as np
 
 from mjstack.datasets import lerobot, reader, tables
 from mjstack.datasets.part import Part, PartWriter
+from mjstack.datasets.reader import StoredDataset
 from mjstack.datasets.spec import DatasetSpec, EpisodeData, typed_episode
 from mjstack.datasets.statistics import (
-    RunningStatistics,
     by_name,
+    count_pixels,
+    frame_statistics,
     image_statistics,
     sampled_frames,
 )
@@ -71,9 +72,10 @@ class DatasetWriter:
         self._shards = 0
         self._provenance: list[dict[str, Any]] = []
         self._tasks: dict[str, int] = {}
-        self._statistics: dict[str, RunningStatistics] = {}  # of the committed frames
-        self._pixels: dict[str, np.ndarray] = {}  # of those of their images that are sampled
-        self._sampled = 0
+        self._described = 0  # frames that the statistics are of
+        self._pixels = {name: np.zeros((3, 256), np.int64) for name in spec.videos}
+        self._sampled = 0  # frames whose pixels are counted
+        self._left_out: list[str] = []  # columns that an earlier version has not begun
         self._part: PartWriter | None = None  # since the last commit
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -108,16 +110,17 @@ class DatasetWriter:
             FolderError: It cannot be written; the writer is closed, and what was committed is
                 kept.
         """
-        checked = [typed_episode(self.spec, episode) for episode in episodes]
-        for episode, (facts, columns) in zip(episodes, checked, strict=True):
+        for episode in episodes:
+            typed_episode(self.spec, episode)
+        for episode in episodes:
             with self.guarded():
                 if self._part is None:
                     self._part = PartWriter(self.folder, self.spec, f"{self._shards:06d}")
                 rows = self._part.part.rows
                 number = len(self.committed) + len(rows)
-                start = rows[-1]["dataset_to_index"] if rows else self.frames
+                start = self.frames + sum(row["length"] for row in rows)
                 task = self.number_task(episode.task)
-                self._part.write(episode, task, facts, columns, number, start)
+                self._part.write(episode, task, number, start)
             if self._part.is_full():
                 self.flush()
 
@@ -148,6 +151,8 @@ class DatasetWriter:
         try:
             if self._open:
                 self.flush()
+                with self.guarded():
+                    self._write_statistics()
         finally:
             self._open = False
             self._unlock()
@@ -158,8 +163,10 @@ class DatasetWriter:
         if stored is not None:
             self._tasks = {task: index for index, task in enumerate(stored.tasks)}
             self._provenance = stored.info["mjstack"]["provenance"]
-            for shard, rows in itertools.groupby(stored.episodes, lerobot.shard_of):
-                self._count(shard, rows, stored.pixels(shard))
+            for row in stored.episodes:
+                self._count(row, stored)
+            pixels = [f"{lerobot.PIXELS}/{name}" for name in self.spec.videos]
+            self._left_out = [n for n in pixels if any(n not in row for row in stored.episodes)]
             self._shards = stored.info["mjstack"]["shards"]
         for path in reader.uncommitted(self.folder, self._shards):
             path.unlink()
@@ -170,10 +177,12 @@ class DatasetWriter:
         *_, last = [{"from_episode": 0}, *self._provenance]
         if last != {"from_episode": last["from_episode"], **now}:
             self._provenance.append({"from_episode": count, **now})
-        self._write_totals()
+        (self.folder / "meta").mkdir(exist_ok=True)
+        write_atomic(self.folder / lerobot.INFO, lerobot.to_json(self._make_info()))
 
     def _commit(self, parts: Sequence[Part]) -> None:
         """Put the frames to their places, then what says what is in them, and info.json last."""
+        self._write_table(lerobot.tasks_table(list(self._tasks)), self.folder / lerobot.TASKS)
         for shard, part in enumerate(parts, self._shards):
             moves = {lerobot.shard_path(self.folder, lerobot.DATA, shard): part.path}
             for name, hidden in part.videos.items():
@@ -181,20 +190,20 @@ class DatasetWriter:
             for path, hidden in moves.items():
                 path.parent.mkdir(parents=True, exist_ok=True)
                 os.replace(hidden, path)
-            files = ["data", "meta/episodes", *(f"videos/{name}" for name in part.videos)]
-            for row in part.rows:
-                for name, index in lerobot.shard_indices(shard).items():
-                    row |= {f"{file}/{name}": index for file in files}
             self.waited += part.waited
-        self._write_table(lerobot.tasks_table(list(self._tasks)), self.folder / lerobot.TASKS)
-        for shard, part in enumerate(parts, self._shards):
-            pixels = {name: counts.tolist() for name, counts in part.pixels.items()}
-            rows = self._pa.Table.from_pylist(part.rows)
-            rows = rows.replace_schema_metadata({lerobot.PIXELS: json.dumps(pixels)})
+            first = self.frames
+            for number, row in enumerate(part.rows, len(self.committed)):
+                end = self.frames + row["length"]
+                row |= lerobot.episode_columns(
+                    self.spec.videos, self.spec.fps, shard, number, first, self.frames, end
+                )
+                self._count(row)
+            rows = self._pa.Table.from_pylist(part.rows).drop_columns(self._left_out)
             self._write_table(rows, lerobot.shard_path(self.folder, lerobot.EPISODES, shard))
-            self._count(shard, part.rows, part.pixels)
         self._shards += len(parts)
-        self._write_totals()
+        if self.frames > 2 * self._described:  # all frames are read: not in every commit
+            self._write_statistics()
+        write_atomic(self.folder / lerobot.INFO, lerobot.to_json(self._make_info()))
 
     def _write_table(self, table: Any, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -202,35 +211,39 @@ class DatasetWriter:
         self._parquet.write_table(table, buffer)
         write_atomic(path, buffer.getvalue())
 
-    def _count(
-        self, shard: int, rows: Iterable[dict[str, Any]], pixels: Mapping[str, np.ndarray]
-    ) -> None:
-        """Count a shard, by its frames, its episodes' rows and the pixels of its videos."""
-        path = lerobot.shard_path(self.folder, lerobot.DATA, shard)
-        columns = lerobot.columns_of(self.spec)
-        with tables.readable(path):
-            frames = tables.read_columns(path, lerobot.make_info(self.spec), columns)
-        for name, (_, dim) in columns.items():
-            self._statistics.setdefault(name, RunningStatistics(dim)).add(frames[name])
-        for name, counts in pixels.items():
-            self._pixels[name] = self._pixels.get(name, 0) + counts
-        for row in rows:
-            self.frames += row["length"]
-            self._sampled += len(sampled_frames(row["length"]))
-            self.committed.append((row["seed"], row["world"]))
+    def _count(self, row: dict[str, Any], stored: StoredDataset | None = None) -> None:
+        """Count an episode by its row. Where that has no counts of pixels, as an earlier version
+        left none, they are of the images of ``stored``.
+        """
+        sampled = sampled_frames(row["length"])
+        for name, counts in self._pixels.items():
+            column = f"{lerobot.PIXELS}/{name}"
+            if stored is None or column in row:
+                counts += row[column].reshape(counts.shape)
+            else:
+                counts += count_pixels(stored.images(name, row["episode_index"])[sampled])
+        self.frames += row["length"]
+        self._sampled += len(sampled)
+        self.committed.append((row["seed"], row["world"]))
 
-    def _write_totals(self) -> None:
-        """Write statistics, and last the file that says what counts."""
-        (self.folder / "meta").mkdir(exist_ok=True)
-        if self._shards:
-            stats = {
-                name: by_name(running.statistics(), running.count)
-                for name, running in self._statistics.items()
-            }
-            for name, pixels in self._pixels.items():
-                stats[name] = by_name(image_statistics(pixels), self._sampled, video=True)
-            write_atomic(self.folder / lerobot.STATS, lerobot.to_json(stats))
-        info = lerobot.make_info(
+    def _write_statistics(self) -> None:
+        """Write statistics of all frames that are committed."""
+        if not self.committed:
+            return
+        info = self._make_info()
+        stored = StoredDataset(folder=self.folder, info=info, tasks=[], episodes=[])
+        stats = {}
+        for name in lerobot.numeric_columns(info):
+            # Number by number: all of them in float64 may not fit into memory
+            columns = [frame_statistics(values[:, None]) for values in stored.frames(name).T]
+            stats[name] = by_name(np.concatenate(columns, axis=1), self.frames)
+        for name, pixels in self._pixels.items():
+            stats[name] = by_name(image_statistics(pixels), self._sampled, video=True)
+        write_atomic(self.folder / lerobot.STATS, lerobot.to_json(stats))
+        self._described = self.frames
+
+    def _make_info(self) -> dict[str, Any]:
+        return lerobot.make_info(
             self.spec,
             provenance=self._provenance,
             episodes=len(self.committed),
@@ -238,7 +251,6 @@ class DatasetWriter:
             tasks=len(self._tasks),
             shards=self._shards,
         )
-        write_atomic(self.folder / lerobot.INFO, lerobot.to_json(info))
 
     @contextlib.contextmanager
     def guarded(self) -> Iterator[None]:
@@ -258,6 +270,9 @@ class DatasetWriter:
                 self._part.abandon()
                 self._part = None
             info = tables.read_info(self.folder)
+            if info["total_frames"] == self.frames > self._described:  # not amid a commit
+                with contextlib.suppress(OSError):
+                    self._write_statistics()
             del self.committed[info["total_episodes"] :]
             self.frames = info["total_frames"]
             for path in reader.uncommitted(self.folder, info["mjstack"]["shards"]):

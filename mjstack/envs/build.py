@@ -73,16 +73,9 @@ def build_env(
     """Build an environment with its simulation. Gates, whose simulation is shared, build `Env` on
     that.
 
-    Args:
-        cfg: The configuration.
-        nworld: Number of worlds, if not the configured one.
-        model: The scene, if it has been compiled before.
-        backend: Overrides the configured backend.
-        device: Overrides the configured device.
-        sizes: Overrides MJWarp's buffer sizes, which by default have room for random actions. With
-            ``batch=auto`` they are measured first, in worlds that are gone again before these are
-            made.
-        first_world: Number of the first world; see `Env`.
+    Arguments override what is configured; ``model`` is the scene, if it has been compiled before,
+    and ``first_world`` as of `Env`. MJWarp's buffers have room for random actions by default. With
+    ``batch=auto`` they are measured first, in worlds that are gone again before these are made.
 
     Raises:
         ArgumentError: The number of the first world is negative.

@@ -11,12 +11,9 @@ from mjstack.sim.cameras import Cameras, Masks
 
 
 class CameraSchedule:
-    """Draws each camera at its rate, counted from the start of each world's episode.
-
-    Attributes:
-        cameras: What draws; None without cameras.
-        images: Images by output and camera, see `Cameras.allocate`.
-        final_images: Those of the last state of an episode, of cameras with ``terminal``.
+    """Draws each camera at its rate, counted from the start of each world's episode, into
+    ``images`` by output and camera, as of `Cameras.allocate`; and cameras with ``terminal`` in the
+    last state of an episode into ``final_images``. Without cameras ``cameras`` is None.
     """
 
     def __init__(self, env: EnvView) -> None:
@@ -25,8 +22,7 @@ class CameraSchedule:
         Raises:
             ConfigError: They do not fit into the device's memory.
         """
-        scene = env.cfg.scene
-        cameras = {name: camera for name, camera in scene.cameras.items() if camera.outputs}
+        cameras = {n: camera for n, camera in env.cfg.scene.cameras.items() if camera.outputs}
         self._env = env
         timing = env.cfg.timing
         self._decimation = timing.policy_decimation

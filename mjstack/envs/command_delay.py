@@ -10,11 +10,8 @@ from mjstack.managers.view import EnvView, random_uniform
 
 
 class CommandDelay:
-    """Holds the commands that physics has not seen yet, the oldest first.
-
-    Attributes:
-        steps: Control steps by which the commands of each world are late, shape ``(nworld,)``,
-            int64.
+    """Holds the commands that physics has not seen yet, the oldest first. Those of each world are
+    late by ``steps`` control steps, shape ``(nworld,)``, int64.
     """
 
     def __init__(self, env: EnvView) -> None:
@@ -24,7 +21,7 @@ class CommandDelay:
         self._least = timing.command_delay
         self._choices = 1 + timing.random_delay
         self.steps = torch.full_like(env.world, self._least)
-        most = timing.command_delay + timing.random_delay
+        most = self._least + timing.random_delay
         self._waiting = env.sim.ctrl.new_zeros((most, *env.sim.ctrl.shape))
 
     @contextmanager

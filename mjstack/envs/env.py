@@ -106,7 +106,6 @@ class Env:
         self.given_places: dict[str, Tensor] = {}
         self.success = torch.zeros(sim.nworld, dtype=torch.bool, device=sim.device)
         self._all_worlds = torch.ones_like(self.success)
-        self._no_worlds = sim.no_worlds
         self._version = 0
         self._started = False
         self._closed = False
@@ -216,7 +215,7 @@ class Env:
         """The part of `step` that is the same at every step: it acts on the action that was
         processed last. On CUDA it has no host read, so that a larger graph may hold it.
         """
-        ended: Tensor | None = None
+        ended = None
         for left in reversed(range(self.cfg.timing.policy_decimation)):
             self.action_manager.apply()
             self._step_physics()
@@ -302,11 +301,11 @@ class Env:
                 ends.begin()
                 return lost
 
-            succeed = partial(self.success_term or (lambda _: self._no_worlds), self)
+            succeed = partial(self.success_term or (lambda _: self.sim.no_worlds), self)
             begun = [partial(rewards.begin, name) for name in rewards.early]
             achieved, lost, *_ = branches(self.device, succeed, begin_ends, *begun, *early)
             # None where the host can see that there are none
-            none_lost = lost is self._no_worlds or not (lost.is_cuda or bool(lost.any()))
+            none_lost = lost is self.sim.no_worlds or not (lost.is_cuda or bool(lost.any()))
             broken = None if none_lost else lost
             if ended is not None:  # their success stays
                 achieved = torch.where(ended, self.success, achieved)

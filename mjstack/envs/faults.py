@@ -33,11 +33,8 @@ class FaultLatch:
     """Keeps the faults of every world of an environment until it is cleared."""
 
     def __init__(self, env: "Env", *, check: bool) -> None:
-        """Allocate for the worlds of an environment whose managers are there.
-
-        Args:
-            env: The environment.
-            check: Whether faults of its steps are recorded.
+        """Allocate for an environment whose managers are there; ``check`` says whether faults of
+        its steps are recorded.
         """
         self._env = env
         self._check = check
@@ -47,7 +44,7 @@ class FaultLatch:
         self._faults = torch.zeros((n, len(_FIXES)), dtype=torch.bool, device=env.device)
         self._reward = torch.zeros(n, device=env.device)  # NaN if one was not finite
         self._overflow = torch.zeros(n, dtype=torch.int32, device=env.device)
-        self._none = torch.zeros(n, dtype=torch.bool, device=env.device)
+        self._none = env.sim.no_worlds
         ends_on = {offered(term.func, "ends_on") for term in env.cfg.termination.values()}
         # A world's own overflow may end its episode; that of the shared pool voids the whole batch.
         self._lost = POOL if "overflow" in ends_on else LOST_PHYSICS
@@ -86,7 +83,7 @@ class FaultLatch:
         groups = env.observation_manager.groups.values()
         seen = not_finite(*groups) if groups else self._none
         state = self._none if self._state_ends else broken
-        # Seen in a world that is broken anyway says nothing: True is more than False
+        # In a world that is broken the observation adds nothing: True is more than False
         faults = (env.action_manager.not_finite(), state, self._none, seen > broken)
         self._faults |= torch.stack(faults, dim=1)
 
@@ -131,21 +128,17 @@ class FaultLatch:
         """Names of the terms behind a number that is not finite, as far as their last values
         tell.
         """
-        rewards = self._env.reward_manager
         if "reward" in what:
-            finite = torch.isfinite(rewards.values[world]).tolist()
-            pairs = zip(rewards.names, finite, strict=True)
+            rewards = self._env.reward_manager
+            pairs = zip(rewards.names, rewards.values[world].isfinite().tolist(), strict=True)
             return [f"reward.{name}" for name, is_finite in pairs if not is_finite]
         observations = self._env.observation_manager
         return observations.not_finite_terms(world) if "observation" in what else []
 
 
 def describe_loss(overflow: np.ndarray, sizes: BatchSizes | None) -> tuple[str, list[str]]:
-    """Which buffers overflowed in which worlds, and the keys to raise; empty if none did.
-
-    Args:
-        overflow: Bits of `Overflow` raised in each world, shape ``(nworld,)``.
-        sizes: The room there was, or None on native MuJoCo.
+    """Which buffers overflowed in which worlds, and the keys to raise; empty if none did. Takes
+    bits of `Overflow` of each world, shape ``(nworld,)``, and the room there was, if it is fixed.
     """
     bits = int(np.bitwise_or.reduce(overflow))
     if not bits:

@@ -27,12 +27,9 @@ class Outputs:
         self._final_success = torch.zeros_like(env.success)
 
     def write_final(self, broken: Tensor | None) -> None:
-        """Keep success and the observations of this step, before a reset changes them.
-
-        Args:
-            broken: Worlds whose state is not finite, shape ``(nworld,)``, bool; None if there are
-                none. Their last observation is 0 where it is NaN, which a value times 0 would hand
-                on.
+        """Keep success and the observations of this step, before a reset changes them. Those of
+        ``broken`` worlds, whose state is not finite, shape ``(nworld,)``, bool, or None, are 0
+        where they are NaN, which a value times 0 would hand on.
         """
         self._final_success.copy_(self._env.success)
         for name, final in self._final.items():

@@ -104,15 +104,10 @@ def draw_seen(
 def moving_worlds(
     stage: Stage, env: Env, qpos: Tensor, failed: np.ndarray, names: Mapping[int, str], seen: int
 ) -> list[World]:
-    """Worlds of a batch in motion.
-
-    Args:
-        stage: On which they were played.
-        env: The worlds, as the episode left them.
-        qpos: Positions that `motion_recorder` has recorded.
-        failed: Bits of the task's rules, shape ``(nworld,)``.
-        names: Of the worlds that are shown, by their rows; the rules that they broke follow.
-        seen: How many of them show what their driver saw.
+    """Worlds of a batch in motion, as an episode on the stage has left them: positions that
+    `motion_recorder` has recorded, bits of the task's rules, shape ``(nworld,)``, and the names of
+    the worlds that are shown, by their rows; the rules that they broke follow. So many as ``seen``
+    show what their driver saw.
     """
     rules = stage.check.rules
     stride = frame_stride(stage.cfg.timing.step_dt)

@@ -163,15 +163,9 @@ class Run:
         env: Env,
         title: str = "",
     ) -> None:
-        """Show a world that was played alone, on the run's page if that has worlds in motion.
-
-        Args:
-            part: The part of the run that has played it.
-            label: Its text on the page.
-            qpos: Positions at every step end, shape ``(steps, nq)``.
-            status: How it ended.
-            env: The world.
-            title: Title of the run's pictures, if they show it too.
+        """Show a world that was played alone, under a label, on the run's page if that has worlds
+        in motion; with a title on the run's pictures too. ``part`` is the part of the run that has
+        played it, ``qpos`` its positions at every step end, shape ``(steps, nq)``.
         """
         (fields,) = world_fields(self.stage, env, [0])
         if self.page.motion:

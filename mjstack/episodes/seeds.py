@@ -45,17 +45,11 @@ def play_seeds(
     signs: bool = False,
     observers: Callable[[int], Sequence[Observer]],
 ) -> EpisodeTally:
-    """Play seed after seed in as many worlds as are configured, and record each.
-
-    A seed that breaks ends it, and those before it still count; the first one's error is raised.
-
-    Args:
-        run: The run.
-        gate: The gate, which names the files.
-        count: Number of seeds, from the configured one on.
-        noun: The things that are counted, such as ``worlds``.
-        signs: Whether starts and signs of failure are recorded too.
-        observers: More observers, by seed.
+    """Play ``count`` seeds, from the configured one on, in as many worlds as are configured, and
+    record each for a gate, which names the files. A seed that breaks ends it, and those before it
+    still count; the first one's error is raised. ``noun`` names what is counted, such as
+    ``worlds``; with ``signs``, starts and signs of failure are recorded too; ``observers`` gives
+    more of them by seed.
     """
     folder = run.folder
     seeds = range(run.cfg.seed, run.cfg.seed + count)

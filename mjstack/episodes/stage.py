@@ -220,13 +220,8 @@ class Stage:
     def simulation(
         self, nworld: int, backend: Backend, device: str, *, sizes: BatchSizes | None = None
     ) -> Simulation:
-        """Worlds that can start as the configuration says.
-
-        Args:
-            nworld: How many.
-            backend: Native or MJWarp.
-            device: ``cpu`` or ``cuda:N``.
-            sizes: Buffer sizes, if not those of the batch.
+        """So many worlds that can start as the configuration says, on a backend and a device,
+        ``cpu`` or ``cuda:N``, with buffer sizes of the batch unless there are others.
         """
         if sizes is None and backend is Backend.mjwarp:
             sizes = self.sizes

@@ -159,14 +159,9 @@ class EpisodeTally:
         thresholds: dict[str, float],
         tables: Sequence[Table] = (),
     ) -> GateResult:
-        """The episodes as the gate's result; with a problem it has failed.
-
-        Args:
-            parts: The result in words, before failures and problems.
-            passed: Whether enough episodes succeeded.
-            metrics: More of them than `metrics`.
-            thresholds: More of them than the check's.
-            tables: More of them than `tables`.
+        """The episodes as the gate's result, in words (``parts``) before failures and problems;
+        with a problem it has failed. Metrics, thresholds and tables add to those of the tally and
+        the check.
         """
         bits = self.array("failed")
         failed = np.flatnonzero(bits)

@@ -149,14 +149,9 @@ def _report(stage: Stage, result: GateResult, agreements: dict[str, _Agreement])
 def agree(
     camera: str, native: Images, mjwarp: Images, labels: list[str], least_pixels: int
 ) -> _Agreement:
-    """How far images of a camera agree.
-
-    Args:
-        camera: Its name.
-        native: Images of native MuJoCo by output and camera, one of each state.
-        mjwarp: Images of MJWarp.
-        labels: Names of the things in the segmentation.
-        least_pixels: Things with fewer pixels, of both backends' images together, are left out.
+    """How far images of a camera agree, by output and camera, one of each state. Of the things in
+    the segmentation, whose names are ``labels``, those with fewer pixels in both backends' images
+    together than ``least_pixels`` are left out.
     """
     a = native[f"segmentation.{camera}"]
     b = mjwarp[f"segmentation.{camera}"]

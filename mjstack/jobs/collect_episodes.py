@@ -12,7 +12,6 @@ import torch
 
 from mjstack.datasets import DatasetSpec, EpisodeData
 from mjstack.datasets.part import Part, PartWriter
-from mjstack.datasets.spec import typed_episode
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.batches import Batch
@@ -89,18 +88,10 @@ class EpisodeSource:
     def write(
         self, batch: Batch, chosen: Sequence[int], episode: int, frame: int, task: int
     ) -> list[Part]:
-        """Write a batch's episodes into hidden files of the dataset.
-
-        Args:
-            batch: This rank's worlds.
-            chosen: Numbers of the worlds of all ranks whose episodes are kept.
-            episode: Number of the first of these episodes in the dataset.
-            frame: Number of its first frame.
-            task: Number of the task.
-
-        Raises:
-            FolderError: An episode does not fit the spec.
-            OSError: A file cannot be written.
+        """Write this rank's part of a batch into hidden files: of the worlds of all ranks those
+        that are ``chosen``. ``episode``, ``frame`` and ``task`` are numbers in the dataset: of the
+        first of these episodes, of its first frame, and of the task. A FolderError if an episode
+        does not fit the spec, an OSError if a file cannot be written.
         """
         worlds = batch.plan.worlds
         order = {world: number for number, world in enumerate(chosen) if world in worlds}
@@ -114,14 +105,13 @@ class EpisodeSource:
                     name = f"rank{self._stage.ranks.rank:04d}-{len(files)}"
                     writer = PartWriter(self._folder, self._spec, name, images_gib=images_gib)
                 first_frame = frame + number * len(data.arrays[STATE])
-                typed = typed_episode(self._spec, data)
-                writer.write(data, task, *typed, episode + number, first_frame)
-                if writer.is_full():
+                writer.write(data, task, episode + number, first_frame)
+                if writer.is_full() or count == len(order):
                     files.append(writer.complete())
                     writer = None
                 label = f"episodes of seed {batch.plan.seed}"
                 self._stage.progress.advance(label, count, len(order))
-            return [*files, writer.complete()] if writer is not None else files
+            return files
         except BaseException:
             if writer is not None:
                 writer.abandon()

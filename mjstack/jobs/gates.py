@@ -178,13 +178,8 @@ def check_gates(cfg: Config) -> CheckedJob:
 
 
 def _check_resumed(stage: Stage, name: str) -> list[str]:
-    """Raise if a folder has no run of this configuration, of which episodes can be kept.
-
-    Returns:
-        The calls that have played it so far.
-
-    Raises:
-        FolderError: It has none, or one of another configuration or model.
+    """The calls that have played a run so far; a FolderError if the folder has none, or one of
+    another configuration or model, of which no episode can be kept.
     """
     run = EarlierRun.read(name, "resume")
     earlier, asked = (_played_config(cfg) for cfg in (run.cfg, stage.cfg))

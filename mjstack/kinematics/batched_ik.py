@@ -31,14 +31,8 @@ _Link = tuple[_Pose, ndarray, int, int]  # frame, axis, kind, column of the join
 
 
 def build_chain(model: mujoco.MjModel, robot: RobotCfg) -> tuple[Chain, Shape]:
-    """Read the bodies from the world to each site.
-
-    Args:
-        model: The compiled model.
-        robot: The robot's profile.
-
-    Returns:
-        The chain, in Warp arrays on the current device, and its shape.
+    """Read the bodies of a compiled model from the world to each site: the chain, in Warp arrays on
+    the current device, and its shape.
     """
     # Columns of the joint targets: the joint of each, those that move, and their limits
     columns = {model.joint(name).id: column for column, name in enumerate(robot.joints)}
@@ -233,15 +227,10 @@ class BatchedIk:
         wp.synchronize_device(self._device)
 
     def forward(self, q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Forward kinematics, in one launch.
-
-        Args:
-            q: Joint positions [rad, m], shape ``(nworld, n_arm + n_gripper)``.
-
-        Returns:
-            The grasp point [m]; the closing axis, a unit vector from the first grasp site to the
-            second, zero where they meet; and the approach axis, a unit vector from the wrist
-            towards the grasped object. Each has shape ``(nworld, 3)``, float32.
+        """Forward kinematics, in one launch, of joint positions [rad, m], shape ``(nworld, n_arm +
+        n_gripper)``. Returns the grasp point [m]; the closing axis, a unit vector from the first
+        grasp site to the second, zero where they meet; and the approach axis, a unit vector from
+        the wrist towards the grasped object. Each has shape ``(nworld, 3)``, float32.
         """
         self._copy_in("q", q)
         self._launch(forward_kernel, ["q"], [], ["point", "closing", "pointing"])

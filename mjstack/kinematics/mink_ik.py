@@ -46,12 +46,8 @@ class GraspIk:
     """Arm positions that bring the grasp point to a target at a given gripper opening."""
 
     def __init__(self, robot: RobotCfg, model: ModelCfg, *, tolerance: float) -> None:
-        """Compile the robot without a scene.
-
-        Args:
-            robot: The robot's profile.
-            model: Where its description comes from.
-            tolerance: Distance that counts as reached [m].
+        """Compile the robot without a scene, from its description ``model``; ``tolerance`` is the
+        distance that counts as reached [m].
         """
         spec = robot_spec(robot, model)
         spec.compiler.discardvisual = True
@@ -80,15 +76,9 @@ class GraspIk:
         self._posture.set_target(self._to_qpos(self.home))
 
     def solve(self, target: ndarray, start: ndarray) -> tuple[ndarray, float]:
-        """Find joint positions.
-
-        Args:
-            target: Target of the grasp point [m], shape ``(3,)``.
-            start: Joint positions to start from [rad, m], shape ``(nu,)``, arm joints first; those
-                of the gripper stay.
-
-        Returns:
-            The joint positions, shape ``(nu,)``, and the distance [m] that is left.
+        """Find joint positions [rad, m], shape ``(nu,)``, arm joints first, for a target of the
+        grasp point [m], shape ``(3,)``, from those of ``start``; the gripper's stay. Returns them,
+        and the distance that is left [m].
         """
         self._task.target[:] = target
         configuration = self._configuration

@@ -27,18 +27,11 @@ class PointReach:
 
     Arm joints are hinges and slides. Those that are not ik joints stay at the robot's home, or
     where they are locked.
-
-    Attributes:
-        tip: The grasp point at home [m], shape ``(3,)``.
     """
 
     def __init__(self, model: mujoco.MjModel, robot: RobotCfg, gripper: Sequence[float]) -> None:
-        """Read axes and limits of the ik joints.
-
-        Args:
-            model: A compiled model that contains the robot, alone or in a scene. It is not kept.
-            robot: The robot's profile.
-            gripper: Joint positions of the gripper [rad, m].
+        """Read axes and limits of the ik joints from a compiled model, which contains the robot,
+        alone or in a scene, and is not kept. ``gripper`` has the gripper's positions [rad, m].
         """
         data = mujoco.MjData(model)
         home = locked_home(robot)
@@ -54,18 +47,13 @@ class PointReach:
         self._anchors = data.xanchor[joints].copy()
         self._axes = data.xaxis[joints].copy()
         sites = [model.site(name).id for name in robot.grasp_sites]
-        self.tip = data.site_xpos[sites].mean(axis=0)
+        self.tip = data.site_xpos[sites].mean(axis=0)  # the grasp point at home [m], ``(3,)``
         self._low, self._high = joint_limits(model, [model.joint(j).name for j in joints])
 
     def solve(self, points: ndarray) -> tuple[ndarray, ndarray]:
-        """Bring the grasp point as near to each point as possible, from a few starts.
-
-        Args:
-            points: Targets [m], shape ``(n, 3)``.
-
-        Returns:
-            Positions of the ik joints [rad, m], shape ``(n, joints)``, and the distance that is
-            left [m], shape ``(n,)``.
+        """Bring the grasp point as near to each point [m], shape ``(n, 3)``, as possible, from a
+        few starts. Returns positions of the ik joints [rad, m], shape ``(n, joints)``, and the
+        distance that is left [m], shape ``(n,)``.
         """
         best = np.tile(self._home, (len(points), 1))
         distance = np.linalg.norm(points - self.forward(best)[1], axis=1)

@@ -115,18 +115,13 @@ _pass_values: ContextVar[dict[Any, Any] | None] = ContextVar("_pass_values", def
 
 
 def in_one_pass(work: Callable[[], Result]) -> Result:
-    """Do work that does not change the state: a value that several terms need is computed once.
+    """The result of work that does not change the state: a value that several terms need is
+    computed once.
 
     An inner pass knows what the outer one has computed so far, and keeps the rest to itself,
     because it may be a branch of a captured graph. The values belong to a context, which Python
     leaves however the work ends: a ``finally`` clause that Ctrl-C cuts short would leave old values
     to every later step of the process.
-
-    Args:
-        work: What to do.
-
-    Returns:
-        The result of the work.
     """
     context = copy_context()
     context.run(_pass_values.set, dict(_pass_values.get() or {}))
@@ -139,19 +134,27 @@ def branches(device: torch.device, *works: Callable[[], Any]) -> list[Any]:
     """
     if device.type != "cuda":
         return [work() for work in works]
-    results: dict[int, Any] = {}
+    results: list[Any] = [None] * len(works)
 
     def keep(number: int, work: Callable[[], Any]) -> None:
         results[number] = in_one_pass(work)
 
     side_by_side(device, *(partial(keep, *pair) for pair in enumerate(works)))
-    return [results[number] for number in range(len(works))]
+    return results
 
 
 def known_values() -> dict[Any, Any]:
     """What the current pass has computed, to read and to add to; outside a pass a new dict."""
     values = _pass_values.get()
     return {} if values is None else values
+
+
+def pass_value(key: Any, compute: Callable[..., Any], /, *args: Any, **named: Any) -> Any:
+    """The value of this key in the current pass, computed where it is asked for first."""
+    values = known_values()
+    if key not in values:
+        values[key] = compute(*args, **named)
+    return values[key]
 
 
 def shared(compute: Callable[..., Tensor]) -> Callable[..., Tensor]:
@@ -161,11 +164,8 @@ def shared(compute: Callable[..., Tensor]) -> Callable[..., Tensor]:
 
     @wraps(compute)
     def value(env: EnvView, *names: str, **named: str) -> Tensor:
-        values = known_values()
         key = (id(env), compute, *names, *named.items())
-        if key not in values:
-            values[key] = compute(env, *names, **named)
-        return values[key]
+        return pass_value(key, compute, env, *names, **named)
 
     return value
 
@@ -173,14 +173,6 @@ def shared(compute: Callable[..., Tensor]) -> Callable[..., Tensor]:
 class Term:
     """A term ready to be called: a function with its parameters, or an instance of a class built
     with them.
-
-    Attributes:
-        label: Dotted configuration key, for errors.
-        call: The function or instance.
-        params: Its parameters.
-        model_fields: Per-world model fields that it writes.
-        has_memory: Whether it keeps something from step to step.
-        ignores_success: Whether it is marked as such.
     """
 
     def __init__(
@@ -192,26 +184,20 @@ class Term:
         masked: bool = False,
         base: type | None = None,
     ) -> None:
-        """Find the function or class and check its parameters.
-
-        Args:
-            label: Dotted configuration key, for errors.
-            cfg: Dotted name and parameters.
-            env: What the term is built on.
-            masked: The term takes a mask after the environment, as reset terms do.
-            base: The class that it must be a subclass of.
+        """Find the function or class, which may have to be a subclass of ``base``, and check its
+        parameters. A ``masked`` term takes a mask after the environment, as reset terms do.
 
         Raises:
             ConfigError: One of its parameters has a value that it cannot use.
             TermError: The name or a parameter is wrong, or the class raised an error.
         """
-        self.label = label
+        self.label = label  # dotted configuration key, for errors
         check_fields(label, cfg)
         func = resolve_func(label, cfg.func, base=base)
         self.params = dict(cfg.params)
         is_class = inspect.isclass(func)
         check_params(label, func, self.params, 1 if is_class or not masked else 2)
-        self.model_fields: Sequence[str] = getattr(func, "model_fields", ())
+        self.model_fields: Sequence[str] = getattr(func, "model_fields", ())  # that it writes
         self.ignores_success = getattr(func, "ignores_success", None) is func
         self.call: Any = partial(func, **self.params)
         if is_class:
@@ -219,7 +205,7 @@ class Term:
                 self.call = self.call(env)
             if hasattr(func, "label"):
                 self.call.label = label
-        self.has_memory = hasattr(self.call, "reset")
+        self.has_memory = hasattr(self.call, "reset")  # from step to step
         # Two groups may need the same: a function of the state gives both the same value, while
         # others may keep something.
         key = (id(env), func, repr(sorted(self.params.items())))
@@ -228,12 +214,7 @@ class Term:
     def __call__(self, *args: Any) -> Any:
         """Call the term with the environment, and a mask if it takes one."""
         current_term.label = self.label
-        if self._key is None:
-            return self.call(*args)
-        values = known_values()
-        if self._key not in values:
-            values[self._key] = self.call(*args)
-        return values[self._key]
+        return self.call(*args) if self._key is None else pass_value(self._key, self.call, *args)
 
     def reset(self, mask: Tensor) -> None:
         """Let a term with a memory forget the masked worlds."""
@@ -244,13 +225,8 @@ class Term:
 def first_value(
     term: Term, env: EnvView, *, dims: tuple[int, ...] = (1,), boolean: bool = False
 ) -> Tensor:
-    """Call a value term for the first time and check what it returns.
-
-    Args:
-        term: The term.
-        env: Whose worlds they are.
-        dims: Allowed numbers of dimensions.
-        boolean: Whether truth values are expected, not numbers.
+    """Call a value term for the first time and check what it returns: numbers, or truth values if
+    ``boolean``, of one of the numbers of dimensions ``dims``.
 
     Raises:
         TermError: It raised an error, or returned no tensor, or one of a wrong shape,

@@ -25,34 +25,22 @@ _SHAPES = {
 
 @dataclass(frozen=True, slots=True)
 class RobotTensors:
-    """The robot's columns and limits as tensors, arm joints first, then the gripper's.
+    """The robot's columns and limits as tensors, arm joints first, then the gripper's, in rad or m.
 
-    Attributes:
-        qpos: Columns of qpos.
-        qvel: Columns of qvel.
-        ctrl: Columns of ctrl.
-        gripper_qpos: The gripper's columns of qpos.
-        range: Joint limits [rad, m], shape ``(n, 2)``.
-        ctrl_range: Limits of the joint targets, shape ``(n, 2)``.
-        home: Joint values at home, shape ``(n,)``.
-        start: Start of environments, clear of the table, shape ``(n,)``.
-        gripper_open: Command of the open gripper, shape ``(n_gripper,)``.
-        gripper_closed: Command of the gripper closed around the narrowest object of the scene, or
-            ``robot.closed_width``, shape ``(n_gripper,)``.
-        gripper_travel: The open less the closed one, shape ``(n_gripper,)``.
+    Limits are of shape ``(n, 2)``, joint values ``(n,)``, the gripper's commands ``(n_gripper,)``.
     """
 
     qpos: Columns
     qvel: Columns
     ctrl: Columns
     gripper_qpos: Columns
-    range: Tensor
-    ctrl_range: Tensor
+    range: Tensor  # limits of the joints
+    ctrl_range: Tensor  # limits of the joint targets
     home: Tensor
-    start: Tensor
+    start: Tensor  # of environments, clear of the table
     gripper_open: Tensor
-    gripper_closed: Tensor
-    gripper_travel: Tensor
+    gripper_closed: Tensor  # around the scene's narrowest object, or ``robot.closed_width``
+    gripper_travel: Tensor  # the open less the closed one
 
 
 class SceneIndex:
@@ -166,14 +154,8 @@ class SceneIndex:
 
 
 def joint_limits(model: mujoco.MjModel, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Narrower of each joint's range and its servo's.
-
-    Args:
-        model: A compiled model that contains the robot.
-        names: The joints.
-
-    Returns:
-        Low and high limits [rad, m], each of shape ``(n,)``; infinite where there is none.
+    """Narrower of each joint's range and its servo's: low and high limits [rad, m], each of shape
+    ``(n,)``; infinite where there is none.
     """
     joints = [model.joint(name).id for name in names]
     servos = [model.actuator(name).id for name in names]
@@ -189,12 +171,8 @@ def gripper_targets(
     """Joint targets of jaws closed around objects [rad, m], shape ``(n, n_gripper)``.
 
     ``robot.gripper_closed`` is for ``robot.closed_width``. Around other objects the grasp sites are
-    as much nearer to each other, or farther apart, as far as the joints' ranges allow.
-
-    Args:
-        model: A compiled model that contains the robot.
-        robot: The robot's profile.
-        widths: How wide each object is across the jaws [m]; None for the open gripper.
+    as much nearer to each other, or farther apart, as far as the joints' ranges allow. ``widths``
+    are those of the objects across the jaws [m]; None is for the open gripper.
     """
     opened, closed = np.array([robot.gripper_open, robot.gripper_closed], dtype=float)
     shares = np.linspace(-2.0, 1.0, 301)[:, None]  # of the way from closed (the 200th) to open
@@ -259,16 +237,12 @@ def geom_corners(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray:
 def lowest_height(
     model: mujoco.MjModel, bodies: Sequence[str], xpos: Tensor, xquat: Tensor
 ) -> Tensor:
-    """Height of the lowest point of the colliding geoms of some bodies [m], shape ``(nworld,)``.
+    """Height of the lowest point of the colliding geoms of some bodies, without those attached to
+    them [m], shape ``(nworld,)``, from the poses of all bodies: positions [m], shape ``(nworld,
+    nbody, 3)``, and orientations, ``(nworld, nbody, 4)``.
 
     Of shapes that objects do not have, such as meshes, the bounding box counts, which reaches
     lower, never higher.
-
-    Args:
-        model: The compiled scene.
-        bodies: Names of the bodies; those attached to them do not count.
-        xpos: Positions of all bodies [m], shape ``(nworld, nbody, 3)``.
-        xquat: Their orientations, shape ``(nworld, nbody, 4)``.
     """
     owners = [model.body(name).id for name in bodies]
     collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)

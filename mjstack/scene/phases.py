@@ -9,47 +9,28 @@ from mjstack.config.schema import Config, PhaseCfg, SceneCfg
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Where a phase brings the grasp point.
+    """Where a phase brings the grasp point."""
 
-    Attributes:
-        source: Number of its anchor among `source_names`.
-        toward: Number of the source towards which the offset's x axis points; the anchor itself for
-            world x.
-        offset: Along that axis and to its left [m].
-        z: Height [m].
-        above: The same over the anchor's centre, or over the table where a place is the anchor [m].
-    """
-
-    source: int
+    source: int  # number of its anchor among `source_names`
+    # Number of the source towards which the offset's x axis points; the anchor itself for world x
     toward: int
-    offset: tuple[float, float]
-    z: float
-    above: float
+    offset: tuple[float, float]  # along that axis and to its left [m]
+    z: float  # height [m]
+    above: float  # over the anchor's centre, or over the table where a place is the anchor [m]
 
 
 @dataclass(frozen=True, slots=True)
 class Phase:
-    """A phase of the scripted motion.
-
-    Attributes:
-        name: Its name.
-        start: Its first step in the episode.
-        stop: The first step after it.
-        spec: The configuration of the phase.
-        target: Where it brings the grasp point; None where the last target holds.
-        grasped: Number of the object that it grasps, or -1.
-        carried: Number of the object that is in the hand all through it, or -1.
-        width: Width [m] to which the jaws close; None for an open gripper.
-    """
+    """A phase of the scripted motion."""
 
     name: str
-    start: int
-    stop: int
+    start: int  # its first step in the episode
+    stop: int  # the first step after it
     spec: PhaseCfg
-    target: Target | None
-    grasped: int
-    carried: int
-    width: float | None
+    target: Target | None  # None where the last target holds
+    grasped: int  # number of the object that it grasps, or -1
+    carried: int  # number of the object that is in the hand all through it, or -1
+    width: float | None  # to which the jaws close [m]; None for an open gripper
 
 
 def source_names(scene: SceneCfg) -> list[str]:

@@ -45,13 +45,7 @@ def resolve_device(requested: str) -> str:
 def resolve_backend(
     cfg: Config, backend: Backend | None = None, device: str | None = None
 ) -> tuple[Backend, str]:
-    """Backend (never auto) and device of a simulation.
-
-    Args:
-        cfg: The configuration.
-        backend: Overrides the configured backend.
-        device: Overrides the configured device.
-    """
+    """Backend (never auto) and device of a simulation; arguments override what is configured."""
     device = device or resolve_device(cfg.sim.device)
     backend = backend or cfg.sim.backend
     if backend is Backend.auto:
@@ -72,16 +66,9 @@ def make_simulation(
     fields: Sequence[str] = (),
     sizes: BatchSizes | None = None,
 ) -> Simulation:
-    """Build a simulation.
-
-    Args:
-        model: The compiled model, its timestep set.
-        cfg: The configuration; `sim`, `batch` and `graph` are used.
-        nworld: Number of worlds.
-        backend: Overrides the configured backend.
-        device: Overrides the configured device.
-        fields: Model fields that may differ from world to world, by MuJoCo's names.
-        sizes: Overrides the configured buffer sizes; only MJWarp has any.
+    """Build a simulation of a compiled model, whose timestep is set, by ``sim``, ``batch`` and
+    ``graph`` of the configuration. ``backend``, ``device`` and ``sizes`` of MJWarp's buffers
+    override what is configured. ``fields`` may differ from world to world, by MuJoCo's names.
 
     Raises:
         UnknownName: A field does not exist, or cannot differ.
@@ -114,10 +101,7 @@ def make_simulation(
 
 class StateRenderer:
     """Draws states, each in a world of its own: an image depends on nothing else. All steps of an
-    episode can be drawn at once, whenever they are needed.
-
-    Attributes:
-        labels: Names of the things in the segmentation, see `Cameras`.
+    episode can be drawn at once, whenever they are needed. ``labels`` are as of `Cameras`.
     """
 
     def __init__(self, model: mujoco.MjModel, cfg: Config, count: int, **options: Any) -> None:
@@ -134,15 +118,9 @@ class StateRenderer:
         self.labels = self._cameras.labels
 
     def draw(self, qpos: Tensor, fields: Mapping[str, Tensor] | None = None) -> dict[str, Tensor]:
-        """Draw states.
-
-        Args:
-            qpos: The states, shape ``(n, nq)``, n at most ``count``.
-            fields: Model fields of each state by name, each ``(n, ...)``.
-
-        Returns:
-            Images by output and camera as of `Cameras.allocate`, a row for each state. The next
-            call writes into them.
+        """Draw states, shape ``(n, nq)``, n at most ``count``, with model fields of each by name,
+        each ``(n, ...)``. Returns images as of `Cameras.allocate`, a row for each state; the next
+        call writes into them.
 
         Raises:
             ArgumentError: There are more states than worlds.

@@ -30,17 +30,13 @@ drawn."""
 
 
 class Cameras(ABC):
-    """Draws the worlds of a simulation, as its poses are.
+    """Draws the worlds of a simulation, as its poses are, by ``cameras``, which have names.
 
-    Attributes:
-        mjwarp: Whether MJWarp draws.
-        cameras: The cameras by name.
-        labels: Names of the things that segmentation tells apart: its numbers are places in this
-            list, and -1 where the ray hits nothing. A body is a thing, and so is each geom that is
-            fixed to the world.
+    The numbers of segmentation are places in the list ``labels``, and -1 where the ray hits
+    nothing. A body is a thing with a label, and so is each geom that is fixed to the world.
     """
 
-    mjwarp = False
+    mjwarp = False  # whether MJWarp draws
 
     def __init__(
         self,
@@ -63,15 +59,10 @@ class Cameras(ABC):
         self._label_of_geom = [self.labels.index(name) for name in of_geoms]
 
     def allocate(self, *, terminal: bool = False) -> dict[str, Tensor]:
-        """Buffers for every output of every camera, zero.
-
-        Args:
-            terminal: Of the cameras alone that draw the ends of episodes.
-
-        Returns:
-            By name: ``images.CAMERA`` ``(nworld, height, width, 3)``, uint8; ``depth.CAMERA``
-            ``(nworld, height, width, 1)``, float32, metres along the camera's axis, 0 where the ray
-            hits nothing; ``segmentation.CAMERA`` ``(nworld, height, width)``, int32.
+        """Buffers for every output of every camera, or of those that draw the ends of episodes,
+        zero. By name: ``images.CAMERA`` ``(nworld, height, width, 3)``, uint8; ``depth.CAMERA``
+        ``(nworld, height, width, 1)``, float32, metres along the camera's axis, 0 where the ray
+        hits nothing; ``segmentation.CAMERA`` ``(nworld, height, width)``, int32.
         """
         return {
             f"{PREFIXES[output]}.{name}": torch.zeros(
@@ -130,13 +121,13 @@ def check_image_memory(
     size = image_bytes(model, cameras, nworld, mjwarp=mjwarp)
     free = free_memory(device)
     if size > free:
-        sizes = {name: "x".join(map(str, camera.size)) for name, camera in cameras.items()}
-        listing = ", ".join(f"{name} {pixels}" for name, pixels in sizes.items())
+        sizes = [f"{name} {'x'.join(map(str, camera.size))}" for name, camera in cameras.items()]
         expected = (
             f"images that fit into the memory of {device}, where {nworld} worlds need"
             f" {size / 2**30:.3g} GiB and {free / 2**30:.3g} GiB are free"
         )
-        raise ConfigError("scene.cameras", listing, expected, "Lower nworld, or the cameras' size")
+        fix = "Lower nworld, or the cameras' size"
+        raise ConfigError("scene.cameras", ", ".join(sizes), expected, fix)
 
 
 def _outputs(cameras: Mapping[str, CameraCfg]) -> Iterator[tuple[str, CameraCfg, str]]:

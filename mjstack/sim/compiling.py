@@ -58,7 +58,8 @@ def _stages(m: mjw.Model, plan: StepPlan) -> list[Stage]:
     """Stages of a step: collision, which shares no module with the others, then the slowest."""
     rows = constraints if plan.name == "fused" else mjw
     stages: list[Stage] = [rows.collision, mjw.sensor_acc, rows.solve, rows.make_constraint]
-    stages += [mjw.sensor_pos, mjw.sensor_vel, _reset]
+    stages += [mjw.sensor_pos, mjw.sensor_vel]
+    stages.append(lambda m, d: mjw.reset_data(m, d, reset=wp.zeros(1, dtype=bool)))
     if plan.smooth:
         return [*stages, smooth.positions, smooth.forces, smooth.advance]
     stages += [mjw.kinematics, mjw.com_pos, mjw.crb, mjw.transmission, mjw.fwd_velocity]
@@ -66,7 +67,3 @@ def _stages(m: mjw.Model, plan: StepPlan) -> list[Stage]:
     if m.opt.integrator == mjw.IntegratorType.IMPLICITFAST:
         stages.append(mjw.implicit)
     return stages
-
-
-def _reset(m: mjw.Model, d: mjw.Data) -> None:
-    mjw.reset_data(m, d, reset=wp.zeros(1, dtype=bool))

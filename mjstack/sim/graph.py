@@ -51,13 +51,9 @@ class StepGraph:
     captures it, and from then on a call replays it. Whatever the work bakes in (a Python number, a
     solver option, an address) stays as it was at the capture, until `drop` or a new version. A
     graph that is called while another one warms up or is captured only does its work.
-
-    Attributes:
-        warm_up_seconds: Time of the eager call, compilation included [s].
-        capture_seconds: Time of the capture [s].
     """
 
-    warm_up_seconds = 0.0
+    warm_up_seconds = 0.0  # of the eager call, compilation included
     capture_seconds = 0.0
 
     def __init__(
@@ -71,17 +67,12 @@ class StepGraph:
         culprit: Callable[[], str] = lambda: "",
         scratch: bool = True,
     ) -> None:
-        """Keep the work without running it.
+        """Keep the work without running it. Messages have its ``name``.
 
-        Args:
-            work: What is captured.
-            device: Where it runs.
-            mode: ``off`` never captures; ``auto`` goes on eagerly, with one warning, where the
-                capture fails; ``require`` raises there.
-            name: What it is called in messages.
-            version: A number that changes when the graph has to be captured anew.
-            culprit: Names the current term, for the message of a failed capture.
-            scratch: Whether Warp's temporaries come from a `Scratch`.
+        Mode ``off`` never captures; ``auto`` goes on eagerly, with one warning, where the capture
+        fails; ``require`` raises there. ``version`` changes when the graph has to be captured anew,
+        and ``culprit`` names the current term for the message of a failed capture. Warp's
+        temporaries come from a `Scratch`, unless ``scratch`` is false.
         """
         self._work = work
         self._mode = mode
@@ -254,12 +245,8 @@ class Scratch:
 
 def side_by_side(device: torch.device, *works: Callable[[], object]) -> None:
     """Do independent works: in a CUDA graph that is being captured as parallel branches, else one
-    after the other.
-
-    Args:
-        device: Where they run.
-        works: No one may write what another reads or writes, nor keep a temporary that another one
-            uses.
+    after the other. None of them may write what another reads or writes, nor keep a temporary that
+    another uses.
     """
     if device.type != "cuda" or not torch.cuda.is_current_stream_capturing():
         for work in works:
@@ -292,23 +279,17 @@ def side_by_side(device: torch.device, *works: Callable[[], object]) -> None:
 
 
 def where_any(mask: Tensor, work: Callable[[], None]) -> None:
-    """Do work that matters to the masked worlds alone, where there are some. A CUDA graph that is
-    captured looks in each replay, except in a branch, which cannot be interrupted. An eager step on
-    CUDA does not look: that would stop the device.
-
-    Args:
-        mask: Shape ``(nworld,)``, bool or integers.
-        work: Changes nothing that counts if the mask is empty.
+    """Do work that matters to the masked worlds alone, where there are some; the mask is of shape
+    ``(nworld,)``, bool or integers. A CUDA graph that is captured looks in each replay, except in a
+    branch, which cannot be interrupted. An eager step on CUDA does not look, which would stop the
+    device: the work changes nothing that counts if the mask is empty.
     """
-    if not mask.is_cuda and not bool(mask.any()):
-        return
-    if not mask.is_cuda or _branching or not torch.cuda.is_current_stream_capturing():
-        work()
-        return
-    from mjstack.sim.warp_setup import torch_stream_scope, wp
+    if mask.is_cuda and torch.cuda.is_current_stream_capturing() and not _branching:
+        from mjstack.sim.warp_setup import torch_stream_scope, wp
 
-    if not wp.is_conditional_graph_supported():
+        if wp.is_conditional_graph_supported():
+            with torch_stream_scope(wp.get_device(str(mask.device))):
+                wp.capture_if(wp.from_torch(mask.sum(dtype=torch.int32).view(1)), work)
+            return
+    if mask.is_cuda or bool(mask.any()):
         work()
-        return
-    with torch_stream_scope(wp.get_device(str(mask.device))):
-        wp.capture_if(wp.from_torch(mask.sum(dtype=torch.int32).view(1)), work)

@@ -44,9 +44,6 @@ class MjwarpSimulation(Simulation):
     Box against box uses the primitive collider, as native MuJoCo does: with MJWarp's convex one the
     kept contacts of a resting stack can alternate, and it never comes to rest. The physics
     steps of one `step(n)` are captured into a graph, unless they are a part of a larger one.
-
-    Attributes:
-        plan: How a physics step is done.
     """
 
     backend = "mjwarp"
@@ -91,17 +88,17 @@ class MjwarpSimulation(Simulation):
             self._m.opt.disableflags |= int(mjw.DisableBit.NATIVECCD)
             self._m.opt.warn_overflow = 0
             self._d = mjw.make_data(model, nworld=nworld, **sizes.as_kwargs())
-            self.plan = (
-                StepPlan() if cfg.sim.step == "stock" else plan_step(model, self._m, self._d)
-            )
+            self.plan = StepPlan()  # how a physics step is done
+            if cfg.sim.step != "stock":
+                self.plan = plan_step(model, self._m, self._d)
             if self.plan.name != "stock" and mjw.__version__ not in RELEASES:
-                facts = (model, self._m, self._d, self.device, self.plan)
                 with torch_stream_scope(self._device):
-                    wrong = disagreement(*facts)
+                    wrong = disagreement(model, self._m, self._d, self.device, self.plan)
                 if wrong:
-                    verified = ", ".join(RELEASES)
-                    text = f"mjstack's was written for mujoco-warp {verified}, and {wrong}"
-                    self.plan = StepPlan(reason=text)
+                    releases = f"mujoco-warp {', '.join(RELEASES)}"
+                    self.plan = StepPlan(
+                        reason=f"mjstack's was written for {releases}, and {wrong}"
+                    )
             self._usage = Usage(model, nworld, self.device)
             # MJWarp's kernel skips geoms that are welded to the world, but not to a mocap body:
             # with these it skips all others

@@ -105,10 +105,8 @@ class MjwarpCameras(Cameras):
                 self._copy(out, name, due)
 
     def _arrange_rays(self, tile: int) -> list[np.ndarray]:
-        """Order the rays of each camera by squares of pixels.
-
-        Returns:
-            For each camera the ray of each pixel among those of the camera.
+        """Order the rays of each camera by squares of pixels; for each camera the ray of each pixel
+        among those of the camera.
         """
         orders = []
         for camera in self.cameras.values():

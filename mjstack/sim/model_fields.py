@@ -91,13 +91,9 @@ def simple_inertia(
 
     Native MuJoCo does not compute the mass matrix of a body that it calls simple, such as a free
     cube: it reads ``dof_M0``, which the compiler made from `SIMPLE_FIELDS`. A body whose mass is
-    changed would weigh more and resist no more, so ``dof_M0`` has to follow.
-
-    Args:
-        model: The compiled model.
-        fields: Every world's values of the fields that differ.
-        dof_M0: Diagonal of the mass matrix at qpos0 [kg, kg m2], shape ``(nworld, nv)``, which the
-            function writes.
+    changed would weigh more and resist no more, so ``dof_M0`` has to follow: the diagonal of the
+    mass matrix at qpos0 [kg, kg m2], shape ``(nworld, nv)``, which the function writes. ``fields``
+    has every world's values of the fields that differ.
     """
     dofs = np.flatnonzero(model.dof_simplenum)
     bodies = model.dof_bodyid[dofs]

@@ -52,10 +52,6 @@ class NativeSimulation(Simulation):
     which thread it gets. MuJoCo's automatic reset of a diverged world is switched off, because it
     would hide the divergence; a world whose state is not finite is not stepped any more, and its
     derived arrays are NaN.
-
-    Attributes:
-        batch: The worlds in MuJoCo's hands.
-        rows: The arrays that a reset writes, a row for each world.
     """
 
     backend = "native"

@@ -73,9 +73,7 @@ class Columns:
 
     def read(self, view: Tensor) -> Tensor:
         """The columns, shape ``(nworld, n, ...)``, perhaps the view's memory: only read it."""
-        if isinstance(self.at, slice):
-            return view[:, self.at]
-        return view.index_select(1, self.at)
+        return view[:, self.at] if isinstance(self.at, slice) else view.index_select(1, self.at)
 
     def write(self, view: Tensor, value: Tensor) -> None:
         """Write all worlds."""
@@ -192,13 +190,9 @@ class Simulation(ABC):
         super().__setattr__(name, value)
 
     def part(self, name: str, columns: Columns | int, *shape: int) -> Tensor:
-        """Columns of a view, for reading. Those that lie side by side are sliced once, because a
-        view keeps its address for life.
-
-        Args:
-            name: Of the view.
-            columns: The columns, or the number of a single one.
-            shape: Of each world's numbers, such as ``(2, 3)`` for six columns.
+        """Columns of a view of this name, or a single one by its number, for reading. Each world's
+        numbers have a ``shape``, such as ``(2, 3)`` for six columns. Those that lie side by side
+        are sliced once, because a view keeps its address for life.
         """
         at = columns if isinstance(columns, int) else columns.at
         which = columns if isinstance(columns, int) else columns.indices
@@ -235,12 +229,9 @@ class Simulation(ABC):
 
     @abstractmethod
     def step(self, n: int = 1, *, kinematics: bool = False) -> None:
-        """Advance every world by n physics steps under the current ctrl.
-
-        Args:
-            n: Number of steps, at least 1.
-            kinematics: Whether the poses are brought up to the state after the last of them. The
-                physics is the same.
+        """Advance every world by n physics steps, at least 1, under the current ctrl.
+        ``kinematics`` brings the poses up to the state after the last of them; the physics is the
+        same.
         """
 
     @abstractmethod
@@ -251,10 +242,8 @@ class Simulation(ABC):
 
     @abstractmethod
     def kinematics(self, mask: Tensor | None = None) -> None:
-        """Bring the poses up to the current qpos, without advancing time.
-
-        Args:
-            mask: Worlds that need it (None: all). Others may be brought up to date too.
+        """Bring the poses up to the current qpos, without advancing time, in the worlds of the mask
+        (None: all). Others may be brought up to date too.
 
         Raises:
             ArgumentError: As for `reset`.
@@ -262,11 +251,8 @@ class Simulation(ABC):
 
     @abstractmethod
     def reset(self, mask: Tensor | None = None) -> None:
-        """Put worlds back to the model's qpos0, at rest: act, ctrl, sensordata, counters and
-        overflow bits become zero.
-
-        Args:
-            mask: Worlds to reset (None: all).
+        """Put the worlds of the mask (None: all) back to the model's qpos0, at rest: act, ctrl,
+        sensordata, counters and overflow bits become zero.
 
         Raises:
             ArgumentError: The mask is not a bool tensor of shape ``(nworld,)`` on the simulation's

@@ -90,9 +90,6 @@ def torch_stream_scope(device: wp.Device) -> AbstractContextManager[object]:
     neither waits. On Warp's CPU device, which has no streams, it only makes the device the current
     one, where it is not: all of Warp's scopes of that device keep one CUDA context between them, so
     a thread's scope would hand its own context to the thread that waits for it.
-
-    Args:
-        device: The Warp device.
     """
     if not device.is_cuda:
         return nullcontext() if wp.get_device() == device else wp.ScopedDevice(device)

@@ -272,15 +272,9 @@ class EpisodeCheck(ABC):
     def why(
         self, failed: np.ndarray, values: Mapping[str, np.ndarray]
     ) -> tuple[dict[str, str], list[str]]:
-        """Say which thresholds broke.
-
-        Args:
-            failed: Bits of every world, shape ``(nworld,)``.
-            values: What was measured, each ``(nworld,)``.
-
-        Returns:
-            The thresholds in words, by the name of each rule that was broken; empty where the rule
-            has but one. And the names of all values beyond their limits.
+        """The thresholds that broke, in words, by the name of each rule that was broken, empty
+        where the rule has but one; and the names of all values beyond their limits. ``failed`` are
+        the rules' bits, ``values`` what was measured, each of shape ``(nworld,)``.
         """
         broken = dict.fromkeys(self.rules.failing(failed), "")
         beyond = []

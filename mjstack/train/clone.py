@@ -30,7 +30,8 @@ def check_clone(stage: Stage) -> range:
     job: CloneJobCfg = cfg.job
     if job.rounds:
         _check_rounds(stage, job)
-    _check_vision(stage, job)
+    if job.vision.cameras:
+        _check_vision(stage, job)
     widths = observed_widths(stage)
     if job.dataset is not None:
         return check_dataset(stage, widths)
@@ -62,8 +63,6 @@ def _check_vision(stage: Stage, job: CloneJobCfg) -> None:
         if "rgb" not in cameras[name].outputs:
             expected = "rgb among them, which a policy sees"
             raise ConfigError(f"scene.cameras.{name}.outputs", cameras[name].outputs, expected)
-    if not job.vision.cameras:
-        return
     if len(set(job.vision.cameras)) < len(job.vision.cameras):
         raise ConfigError("job.vision.cameras", job.vision.cameras, "names, each once")
     if not job.vision.channels:
@@ -78,11 +77,9 @@ def train_clone(stage: Stage, folder: Path) -> Trained:
     """Fit a network to the expert's answers; see `Trainer`."""
     # An earlier call's training, which may be complete
     job: CloneJobCfg = stage.cfg.job
-    earlier = earlier_state(stage, folder)
-    if earlier:
+    if earlier := earlier_state(stage, folder):
         _, facts = earlier
-        complete = len(facts["curve"]) == job.rounds if job.rounds else facts["done"] == job.batches
-        if complete:
+        if len(facts["curve"]) == job.rounds if job.rounds else facts["done"] == job.batches:
             stage.progress.print_line(f"train: {folder} is trained already, and is judged anew")
             return _trained(job, folder, facts)
 
@@ -125,12 +122,9 @@ def train_clone(stage: Stage, folder: Path) -> Trained:
 
 
 def _judge(stage: Stage, who: str, episodes: Demonstrations) -> dict[str, float]:
-    """Print how many judged episodes of all ranks succeeded, and return their figures.
-
-    Returns:
-        ``success``, their share, with its 95 % interval; ``judged``, their number; ``played_s``,
-        the time in which the slowest rank played the round [s]; and how many broke each rule,
-        ``failed.<rule>``.
+    """Print how many judged episodes of all ranks succeeded. Returns ``success``, their share, with
+    its 95 % interval; ``judged``, their number; ``played_s``, the time in which the slowest rank
+    played the round [s]; and how many broke each rule, ``failed.<rule>``.
     """
     facts = (episodes.succeeded, episodes.judged, episodes.seconds, Counter(episodes.broken))
     successes, numbers, seconds, broken = zip(*stage.ranks.gather(facts), strict=True)

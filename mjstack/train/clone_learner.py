@@ -219,14 +219,9 @@ class CloneLearner(Learner):
         later = torch.minimum(steps[:, None] + ahead, self._last[steps][:, None])
         target = (self._labels[later] - network.action_mean) / network.action_std
         # Convolutions on CUDA in bfloat16. A graph cannot hold the cache of converted weights.
-        fast = torch.autocast(
-            steps.device.type,
-            torch.bfloat16,
-            enabled=steps.is_cuda and len(images) > 0,
-            cache_enabled=False,
-        )
+        fast = steps.is_cuda and len(images) > 0
         error = _LOSSES[self._job.loss]
-        with fast:
+        with torch.autocast(steps.device.type, torch.bfloat16, enabled=fast, cache_enabled=False):
             features = network.encode(images)
             action = network.normalized(self._seen[steps] + noise, features)
             action_loss = loss = error(action.float(), target)
@@ -256,15 +251,14 @@ class CloneLearner(Learner):
         loss = self._validate()
         earlier = self.curve[-1]["batch"] if self.curve else 0
         mean = self._sum / max(1, self.done - earlier)
+        self._sum.zero_()
         self._ranks.sum_(mean)
-        row = {
+        return {
             "batch": self.done,
             "loss": float(mean) / self._ranks.size,
             "validation_loss": loss,
             "training_s": self.seconds,
         }
-        self._sum.zero_()
-        return row
 
     @override
     def score(self, row: Facts) -> tuple[float, ...]:

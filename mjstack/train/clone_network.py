@@ -72,13 +72,9 @@ def input_noise(
 ) -> Tensor:
     """Half-width of the noise on each column of the observation in a training, shape ``(n,)``.
 
-    Args:
-        cfg: The configuration.
-        model: The scene.
-        widths: Numbers of each term, by name.
-        std: Standard deviation of each column in the demonstrations, shape ``(n,)``, from which the
-            noise of terms without some follows. A policy that learned without any leaves the
-            expert's path and does not come back.
+    ``widths`` are the numbers of each term. The noise of terms without some follows from ``std``,
+    the standard deviation of each column in the demonstrations, shape ``(n,)``: a policy that
+    learned without any leaves the expert's path and does not come back.
     """
     job: CloneJobCfg = cfg.job
     slides = slide_joints(model, cfg.robot.joints)

@@ -85,12 +85,11 @@ def read_demonstrations(stage: Stage, widths: dict[str, int]) -> Demonstrations:
     stage.progress.print_line(
         f"train: {len(episodes)} of {played} episodes of {stored.folder} {done} the task"
     )
+    joined = np.cumsum([stop - start for start, stop in episodes], dtype=np.int64)
     return Demonstrations(
         seen=on_device("observation"),
         labels=on_device(_ACTION),
-        ends=torch.as_tensor(
-            np.cumsum([b - a for a, b in episodes]), dtype=torch.int64, device=device
-        ),
+        ends=torch.as_tensor(joined, device=device),
         widths=widths,
         played=played,
         seconds=time.perf_counter() - began,

@@ -24,41 +24,26 @@ _SUMS = ("played", "judged", "succeeded", "seconds")
 
 @dataclass(frozen=True, kw_only=True)
 class Demonstrations:
-    """Episodes, one after the other, with the expert's answers in every step.
-
-    Attributes:
-        seen: Observations before each step, shape ``(steps of all episodes, inputs)``.
-        labels: The expert's joint targets, shape ``(steps of all episodes, nu)``.
-        ends: The step after the last one of each episode, shape ``(episodes,)``, int64.
-        widths: Numbers of each term of the observation, in order.
-        driven: Where the expert drove the step, shape ``(steps of all episodes,)``, int8; None if
-            it drove all of them.
-        played: Episodes that were played, kept or not.
-        judged: Of these, those in which the policy drove alone, or the expert in its own ones.
-        succeeded: Of these, those that the task's check accepted.
-        broken: How many of these broke a rule of the check, by the rule's name.
-        seconds: Time in which they were played or read [s].
-        source: Where they come from, in words.
-        qpos: Positions before each step, from which images can be rendered, shape ``(steps of all
-            episodes, nq)``, in the backend's precision; None where there are no images.
-        estimated: What a policy learns to estimate from its images, shape ``(steps of all
-            episodes, n)``; None if nothing.
-        fields: Model fields of the episodes' worlds by name, each ``(episodes, ...)``.
+    """Episodes, one after the other, with the expert's answers in every step: ``steps`` of all
+    episodes together.
     """
 
-    seen: Tensor
-    labels: Tensor
-    ends: Tensor
-    widths: dict[str, int]
-    driven: Tensor | None = None
-    played: int = 0
-    judged: int = 0
-    succeeded: int = 0
-    broken: Mapping[str, int] = field(default_factory=dict)
-    seconds: float = 0.0
-    source: str = ""
+    seen: Tensor  # observations before each step, shape ``(steps, inputs)``
+    labels: Tensor  # the expert's joint targets, shape ``(steps, nu)``
+    ends: Tensor  # the step after the last one of each episode, shape ``(episodes,)``, int64
+    widths: dict[str, int]  # numbers of each term of the observation, in order
+    driven: Tensor | None = None  # where the expert drove, ``(steps,)``, int8; None: everywhere
+    played: int = 0  # episodes that were played, kept or not
+    judged: int = 0  # of these, those in which the policy drove alone, or the expert in its own
+    succeeded: int = 0  # of these, those that the task's check accepted
+    broken: Mapping[str, int] = field(default_factory=dict)  # of the judged ones, by broken rule
+    seconds: float = 0.0  # in which they were played or read
+    source: str = ""  # in words
+    # With images: positions before each step, from which they can be rendered, ``(steps, nq)``, in
+    # the backend's precision; and the truths that a policy learns to estimate, ``(steps, n)``
     qpos: Tensor | None = None
     estimated: Tensor | None = None
+    # Model fields of the episodes' worlds by name, each ``(episodes, ...)``
     fields: Mapping[str, Tensor] = field(default_factory=dict)
 
     @classmethod

@@ -43,12 +43,8 @@ class ImagePool:
         }
 
     def add(self, steps: Tensor, count: int, read: ReadImages) -> None:
-        """Keep images of some of the next ``count`` steps.
-
-        Args:
-            steps: Those that have images, counted from 0 on, shape ``(n,)``, int64.
-            count: How many steps there are, with images or not.
-            read: Gives images of some of these, shape ``(m,)``.
+        """Keep images of some of the next ``count`` steps: of ``steps``, counted from 0 on, shape
+        ``(n,)``, int64, some of which ``read`` is asked for.
         """
         rows = len(self.steps)
         candidates = torch.cat([self.steps, self._before + steps])

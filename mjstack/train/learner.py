@@ -28,18 +28,10 @@ class Learner(ABC):
     no row before has a higher score, and everything with which a later call goes on.
 
     A subclass sets ``policy``, ``_networks`` and ``_optimizer``.
-
-    Attributes:
-        trainer: The trainer's name.
-        step: What a step is called.
-        policy: The policy so far.
-        done: Steps so far.
-        seconds: Time of them, in all calls [s].
-        curve: A row for each time that policies were saved.
     """
 
     trainer = ""
-    step = "batch"
+    step = "batch"  # the noun for a step
     _look_every = 1  # steps between two looks at the progress
     policy: Policy
     _networks: nn.ModuleDict
@@ -53,9 +45,9 @@ class Learner(ABC):
         self._ranks = stage.ranks
         self._folder = folder
         self._save_every = save_every
-        self.done = 0
-        self.seconds = 0.0
-        self.curve: list[Facts] = []
+        self.done = 0  # steps so far
+        self.seconds = 0.0  # of them, in all calls
+        self.curve: list[Facts] = []  # a row for each time that policies were saved
         self._before = 0.0  # seconds of earlier calls
         self._notes: Facts = {}  # what the policy's file says of its training beside the row
 

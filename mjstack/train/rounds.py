@@ -31,35 +31,25 @@ _FIELD = "field."  # before the name of a model field, in the file of a round
 
 class MixedDriver(Driver):
     """The expert or the policy drives, as a draw for every world and spell says. In some worlds the
-    policy drives alone. Phases, errors and retries are the expert's.
-
-    Attributes:
-        label: The expert's joint targets of the last step, shape ``(nworld, action_dim)``.
-        driven: Where the expert drives this step, shape ``(nworld,)``, int8.
-        query_images: The policy's images.
+    policy drives alone. Phases, errors and retries are the expert's; ``label`` has its joint
+    targets of the last step, shape ``(nworld, action_dim)``, and ``driven`` says where it drives
+    this step, shape ``(nworld,)``, int8.
     """
 
     def __init__(
         self, stage: Stage, env: Env, policy: Policy | None, *, beta: float, alone: int
     ) -> None:
-        """Make the drivers of worlds that have started.
-
-        Args:
-            stage: The stage, whose expert answers in every state.
-            env: The environment.
-            policy: None where the expert drives alone.
-            beta: Share of the time in which the expert drives.
-            alone: Number of worlds, the first ones, in which the policy drives alone.
+        """Make the drivers of worlds that have started. The stage's expert answers in every state,
+        and drives a share ``beta`` of the time, or alone without a policy. In the first ``alone``
+        worlds the policy drives alone.
         """
         job: CloneJobCfg = stage.cfg.job
         cameras = stage.cfg.scene.cameras
         self._policy = PolicyDriver(env, policy, cameras) if policy else None
-        # Those of the policy, or of one that would see them
-        self.query_images = (
-            self._policy.query_images
-            if self._policy
-            else QueryImages(env, cameras, job.vision.cameras, job.execute)
-        )
+        if self._policy:
+            self.query_images = self._policy.query_images
+        else:  # images that a policy would see
+            self.query_images = QueryImages(env, cameras, job.vision.cameras, job.execute)
         expert = stage.driver(env)
         steps = math.ceil(job.length * expert.steps)
         super().__init__(env.nworld, steps, env.device, expert.phases)
@@ -125,14 +115,8 @@ def make_round(
     stage: Stage, folder: Path, policy: Policy | None, number: int, pool: ImagePool | None = None
 ) -> Demonstrations:
     """Play a round, or read it where an earlier call has played it in every rank. Each rank keeps
-    its own part.
-
-    Args:
-        stage: The stage.
-        folder: That of the training, in which rounds are kept.
-        policy: The policy so far; None: the expert drives alone.
-        number: Of the round; 0 is the expert's.
-        pool: Gets the round's images, which no file has.
+    its own part in the training's folder; the pool gets the images, which no file has. Without a
+    policy the expert drives alone, as in round 0.
 
     Raises:
         FolderError: It was played on another kind of device or in another number of ranks.
@@ -142,13 +126,13 @@ def make_round(
         return _play_round(stage, policy, number, pool)
     ranks = stage.ranks
     name = round_file(number, ranks.rank)
-    plays = ranks.any(not (folder / name).exists())
-    if plays:
+    if ranks.any(not (folder / name).exists()):
         played = _play_round(stage, policy, number, pool)
         facts = {**vars(played)}
         facts |= {f"{_FIELD}{key}": values for key, values in facts.pop("fields").items()}
         tensors = {key: facts.pop(key) for key in [*facts] if isinstance(facts[key], Tensor)}
         write_state(folder / name, tensors, facts | {"made_with": made_with(stage)})
+        return played
     state = earlier_state(stage, folder, name)
     assert state is not None
     tensors, facts = state
@@ -157,7 +141,7 @@ def make_round(
     names = [key for key in values if key.startswith(_FIELD)]
     looks = {key.removeprefix(_FIELD): values.pop(key) for key in names}
     episodes = Demonstrations(**facts | values, fields=looks)
-    if pool is not None and not plays:
+    if pool is not None:
         episodes.render(stage, pool)
     return episodes
 

@@ -25,40 +25,28 @@ FAILED = "failed."  # a column of the curve: judged episodes that broke the rule
 
 @dataclass(kw_only=True, slots=True)
 class Trained:
-    """The result of a training.
+    """The result of a training."""
 
-    Attributes:
-        metrics: Figures, by name with unit.
-        notes: Facts in words, by name.
-        curve: Rows of the training curve: values by column.
-        lines: Columns that are drawn.
-        abscissa: The column over which they are drawn.
-        scale: Of their axis, ``log`` or ``linear``.
-    """
-
-    metrics: dict[str, float]
-    notes: dict[str, str]
-    curve: list[Facts]
-    lines: list[str] = field(default_factory=lambda: ["success"])
-    abscissa: str = "batch"
-    scale: str = "linear"
+    metrics: dict[str, float]  # figures, by name with unit
+    notes: dict[str, str]  # facts in words, by name
+    curve: list[Facts]  # rows of the training curve: values by column
+    lines: list[str] = field(default_factory=lambda: ["success"])  # columns that are drawn
+    abscissa: str = "batch"  # the column over which they are drawn
+    scale: str = "linear"  # of their axis: log or linear
 
 
 @dataclass(frozen=True)
 class Trainer:
     """One way to train; ``conf/trainer/<name>.yaml`` names it.
 
-    Attributes:
-        check: Raises a `MjstackError` for what cannot be trained, before anything is written.
-            Returns the seeds of the starts that training uses.
-        train: Trains in a folder, in which it goes on with an earlier call's training, and leaves
-            the policies `LAST` and `BEST` there.
-        midway: Whether its worlds may start in the middle of an episode.
+    ``check`` raises a `MjstackError` for what cannot be trained, before anything is written, and
+    returns the seeds of the starts that training uses. ``train`` trains in a folder, in which it
+    goes on with an earlier call's training, and leaves the policies `LAST` and `BEST` there.
     """
 
     check: Callable[[Stage], range]
     train: Callable[[Stage, Path], Trained]
-    midway: bool = False
+    midway: bool = False  # whether its worlds may start in the middle of an episode
 
 
 def whole_starts(reset: dict[str, TermCfg]) -> dict[str, TermCfg]:

@@ -61,16 +61,12 @@ class ExpertStates:
             raise ParameterError("path", path, expected, "Record it anew") from error
         self._count = len(self._source)
         # Of the worlds, and the states
-        self._views = [
-            (view, _matching(path, name, view, tensors.get(name)))
-            for name in VIEWS
-            if (view := getattr(env.sim, name)).shape[1]
-        ]
-        self._fields = [
-            (field, _matching(path, name, field, tensors[FIELD + name]))
-            for name, field in env.sim.fields.items()
-            if FIELD + name in tensors
-        ]
+        views = {name: view for name in VIEWS if (view := getattr(env.sim, name)).shape[1]}
+        fields = {f: field for f, field in env.sim.fields.items() if FIELD + f in tensors}
+        self._views, self._fields = (
+            [(v, _matching(path, n, v, tensors.get(prefix + n))) for n, v in written.items()]
+            for prefix, written in (("", views), (FIELD, fields))
+        )
         self._share = share
         self._fall = share - last_share
         self._episodes = episodes
@@ -91,14 +87,9 @@ class ExpertStates:
 def write_states(
     path: Path, states: Mapping[str, Tensor], fields: Mapping[str, Tensor], episodes: int
 ) -> None:
-    """Write a file of states.
-
-    Args:
-        path: The file.
-        states: The views of `VIEWS` by name, each ``(times * episodes, width)``: all episodes at
-            one time, then all at the next.
-        fields: Model fields of the episodes' worlds by name, each ``(episodes, ...)``.
-        episodes: Number of the episodes.
+    """Write a file of states: the views of `VIEWS` by name, each ``(times * episodes, width)``, all
+    episodes at one time, then all at the next; and model fields of the episodes' worlds by name,
+    each ``(episodes, ...)``.
 
     Raises:
         OSError: The file cannot be written.

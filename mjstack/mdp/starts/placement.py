@@ -62,14 +62,9 @@ class Placement:
         pose: Sequence[float],
         noise: float = 0.0,
     ) -> None:
-        """Find what could be in the way.
-
-        Args:
-            env: The environment.
-            region: Half-widths of the region in x and y [m].
-            gap: Free room between objects, and around what is fixed to the world [m], for fingers.
-            pose: Where the robot's joints are [rad, m].
-            noise: How far each arm joint may be from there [rad].
+        """Find what could be in the way of objects in a region of these half-widths in x and y [m],
+        with a gap between them and around what is fixed to the world [m], for fingers. The robot's
+        joints are at ``pose`` [rad, m], those of the arm as far from there as ``noise`` [rad].
         """
         scene = env.cfg.scene
         model = env.sim.model
@@ -115,14 +110,10 @@ class Placement:
         self._tensors = [t.to(device, dtype) for t in self._tensors]
 
     def require_room(self, xy: object, candidates: int) -> None:
-        """Try the region on many imaginary worlds.
-
-        Args:
-            xy: The region as the user wrote it, for the error.
-            candidates: Draws per object and world.
+        """Try the region on many imaginary worlds, with so many draws per object and world.
 
         Raises:
-            ParameterError: In some of them no candidate fits.
+            ParameterError: In some of them no candidate fits; names ``xy`` as the user wrote it.
         """
         count = len(self._apart)
         key = (candidates, str(self._apart), *(t.numpy().tobytes() for t in self._tensors))
@@ -145,12 +136,9 @@ class Placement:
         The first free candidate of each object is tried with those of the others, then the second
         of each, and so on. So all sets of free positions that are apart are equally likely.
 
-        Args:
-            draws: Numbers in [-1, 1), shape ``(n, objects, candidates, 2)``: x and y.
-
-        Returns:
-            Offsets from the nominal positions [m], shape ``(n, objects, 2)``, 0 for all objects
-            where nothing fits; and whether all objects fit, ``(n,)``.
+        Takes x and y in [-1, 1), shape ``(n, objects, candidates, 2)``. Returns offsets from the
+        nominal positions [m], shape ``(n, objects, 2)``, 0 for all objects where nothing fits; and
+        whether all objects fit, ``(n,)``.
         """
         nominal, region, center, room, *rectangles = self._tensors
         offsets = draws * region
@@ -191,11 +179,9 @@ sine of their yaw, ``(n, 3)``."""
 
 
 def _around(thing: ObjectCfg, top: float, boxes: _Boxes, clear: float) -> ndarray:
-    """Distance that boxes ask of an object: of its centre from a rectangle.
-
-    Returns:
-        Centre and half sizes of the rectangle in x and y, the distance [m], and cosine and sine of
-        its yaw, shape ``(m, 7)``, of the boxes that are low enough to matter.
+    """Distance that boxes ask of an object: of its centre from a rectangle. Returns the rectangle's
+    centre and half sizes in x and y, the distance [m], and cosine and sine of its yaw, shape ``(m,
+    7)``, of the boxes that are low enough to matter.
     """
     centers, halves, turned = boxes
     half = thing.half_height
@@ -276,13 +262,8 @@ def require_reach(env: EnvView, region: Sequence[float]) -> None:
 
 
 def out_of_reach(env: EnvView, name: str, xy: np.ndarray) -> tuple[int, str] | None:
-    """The position of an object that is farthest out of reach, by its row, and a sentence on it;
-    None if the arm reaches them all.
-
-    Args:
-        env: The environment.
-        name: The object.
-        xy: Where it may stand [m], shape ``(n, 2)``.
+    """The position of an object that is farthest out of reach, by its row in ``xy``, where it may
+    stand [m], shape ``(n, 2)``, and a sentence on it; None if the arm reaches them all.
     """
     # How far the grasp point stays from each target at each position
     scene = env.cfg.scene

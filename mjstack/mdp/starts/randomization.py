@@ -19,19 +19,13 @@ class Randomized(ABC):
 
     All that follows from a value is computed in float64 from the value that the field holds, so
     that writing what was read changes nothing.
-
-    Attributes:
-        model_fields: The model fields that it needs.
-        ends: Smallest and largest value, over the nominal one.
-        columns: Names of its numbers in a file of starts.
-        nominal: The numbers that the ends are relative to, shape ``(n,)``, float64.
     """
 
     label = "reset.model"
-    model_fields: ClassVar[tuple[str, ...]]
-    ends: tuple[float, float]
-    columns: list[str]
-    nominal: Tensor
+    model_fields: ClassVar[tuple[str, ...]]  # that it needs
+    ends: tuple[float, float]  # smallest and largest value, over the nominal one
+    columns: list[str]  # names of its numbers in a file of starts
+    nominal: Tensor  # numbers that the ends are relative to, shape ``(n,)``, float64
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write the model fields."""
@@ -59,13 +53,8 @@ def bounds(name: str, values: Sequence[float]) -> tuple[float, float]:
 
 
 class Elements:
-    """Some elements of a per-world model field.
-
-    Attributes:
-        dtype: The field's type.
-        nominal: The model's own values of them.
-        read: Reads the values of every world.
-        write: Writes values into the masked worlds, as ``(mask, value)``.
+    """Some elements of a per-world model field, of its ``dtype``; ``nominal`` are the model's own
+    values of them.
     """
 
     def __init__(
@@ -74,8 +63,8 @@ class Elements:
         """Find them; nominal values are ``exact`` in float64, or of the field's type."""
         view = env.sim.fields[name]
         columns = Columns(elements, env.device)
-        self.read = partial(columns.read, view)
-        self.write = partial(columns.write_masked, view)
+        self.read = partial(columns.read, view)  # the values of every world
+        self.write = partial(columns.write_masked, view)  # (mask, value), into the masked worlds
         self.dtype = view.dtype
         nominal = torch.from_numpy(getattr(env.sim.model, name)[list(elements)].copy())
         self.nominal = nominal.to(env.device, torch.float64 if exact else self.dtype)

@@ -34,11 +34,8 @@ _RANDOMIZED: dict[Any, str] = {
 
 
 class StartsTable:
-    """The content of a starts file: an npz archive of arrays with a row per world.
-
-    Attributes:
-        arrays: Values by name, float64, each of shape ``(worlds,)`` or ``(worlds, n)``.
-        worlds: How many there are.
+    """The content of a starts file: an npz archive of arrays with a row for each of its ``worlds``,
+    in ``arrays`` by name, float64, each of shape ``(worlds,)`` or ``(worlds, n)``.
     """
 
     def __init__(
@@ -48,13 +45,9 @@ class StartsTable:
         ranges: Mapping[str, tuple[ArrayLike, ArrayLike]],
         required: Sequence[str],
     ) -> None:
-        """Read a file and check the name, the shape and the numbers of every array.
-
-        Args:
-            path: The file.
-            key: The configuration key that names it: ``starts``, or ``path`` of a term.
-            ranges: Smallest and largest row of each array that a file may have, by its name.
-            required: The arrays that every file has.
+        """Read a file, which the configuration key ``starts`` or ``path`` of a term names, and
+        check the name, the shape and the numbers of every array. ``ranges`` has the smallest and
+        largest row of each array that a file may have; every file has the required ones.
 
         Raises:
             ConfigError: The file cannot be read, or an array is missing or wrong.
@@ -214,11 +207,8 @@ class FromStartsFile:
 
 
 def write_starts(env: EnvView, path: str | Path) -> None:
-    """Write how the worlds of an environment have just started, for ``reset=starts_file``.
-
-    Args:
-        env: An environment after `reset`, before its first step.
-        path: The file. World k of the environment becomes world k of the file.
+    """Write how the worlds of an environment have just started, for ``reset=starts_file``: after
+    `reset`, before its first step. World k of the environment becomes world k of the file.
 
     Raises:
         ArgumentError: The worlds have moved on.

@@ -50,16 +50,13 @@ def launch(
     fast_math: bool = False,
     bounds: tuple[int, int] | None = None,
 ) -> None:
-    """Run a kernel; the first launch for models of these sizes compiles it.
+    """Run a kernel, whose body is made up of the named C++ files, one after the other; the first
+    launch for models of these sizes compiles it.
 
-    Args:
-        texts: Names of the C++ files, one after the other, that make up the kernel's body.
-        m: The uploaded model.
-        d: The worlds.
-        warps: How many warps; by default one for each world.
-        fast_math: Whether CUDA's division and roots may be good to the last two bits alone. On a
-            CPU fast math would assume that there is no NaN, so it has no effect there.
-        bounds: Most threads of a block, and fewest blocks on a multiprocessor.
+    There is one warp for each world by default. ``bounds`` are the most threads of a block, and the
+    fewest blocks on a multiprocessor. With ``fast_math`` CUDA's division and roots may be good to
+    the last two bits alone. On a CPU fast math would assume that there is no NaN, so it has no
+    effect there.
     """
     warps = warps or d.nworld
     arrays, constants = _names(texts)

@@ -24,19 +24,14 @@ _AGREES = 1e-3  # of a world's largest acceleration, or of 1 m/s^2
 
 @dataclass(frozen=True)
 class StepPlan:
-    """How the physics steps of a model are done.
-
-    Attributes:
-        name: ``stock`` is `mujoco_warp.step`. ``arranged`` has its stages as parallel branches, and
-            only those that the model needs. ``fused`` is arranged too, with contact rows and the
-            solver as one kernel each.
-        smooth: Whether a fused step has smooth dynamics as three kernels.
-        reason: Why the step is not faster; empty if nothing is left to MJWarp.
+    """How the physics steps of a model are done: ``stock`` is `mujoco_warp.step`; ``arranged`` has
+    its stages as parallel branches, and only those that the model needs; ``fused`` is arranged too,
+    with contact rows and the solver as one kernel each.
     """
 
     name: str = "stock"
-    smooth: bool = False
-    reason: str = ""
+    smooth: bool = False  # whether a fused step has smooth dynamics as three kernels
+    reason: str = ""  # why the step is not faster; empty if nothing is left to MJWarp
 
     def __str__(self) -> str:
         return f"{self.name} step" + (f" ({self.reason})" if self.reason else "")
@@ -89,16 +84,11 @@ def rearranged_forward(
     sensors: bool,
     beside_kinematics: tuple[Callable[[], None], ...] = (),
 ) -> None:
-    """`mujoco_warp.forward`, with contacts and smooth dynamics as parallel branches of a captured
-    graph: neither needs the other.
+    """`mujoco_warp.forward` by a plan, fused or arranged, with contacts and smooth dynamics as
+    parallel branches of a captured graph: neither needs the other.
 
-    Args:
-        m: The uploaded model.
-        d: The worlds.
-        device: Where they are.
-        plan: The step, fused or arranged.
-        sensors: Whether sensordata is computed; of several steps only the last one's is seen.
-        beside_kinematics: Work that may run while the poses are computed.
+    ``sensors`` says whether sensordata is computed: of several steps only the last one's is seen.
+    ``beside_kinematics`` is work that may run while the poses are computed.
     """
     stages = constraints if plan.name == "fused" else mjw
 
