@@ -108,10 +108,18 @@ def test_a_file_that_does_not_fit_the_profile_is_refused(
 
 
 @pytest.mark.parametrize("name", ["floor", "table", "red"])
-def test_a_file_with_a_name_of_the_scene_is_refused(name: str, tmp_path: Path) -> None:
-    geom = f'<worldbody><geom name="{name}" size="0.01" pos="0 0 2"/>'
-    cfg = changed(tmp_path, "<worldbody>", geom)
-    refusal(lambda: build_model(cfg), f"scene stack: repeated name '{name}'")
+def test_a_name_of_the_scene_gets_a_prefix(name: str, tmp_path: Path) -> None:
+    geom = f'<worldbody><geom name="{name}" type="sphere" size="0.01" pos="0 0 2" contype="1"/>'
+    model = build_model(changed(tmp_path, "<worldbody>", geom))
+    assert model.geom(f"robot_{name}").size[0] == 0.01
+    assert model.geom(name).size[0] != 0.01
+
+
+def test_a_name_that_robot_and_scene_need_is_refused(tmp_path: Path) -> None:
+    cfg = changed(tmp_path, 'body name="left_finger"', 'body name="red"')
+    robot = replace(cfg.robot, jaw_bodies=["red", "right_finger"])
+    line = "robot scara: the scene has red too, expected other names in the robot's file"
+    refusal(lambda: build_model(replace(cfg, robot=robot)), line)
 
 
 def test_a_servo_is_found_by_its_joint_and_limited_as_the_joint_is(tmp_path: Path) -> None:

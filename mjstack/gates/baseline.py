@@ -2,6 +2,9 @@
 
 from mjstack.episodes.run import Run, needs_episode
 from mjstack.report.record import GateResult
+from mjstack.robots import read_robot
+from mjstack.robots.guest import left_behind
+from mjstack.scene.build import scene_names
 
 
 @needs_episode
@@ -33,4 +36,7 @@ def run_baseline(run: Run) -> list[GateResult]:
     result.metrics = metrics
     result.beyond = beyond
     result.notes["backend"] = sim.description
+    names = scene_names(cfg.scene)
+    lines = left_behind(read_robot(cfg.robot, cfg.model), cfg.robot, run.stage.model, names)
+    result.details += [f"robot's file: {line}" for line in lines]
     return [result]

@@ -15,6 +15,7 @@ WORLD = "world"  # MuJoCo's name of the body that never moves
 
 # Figures of the solver that the group `solver` leaves to the robot's file where they are null
 _SOLVER = ("iterations", "ls_iterations", "impratio", "tolerance")
+_CONFIGURED = (*_SOLVER, "timestep", "integrator", "cone")  # by groups timing and solver
 _FREE = mujoco.mjtJoint.mjJNT_FREE
 _PREFIX = "robot_"
 _NAMED = ("geoms", "bodies", "cameras")  # elements that a scene has too
@@ -93,10 +94,14 @@ def left_behind(
     fresh = mujoco.MjSpec().option
     for name in _fields(fresh):
         asked, default, there = (getattr(o, name) for o in (spec.option, fresh, model.opt))
-        if np.array_equal(asked, default) or np.array_equal(asked, there):
+        if name in _CONFIGURED or np.array_equal(asked, default) or np.array_equal(asked, there):
             continue
         if kind := _FLAGS.get(name):
-            bits = [b.name.rpartition("_")[2].lower() for b in kind if b & asked & ~there]
+            bits = [
+                name.rpartition("_")[2].lower()
+                for name, bit in kind.__members__.items()
+                if int(bit) & asked & ~there
+            ]
             if bits:
                 yield f"flags {', '.join(bits)}"
         else:
@@ -106,7 +111,8 @@ def left_behind(
     ]
     if strangers:
         yield f"left out: {', '.join(sorted(set(strangers)))}"
-    if names := _clashes(spec, reserved):
+    names = set(_clashes(spec, reserved)) - {e.name for e in _strangers(spec, robot)}
+    if names:
         yield f"renamed to {_PREFIX}NAME: {', '.join(sorted(names))}"
 
 
@@ -127,9 +133,9 @@ def _strangers(spec: mujoco.MjSpec, robot: RobotCfg) -> list[Any]:
     if robot.root:
         require_names("robot.root: body", [robot.root], [body.name for body in spec.bodies])
         root = spec.body(robot.root)
-        kept = {body.name for body in (*_below(root), *_above(root))}
-        outside = [b for b in spec.bodies if b.name not in kept and b.parent.name in kept]
-        missing = [n for n, joint in joints.items() if joint.parent.name not in kept]
+        subtree = {body.name for body in (*_below(root), *_above(root))}
+        outside = [b for b in spec.bodies if b.name not in subtree and b.parent.name in subtree]
+        missing = [n for n, joint in joints.items() if joint.parent.name not in subtree]
         require_names(
             f"robot.root={robot.root}: joint",
             missing,
@@ -178,7 +184,7 @@ def _fields(option: object) -> list[str]:
     return [name for name in dir(option) if not name.startswith("_")]
 
 
-def _text(value: object) -> str:
+def _text(value: Any) -> str:
     return " ".join(f"{number:g}" for number in np.ravel(value))
 
 
