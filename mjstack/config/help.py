@@ -33,7 +33,7 @@ mjstack: a task of a robot arm, from native MuJoCo to thousands of MuJoCo Warp w
 Usage: mjstack [group=choice ...] [key=value ...] [flags]
        mjstack list [tasks|robots|terms|conditions|gates|trainers|policies]
        mjstack demo    16 worlds stack by a shipped policy, shown in a browser
-       mjstack new task|driver|action NAME, or robot NAME FILE.xml    a folder of your own
+       mjstack new task|driver|action|robot NAME [FILE.xml]    your own folder
 In a checkout: python scripts/run.py ...  What this machine has: mjstack doctor
 
 Examples:

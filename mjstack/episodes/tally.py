@@ -176,7 +176,7 @@ class EpisodeTally:
         look = ""
         if len(failed) and self.path is not None and self.replayed:
             gate = "" if self.path.name == FAILING else f"{self.gate}:"
-            world = assign("world", gate + self.names(failed[:1])[0])
+            world = f"world={gate}{self.names(failed[:1])[0]}"
             look = command("job=replay", assign("run", self.path.parent), world)
             look = f". To look at one: {look}"
         if "sign" in self.records[0].worlds and self.array("unreachable").any():

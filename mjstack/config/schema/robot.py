@@ -130,7 +130,7 @@ class RobotCfg:
     servos: dict[str, ServoCfg] = spec({})
     """Servos by joint, which the group ``actuator`` chooses; other joints have the file's own. One
     with stiffness, damping and effort is made where the file has a motor, or none."""
-    ranges: dict[str, list[float]] = spec({}, unit="rad, m", length=2)
+    ranges: dict[str, Any] = spec({}, vectors=True, unit="rad, m", length=2)
     """Ranges of joints, in place of the file's own."""
 
     locked: dict[str, float] = spec({}, unit="rad, m")
