@@ -30,7 +30,9 @@ def complete_terms(cfg: DictConfig, overrides: Sequence[str]) -> None:
     does not act into ``unused_terms``, in place. The composition, of the command line's overrides,
     has Hydra's part.
     """
-    chosen = any(o.startswith(f"reset@{_JUDGED}=") for o in overrides)
+    choice = f"reset@{_JUDGED}"
+    chosen = cfg.hydra.runtime.choices.get(choice) != "randomized"  # what the gate's file has
+    chosen = chosen or any(o.startswith(f"{choice}=") for o in overrides)
     with open_dict(cfg):
         if cfg.job.name == "train" and not chosen:  # judged from starts as training has them
             terms = {name: f"${{reset.{name}}}" for name in cfg.reset}
@@ -45,7 +47,7 @@ def _complete_copy(cfg: DictConfig, key: str) -> Iterator[str]:
     """
     shipped = _shipped(cfg, "reset")
     copy = _terms(cfg, key)
-    explicit = _written(cfg, key)
+    explicit = {*_written(cfg, key), *(name for name, term in copy.items() if term is None)}
     for name, term in _written(cfg, "reset").items():
         func = _func(term)
         there = _func(copy.get(name))
@@ -74,6 +76,7 @@ def _unseen(cfg: DictConfig) -> Iterator[str]:
     if "observation" not in cfg.job:
         return
     seen = _terms(cfg, "job.observation", cfg.job.group)
+    seen = {name: term for name, term in seen.items() if term}
     known = [_content(term) for term in seen.values()]
     written = _written(cfg, "observation", cfg.job.group)
     if unseen := [n for n, term in written.items() if term and _content(term) not in known]:
@@ -91,6 +94,11 @@ def _written(cfg: DictConfig, key: str, group: str = "") -> Terms:
     """Terms that are not as the chosen file of mjstack has them; None for those left out."""
     shipped = _shipped(cfg, key, group)
     terms = _terms(cfg, key, group)
+    if not shipped:  # a file of the user's, which may include one of mjstack's
+        kind = key.rpartition(".")[2]
+        for file in (CONFIG_FOLDER / kind).glob("*.yaml"):
+            known = _file_terms(kind, file.stem, group)
+            shipped |= {n: term for n, term in known.items() if terms.get(n) == term}
     names = dict.fromkeys([*shipped, *terms])
     return {n: terms.get(n) for n in names if terms.get(n) != shipped.get(n)}
 

@@ -132,10 +132,11 @@ def _requirements(config: Facts, cameras: Sequence[str]) -> Facts:
     return values
 
 
-def save_policy(folder: Path, policy: Policy) -> None:
+def save_policy(folder: str | os.PathLike, policy: Policy) -> None:
     """Write a policy's folder; an earlier policy in it is replaced at once or not at all, such as
     where a FolderError says that it cannot be written.
     """
+    folder = Path(folder)
     weights = save({k: v.contiguous() for k, v in policy.network.state_dict().items()})
     digest = sha256(weights).hexdigest()
     facts = {

@@ -24,6 +24,9 @@ _NAMING = {  # elements with the names of others
     "excludes": ("bodyname1", "bodyname2"),
     "equalities": ("name1", "name2"),
     "sensors": ("objname", "refname"),
+    "actuators": ("target",),
+    "cameras": ("targetbody",),
+    "lights": ("targetbody",),
 }
 _FLAGS = {"disableflags": mujoco.mjtDisableBit, "enableflags": mujoco.mjtEnableBit}
 
@@ -41,6 +44,9 @@ def as_guest(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) ->
     fresh.modelname = spec.modelname
     for element in _strangers(spec, robot):
         spec.delete(element)
+    bodies = {body.name for body in spec.bodies}
+    for camera in [c for c in spec.cameras if c.targetbody and c.targetbody not in bodies]:
+        spec.delete(camera)
     geoms = {geom.name for geom in spec.geoms}
     for pair in list(spec.pairs):  # MuJoCo leaves them behind
         if not {pair.geomname1, pair.geomname2} <= geoms:
@@ -198,4 +204,6 @@ def _fix_masses(spec: mujoco.MjSpec) -> None:
         body.mass = model.body_mass[twin.id]
         for name in ("inertia", "ipos", "iquat"):
             setattr(body, name, getattr(model, f"body_{name}")[twin.id])
+        body.fullinertia = [np.nan, *[0.0] * 5]  # none
     spec.compiler.settotalmass = -1.0
+    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO

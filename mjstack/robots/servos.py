@@ -45,6 +45,7 @@ def prepare_servos(spec: mujoco.MjSpec, robot: RobotCfg) -> None:
             servo.inheritrange = servo.inheritrange or 1.0
         if name in robot.arm_joints and robot.arm_force_limit is not None:
             servo.forcerange = [-robot.arm_force_limit, robot.arm_force_limit]
+            servo.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
         if name in robot.servos:
             _set_servo(spec, name, robot.servos[name])
 
@@ -59,17 +60,30 @@ def _find_servo(spec: mujoco.MjSpec, name: str, made: ServoCfg | None) -> mujoco
     servos = [a for a in spec.actuators if a.trntype in _JOINT and a.target == name]
     reason = _refusal(servos[0]) if len(servos) == 1 else ""
     if len(servos) == 1 and not reason:
+        servos[0].trntype = mujoco.mjtTrn.mjTRN_JOINT  # the same for hinges and slides
         _convert(servos[0])
         return servos[0]
-    if made is None or None in (made.stiffness, made.damping, made.effort):
+    if made is None or made.stiffness is None or made.damping is None or made.effort is None:
         names = ", ".join(a.name or "unnamed" for a in servos) or "none"
         expected = f"one <position> in the robot's file{reason and f' ({reason})'}, or"
         expected += f" stiffness, damping and effort in robot.servos.{name}"
         raise ConfigError(f"actuators of joint {name}", names, expected)
     for servo in servos:
         spec.delete(servo)
-    servo = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-    servo.set_to_position(kp=made.stiffness, kv=made.damping)
+    return _add_servo(spec, name, made.stiffness, made.damping)
+
+
+def _add_servo(
+    spec: mujoco.MjSpec, joint: str, stiffness: float, damping: float
+) -> mujoco.MjsActuator:
+    """A new position servo, with nothing of the file's default class."""
+    servo = spec.add_actuator(name=f"servo of {joint}", target=joint)
+    servo.trntype = mujoco.mjtTrn.mjTRN_JOINT
+    servo.gear = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    servo.ctrlrange = servo.forcerange = [0.0, 0.0]
+    servo.ctrllimited = servo.forcelimited = mujoco.mjtLimited.mjLIMITED_AUTO
+    servo.set_to_position(kp=stiffness, kv=damping)
+    servo.inheritrange = 0.0
     return servo
 
 
@@ -135,20 +149,21 @@ def _split_tendons(spec: mujoco.MjSpec, joints: Sequence[str]) -> None:
             expected = f"a position servo ({reason})"
             raise ConfigError(f"actuator of tendon {tendon.name}", servo.name, expected)
         if servo.biasprm[2] > 0.0:  # a damping ratio, which MuJoCo resolves for the tendon
+            servo.name = servo.name or f"servo of {tendon.name}"
             compiled = spec.copy().compile()
-            number = [actuator.name for actuator in spec.actuators].index(servo.name)
-            servo.biasprm[2] = compiled.actuator_biasprm[number, 2]
+            servo.biasprm[2] = compiled.actuator(servo.name).biasprm[2]
         _convert(servo)
         moves = _ratios(spec, share)
         length = sum(coef * moves[name] for name, coef in share.items())
-        if abs(length) < 1e-9:
-            raise ConfigError(f"tendon {tendon.name}", share, "coefficients that do not cancel")
+        if min(coef * length / moves[name] for name, coef in share.items()) < 1e-9:
+            expected = "coefficients with which each finger moves as the servo pulls it"
+            raise ConfigError(f"tendon {tendon.name}", share, expected)
         _, bias, damping = servo.biasprm[:3]
         for name, coef in share.items():
             part = coef * length / moves[name]
-            actuator = spec.add_actuator(name=f"servo of {name}", target=name)
-            actuator.trntype = mujoco.mjtTrn.mjTRN_JOINT
-            actuator.set_to_position(kp=-part * bias, kv=-part * damping)
+            actuator = _add_servo(spec, name, -part * bias, -part * damping)
+            actuator.ctrllimited = servo.ctrllimited
+            actuator.forcelimited = servo.forcelimited
             actuator.ctrlrange = np.sort(servo.ctrlrange * moves[name] / length)
             actuator.forcerange = np.sort(coef * servo.forcerange)
         spec.delete(servo)
@@ -161,7 +176,8 @@ def _ratios(spec: mujoco.MjSpec, share: Mapping[str, float]) -> dict[str, float]
     for equality in spec.equalities:
         names = (equality.name1, equality.name2)
         slope = equality.data[1]
-        if equality.type == mujoco.mjtEq.mjEQ_JOINT and first in names and slope:
+        linear = equality.type == mujoco.mjtEq.mjEQ_JOINT and not equality.data[0]
+        if linear and equality.active and first in names and slope:
             follower, leader = names
             ratios |= {follower: slope} if leader == first else {leader: 1.0 / slope}
     return {name: ratios[name] for name in share}
@@ -177,6 +193,7 @@ def _set_servo(spec: mujoco.MjSpec, name: str, servo: ServoCfg) -> None:
         actuator.biasprm[2] = -servo.damping
     if servo.effort is not None:
         actuator.forcerange = [-servo.effort, servo.effort]
+        actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
     joint = spec.joint(name)
     if servo.armature is not None:
         joint.armature = servo.armature

@@ -50,7 +50,10 @@ def read_robot(robot: RobotCfg, model: ModelCfg) -> mujoco.MjSpec:
     """The robot's file as it is; errors as of `robot_spec`."""
     menagerie = model.source == "menagerie"
     path = _menagerie_path(robot) if menagerie else _file_path(robot)
-    return read_mjcf(path, _MENAGERIE_FIX if menagerie else "Correct the file (robot.file).")
+    spec = read_mjcf(path, _MENAGERIE_FIX if menagerie else "Correct the file (robot.file).")
+    for number, body in enumerate(spec.bodies):
+        body.name = body.name or f"unnamed_{number}"  # bodies are told apart by their names
+    return spec
 
 
 def read_mjcf(path: str | Path, fix: str) -> mujoco.MjSpec:
