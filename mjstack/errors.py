@@ -200,7 +200,7 @@ def shorten(text: str, most: int = _MOST_LETTERS) -> str:
     if len(text) <= most:
         return text
     begin, end = text[: -(most // 2)], text[-(most // 2) :]
-    begin = re.sub(r"/\S{64,}|\S{100,}", lambda long: f"{long[0][:15]}...{long[0][-45:]}", begin)
+    begin = re.sub(r"/\S{50,}|\S{100,}", lambda long: f"{long[0][:20]}...{long[0][-20:]}", begin)
     return begin + end if len(begin + end) <= most else f"{begin[: most // 2 - 5]} ... {end}"
 
 

@@ -778,7 +778,7 @@ def test_missing_and_cut_files_are_named(file: str, tmp_path: Path) -> None:
     write(tmp_path, range(3))
     whole = (tmp_path / file).read_bytes()
     (tmp_path / file).write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(FolderError, match=re.escape(file)):
+    with pytest.raises(FolderError, match=re.escape(Path(file).name)):  # a long path is shortened
         read_dataset(tmp_path)
     (tmp_path / file).unlink()
     for use in (read_dataset, lambda folder: DatasetWriter(folder, SPEC)):

@@ -259,7 +259,9 @@ def test_a_bad_file_is_refused_in_one_line(message: str, tmp_path: Path) -> None
         else:
             starts[name] = values
     np.savez(path, **{name: values for name, values in starts.items() if values is not None})
-    assert refusal_of(cfg).startswith(f"starts={path}{message}")
+    line = refusal_of(cfg)
+    assert line.startswith("starts=/")
+    assert f"/worlds.npz{message}" in line  # in a long line the path loses its middle
 
 
 @pytest.mark.parametrize("rows", [0, 3])
