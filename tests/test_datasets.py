@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import weakref
 from collections.abc import Callable
 from dataclasses import replace
@@ -774,11 +775,16 @@ def test_damage_and_a_strangers_files_are_one_line(name: str, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("file", [DATA, ROWS, lerobot.TASKS, INFO])
-def test_missing_and_cut_files_are_named(file: str, tmp_path: Path) -> None:
+def test_missing_and_cut_files_are_named(file: str) -> None:
+    with tempfile.TemporaryDirectory() as folder:  # its path is short enough for a line
+        check_missing_and_cut(file, Path(folder))
+
+
+def check_missing_and_cut(file: str, tmp_path: Path) -> None:
     write(tmp_path, range(3))
     whole = (tmp_path / file).read_bytes()
     (tmp_path / file).write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(FolderError, match=re.escape(Path(file).name)):  # a long path is shortened
+    with pytest.raises(FolderError, match=re.escape(file)):
         read_dataset(tmp_path)
     (tmp_path / file).unlink()
     for use in (read_dataset, lambda folder: DatasetWriter(folder, SPEC)):

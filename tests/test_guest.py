@@ -209,3 +209,13 @@ def test_a_joint_gets_a_range(tmp_path: Path) -> None:
     np.testing.assert_allclose(model.actuator("elbow").ctrlrange, [0.2, 2.5])
     with pytest.raises(MjstackError, match=r"robot.ranges: joint 'elbo' does not exist"):
         build_model(changed(tmp_path, ranges={"elbo": [0.2, 2.5]}))
+
+
+def test_a_made_servo_has_nothing_of_the_files_defaults(tmp_path: Path) -> None:
+    default = '<position inheritrange="1"/>'
+    motor = '<motor gear="30" ctrlrange="-1 1" forcelimited="false"/>'
+    made = ServoCfg(stiffness=10.0, damping=1.0, effort=4.0)
+    cfg = changed(tmp_path, (default, default + motor), (ELBOW, ""), servos={"elbow": made})
+    model = robot_spec(cfg.robot, cfg.model).compile()
+    assert force_of(model, "elbow", 0.5, 0.0, 0.7) == pytest.approx(2.0)
+    assert force_of(model, "elbow", 0.2, 0.0, 2.0) == pytest.approx(4.0)  # its effort

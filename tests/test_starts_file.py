@@ -3,6 +3,7 @@ file.
 """
 
 import re
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -246,8 +247,12 @@ def refusal_of(cfg: Config) -> str:
 
 
 @pytest.mark.parametrize("message", BAD)
-def test_a_bad_file_is_refused_in_one_line(message: str, tmp_path: Path) -> None:
-    path = tmp_path / "worlds.npz"
+def test_a_bad_file_is_refused_in_one_line(message: str) -> None:
+    with tempfile.TemporaryDirectory() as folder:  # its path is short enough for a line
+        check_bad_file(message, Path(folder) / "worlds.npz")
+
+
+def check_bad_file(message: str, path: Path) -> None:
     cfg = from_file(path)
     changes = dict(BAD[message])
     cfg.reset["starts"].params["pose"] = changes.pop("pose", "start")
@@ -259,9 +264,7 @@ def test_a_bad_file_is_refused_in_one_line(message: str, tmp_path: Path) -> None
         else:
             starts[name] = values
     np.savez(path, **{name: values for name, values in starts.items() if values is not None})
-    line = refusal_of(cfg)
-    assert line.startswith("starts=/")
-    assert f"/worlds.npz{message}" in line  # in a long line the path loses its middle
+    assert refusal_of(cfg).startswith(f"starts={path}{message}")
 
 
 @pytest.mark.parametrize("rows", [0, 3])

@@ -89,7 +89,7 @@ def _without_prefix() -> Iterator[None]:
 def left_behind(
     spec: mujoco.MjSpec, robot: RobotCfg, model: mujoco.MjModel, reserved: Collection[str]
 ) -> Iterator[str]:
-    """What a robot's file asks for and the scene does not do, a line each.
+    """List requests of a robot's file that the scene does not follow, a line each.
 
     Args:
         spec: The file as it was read.
