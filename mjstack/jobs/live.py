@@ -225,7 +225,10 @@ class LiveView(Observer):
         for number, name in enumerate(values):
             color = _COLORS[number % len(_COLORS)]
             if title == _HEIGHT:  # the object's own
-                rgb = (round(255 * part) for part in self.env.cfg.scene.objects[name].color[:3])
+                rgb = (
+                    round(255 * part)
+                    for part in (self.env.cfg.scene.objects[name].color or [0.6] * 3)[:3]
+                )
                 color = f"rgb({', '.join(map(str, rgb))})"
             series.append({"label": name, "stroke": color, "width": 2})
         self._plots[key] = self._server.gui.add_uplot(

@@ -1,13 +1,12 @@
 """A robot as a guest in a scene: what of its file comes along, and what stays behind."""
 
-import warnings
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import mujoco
 import numpy as np
 
+from mjstack.config.mjcf import FREE, attach_guest, describe, option_names, scenery
 from mjstack.config.schema import RobotCfg
 from mjstack.errors import MjstackError, require_names
 
@@ -16,7 +15,6 @@ WORLD = "world"  # MuJoCo's name of the body that never moves
 # Figures of the solver that the group `solver` leaves to the robot's file where they are null
 _SOLVER = ("iterations", "ls_iterations", "impratio", "tolerance")
 _CONFIGURED = (*_SOLVER, "timestep", "integrator", "cone")  # by groups timing and solver
-_FREE = mujoco.mjtJoint.mjJNT_FREE
 _PREFIX = "robot_"
 _NAMED = ("geoms", "bodies", "cameras")  # elements that a scene has too
 _NAMING = {  # elements with the names of others
@@ -54,36 +52,11 @@ def as_guest(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) ->
     _rename(spec, robot, reserved)
     if spec.compiler.settotalmass > 0.0:  # it counts all bodies of a compilation
         _fix_masses(spec)
-    for name in _fields(spec.option):
-        if name in _SOLVER:
-            setattr(fresh.option, name, getattr(spec.option, name))
-        else:
-            setattr(spec.option, name, getattr(fresh.option, name))
-    with _without_prefix():
-        base = fresh.worldbody.add_frame(pos=robot.base.pos, quat=robot.base.quat)
-        fresh.attach(spec, frame=base, prefix="")
+    for name in _SOLVER:
+        setattr(fresh.option, name, getattr(spec.option, name))
+    base = fresh.worldbody.add_frame(pos=robot.base.pos, quat=robot.base.quat)
+    attach_guest(fresh, spec, base, "")
     return fresh
-
-
-def compile_scene(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compile a scene with a guest."""
-    with _without_prefix():
-        return spec.compile()
-
-
-@contextmanager
-def _without_prefix() -> Iterator[None]:
-    """Silence MuJoCo's warning that names without a prefix may spoil a file that is written: none
-    is written.
-    """
-    hook = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda text: None)
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "Attaching a spec with an empty prefix")
-            yield
-    finally:
-        mujoco.set_mju_user_warning(hook)
 
 
 def left_behind(
@@ -97,8 +70,19 @@ def left_behind(
         model: The compiled scene.
         reserved: As of `as_guest`.
     """
+    strangers = _strangers(spec, robot)
+    yield from options_left(spec, model)
+    if strangers:
+        yield f"left out: {describe(strangers)}"
+    names = set(_clashes(spec, reserved)) - {e.name for e in strangers}
+    if names:
+        yield f"renamed to {_PREFIX}NAME: {', '.join(sorted(names))}"
+
+
+def options_left(spec: mujoco.MjSpec, model: mujoco.MjModel) -> Iterator[str]:
+    """List options and flags of a file that the compiled scene does not have, a line each."""
     fresh = mujoco.MjSpec().option
-    for name in _fields(fresh):
+    for name in option_names(fresh):
         asked, default, there = (getattr(o, name) for o in (spec.option, fresh, model.opt))
         if name in _CONFIGURED or np.array_equal(asked, default) or np.array_equal(asked, there):
             continue
@@ -112,14 +96,6 @@ def left_behind(
                 yield f"flags {', '.join(bits)}"
         else:
             yield f"option {name} {_text(asked)}: the scene has {_text(there)}"
-    strangers = [
-        f"{type(e).__name__[3:].lower()} {e.name}".strip() for e in _strangers(spec, robot)
-    ]
-    if strangers:
-        yield f"left out: {', '.join(sorted(set(strangers)))}"
-    names = set(_clashes(spec, reserved)) - {e.name for e in _strangers(spec, robot)}
-    if names:
-        yield f"renamed to {_PREFIX}NAME: {', '.join(sorted(names))}"
 
 
 def _strangers(spec: mujoco.MjSpec, robot: RobotCfg) -> list[Any]:
@@ -127,15 +103,14 @@ def _strangers(spec: mujoco.MjSpec, robot: RobotCfg) -> list[Any]:
     else floors, lights, and bodies that are free; and keyframes, which fit no scene.
     """
     world = spec.worldbody
-    planes = [geom for geom in world.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]
     joints = {name: spec.joint(name) for name in robot.joints}
     trees = {_tree(joint.parent).name for joint in joints.values()}
     free = [
         body
         for body in world.bodies
-        if body.name not in trees and any(j.type == _FREE for b in _below(body) for j in b.joints)
+        if body.name not in trees and any(j.type == FREE for b in _below(body) for j in b.joints)
     ]
-    out = [*spec.keys, *world.lights, *planes, *free]
+    out = [*scenery(spec), *free]
     if robot.root:
         require_names("robot.root: body", [robot.root], [body.name for body in spec.bodies])
         root = spec.body(robot.root)
@@ -184,10 +159,6 @@ def _rename(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) -> 
             for field in ("name", *_NAMING.get(kind, ())):
                 if getattr(element, field) in clashes:
                     setattr(element, field, _PREFIX + getattr(element, field))
-
-
-def _fields(option: object) -> list[str]:
-    return [name for name in dir(option) if not name.startswith("_")]
 
 
 def _text(value: Any) -> str:

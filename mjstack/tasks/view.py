@@ -196,7 +196,7 @@ class Step:
     @step_value
     def height(self) -> Tensor:
         """Height of the lowest point above the table [m], shape ``(nworld, objects)``."""
-        forms = [(thing.shape, thing.size) for thing in self.view.things]
+        forms = [thing.form for thing in self.view.things]
         if forms[1:] == forms[:-1]:  # all alike
             return lowest_point(self.pos, self.quat, *forms[0]) - self.view.top
         poses = zip(self.pos.unbind(1), self.quat.unbind(1), forms, strict=True)
