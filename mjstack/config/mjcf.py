@@ -2,7 +2,7 @@
 
 import itertools
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
@@ -17,6 +17,8 @@ from mjstack.errors import MjstackError, first_line
 from mjstack.files import MESHES
 
 FREE = mujoco.mjtJoint.mjJNT_FREE
+_SHAPES = mujoco.mjtGeom
+_ROUND = (_SHAPES.mjGEOM_SPHERE, _SHAPES.mjGEOM_CAPSULE, _SHAPES.mjGEOM_CYLINDER)
 _DIRECTIONS = 128  # in which an object's farthest points are taken
 
 
@@ -27,10 +29,11 @@ class Solid:
     Attributes:
         center: Middle of the box around them [m].
         half: Half sizes of that box [m].
-        points: Points on their convex hull, from the middle [m], shape ``(n, 3)``.
+        points: Points on their convex hull [m], shape ``(n, 3)``: from the middle, or, where the
+            object is fixed, from the file's origin.
     """
 
-    center: list[float]
+    center: np.ndarray
     half: list[float]
     points: list[list[float]]
 
@@ -54,14 +57,13 @@ def read_mjcf(path: str | Path, fix: str) -> mujoco.MjSpec:
 def scenery(spec: mujoco.MjSpec) -> list[Any]:
     """Floors, lights and keyframes of a file, which stay behind where it is part of a scene."""
     world = spec.worldbody
-    planes = [geom for geom in world.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]
+    planes = [geom for geom in world.geoms if geom.type == _SHAPES.mjGEOM_PLANE]
     return [*spec.keys, *world.lights, *planes]
 
 
-def describe(elements: list[Any]) -> str:
+def describe(elements: Iterable[Any]) -> str:
     """Kinds and names of elements of a file."""
-    names = {f"{type(e).__name__[3:].lower()} {e.name}".strip() for e in elements}
-    return ", ".join(sorted(names))
+    return ", ".join(sorted({f"{type(e).__name__[3:].lower()} {e.name}".strip() for e in elements}))
 
 
 def read_object(file: str, *, fixed: bool) -> tuple[mujoco.MjSpec, str]:
@@ -77,7 +79,7 @@ def read_object(file: str, *, fixed: bool) -> tuple[mujoco.MjSpec, str]:
         spec = mujoco.MjSpec()
         mesh = spec.add_mesh(name="mesh", file=str(Path(file).absolute()))
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
-        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh")
+        spec.worldbody.add_geom(type=_SHAPES.mjGEOM_MESH, meshname="mesh")
         return spec, ""
     spec = read_mjcf(file, "Correct the object's file.")
     world = spec.worldbody
@@ -92,66 +94,62 @@ def read_object(file: str, *, fixed: bool) -> tuple[mujoco.MjSpec, str]:
     joints = [joint for body in free if body not in extra for joint in body.joints]
     for element in (*extra, *(joint for joint in joints if joint.type == FREE)):
         spec.delete(element)
+    for number, joint in enumerate(spec.joints):
+        joint.name = joint.name or f"joint{number}"
     if not fixed:
         for element in (*spec.excludes, *spec.sensors):  # bodies that they name would stay apart
             spec.delete(element)
         if len(free) > 1 or spec.joints:
-            problem = "it has joints; with fixed: true it is a fixture"
-            problem = f"{len(free)} of its bodies are free" if len(free) > 1 else problem
-            raise MjstackError(f"{file}: expected one rigid body to move, {problem}.")
+            found = f"{len(free)} free ones" if len(free) > 1 else f"joint {spec.joints[0].name}"
+            problem = f"{file}: expected one rigid body, as the object moves; it has {found}"
+            raise MjstackError(
+                problem, "Correct the file, or make the object a fixture: fixed=true"
+            )
+    if spec.compiler.settotalmass > 0.0:  # it counts all bodies of a compilation
+        fix_masses(spec)
     return spec, left
 
 
-def attach_guest(
-    host: mujoco.MjSpec, guest: mujoco.MjSpec, frame: mujoco.MjsFrame, prefix: str
-) -> None:
-    """Attach a file's content to a scene, which keeps its own options."""
-    for name in option_names(guest.option):
-        setattr(guest.option, name, getattr(host.option, name))
-    with without_prefix():
-        host.attach(guest, frame=frame, prefix=prefix)
-
-
-def option_names(option: object) -> list[str]:
-    """Names of MuJoCo's options."""
-    return [name for name in dir(option) if not name.startswith("_")]
-
-
 def free_body(
-    file: str, name: str, shift: list[float], density: float | None = None
+    file: str, name: str, origin: Iterable[float], density: float | None = None
 ) -> mujoco.MjSpec:
-    """A scene with an object's file as one body with a free joint, both of a name, and the file's
-    origin shifted in it [m]; of a density [kg/m3], if that is given.
+    """A scene with an object's file as one body with a free joint, both of a name, which holds the
+    file's origin at a position [m]; of a density [kg/m3], if that is given.
 
     Raises:
         MjstackError: As of `read_object`.
     """
     spec, _ = read_object(file, fixed=False)
-    total = spec.compiler.settotalmass
     if density is not None:
-        total = 0.0
         spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
         for geom in spec.geoms:
             geom.mass = np.nan
             geom.density = density
-    host = mujoco.MjSpec()
-    body = host.worldbody.add_body(name=name)
+    scene = mujoco.MjSpec()
+    body = scene.worldbody.add_body(name=name)
     body.add_freejoint(name=name)
-    attach_guest(host, spec, body.add_frame(pos=shift), f"{name}_")
-    host.fuse_static()
-    if total > 0.0:  # it counts all bodies of a compilation
-        set_mass(host, name, total)
-    return host
+    attach_guest(scene, spec, body.add_frame(pos=origin), f"{name}_")
+    scene.fuse_static()
+    return scene
 
 
-def set_mass(spec: mujoco.MjSpec, name: str, mass: float) -> None:
-    """Give a body a mass [kg], and inertia in proportion."""
-    body = spec.body(name)
-    if not body.explicitinertial:
-        spec.adopt_inertial(body)
-    for field in ("inertia", "fullinertia"):
-        setattr(body, field, np.multiply(getattr(body, field), mass / body.mass))
-    body.mass = mass
+def fix_masses(spec: mujoco.MjSpec) -> None:
+    """Give bodies the masses and inertias that they have when the file is compiled alone, with its
+    total mass.
+    """
+    alone = spec.copy()
+    alone.compiler.fusestatic = False  # the same bodies
+    alone.compiler.settotalmass = -1.0
+    model = alone.compile()
+    mujoco.mj_setTotalmass(model, spec.compiler.settotalmass)
+    for body, twin in zip(spec.bodies[1:], alone.bodies[1:], strict=True):
+        body.explicitinertial = True
+        body.mass = model.body_mass[twin.id]
+        for name in ("inertia", "ipos", "iquat"):
+            setattr(body, name, getattr(model, f"body_{name}")[twin.id])
+        body.fullinertia = [np.nan, *[0.0] * 5]  # none
+    spec.compiler.settotalmass = -1.0
+    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
 
 
 @lru_cache(maxsize=64)
@@ -167,57 +165,69 @@ def measure(file: str, *, fixed: bool) -> Solid:
     except ValueError as error:
         problem = ", ".join(str(error).removeprefix("Error: ").splitlines())
         raise MjstackError(f"{file}: {problem}. Correct the object's file") from error
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
     collides = (model.geom_contype | model.geom_conaffinity) != 0
     if not (collides.any() or (fixed and model.ngeom)):
         raise MjstackError(f"{file}: expected a geom that collides, there is none.")
-    geoms = np.flatnonzero(collides | ~collides.any())
-    step = np.arange(_DIRECTIONS)
     z = np.linspace(-1.0, 1.0, _DIRECTIONS)  # of a spiral from pole to pole
-    turn = np.pi * (1.0 + 5.0**0.5) * step
-    spiral = np.sqrt(1.0 - z**2) * (np.cos(turn), np.sin(turn))
-    around = np.concatenate((np.eye(3), -np.eye(3), np.vstack((spiral, z)).T))
-    points = np.concatenate([_surface(data, geom, around) for geom in geoms])
+    turn = np.pi * (1.0 + 5.0**0.5) * np.arange(_DIRECTIONS)
+    spiral = np.stack((np.cos(turn), np.sin(turn), z), axis=1)
+    spiral[:, :2] *= np.sqrt(1.0 - z**2)[:, None]
+    around = np.concatenate((np.eye(3), -np.eye(3), spiral))
+    geoms = np.flatnonzero(collides | ~collides.any())
+    points = np.concatenate([_surface(model, geom, around) for geom in geoms])
     low, high = points.min(axis=0), points.max(axis=0)
     center = 0.5 * (low + high)
-    farthest = points[np.unique(np.argmax(points @ around.T, axis=0))]
-    return Solid(center.tolist(), (high - center).tolist(), (farthest - center).tolist())
+    farthest = points[np.unique(np.argmax(points @ around.T, axis=0))] - center * (not fixed)
+    return Solid(center, (high - center).tolist(), farthest.tolist())
 
 
-def _surface(data: mujoco.MjData, geom: np.integer, around: np.ndarray) -> np.ndarray:
-    """Points of a geom [m], shape ``(n, 3)``, in the world: of a round one those farthest in some
-    directions, shape ``(m, 3)``; of a shape that objects do not have, corners of its box.
+def _surface(model: mujoco.MjModel, geom: np.integer, around: np.ndarray) -> np.ndarray:
+    """Points of a geom in the world [m], shape ``(n, 3)``: a mesh's, corners of a box that holds
+    it, or the farthest of a round one in some directions, shape ``(m, 3)``.
     """
-    model = data.model
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
     kind = model.geom_type[geom]
-    radius, half, _ = model.geom_size[geom]
     turn = data.geom_xmat[geom].reshape(3, 3)
-    local = around @ turn
-    ends = np.sign(local) * [0.0, 0.0, half]
-    if kind == mujoco.mjtGeom.mjGEOM_MESH:
+    if kind == _SHAPES.mjGEOM_MESH:
         mesh = model.geom_dataid[geom]
         first = model.mesh_vertadr[mesh]
         points = model.mesh_vert[first : first + model.mesh_vertnum[mesh]].astype(float)
-    elif kind in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE):
-        points = radius * local + ends
-    elif kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
-        local[:, 2] = 0.0
-        points = radius * local / np.linalg.norm(local, axis=1, keepdims=True).clip(1e-9) + ends
+    elif kind in _ROUND:
+        radius, length, _ = model.geom_size[geom]
+        local = around @ turn
+        flat = local * [1.0, 1.0, float(kind != _SHAPES.mjGEOM_CYLINDER)]
+        flat *= radius / np.linalg.norm(flat, axis=1, keepdims=True).clip(1e-9)
+        points = flat + np.sign(local) * [0.0, 0.0, length]
     else:
-        middle, sizes = model.geom_aabb[geom].reshape(2, 3)
-        points = middle + sizes * list(itertools.product((-1.0, 1.0), repeat=3))
+        middle, half = model.geom_aabb[geom].reshape(2, 3)
+        points = middle + half * list(itertools.product((-1.0, 1.0), repeat=3))
     return data.geom_xpos[geom] + points @ turn.T
+
+
+def attach_guest(
+    host: mujoco.MjSpec, guest: mujoco.MjSpec, frame: mujoco.MjsFrame, prefix: str
+) -> None:
+    """Attach a file's content to a scene, which keeps its own options."""
+    for name in option_names(guest.option):
+        setattr(guest.option, name, getattr(host.option, name))
+    with _without_prefix():
+        host.attach(guest, frame=frame, prefix=prefix)
+
+
+def option_names(option: object) -> list[str]:
+    """Names of MuJoCo's options."""
+    return [name for name in dir(option) if not name.startswith("_")]
 
 
 def compile_scene(spec: mujoco.MjSpec) -> mujoco.MjModel:
     """Compile a scene with a guest."""
-    with without_prefix():
+    with _without_prefix():
         return spec.compile()
 
 
 @contextmanager
-def without_prefix() -> Iterator[None]:
+def _without_prefix() -> Iterator[None]:
     """Silence MuJoCo's warning that names without a prefix may spoil a file that is written: none
     is written.
     """

@@ -3,7 +3,7 @@
 from mjstack.episodes.run import Run, needs_episode
 from mjstack.report.record import GateResult
 from mjstack.robots import read_robot
-from mjstack.robots.guest import left_behind
+from mjstack.robots.guest import left_behind, object_left_behind
 from mjstack.scene.build import scene_names
 
 
@@ -39,4 +39,8 @@ def run_baseline(run: Run) -> list[GateResult]:
     names = scene_names(cfg.scene)
     lines = left_behind(read_robot(cfg.robot, cfg.model), cfg.robot, run.stage.model, names)
     result.details += [f"robot's file: {line}" for line in lines]
+    for name, thing in cfg.scene.objects.items():
+        if thing.file is not None:
+            lines = object_left_behind(thing.file, run.stage.model, fixed=thing.fixed)
+            result.details += [f"file of {name}: {line}" for line in lines]
     return [result]

@@ -6,7 +6,15 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjstack.config.mjcf import FREE, attach_guest, describe, option_names, scenery
+from mjstack.config.mjcf import (
+    FREE,
+    attach_guest,
+    describe,
+    fix_masses,
+    option_names,
+    read_object,
+    scenery,
+)
 from mjstack.config.schema import RobotCfg
 from mjstack.errors import MjstackError, require_names
 
@@ -51,7 +59,7 @@ def as_guest(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) ->
             spec.delete(pair)
     _rename(spec, robot, reserved)
     if spec.compiler.settotalmass > 0.0:  # it counts all bodies of a compilation
-        _fix_masses(spec)
+        fix_masses(spec)
     for name in _SOLVER:
         setattr(fresh.option, name, getattr(spec.option, name))
     base = fresh.worldbody.add_frame(pos=robot.base.pos, quat=robot.base.quat)
@@ -71,7 +79,7 @@ def left_behind(
         reserved: As of `as_guest`.
     """
     strangers = _strangers(spec, robot)
-    yield from options_left(spec, model)
+    yield from _options_left(spec, model)
     if strangers:
         yield f"left out: {describe(strangers)}"
     names = set(_clashes(spec, reserved)) - {e.name for e in strangers}
@@ -79,7 +87,15 @@ def left_behind(
         yield f"renamed to {_PREFIX}NAME: {', '.join(sorted(names))}"
 
 
-def options_left(spec: mujoco.MjSpec, model: mujoco.MjModel) -> Iterator[str]:
+def object_left_behind(file: str, model: mujoco.MjModel, *, fixed: bool) -> Iterator[str]:
+    """List requests of an object's file that the compiled scene does not follow, a line each."""
+    spec, left = read_object(file, fixed=fixed)
+    yield from _options_left(spec, model)
+    if left:
+        yield f"left out: {left}"
+
+
+def _options_left(spec: mujoco.MjSpec, model: mujoco.MjModel) -> Iterator[str]:
     """List options and flags of a file that the compiled scene does not have, a line each."""
     fresh = mujoco.MjSpec().option
     for name in option_names(fresh):
@@ -163,18 +179,3 @@ def _rename(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) -> 
 
 def _text(value: Any) -> str:
     return " ".join(f"{number:g}" for number in np.ravel(value))
-
-
-def _fix_masses(spec: mujoco.MjSpec) -> None:
-    """Give bodies the masses and inertias that they have when the robot is compiled alone."""
-    alone = spec.copy()
-    alone.compiler.fusestatic = False  # the same bodies
-    model = alone.compile()
-    for body, twin in zip(spec.bodies[1:], alone.bodies[1:], strict=True):
-        body.explicitinertial = True
-        body.mass = model.body_mass[twin.id]
-        for name in ("inertia", "ipos", "iquat"):
-            setattr(body, name, getattr(model, f"body_{name}")[twin.id])
-        body.fullinertia = [np.nan, *[0.0] * 5]  # none
-    spec.compiler.settotalmass = -1.0
-    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO

@@ -14,10 +14,10 @@ import numpy as np
 from mjstack.config.mjcf import (
     attach_guest,
     compile_scene,
+    fix_masses,
     free_body,
     measure,
     read_object,
-    set_mass,
 )
 from mjstack.config.schema import BoxCfg, CameraCfg, Config, ObjectCfg, SceneCfg
 from mjstack.errors import ConfigError, MjstackError, UnknownName, require_names
@@ -193,9 +193,10 @@ def _attach_file(spec: mujoco.MjSpec, name: str, thing: ObjectCfg, pose: Mapping
         child.fuse_static()
     else:
         center = measure(thing.file, fixed=False).center
-        child = free_body(thing.file, name, [-part for part in center], thing.density)
+        child = free_body(thing.file, name, -center, thing.density)
         if thing.mass is not None:
-            set_mass(child, name, thing.mass)
+            child.compiler.settotalmass = thing.mass
+            fix_masses(child)
     for geom in child.geoms:
         if thing.friction is not None:
             geom.friction = thing.friction

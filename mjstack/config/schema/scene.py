@@ -4,7 +4,6 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import chain
 from operator import mul
 
 from mjstack.config.fields import spec
@@ -173,17 +172,16 @@ class ObjectCfg(ShapeCfg):
 
         solid = measure(self.file, fixed=self.fixed)
         up = self.axes[2]
-        lowest = min(sum(map(mul, up, point)) for point in solid.points)
-        return -lowest - self.fixed * sum(map(mul, up, solid.center))
+        return -min(sum(map(mul, up, point)) for point in solid.points)
 
     @property
     def form(self) -> tuple[str, Sequence[float]]:
         """Shape and sizes, as of `lowest_point`: of a file's, points of its hull."""
-        if self.file is None or self.fixed:
+        if self.file is None:
             return self.shape, self.size
         from mjstack.config.mjcf import measure
 
-        return "hull", tuple(chain(*measure(self.file, fixed=False).points))
+        return "hull", tuple(itertools.chain(*measure(self.file, fixed=self.fixed).points))
 
     @property
     def has_faces(self) -> bool:
