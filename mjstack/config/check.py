@@ -133,8 +133,10 @@ def _scene(cfg: Config) -> Checks:
         wrong = (thing.mass, thing.density) == (None, None) and not thing.fixed
         wrong &= thing.file is None or thing.file.lower().endswith(MESHES)
         yield f"{key}.mass", wrong, "a number [kg], or a density: it moves"
-        wrong = thing.density is not None and thing.mass is not None
-        yield f"{key}.density", wrong, "null, because it has a mass"
+        wrong = thing.density is not None and (thing.mass is not None or thing.fixed)
+        yield f"{key}.density", wrong, "null, because it has a mass or is fixed"
+        wrong = bool(thing.file) and thing.fixed and thing.mass is not None
+        yield f"{key}.mass", wrong, "null: masses of a fixture are its file's"
         wrong = bool(thing.parts) and not thing.fixed
         yield f"{key}.fixed", wrong, "true, because it has parts"
         wrong = bool(thing.joints) and not (thing.file and thing.fixed)

@@ -2,7 +2,7 @@
 
 import itertools
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
@@ -131,6 +131,13 @@ def free_body(
     attach_guest(scene, spec, body.add_frame(pos=origin), f"{name}_")
     scene.fuse_static()
     return scene
+
+
+def set_range(joint: mujoco.MjsJoint, ends: Sequence[float]) -> None:
+    """Limit a hinge or a slide [rad, m]."""
+    turns = joint.type == mujoco.mjtJoint.mjJNT_HINGE and joint.compiler.degree
+    joint.range = np.degrees(ends) if turns else ends
+    joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
 
 
 def fix_masses(spec: mujoco.MjSpec) -> None:

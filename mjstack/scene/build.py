@@ -18,6 +18,7 @@ from mjstack.config.mjcf import (
     free_body,
     measure,
     read_object,
+    set_range,
 )
 from mjstack.config.schema import BoxCfg, CameraCfg, Config, ObjectCfg, SceneCfg
 from mjstack.errors import ConfigError, MjstackError, UnknownName, require_names
@@ -209,8 +210,7 @@ def _attach_file(spec: mujoco.MjSpec, name: str, thing: ObjectCfg, pose: Mapping
         if values.damping is not None:
             child.joint(joint).damping[0] = values.damping
         if values.range is not None:
-            child.joint(joint).range = values.range
-            child.joint(joint).limited = mujoco.mjtLimited.mjLIMITED_TRUE
+            set_range(child.joint(joint), values.range)
     if thing.fixed:
         body = spec.worldbody.add_body(name=name, **pose)
         attach_guest(spec, child, body.add_frame(), f"{name}_")
