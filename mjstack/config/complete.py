@@ -115,7 +115,7 @@ def _complete_scene(scene: schema.SceneCfg) -> None:
             size = [1e-4] * 3  # of no account: its parts are what others meet
             if thing.file and not thing.fixed:
                 size = measure(thing.file, fixed=False).half
-            if thing.size not in ([], size):
+            if thing.size not in ([], size) and (thing.file or thing.fixed):
                 raise ConfigError(f"{key}.size", thing.size, "[], because it has parts or a file")
             thing.shape = "box"
             thing.size = size

@@ -1,6 +1,5 @@
 """MJCF files, and the bodies of objects that come from one."""
 
-import itertools
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -12,14 +11,12 @@ from typing import Any
 import mujoco
 import numpy as np
 
-import mjstack.report.gl  # noqa: F401  (before mujoco)
 from mjstack.errors import MjstackError, first_line
 from mjstack.files import MESHES
 
 FREE = mujoco.mjtJoint.mjJNT_FREE
-_SHAPES = mujoco.mjtGeom
-_ROUND = (_SHAPES.mjGEOM_SPHERE, _SHAPES.mjGEOM_CAPSULE, _SHAPES.mjGEOM_CYLINDER)
 _DIRECTIONS = 128  # in which an object's farthest points are taken
+_FAR = 10.0  # m
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +54,7 @@ def read_mjcf(path: str | Path, fix: str) -> mujoco.MjSpec:
 def scenery(spec: mujoco.MjSpec) -> list[Any]:
     """Floors, lights and keyframes of a file, which stay behind where it is part of a scene."""
     world = spec.worldbody
-    planes = [geom for geom in world.geoms if geom.type == _SHAPES.mjGEOM_PLANE]
+    planes = [geom for geom in world.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]
     return [*spec.keys, *world.lights, *planes]
 
 
@@ -79,7 +76,7 @@ def read_object(file: str, *, fixed: bool) -> tuple[mujoco.MjSpec, str]:
         spec = mujoco.MjSpec()
         mesh = spec.add_mesh(name="mesh", file=str(Path(file).absolute()))
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
-        spec.worldbody.add_geom(type=_SHAPES.mjGEOM_MESH, meshname="mesh")
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh")
         return spec, ""
     spec = read_mjcf(file, "Correct the object's file.")
     world = spec.worldbody
@@ -88,8 +85,8 @@ def read_object(file: str, *, fixed: bool) -> tuple[mujoco.MjSpec, str]:
     if fixed and len(world.bodies) > 1:
         extra += free
     elif free and not fixed:
-        others = (*world.bodies, *world.geoms, *world.sites, *world.cameras)
-        extra += [element for element in others if element not in (*free, *extra)]
+        content = (*world.bodies, *world.geoms, *world.sites, *world.cameras)
+        extra += [element for element in content if element not in (*free, *extra)]
     left = describe(extra)
     joints = [joint for body in free if body not in extra for joint in body.joints]
     for element in (*extra, *(joint for joint in joints if joint.type == FREE)):
@@ -100,11 +97,9 @@ def read_object(file: str, *, fixed: bool) -> tuple[mujoco.MjSpec, str]:
         for element in (*spec.excludes, *spec.sensors):  # bodies that they name would stay apart
             spec.delete(element)
         if len(free) > 1 or spec.joints:
-            found = f"{len(free)} free ones" if len(free) > 1 else f"joint {spec.joints[0].name}"
-            problem = f"{file}: expected one rigid body, as the object moves; it has {found}"
-            raise MjstackError(
-                problem, "Correct the file, or make the object a fixture: fixed=true"
-            )
+            cause = f"{len(free)} free ones" if len(free) > 1 else f"joint {spec.joints[0].name}"
+            problem = f"{file}: expected one rigid body, as the object moves; it has {cause}"
+            raise MjstackError(problem, "Correct it, or set fixed=true for a fixture")
     if spec.compiler.settotalmass > 0.0:  # it counts all bodies of a compilation
         fix_masses(spec)
     return spec, left
@@ -168,48 +163,34 @@ def measure(file: str, *, fixed: bool) -> Solid:
     """
     try:
         spec = read_object(file, fixed=True)[0] if fixed else free_body(file, "x", [0.0] * 3)
+        probe = spec.worldbody.add_geom(size=[1e-6] * 3, contype=0, conaffinity=0)
         model = compile_scene(spec)
     except ValueError as error:
         problem = ", ".join(str(error).removeprefix("Error: ").splitlines())
         raise MjstackError(f"{file}: {problem}. Correct the object's file") from error
     collides = (model.geom_contype | model.geom_conaffinity) != 0
-    if not (collides.any() or (fixed and model.ngeom)):
+    if not collides.any() and (not fixed or model.ngeom == 1):
         raise MjstackError(f"{file}: expected a geom that collides, there is none.")
+    geoms = np.flatnonzero(collides if collides.any() else np.arange(model.ngeom) != probe.id)
     z = np.linspace(-1.0, 1.0, _DIRECTIONS)  # of a spiral from pole to pole
     turn = np.pi * (1.0 + 5.0**0.5) * np.arange(_DIRECTIONS)
     spiral = np.stack((np.cos(turn), np.sin(turn), z), axis=1)
     spiral[:, :2] *= np.sqrt(1.0 - z**2)[:, None]
+    # The point of an object that lies farthest in a direction is nearest to one far away there
     around = np.concatenate((np.eye(3), -np.eye(3), spiral))
-    geoms = np.flatnonzero(collides | ~collides.any())
-    points = np.concatenate([_surface(model, geom, around) for geom in geoms])
-    low, high = points.min(axis=0), points.max(axis=0)
-    center = 0.5 * (low + high)
-    farthest = points[np.unique(np.argmax(points @ around.T, axis=0))] - center * (not fixed)
-    return Solid(center, (high - center).tolist(), farthest.tolist())
-
-
-def _surface(model: mujoco.MjModel, geom: np.integer, around: np.ndarray) -> np.ndarray:
-    """Points of a geom in the world [m], shape ``(n, 3)``: a mesh's, corners of a box that holds
-    it, or the farthest of a round one in some directions, shape ``(m, 3)``.
-    """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    kind = model.geom_type[geom]
-    turn = data.geom_xmat[geom].reshape(3, 3)
-    if kind == _SHAPES.mjGEOM_MESH:
-        mesh = model.geom_dataid[geom]
-        first = model.mesh_vertadr[mesh]
-        points = model.mesh_vert[first : first + model.mesh_vertnum[mesh]].astype(float)
-    elif kind in _ROUND:
-        radius, length, _ = model.geom_size[geom]
-        local = around @ turn
-        flat = local * [1.0, 1.0, float(kind != _SHAPES.mjGEOM_CYLINDER)]
-        flat *= radius / np.linalg.norm(flat, axis=1, keepdims=True).clip(1e-9)
-        points = flat + np.sign(local) * [0.0, 0.0, length]
-    else:
-        middle, half = model.geom_aabb[geom].reshape(2, 3)
-        points = middle + half * list(itertools.product((-1.0, 1.0), repeat=3))
-    return data.geom_xpos[geom] + points @ turn.T
+    ends = np.empty((len(around), len(geoms), 6))
+    for row, direction in zip(ends, around, strict=True):
+        data.geom_xpos[probe.id] = _FAR * direction
+        for end, geom in zip(row, geoms, strict=True):
+            mujoco.mj_geomDistance(model, data, geom, probe.id, 2.0 * _FAR, end)
+    points = ends[..., :3]
+    low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
+    center = 0.5 * (low + high)
+    farthest = np.argmax(np.einsum("nki,ni->nk", points, around), axis=1)
+    hull = np.unique(points[np.arange(len(around)), farthest].round(9), axis=0)
+    return Solid(center, (high - center).tolist(), (hull - center * (not fixed)).tolist())
 
 
 def attach_guest(

@@ -226,8 +226,8 @@ class LiveView(Observer):
         for number, name in enumerate(values):
             color = _COLORS[number % len(_COLORS)]
             if title == _HEIGHT:  # the object's own
-                own = self.env.cfg.scene.objects[name].color or _GREY
-                rgb = (round(255 * part) for part in own[:3])
+                rgba = self.env.cfg.scene.objects[name].color or _GREY
+                rgb = (round(255 * part) for part in rgba[:3])
                 color = f"rgb({', '.join(map(str, rgb))})"
             series.append({"label": name, "stroke": color, "width": 2})
         self._plots[key] = self._server.gui.add_uplot(
