@@ -50,7 +50,7 @@ PATHS: dict[str, dict[str, str] | None] = {
     },
     "mdp/reset.py": {
         "": "home _write_objects",
-        "JointNoise JointZeros JitterObjects RandomizeObjects": "__call__",
+        "JointNoise JointZeros JitterObjects RandomizeObjects FixtureJoints": "__call__",
         "ObjectMass ObjectFriction ActuatorGains": "read write",
     },
     "mdp/starts/randomization.py": {"Randomized": "__call__", "Elements": "scale"},
