@@ -197,7 +197,9 @@ def host_accesses(function: ast.FunctionDef) -> list[str]:
 def test_a_captured_step_does_not_touch_the_host(path: str) -> None:
     found = functions(ast.parse((ROOT / path).read_text()))
     groups = PATHS[path]
-    names = list(found)
+    # A cached function copies once, before the capture
+    cached = {n for n, node in found.items() if "cache" in map(ast.unparse, node.decorator_list)}
+    names = [name for name in found if name not in cached]
     if groups is not None:
         names = [
             f"{owner}.{name}".lstrip(".")
