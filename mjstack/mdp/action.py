@@ -11,6 +11,7 @@ from mjstack.managers.action import ActionTerm
 from mjstack.managers.view import EnvView
 from mjstack.math import atan2, norm
 from mjstack.mdp.geometry import Pose, robot
+from mjstack.scene.index import base_position
 from mjstack.sim.simulation import Columns
 
 _TILT_STEP = 0.03  # rad: how far `EndEffectorDelta` tilts the gripper in a step at most
@@ -175,6 +176,8 @@ class EndEffectorDelta(_Commands):
         if tilt and not upright:
             raise ParameterError("tilt", tilt, "0, because upright is 0")
         self._tilt = tilt
+        base = base_position(env.sim.model, env.cfg.robot)[:2]
+        self._base = torch.tensor(base, dtype=torch.float32, device=env.device)
         self._all = robot(env).ctrl
         self._scale = scale
         profile = env.cfg.robot
@@ -215,7 +218,8 @@ class EndEffectorDelta(_Commands):
         plane through the base and the grasp point.
         """
         goal = 0.5 * (action + 1.0) * self._tilt
-        away = point[:, :2] / norm(point[:, :2])[:, None]
+        away = point[:, :2] - self._base
+        away /= norm(away)[:, None]
         now = atan2((approach[:, :2] * away).sum(1), -approach[:, 2])
         angle = now + (goal - now).clamp(-_TILT_STEP, _TILT_STEP)
         return torch.cat((torch.sin(angle)[:, None] * away, -torch.cos(angle)[:, None]), dim=1)

@@ -17,7 +17,8 @@ WORLD = "world"  # MuJoCo's name of the body that never moves
 _SOLVER = ("iterations", "ls_iterations", "impratio", "tolerance")
 _CONFIGURED = (*_SOLVER, "timestep", "integrator", "cone")  # by groups timing and solver
 _FREE = mujoco.mjtJoint.mjJNT_FREE
-_PREFIX = "robot_"
+_WRAPS = (mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER)
+PREFIX = "robot_"
 _NAMED = ("geoms", "bodies", "cameras")  # elements that a scene has too
 _NAMING = {  # elements with the names of others
     "pairs": ("geomname1", "geomname2"),
@@ -33,7 +34,7 @@ _FLAGS = {"disableflags": mujoco.mjtDisableBit, "enableflags": mujoco.mjtEnableB
 
 def as_guest(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) -> mujoco.MjSpec:
     """A fresh scene with the robot in it. Its compiler settings act on its bodies alone, and its
-    options, sizes, keyframes, lights, floors and free bodies stay behind.
+    options, sizes, keyframes, lights, floors, free and mocap bodies stay behind.
 
     Args:
         spec: The robot; it is changed in place, and goes on to live in the scene.
@@ -66,9 +67,21 @@ def as_guest(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) ->
 
 
 def compile_scene(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compile a scene with a guest."""
+    """Compile a scene with a guest. Frictions are MuJoCo's least, if not more, as contacts have
+    them: MJWarp warns of less.
+    """
     with _without_prefix():
-        return spec.compile()
+        model = spec.compile()
+    for friction in (model.geom_friction, model.pair_friction):
+        friction[:] = friction.clip(min=mujoco.mjMINMU)
+    return model
+
+
+def compile_alone(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """A copy of the robot as it is, with all of its bodies and geoms."""
+    alone = spec.copy()
+    alone.compiler.fusestatic = alone.compiler.discardvisual = False
+    return alone.compile()
 
 
 @contextmanager
@@ -119,12 +132,12 @@ def left_behind(
         yield f"left out: {', '.join(sorted(set(strangers)))}"
     names = set(_clashes(spec, reserved)) - {e.name for e in _strangers(spec, robot)}
     if names:
-        yield f"renamed to {_PREFIX}NAME: {', '.join(sorted(names))}"
+        yield f"renamed to {PREFIX}NAME: {', '.join(sorted(names))}"
 
 
 def _strangers(spec: mujoco.MjSpec, robot: RobotCfg) -> list[Any]:
     """Elements of the file that are not the robot: all outside of ``robot.root`` if that is given,
-    else floors, lights, and bodies that are free; and keyframes, which fit no scene.
+    else floors, lights, and bodies that are free or mocap; and keyframes, which fit no scene.
     """
     world = spec.worldbody
     planes = [geom for geom in world.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]
@@ -133,7 +146,8 @@ def _strangers(spec: mujoco.MjSpec, robot: RobotCfg) -> list[Any]:
     free = [
         body
         for body in world.bodies
-        if body.name not in trees and any(j.type == _FREE for b in _below(body) for j in b.joints)
+        if body.name not in trees
+        and any(b.mocap or any(j.type == _FREE for j in b.joints) for b in _below(body))
     ]
     out = [*spec.keys, *world.lights, *planes, *free]
     if robot.root:
@@ -173,6 +187,13 @@ def _clashes(spec: mujoco.MjSpec, reserved: Collection[str]) -> list[str]:
 def _rename(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) -> None:
     """Put a prefix in front of names that the scene needs, and wherever they are named."""
     clashes = _clashes(spec, reserved)
+    for tendon in spec.tendons:  # a wrap cannot be renamed: MuJoCo would leave the tendon behind
+        for wrap in tendon.path:
+            if wrap.type in _WRAPS and wrap.target.name in clashes:
+                raise MjstackError(
+                    f"robot {robot.name}: tendon {tendon.name} wraps around {wrap.target.name},"
+                    " a name that the scene needs. Rename the geom in the robot's file"
+                )
     profile = {*robot.joints, *robot.jaw_bodies, *robot.grasp_sites, robot.approach_body}
     if names := profile & set(clashes):
         raise MjstackError(
@@ -183,7 +204,7 @@ def _rename(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) -> 
         for element in getattr(spec, kind):
             for field in ("name", *_NAMING.get(kind, ())):
                 if getattr(element, field) in clashes:
-                    setattr(element, field, _PREFIX + getattr(element, field))
+                    setattr(element, field, PREFIX + getattr(element, field))
 
 
 def _fields(option: object) -> list[str]:
@@ -196,14 +217,13 @@ def _text(value: Any) -> str:
 
 def _fix_masses(spec: mujoco.MjSpec) -> None:
     """Give bodies the masses and inertias that they have when the robot is compiled alone."""
-    alone = spec.copy()
-    alone.compiler.fusestatic = False  # the same bodies
-    model = alone.compile()
-    for body, twin in zip(spec.bodies[1:], alone.bodies[1:], strict=True):
+    model = compile_alone(spec)
+    for body in spec.bodies[1:]:
+        twin = model.body(body.name)
         body.explicitinertial = True
-        body.mass = model.body_mass[twin.id]
+        body.mass = twin.mass[0]
         for name in ("inertia", "ipos", "iquat"):
-            setattr(body, name, getattr(model, f"body_{name}")[twin.id])
+            setattr(body, name, getattr(twin, name))
         body.fullinertia = [np.nan, *[0.0] * 5]  # none
     spec.compiler.settotalmass = -1.0
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO

@@ -33,8 +33,8 @@ def build_model(cfg: Config, *, visuals: bool = False) -> mujoco.MjModel:
     Raises:
         MjstackError: The robot's file does not fit the scene, such as one with a geom named table.
     """
-    spec = robot_spec(cfg.robot, cfg.model, scene_names(cfg.scene))
     try:
+        spec = robot_spec(cfg.robot, cfg.model, scene_names(cfg.scene))
         return build_scene(spec, cfg, visuals=visuals)
     except ValueError as error:
         problem = ", ".join(str(error).removeprefix("Error: ").splitlines())

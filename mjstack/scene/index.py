@@ -51,7 +51,9 @@ class SceneIndex:
         robot_qvel: qvel addresses in the same order.
         robot_range: Joint limits in the same order [rad, m], shape ``(n, 2)``.
         ctrl: Actuator indices in the same order.
-        ctrl_range: Limits of the joint targets in the same order, shape ``(n, 2)``.
+        ctrl_range: Limits of the joint targets in the same order, of `joint_limits`, shape
+            ``(n, 2)``.
+        servo_range: What the file's servos take, which LeRobot's units count in, shape ``(n, 2)``.
         n_arm: How many of them are the arm's.
         grasp_sites: The two site indices whose midpoint is the grasp point.
         object_qpos: First qpos address of every object that moves, in the scene's order.
@@ -78,7 +80,8 @@ class SceneIndex:
         self.robot_qvel = model.jnt_dofadr[joints]
         self.robot_range = model.jnt_range[joints]
         self.ctrl = np.array([model.actuator(name).id for name in robot.joints])
-        self.ctrl_range = model.actuator_ctrlrange[self.ctrl]
+        self.servo_range = model.actuator_ctrlrange[self.ctrl]
+        self.ctrl_range = np.stack(joint_limits(model, robot.joints), axis=1)
         self.n_arm = len(robot.arm_joints)
         self.grasp_sites = [model.site(name).id for name in robot.grasp_sites]
         self.objects = {
@@ -206,6 +209,16 @@ def approach_body(model: mujoco.MjModel, robot: RobotCfg) -> int:
     if robot.approach_body:
         return int(model.body(robot.approach_body).id)
     return int(model.joint(robot.arm_joints[-1]).bodyid[0])
+
+
+def base_position(model: mujoco.MjModel, robot: RobotCfg) -> np.ndarray:
+    """Where the arm stands [m], shape ``(3,)``: the body that carries its first joint, or, on the
+    world, the one that this moves.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    first = int(model.joint(robot.arm_joints[0]).bodyid[0])
+    return data.xpos[int(model.body_parentid[first]) or first]
 
 
 def turn_sign(model: mujoco.MjModel, robot: RobotCfg) -> float:
