@@ -11,7 +11,6 @@ from mjstack.managers.action import ActionTerm
 from mjstack.managers.view import EnvView
 from mjstack.math import atan2, norm
 from mjstack.mdp.geometry import Pose, robot
-from mjstack.scene.index import base_position
 from mjstack.sim.simulation import Columns
 
 _TILT_STEP = 0.03  # rad: how far `EndEffectorDelta` tilts the gripper in a step at most
@@ -176,8 +175,7 @@ class EndEffectorDelta(_Commands):
         if tilt and not upright:
             raise ParameterError("tilt", tilt, "0, because upright is 0")
         self._tilt = tilt
-        base = base_position(env.sim.model, env.cfg.robot)[:2]
-        self._base = torch.tensor(base, dtype=torch.float32, device=env.device)
+        self._base = torch.tensor(env.index.base, device=env.device)
         self._all = robot(env).ctrl
         self._scale = scale
         profile = env.cfg.robot

@@ -67,14 +67,9 @@ def as_guest(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) ->
 
 
 def compile_scene(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compile a scene with a guest. Frictions are MuJoCo's least, if not more, as contacts have
-    them: MJWarp warns of less.
-    """
+    """Compile a scene with a guest."""
     with _without_prefix():
-        model = spec.compile()
-    for friction in (model.geom_friction, model.pair_friction):
-        friction[:] = friction.clip(min=mujoco.mjMINMU)
-    return model
+        return spec.compile()
 
 
 def compile_alone(spec: mujoco.MjSpec) -> mujoco.MjModel:
@@ -82,6 +77,19 @@ def compile_alone(spec: mujoco.MjSpec) -> mujoco.MjModel:
     alone = spec.copy()
     alone.compiler.fusestatic = alone.compiler.discardvisual = False
     return alone.compile()
+
+
+@contextmanager
+def mujoco_errors(robot: str) -> Iterator[None]:
+    """Raise MuJoCo's errors as those of a robot, alone or in a scene."""
+    try:
+        yield
+    except ValueError as error:
+        problem = ", ".join(str(error).removeprefix("Error: ").splitlines())
+        raise MjstackError(
+            f"robot {robot}: {problem}. Correct the robot's file or the scene, whose names (floor,"
+            " table and the objects) the robot cannot have."
+        ) from error
 
 
 @contextmanager

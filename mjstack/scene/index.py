@@ -55,6 +55,7 @@ class SceneIndex:
             ``(n, 2)``.
         servo_range: What the file's servos take, which LeRobot's units count in, shape ``(n, 2)``.
         n_arm: How many of them are the arm's.
+        base: x and y of the body that carries the arm, or, on the world, of its first one [m].
         grasp_sites: The two site indices whose midpoint is the grasp point.
         object_qpos: First qpos address of every object that moves, in the scene's order.
         object_qvel: First qvel address of each of them.
@@ -83,6 +84,10 @@ class SceneIndex:
         self.servo_range = model.actuator_ctrlrange[self.ctrl]
         self.ctrl_range = np.stack(joint_limits(model, robot.joints), axis=1)
         self.n_arm = len(robot.arm_joints)
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        first = model.jnt_bodyid[joints[0]]
+        self.base = data.xpos[model.body_parentid[first] or first, :2].tolist()
         self.grasp_sites = [model.site(name).id for name in robot.grasp_sites]
         self.objects = {
             name: (int(model.joint(name).qposadr[0]), int(model.joint(name).dofadr[0]))
@@ -209,16 +214,6 @@ def approach_body(model: mujoco.MjModel, robot: RobotCfg) -> int:
     if robot.approach_body:
         return int(model.body(robot.approach_body).id)
     return int(model.joint(robot.arm_joints[-1]).bodyid[0])
-
-
-def base_position(model: mujoco.MjModel, robot: RobotCfg) -> np.ndarray:
-    """Where the arm stands [m], shape ``(3,)``: the body that carries its first joint, or, on the
-    world, the one that this moves.
-    """
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    first = int(model.joint(robot.arm_joints[0]).bodyid[0])
-    return data.xpos[int(model.body_parentid[first]) or first]
 
 
 def turn_sign(model: mujoco.MjModel, robot: RobotCfg) -> float:
