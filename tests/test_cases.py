@@ -19,11 +19,15 @@ import pytest
 import torch
 import yaml
 from arm_file import MJCF, SERVOS, changed, scara
-from compositions import refusal
+from compositions import load_config, refusal
 
 from mjstack.config.schema import Config
+from mjstack.config.schema.robot import BasePoseCfg
 from mjstack.envs import build_env
 from mjstack.episodes.stage import Stage
+from mjstack.gates.success import find_regions
+from mjstack.report.page import Map
+from mjstack.report.sections import table_map
 from mjstack.robots import read_robot
 from mjstack.robots.guest import left_behind
 from mjstack.robots.new import write_new
@@ -473,6 +477,8 @@ def test_a_file_of_this_kind_is_right_or_refused(
             if key != "grasp" or "sites" not in case.right:
                 agree(found[key], value, key)
         case.check(env)
+        if "base" in case.right or name == "c00_base":
+            assert Stage(cfg).planner.nominal is not None  # within reach
         hold = torch.zeros((1, env.action_manager.action_dim))
         hold[:, -1] = 1.0  # open
         for _ in range(5):
@@ -489,3 +495,126 @@ def test_a_file_of_this_kind_is_right_or_refused(
 
 def test_there_are_as_many_as_were_met() -> None:
     assert len(CASES) == 61
+
+
+@pytest.mark.parametrize(
+    ("limits", "right"),
+    [
+        ('ctrlrange="-6.283 6.283"', (-2.4, 2.4)),
+        ('ctrlrange="-1 3"', (-1.0, 2.4)),
+        ('ctrlrange="-6 6" ctrllimited="false"', (-2.4, 2.4)),
+        ('inheritrange="2"', (-2.4, 2.4)),
+        ('inheritrange="0.5" gear="-2"', (-0.6, 0.6)),
+    ],
+)
+def test_a_command_stops_at_the_narrower_range(
+    limits: str, right: tuple[float, float], tmp_path: Path
+) -> None:
+    """However long it was pressed against the end, three steps back are three steps."""
+    limits = limits if "inherit" in limits else f'inheritrange="0" {limits}'
+    case = Case([servo("shoulder", f'kp="900" kv="50" {limits}')])
+    with environment(configure(case, tmp_path)) as env:
+        column = env.index.ctrl[0]
+        np.testing.assert_allclose(env.index.ctrl_range[0], right)
+        action = torch.zeros((1, env.action_manager.action_dim))
+        for sign, end in ((1.0, right[1]), (-1.0, right[0])):
+            action[:, 0] = sign
+            for _ in range(130):
+                env.step(action)
+            assert float(env.sim.ctrl[0, column]) == pytest.approx(end)
+            action[:, 0] = -sign
+            for _ in range(3):
+                env.step(action)
+            assert float(env.sim.ctrl[0, column]) == pytest.approx(end - sign * 0.15)
+
+
+def test_ranges_that_do_not_meet_are_refused(tmp_path: Path) -> None:
+    pair = servo("shoulder", 'kp="900" kv="50" inheritrange="0" ctrlrange="3 4"')
+    line = "ctrlrange of joint shoulder=[3.0, 4.0]: expected one that meets its range [-2.4, 2.4]"
+    refusal(lambda: environment(configure(Case([pair]), tmp_path)), line)
+
+
+def test_all_actions_have_the_bounds_of_the_joints() -> None:
+    """SO-101's wrist_roll has a wider servo."""
+    env = build_env(load_config(["sim=native", "nworld=1", "action=joint_absolute"]))
+    ranges = env.sim.model.jnt_range[: len(env.cfg.robot.joints)]
+    bounds = torch.stack((env.action_manager.low, env.action_manager.high), 1).numpy()
+    assert np.abs(bounds - ranges).max() < 1e-5
+    assert (bounds[:, 0] >= ranges[:, 0] - 1e-6).all()
+    assert (bounds[:, 1] <= ranges[:, 1] + 1e-6).all()
+    assert env.index.servo_range[4, 1] == 2.84121
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("pos", "yaw"), [([0.3, -0.25, 0.0], 0.0), ([0.3, -0.25, 0.0], 1.5), ([0.0, -0.4, 0.6], -2.0)]
+)
+def test_a_tilt_counts_from_the_arms_base(pos: list[float], yaw: float) -> None:
+    """An arm that stands elsewhere gets the same commands for the same actions in its frame."""
+    cfg = load_config(["sim=native", "nworld=1", "reset=nominal", "action=ee_tilt"])
+    quat = [float(np.cos(yaw / 2)), 0.0, 0.0, float(np.sin(yaw / 2))]
+    elsewhere = replace(cfg, robot=replace(cfg.robot, base=BasePoseCfg(pos=pos, quat=quat)))
+    commands = []
+    for where, angle in ((cfg, 0.0), (elsewhere, yaw)):
+        with environment(where) as env:
+            assert env.index.base == pytest.approx([0.0, 0.0] if where is cfg else pos[:2])
+            turn = torch.tensor([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+            for k in range(12):
+                action = torch.zeros((1, env.action_manager.action_dim))
+                action[0, :2] = (turn @ torch.tensor([0.6, 0.8 - 0.1 * k]).double()).float()
+                action[0, 3] = 1.0
+                env.step(action)
+            commands.append(env.sim.ctrl[0, env.index.ctrl].numpy().copy())
+    assert np.abs(commands[0] - load_config([]).robot.start).max() > 0.1
+    np.testing.assert_allclose(commands[1], commands[0], atol=1e-4)
+
+
+def test_directions_and_maps_count_from_the_arms_base() -> None:
+    cfg = load_config([]).gate.success
+    angles = np.radians(np.arange(0.0, 90.0, 3.0)).repeat(cfg.cell_episodes)
+    base = np.array([0.9, -0.4])
+    around = np.stack((np.cos(angles), np.sin(angles)), 1)
+    places = np.column_stack((base + 0.3 * around, angles + np.radians(20.0)))[:, None]
+    regions = find_regions(cfg, places, np.ones(len(angles), bool), ["red"], base.tolist())
+    turned = [region for region in regions if "x_min_m" not in region]
+    assert [(r["yaw_min_deg"], r["episodes"]) for r in turned] == [(15.0, len(angles))]
+
+    plan = Map(
+        title="red", xy=places[:, 0, :2], table=([1.2, -0.4], [0.1, 0.2]), base=base.tolist()
+    )
+    moved = Map(title="red", xy=places[:, 0, :2] - base, table=([0.3, 0.0], [0.1, 0.2]))
+    names = [str(k) for k in range(len(angles))]
+    figures = [table_map(m, names, [[]] * len(names), [0]) for m in (plan, moved)]
+    assert figures[0] == figures[1]
+
+
+MESH = """<asset><mesh name="pad" vertex="0 0 0  0.02 0 0  0 0.02 0  0.02 0.02 0
+    0 0 0.06  0.02 0 0.06  0 0.02 0.06  0.02 0.02 0.06"/></asset>"""
+
+
+@pytest.mark.parametrize(
+    ("geom", "right"),
+    [
+        ('<frame pos="0 0 -0.1" euler="0 1.5707963267949 0"><geom name="left_pad" pos="0.03 0.01 0"'
+         ' size="0.01 0.01 0.01"/></frame>', [0.0, 0.01, -0.13]),
+        ('<geom name="left_pad" type="mesh" mesh="pad" pos="0 0 -0.16"/>', [0.01, 0.01, -0.13]),
+        ('<geom name="left_pad" type="capsule" fromto="0 0 -0.1 0.02 0 -0.16" size="0.004"/>',
+         [0.01, 0.0, -0.13]),
+    ],
+    ids=["turned frame", "mesh", "fromto"],
+)  # fmt: skip
+def test_a_grasp_site_is_where_its_geom_is(geom: str, right: list[float], tmp_path: Path) -> None:
+    pairs = [(SITE, ""), (PAD, geom), ("<worldbody>", f"{MESH}<worldbody>")]
+    model = build_model(changed(tmp_path, *pairs, **PARTS))
+    np.testing.assert_allclose(model.site("left_grasp").pos, right, atol=1e-9)
+
+
+def test_parts_of_a_grasp_site_are_on_one_body(tmp_path: Path) -> None:
+    for parts in (["left_pad", "right_pad"], ["left_finger", "right_finger"]):
+        cfg = changed(tmp_path, (SITE, ""), grasp_parts={"left_grasp": parts})
+        line = f"robot.grasp_parts.left_grasp={parts}: expected geoms of one body, or one body"
+        refusal(lambda cfg=cfg: build_model(cfg), line)  # type: ignore[misc]
+    cfg = changed(tmp_path, (SITE, ""), grasp_parts={"left_grasp": ["left_pat"]})
+    refusal(
+        lambda: build_model(cfg), "geom or body 'left_pat' does not exist. Did you mean 'left_pad'"
+    )

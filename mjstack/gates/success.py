@@ -185,16 +185,14 @@ def _describe_start(cfg: Config) -> str:
     return f"gate.success.reset ({', '.join(cfg.reset)}{where})"
 
 
-def radial_yaw_deg(places: np.ndarray, base: Sequence[float] = (0.0, 0.0)) -> np.ndarray:
+def radial_yaw_deg(places: np.ndarray) -> np.ndarray:
     """Angle of an object relative to the direction in which the arm's base sees it [deg], from 0 to
     90.
 
     Args:
-        places: x and y [m] and rotation about z [rad], shape ``(..., 3)``.
-        base: x and y of the base [m].
+        places: x and y from the base [m] and rotation about z [rad], shape ``(..., 3)``.
     """
-    x, y = np.moveaxis(places[..., :2] - base, -1, 0)
-    relative = np.degrees(places[..., 2] - np.arctan2(y, x))
+    relative = np.degrees(places[..., 2] - np.arctan2(places[..., 1], places[..., 0]))
     return np.mod(relative, 90.0) % 90.0  # twice: just below 0 rounds to 90
 
 
@@ -203,7 +201,7 @@ def find_regions(
     places: np.ndarray,
     succeeded: np.ndarray,
     objects: Sequence[str],
-    base: Sequence[float] = (0.0, 0.0),
+    base: Sequence[float],
 ) -> list[Region]:
     """Cells of each object's position, of its direction, and of both, that have enough episodes;
     the lowest rate first. In x and y they begin at multiples of their width; the last one in
@@ -215,13 +213,13 @@ def find_regions(
             shape ``(n, objects, 3)``.
         succeeded: Whether each episode was, shape ``(n,)``, bool.
         objects: Names of the objects.
-        base: As of `radial_yaw_deg`.
+        base: x and y of the arm's base [m].
     """
     out: list[Region] = []
     widths = np.array([cfg.cell, cfg.cell, cfg.yaw_cell_deg])
     ends = np.array([math.inf, math.inf, 90.0])
     for number, name in enumerate(objects):
-        yaw = radial_yaw_deg(places[:, number], base)
+        yaw = radial_yaw_deg(places[:, number] - [*base, 0.0])
         keys = np.floor(np.column_stack((places[:, number, :2], yaw)) / widths + _EDGE)
         keys[keys[:, 2] * cfg.yaw_cell_deg >= 90.0, 2] = 0.0  # on the edge of 90, which is 0
         for axes in ([0, 1],) if np.isnan(yaw).any() else ([0, 1], [2], [0, 1, 2]):

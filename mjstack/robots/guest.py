@@ -195,14 +195,9 @@ def _clashes(spec: mujoco.MjSpec, reserved: Collection[str]) -> list[str]:
 def _rename(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) -> None:
     """Put a prefix in front of names that the scene needs, and wherever they are named."""
     clashes = _clashes(spec, reserved)
-    for tendon in spec.tendons:  # a wrap cannot be renamed: MuJoCo would leave the tendon behind
-        for wrap in tendon.path:
-            if wrap.type in _WRAPS and wrap.target.name in clashes:
-                raise MjstackError(
-                    f"robot {robot.name}: tendon {tendon.name} wraps around {wrap.target.name},"
-                    " a name that the scene needs. Rename the geom in the robot's file"
-                )
-    profile = {*robot.joints, *robot.jaw_bodies, *robot.grasp_sites, robot.approach_body}
+    paths = [wrap for tendon in spec.tendons for wrap in tendon.path]
+    wraps = [wrap.target.name for wrap in paths if wrap.type in _WRAPS]  # they keep their names
+    profile = {*robot.joints, *robot.jaw_bodies, *robot.grasp_sites, robot.approach_body, *wraps}
     if names := profile & set(clashes):
         raise MjstackError(
             f"robot {robot.name}: the scene has {', '.join(sorted(names))} too, expected other"

@@ -35,6 +35,15 @@ def prepare_servos(spec: mujoco.MjSpec, robot: RobotCfg) -> None:
             problem = UnknownName("robot.servos: joint", name, robot.joints)
             fix = "Or set actuator to a choice for this robot, or default"
             raise MjstackError(f"{problem}", fix)
+    for actuator in spec.actuators:  # rotors: those of a joint outlive its actuator
+        joint = spec.joint(actuator.target) if actuator.trntype in _JOINT else None
+        by_tendon = actuator.trntype == mujoco.mjtTrn.mjTRN_TENDON
+        if moved := spec.tendon(actuator.target) if by_tendon else joint:
+            gear = abs(actuator.gear[0])
+            moved.armature += actuator.armature * gear**2
+            moved.damping += actuator.damping * gear ** np.arange(2.0, 5.0)
+            actuator.armature = 0.0
+            actuator.damping = np.zeros(3)
     _split_tendons(spec, robot)
     servos = {name: _find_servo(spec, name, robot.servos.get(name)) for name in robot.joints}
     _name_servos(spec, servos)
@@ -57,7 +66,8 @@ def _find_servo(spec: mujoco.MjSpec, name: str, made: ServoCfg | None) -> mujoco
         expected = f"a range, in the file or as robot.ranges.{name}=[LOW,HIGH]"
         raise ConfigError(f"range of joint {name}", [float(low), float(high)], expected)
     servos = [a for a in spec.actuators if a.trntype in _JOINT and a.target == name]
-    reason = _refusal(servos[0]) if len(servos) == 1 else "" if servos else _driver(spec, name)
+    mocap = [f"mocap body {body.name} takes no commands" for body in spec.bodies if body.mocap]
+    reason = _refusal(servos[0]) if len(servos) == 1 else "".join(mocap[: not servos])
     if len(servos) == 1 and not reason:
         servos[0].trntype = mujoco.mjtTrn.mjTRN_JOINT  # the same for hinges and slides
         _convert(spec, servos[0])
@@ -67,27 +77,14 @@ def _find_servo(spec: mujoco.MjSpec, name: str, made: ServoCfg | None) -> mujoco
         expected = f"one <position> in the robot's file{reason and f' ({reason})'}, or"
         expected += f" stiffness, damping and effort in robot.servos.{name}"
         raise ConfigError(f"actuators of joint {name}", names, expected)
-    new = _add_servo(spec, name, made.stiffness, made.damping)
     for servo in servos:
-        armature, damping = _rotor(servo)
-        new.armature += armature
-        new.damping += damping
         spec.delete(servo)
-    return new
+    return _add_servo(spec, name, made)
 
 
 def _complete(made: ServoCfg | None) -> bool:
     """Whether a servo can be made of what the configuration gives."""
     return made is not None and None not in (made.stiffness, made.damping, made.effort)
-
-
-def _driver(spec: mujoco.MjSpec, joint: str) -> str:
-    """The cause, if there is one to be seen, why a joint has no actuator."""
-    for actuator in spec.actuators:
-        if joint in (names := _coefficients(spec, actuator)):
-            return f"{actuator.name} moves {', '.join(names)} by a tendon: list all of these joints"
-    mocap = [body.name for body in spec.bodies if body.mocap]
-    return f"mocap body {mocap[0]} takes no commands" if mocap else ""
 
 
 def _name_servos(spec: mujoco.MjSpec, servos: Mapping[str, mujoco.MjsActuator]) -> None:
@@ -108,16 +105,14 @@ def _name_servos(spec: mujoco.MjSpec, servos: Mapping[str, mujoco.MjsActuator]) 
             sensor.objname = names.get(sensor.objname, sensor.objname)
 
 
-def _add_servo(
-    spec: mujoco.MjSpec, joint: str, stiffness: float, damping: float
-) -> mujoco.MjsActuator:
+def _add_servo(spec: mujoco.MjSpec, joint: str, made: ServoCfg) -> mujoco.MjsActuator:
     """A new position servo, with nothing of the file's default class."""
     servo = spec.add_actuator(name=f"servo of {joint}", target=joint)
     servo.trntype = mujoco.mjtTrn.mjTRN_JOINT
     servo.gear = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     servo.ctrlrange = servo.forcerange = [0.0, 0.0]
     servo.forcelimited = mujoco.mjtLimited.mjLIMITED_AUTO
-    servo.set_to_position(kp=stiffness, kv=damping)
+    servo.set_to_position(kp=made.stiffness, kv=made.damping)
     servo.inheritrange = 0.0
     return servo
 
@@ -151,8 +146,8 @@ def _convert(spec: mujoco.MjSpec, servo: mujoco.MjsActuator) -> None:
     gear = float(servo.gear[0])
     gain = float(servo.gainprm[0])
     offset, bias, damping = servo.biasprm[:3]
-    tendon = servo.trntype == mujoco.mjtTrn.mjTRN_TENDON
-    if gear == 1.0 and gain == -bias and offset == 0.0 and not tendon:
+    by_tendon = servo.trntype == mujoco.mjtTrn.mjTRN_TENDON
+    if gear == 1.0 and gain == -bias and offset == 0.0 and not by_tendon:
         return
     if damping > 0.0 or servo.inheritrange:  # a damping ratio: MuJoCo resolves both
         servo.name = servo.name or f"servo of {servo.target}"
@@ -162,7 +157,6 @@ def _convert(spec: mujoco.MjSpec, servo: mujoco.MjsActuator) -> None:
         servo.inheritrange = 0.0
     servo.ctrlrange = _span(-(gain * servo.ctrlrange + offset) / (bias * gear))
     servo.forcerange = np.sort(gear * servo.forcerange)
-    servo.armature, servo.damping = _rotor(servo)
     servo.gear[0] = 1.0
     servo.gainprm[0] = -bias * gear**2
     servo.biasprm[:3] = [0.0, bias * gear**2, damping * gear**2]
@@ -171,12 +165,6 @@ def _convert(spec: mujoco.MjSpec, servo: mujoco.MjsActuator) -> None:
 def _span(ends: np.ndarray) -> np.ndarray:
     """A range [rad, m] from its ends; one without width is none, which an offset has moved."""
     return np.sort(ends) if np.ptp(ends) else np.zeros(2)
-
-
-def _rotor(servo: mujoco.MjsActuator) -> tuple[float, np.ndarray]:
-    """An actuator's armature and damping at what it moves."""
-    gear = abs(servo.gear[0])
-    return servo.armature * gear**2, servo.damping * gear ** np.arange(2.0, 5.0)
 
 
 def _coefficients(spec: mujoco.MjSpec, actuator: mujoco.MjsActuator) -> dict[str, float]:
@@ -189,56 +177,52 @@ def _coefficients(spec: mujoco.MjSpec, actuator: mujoco.MjsActuator) -> dict[str
 
 
 def _split_tendons(spec: mujoco.MjSpec, robot: RobotCfg) -> None:
-    """Put a servo of each finger in place of a position servo that moves them by a tendon, and one
-    of a joint in place of its own tendon's.
+    """Put a servo of each joint in place of a position servo that moves them by a tendon.
 
-    A tendon of the length ``sum(c q)`` moves fingers together, each along ``p + r s``, where s is
+    A tendon of the length ``sum(c q)`` moves joints together, each along ``p + r s``, where s is
     the first one's position: as equalities say, else all alike in the tendon's direction. A share
     of the servo's stiffness k is ``c k L / r``, and its target ``p + r (u - P) / L``, with
-    ``L = sum(c r)`` and ``P = sum(c p)``.
+    ``L = sum(c r)`` and ``P = sum(c p)``. That of joints that follow goes to those of the profile.
 
     Raises:
-        ConfigError: The servo is no position servo, or the fingers cancel in the tendon.
+        ConfigError: The servo is no position servo, or the joints cancel in the tendon.
     """
     for servo in list(spec.actuators):
         share = _coefficients(spec, servo)
-        moved = robot.joints if len(share) == 1 else robot.gripper_joints
-        if not share or not share.keys() <= set(moved):
+        known = robot.joints if len(share) == 1 else robot.gripper_joints
+        names = [name for name in known if name in share]
+        if not names:
             continue
-        tendon = spec.tendon(servo.target)
         if reason := _refusal(servo):
-            if all(_complete(robot.servos.get(name)) for name in share):
+            if all(_complete(robot.servos.get(name)) for name in names):
                 spec.delete(servo)
                 continue
             expected = f"a position servo ({reason}), or servos of its joints in robot.servos"
-            raise ConfigError(f"actuator of tendon {tendon.name}", servo.name, expected)
+            raise ConfigError(f"actuator of tendon {servo.target}", servo.name, expected)
         _convert(spec, servo)
-        lines = _couplings(spec, share)
+        lines = _couplings(spec, names[0], share)
         start, length = np.sum([np.multiply(c, lines[name]) for name, c in share.items()], axis=0)
-        if min(coef * length / lines[name][1] for name, coef in share.items()) < 1e-9:
-            expected = "coefficients with which each finger moves as the servo pulls it"
-            raise ConfigError(f"tendon {tendon.name}", share, expected)
-        _, bias, damping = servo.biasprm[:3]
-        for name, coef in share.items():
+        followers = sum(c * lines[name][1] for name, c in share.items() if name not in names)
+        for name in names:
             origin, ratio = lines[name]
-            part = coef * length / ratio
-            actuator = _add_servo(spec, name, -part * bias, -part * damping)
+            coef = share[name] + followers / len(names) / ratio
+            if coef * length / ratio < 1e-9:
+                expected = "coefficients with which each joint moves as the servo pulls it"
+                raise ConfigError(f"tendon {servo.target}", share, expected)
+            stiffness, damping = -coef * length / ratio * servo.biasprm[1:3]
+            actuator = _add_servo(spec, name, ServoCfg(stiffness, damping))
             actuator.forcelimited = servo.forcelimited
             actuator.ctrlrange = _span(origin + (servo.ctrlrange - start) * ratio / length)
             actuator.forcerange = np.sort(coef * servo.forcerange)
-        tendon.armature += servo.armature
-        tendon.damping += servo.damping
         spec.delete(servo)
 
 
-def _couplings(spec: mujoco.MjSpec, share: Mapping[str, float]) -> dict[str, tuple[float, float]]:
-    """Where each finger of a tendon is while the first one is at 0 [rad, m], and how far it moves
-    while that moves by 1.
-
-    Raises:
-        ConfigError: An equality of a finger is not linear.
+def _couplings(
+    spec: mujoco.MjSpec, first: str, share: Mapping[str, float]
+) -> dict[str, tuple[float, float]]:
+    """Where each joint of a tendon is while the first one is at 0 [rad, m], and how far it moves
+    while that moves by 1. An equality that is not linear is a ConfigError.
     """
-    first = next(iter(share))
     lines = {first: (0.0, 1.0)}
     kind = mujoco.mjtEq.mjEQ_JOINT
     links = [e for e in spec.equalities if e.type == kind and e.active and e.name2]
@@ -247,8 +231,7 @@ def _couplings(spec: mujoco.MjSpec, share: Mapping[str, float]) -> dict[str, tup
         if not share.keys().isdisjoint((link.name1, link.name2)):
             expected = "[a, b, 0, 0, 0], because a tendon moves the joint, and b is not 0"
             raise ConfigError(f"polycoef of joint {link.name1}", link.data[:5], expected)
-    # Chains of them, from the first finger on
-    for link in links * len(links):
+    for link in links * len(links):  # chains of them
         follower, leader = spec.joint(link.name1), spec.joint(link.name2)
         slope = link.data[1]
         offset = link.data[0] + follower.ref * _unit(follower) - slope * leader.ref * _unit(leader)
@@ -258,8 +241,10 @@ def _couplings(spec: mujoco.MjSpec, share: Mapping[str, float]) -> dict[str, tup
         elif follower.name in lines:
             origin, ratio = lines[follower.name]
             lines[leader.name] = ((origin - offset) / slope, ratio / slope)
-    signs = {name: float(np.sign(coef * share[first])) for name, coef in share.items()}
-    return {name: lines.get(name, (0.0, sign)) for name, sign in signs.items()}
+    return {
+        name: lines.get(name, (0.0, float(np.sign(coef * share[first]))))
+        for name, coef in share.items()
+    }
 
 
 def _unit(joint: mujoco.MjsJoint) -> float:
