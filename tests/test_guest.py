@@ -80,6 +80,36 @@ def test_its_furniture_stays_behind(tmp_path: Path) -> None:
     assert notes(scara(), plain) == ""
 
 
+def test_a_camera_of_what_stays_behind_stays_behind_too(tmp_path: Path) -> None:
+    cameras = """<camera name="eye" mode="targetbody" target="toy"/>
+    <camera name="other" mode="targetbody" target="hand"/>"""
+    model = build_model(changed(tmp_path, (ROOT, ROOT + FURNITURE + cameras)))
+    assert [model.camera(k).name for k in range(model.ncam)] == ["other"]
+
+
+@pytest.mark.parametrize(
+    "pairs",
+    [
+        [('diaginertia="0.005 0.025 0.027"', 'fullinertia="0.005 0.025 0.027 0.001 0.002 0"')],
+        [
+            ('contype="0" conaffinity="0" mass="0"', 'contype="0" conaffinity="0" mass="0.3"'),
+            (ROOT, f'<compiler inertiafromgeom="true"/>{ROOT}'),
+        ],
+    ],
+    ids=["fullinertia", "inertiafromgeom"],
+)
+def test_a_total_mass_scales_the_robot_alone(pairs: list, tmp_path: Path) -> None:
+    cfg = changed(tmp_path, *pairs, ("<option", '<compiler settotalmass="50"/><option'))
+    model, alone = build_model(cfg), mujoco.MjModel.from_xml_path(str(cfg.robot.file))
+    assert alone.body_mass.sum() == pytest.approx(50.0)
+    for body in range(1, alone.nbody):
+        there = model.body(alone.body(body).name)
+        for name in ("mass", "inertia", "ipos"):
+            right = getattr(alone.body(body), name)
+            np.testing.assert_allclose(getattr(there, name), right, rtol=1e-9, atol=1e-12)
+    assert float(model.body("red").mass[0]) == cfg.scene.objects["red"].mass
+
+
 def test_where_it_stands_and_which_subtree_it_is(tmp_path: Path) -> None:
     base = BasePoseCfg(pos=[0.1, 0.2, 0.3], quat=[0.0, 0.0, 0.0, 1.0])
     moved, plain = (robot_spec(c.robot, c.model).compile() for c in (
@@ -243,6 +273,7 @@ def hung(left: float, right: float, actuator: str, equality: str = COUPLING) -> 
         (hung(-1, -0.5, GENERAL), ALIKE, {}),
         (hung(0.5, 0.5, ROTOR), ALIKE, {}),
         (hung(0.5, 0.5, GRIP.replace('kv="90"', 'dampratio="1"')), ALIKE, {}),
+        (hung(1, 1, '<position tendon="split" kp="900" dampratio="0.7"/>'), ALIKE, {}),
         (
             hung(0.5, 0.5, GRIP.replace('ctrlrange="0 0.05"', 'inheritrange="0.8" gear="-2"')),
             ALIKE,
@@ -262,7 +293,7 @@ def hung(left: float, right: float, actuator: str, equality: str = COUPLING) -> 
         (hung(1, 0.25, GRIP), ALIKE, ONE),
         (hung(1, 0, GRIP), {"left": (0.0, 1.0)}, ONE),
     ],
-    ids=["coefs", "affine", "rotor", "dampratio", "inherit", "offset", "chain", "one", "alone"],
+    ids="coefs affine rotor dampratio unnamed inherit offset chain one alone".split(),
 )  # fmt: skip
 def test_a_tendon_pulls_as_in_its_file(
     pairs: list, lines: dict, profile: dict, tmp_path: Path
@@ -281,7 +312,8 @@ def test_a_tendon_pulls_as_in_its_file(
     mujoco.mj_forward(alone, data)
     share = {name: float(length - data.ten_length[0]) for name, length in share.items()}
     start, slope = np.sum([np.multiply(share[n], line) for n, line in lines.items()], axis=0)
-    grip = alone.actuator("grip")
+    (number,) = np.flatnonzero(alone.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON)
+    grip = alone.actuator(number)
     gear, gain, (offset, bias) = grip.gear[0], grip.gainprm[0], grip.biasprm[:2]
     listed = cfg.robot.gripper_joints
     for name in listed:  # bounds
@@ -299,7 +331,7 @@ def test_a_tendon_pulls_as_in_its_file(
             if of is model and name in listed:
                 data.actuator(name).ctrl = origin + ratio * target
         if of is alone:
-            data.actuator("grip").ctrl = -(offset + bias * gear * (start + slope * target)) / gain
+            data.ctrl[number] = -(offset + bias * gear * (start + slope * target)) / gain
         mujoco.mj_forward(of, data)
         spring = {name: float(data.joint(name).qfrc_passive[0]) for name in lines}
         return {name: float(data.joint(name).qfrc_actuator[0]) + spring[name] for name in lines}
