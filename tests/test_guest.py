@@ -293,7 +293,10 @@ def hung(left: float, right: float, actuator: str, equality: str = COUPLING) -> 
         (hung(1, 0.25, GRIP), ALIKE, ONE),
         (hung(1, 0, GRIP), {"left": (0.0, 1.0)}, ONE),
     ],
-    ids="coefs affine rotor dampratio unnamed inherit offset chain one alone".split(),
+    ids=[
+        *("coefs", "affine", "rotor", "dampratio", "unnamed"),
+        *("inherit", "offset", "chain", "one", "alone"),
+    ],
 )  # fmt: skip
 def test_a_tendon_pulls_as_in_its_file(
     pairs: list, lines: dict, profile: dict, tmp_path: Path
@@ -358,15 +361,30 @@ def test_a_tendon_pulls_as_in_its_file(
     ("pairs", "line"),
     [
         (hung(1, -1, GRIP), "tendon split={'left': 1.0, 'right': -1.0}: expected coefficients"),
-        (hung(1, 1, GRIP, COUPLING.replace("0 1 0", "0 1 2")), "polycoef of joint left="),
-        (hung(1, 1, GRIP, COUPLING.replace("0 1 0", "0.01 0 0")), "polycoef of joint left="),
+        (
+            hung(1, 1, GRIP, COUPLING.replace("0 1 0", "0 1 2")),
+            "joint of a tendon=right: expected one that moves as left",
+        ),
+        (
+            hung(1, 1, GRIP, COUPLING.replace("0 1 0", "0.01 0 0")),
+            "joint of a tendon=right: expected one that moves as left",
+        ),
+        (
+            [*hung(1, 1, GRIP, CHAIN.replace("-2 0 0", "-2 1 0")), (PALM, MIDDLE + PALM)],
+            "joint of a tendon=right: expected one that moves as left",
+        ),
         (hung(1, 1, '<motor name="grip" tendon="split"/>'), "a position servo (grip has biastype"),
         (hung(1, 1, GRIP.replace("split", "spli")), "actuators of joint left=none"),
     ],
-    ids=["cancel", "bent", "still", "motor", "name"],
+    ids=["cancel", "bent", "still", "bent chain", "motor", "name"],
 )
 def test_what_a_tendon_cannot_do_is_one_line(pairs: list, line: str, tmp_path: Path) -> None:
     refusal(lambda: build_model(changed(tmp_path, *pairs)), line)
+
+
+def test_a_finger_that_follows_freely_is_no_follower(tmp_path: Path) -> None:
+    cfg = changed(tmp_path, *hung(1, 1, GRIP, ""), **ONE)
+    refusal(lambda: build_model(cfg), "joint of a tendon=right: expected one that moves as left")
 
 
 def test_servos_in_place_of_a_motor_on_a_tendon(tmp_path: Path) -> None:

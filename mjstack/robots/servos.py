@@ -2,7 +2,7 @@
 position [rad, m].
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -13,6 +13,7 @@ from mjstack.errors import ConfigError, MjstackError, UnknownName, require_names
 from mjstack.robots.guest import PREFIX, compile_alone
 
 _JOINT = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+_TENDON = mujoco.mjtTrn.mjTRN_TENDON
 
 
 def prepare_servos(spec: mujoco.MjSpec, robot: RobotCfg) -> None:
@@ -35,21 +36,20 @@ def prepare_servos(spec: mujoco.MjSpec, robot: RobotCfg) -> None:
             problem = UnknownName("robot.servos: joint", name, robot.joints)
             fix = "Or set actuator to a choice for this robot, or default"
             raise MjstackError(f"{problem}", fix)
-    for actuator in spec.actuators:  # rotors: those of a joint outlive its actuator
-        joint = spec.joint(actuator.target) if actuator.trntype in _JOINT else None
-        by_tendon = actuator.trntype == mujoco.mjtTrn.mjTRN_TENDON
-        if moved := spec.tendon(actuator.target) if by_tendon else joint:
+    for actuator in [a for a in spec.actuators if a.trntype in (*_JOINT, _TENDON)]:
+        find = spec.tendon if actuator.trntype == _TENDON else spec.joint
+        if (moved := find(actuator.target)) is not None:  # its rotor outlives the actuator
             gear = abs(actuator.gear[0])
             moved.armature += actuator.armature * gear**2
             moved.damping += actuator.damping * gear ** np.arange(2.0, 5.0)
-            actuator.armature = 0.0
-            actuator.damping = np.zeros(3)
+            actuator.armature, actuator.damping = 0.0, np.zeros(3)
     _split_tendons(spec, robot)
     servos = {name: _find_servo(spec, name, robot.servos.get(name)) for name in robot.joints}
     _name_servos(spec, servos)
     for name, servo in servos.items():
         if not servo.ctrlrange[0] < servo.ctrlrange[1]:
             servo.inheritrange = servo.inheritrange or 1.0
+            servo.ctrlrange = [0.0, 0.0]  # none, which an offset may have moved
         servo.ctrllimited = mujoco.mjtLimited.mjLIMITED_TRUE
         if name in robot.arm_joints and robot.arm_force_limit is not None:
             servo.forcerange = [-robot.arm_force_limit, robot.arm_force_limit]
@@ -146,8 +146,7 @@ def _convert(spec: mujoco.MjSpec, servo: mujoco.MjsActuator) -> None:
     gear = float(servo.gear[0])
     gain = float(servo.gainprm[0])
     offset, bias, damping = servo.biasprm[:3]
-    by_tendon = servo.trntype == mujoco.mjtTrn.mjTRN_TENDON
-    if gear == 1.0 and gain == -bias and offset == 0.0 and not by_tendon:
+    if gear == 1.0 and gain == -bias and offset == 0.0 and servo.trntype != _TENDON:
         return
     if damping > 0.0 or servo.inheritrange:  # a damping ratio: MuJoCo resolves both
         servo.name = servo.name or f"servo of {servo.target}"
@@ -155,22 +154,16 @@ def _convert(spec: mujoco.MjSpec, servo: mujoco.MjsActuator) -> None:
         damping = compiled.biasprm[2]
         servo.ctrlrange = compiled.ctrlrange
         servo.inheritrange = 0.0
-    servo.ctrlrange = _span(-(gain * servo.ctrlrange + offset) / (bias * gear))
+    servo.ctrlrange = np.sort(-(gain * servo.ctrlrange + offset) / (bias * gear))
     servo.forcerange = np.sort(gear * servo.forcerange)
     servo.gear[0] = 1.0
     servo.gainprm[0] = -bias * gear**2
     servo.biasprm[:3] = [0.0, bias * gear**2, damping * gear**2]
 
 
-def _span(ends: np.ndarray) -> np.ndarray:
-    """A range [rad, m] from its ends; one without width is none, which an offset has moved."""
-    return np.sort(ends) if np.ptp(ends) else np.zeros(2)
-
-
 def _coefficients(spec: mujoco.MjSpec, actuator: mujoco.MjsActuator) -> dict[str, float]:
     """Joints that an actuator moves by a fixed tendon, with their coefficients in its length."""
-    by_tendon = actuator.trntype == mujoco.mjtTrn.mjTRN_TENDON
-    tendon = spec.tendon(actuator.target) if by_tendon else None
+    tendon = spec.tendon(actuator.target) if actuator.trntype == _TENDON else None
     path = [] if tendon is None else tendon.path
     fixed = all(wrap.type == mujoco.mjtWrap.mjWRAP_JOINT for wrap in path)
     return {wrap.target.name: wrap.coef for wrap in path if fixed}
@@ -200,7 +193,7 @@ def _split_tendons(spec: mujoco.MjSpec, robot: RobotCfg) -> None:
             expected = f"a position servo ({reason}), or servos of its joints in robot.servos"
             raise ConfigError(f"actuator of tendon {servo.target}", servo.name, expected)
         _convert(spec, servo)
-        lines = _couplings(spec, names[0], share)
+        lines = _couplings(spec, names, share)
         start, length = np.sum([np.multiply(c, lines[name]) for name, c in share.items()], axis=0)
         followers = sum(c * lines[name][1] for name, c in share.items() if name not in names)
         for name in names:
@@ -212,39 +205,39 @@ def _split_tendons(spec: mujoco.MjSpec, robot: RobotCfg) -> None:
             stiffness, damping = -coef * length / ratio * servo.biasprm[1:3]
             actuator = _add_servo(spec, name, ServoCfg(stiffness, damping))
             actuator.forcelimited = servo.forcelimited
-            actuator.ctrlrange = _span(origin + (servo.ctrlrange - start) * ratio / length)
+            actuator.ctrlrange = np.sort(origin + (servo.ctrlrange - start) * ratio / length)
             actuator.forcerange = np.sort(coef * servo.forcerange)
         spec.delete(servo)
 
 
 def _couplings(
-    spec: mujoco.MjSpec, first: str, share: Mapping[str, float]
+    spec: mujoco.MjSpec, names: Sequence[str], share: Mapping[str, float]
 ) -> dict[str, tuple[float, float]]:
-    """Where each joint of a tendon is while the first one is at 0 [rad, m], and how far it moves
-    while that moves by 1. An equality that is not linear is a ConfigError.
+    """Where each joint of a tendon is while the first of the profile's is at 0 [rad, m], and how
+    far it moves while that moves by 1; a ConfigError if it follows in another way, or freely.
     """
-    lines = {first: (0.0, 1.0)}
+    lines = {names[0]: (0.0, 1.0)}
+    linked = set(lines)
     kind = mujoco.mjtEq.mjEQ_JOINT
     links = [e for e in spec.equalities if e.type == kind and e.active and e.name2]
-    for link in [e for e in links if not e.data[1] or any(e.data[2:5])]:
-        links.remove(link)
-        if not share.keys().isdisjoint((link.name1, link.name2)):
-            expected = "[a, b, 0, 0, 0], because a tendon moves the joint, and b is not 0"
-            raise ConfigError(f"polycoef of joint {link.name1}", link.data[:5], expected)
     for link in links * len(links):  # chains of them
         follower, leader = spec.joint(link.name1), spec.joint(link.name2)
-        slope = link.data[1]
-        offset = link.data[0] + follower.ref * _unit(follower) - slope * leader.ref * _unit(leader)
-        if leader.name in lines:
+        if linked & {follower.name, leader.name}:
+            linked |= {follower.name, leader.name}
+        offset, slope, *rest = link.data[:5]
+        offset += follower.ref * _unit(follower) - slope * leader.ref * _unit(leader)
+        if leader.name in lines and slope and not any(rest):
             origin, ratio = lines[leader.name]
             lines.setdefault(follower.name, (offset + slope * origin, slope * ratio))
-        elif follower.name in lines:
+        elif follower.name in lines and slope and not any(rest):
             origin, ratio = lines[follower.name]
             lines[leader.name] = ((origin - offset) / slope, ratio / slope)
-    return {
-        name: lines.get(name, (0.0, float(np.sign(coef * share[first]))))
-        for name, coef in share.items()
-    }
+    for name, coef in share.items():
+        if name not in lines and (name in linked or name not in names):
+            expected = f"one that moves as {names[0]}, or that linear equalities couple to it"
+            raise ConfigError("joint of a tendon", name, expected)
+        lines.setdefault(name, (0.0, float(np.sign(coef * share[names[0]]))))
+    return lines
 
 
 def _unit(joint: mujoco.MjsJoint) -> float:
