@@ -72,13 +72,6 @@ def compile_scene(spec: mujoco.MjSpec) -> mujoco.MjModel:
         return spec.compile()
 
 
-def compile_alone(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """A copy of the robot as it is, with all of its bodies and geoms."""
-    alone = spec.copy()
-    alone.compiler.fusestatic = alone.compiler.discardvisual = False
-    return alone.compile()
-
-
 @contextmanager
 def mujoco_errors(robot: str) -> Iterator[None]:
     """Raise MuJoCo's errors as those of a robot, alone or in a scene."""
@@ -220,13 +213,14 @@ def _text(value: Any) -> str:
 
 def _fix_masses(spec: mujoco.MjSpec) -> None:
     """Give bodies the masses and inertias that they have when the robot is compiled alone."""
-    model = compile_alone(spec)
-    for body in spec.bodies[1:]:
-        twin = model.body(body.name)
+    alone = spec.copy()
+    alone.compiler.fusestatic = False  # the same bodies
+    model = alone.compile()
+    for body, twin in zip(spec.bodies[1:], alone.bodies[1:], strict=True):
         body.explicitinertial = True
-        body.mass = twin.mass[0]
+        body.mass = model.body_mass[twin.id]
         for name in ("inertia", "ipos", "iquat"):
-            setattr(body, name, getattr(twin, name))
+            setattr(body, name, getattr(model, f"body_{name}")[twin.id])
         body.fullinertia = [np.nan, *[0.0] * 5]  # none
     spec.compiler.settotalmass = -1.0
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO

@@ -10,7 +10,7 @@ import numpy as np
 
 from mjstack.config.schema import RobotCfg, ServoCfg
 from mjstack.errors import ConfigError, MjstackError, UnknownName, require_names
-from mjstack.robots.guest import PREFIX, compile_alone
+from mjstack.robots.guest import PREFIX
 
 _JOINT = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _TENDON = mujoco.mjtTrn.mjTRN_TENDON
@@ -150,7 +150,7 @@ def _convert(spec: mujoco.MjSpec, servo: mujoco.MjsActuator) -> None:
         return
     if damping > 0.0 or servo.inheritrange:  # a damping ratio: MuJoCo resolves both
         servo.name = servo.name or f"servo of {servo.target}"
-        compiled = compile_alone(spec).actuator(servo.name)
+        compiled = spec.copy().compile().actuator(servo.name)
         damping = compiled.biasprm[2]
         servo.ctrlrange = compiled.ctrlrange
         servo.inheritrange = 0.0

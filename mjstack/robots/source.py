@@ -9,7 +9,7 @@ import numpy as np
 
 from mjstack.config.schema import ModelCfg, RobotCfg
 from mjstack.errors import ConfigError, MjstackError, first_line, require_names
-from mjstack.robots.guest import as_guest, compile_alone
+from mjstack.robots.guest import as_guest
 from mjstack.robots.servos import prepare_servos
 
 BUILTIN = Path(__file__).parent
@@ -131,7 +131,9 @@ def _add_grasp_sites(spec: mujoco.MjSpec, robot: RobotCfg) -> None:
             raise ConfigError(f"robot.grasp_parts.{site}", parts, expected)
         pos = robot.grasp_pos.get(site, [0.0, 0.0, 0.0])
         if site not in robot.grasp_pos and bodies[0].name not in parts:
-            model = compile_alone(spec)  # positions in the file may be in frames, or ends of geoms
+            alone = spec.copy()  # the file's positions may be in frames, or of ends
+            alone.compiler.fusestatic = alone.compiler.discardvisual = False
+            model = alone.compile()
             pos = np.mean([model.geom(name).pos for name in parts], axis=0)
         bodies[0].add_site(name=site, pos=pos, group=4)
 
