@@ -83,11 +83,11 @@ class SceneIndex:
         self.ctrl = np.array([model.actuator(name).id for name in robot.joints])
         self.servo_range = model.actuator_ctrlrange[self.ctrl]
         self.ctrl_range = np.stack(joint_limits(model, robot.joints), axis=1)
-        for name, (low, high), servo in zip(robot.joints, self.ctrl_range, self.ctrl, strict=True):
+        for name, (low, high) in zip(robot.joints, self.ctrl_range, strict=True):
             if not low < high:
                 expected = f"one that meets its range {model.joint(name).range.tolist()}"
-                given = model.actuator(servo).ctrlrange.tolist()
-                raise ConfigError(f"ctrlrange of joint {name}", given, expected)
+                span = model.actuator(name).ctrlrange.tolist()
+                raise ConfigError(f"ctrlrange of joint {name}", span, expected)
         self.n_arm = len(robot.arm_joints)
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
