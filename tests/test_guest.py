@@ -10,12 +10,13 @@ import pytest
 from arm_file import MJCF, SERVOS, changed, scara
 from compositions import refusal
 
+from mjstack.config.mjcf import compile_scene
 from mjstack.config.schema import Backend, Config
 from mjstack.config.schema.robot import BasePoseCfg, ServoCfg
 from mjstack.envs import build_env
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.robots import read_robot, robot_spec
-from mjstack.robots.guest import compile_scene, left_behind
+from mjstack.robots.guest import left_behind
 from mjstack.scene import build_model
 from mjstack.scene.build import scene_names
 
