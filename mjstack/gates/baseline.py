@@ -15,11 +15,10 @@ def run_baseline(run: Run) -> list[GateResult]:
     judge it, and where the arm went.
     """
     cfg = run.cfg
-    if faults := scene_faults(cfg, run.stage.model):
+    if faults := list(scene_faults(cfg, run.stage.model)):
         reason = f"the compiled scene is not as configured: {'; '.join(faults[:3])}"
-        result = GateResult(name="baseline", status=Status.failed, reason=reason)
-        result.details = faults
-        return [result]
+        failed = GateResult(name="baseline", status=Status.failed, reason=reason, details=faults)
+        return [failed]
     sim = run.nominal.sim
     episode = run.nominal.episode
     status, reason, metrics, beyond = run.judge_one(episode)
@@ -44,7 +43,7 @@ def run_baseline(run: Run) -> list[GateResult]:
         thresholds["ik_error_m"] = cfg.controller.ik_tolerance
         if errors[worst] > SAG:
             cause = find_cause(run, run.nominal.states[run.stage.phase(worst).stop - 1])
-            miss = f"the arm misses its target by {1e3 * errors[worst]:.1f} mm at the end of {worst}"
+            miss = f"the arm is {1e3 * errors[worst]:.1f} mm off its target as {worst} ends"
             causes.insert(0, f"{miss}: {cause}")
         if not errors[worst] <= thresholds["waypoint_error_m"]:
             status = Status.failed

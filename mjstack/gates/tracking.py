@@ -5,7 +5,6 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
-from mjstack.config.schema import Config
 from mjstack.episodes.rollout import State
 from mjstack.episodes.run import Run
 from mjstack.robots.guest import WORLD, grasp_jacobian
@@ -49,6 +48,8 @@ def find_cause(run: Run, state: State) -> str:
     index, model, data = run.stage.index, run.stage.model, mujoco.MjData(run.stage.model)
     data.qpos[:], data.qvel[:], data.ctrl[:] = (values[0] for values in state)
     mujoco.mj_forward(model, data)
+
+    # The joint
     dofs, ctrl = index.robot_qvel[: index.n_arm], index.ctrl[: index.n_arm]
     off = data.ctrl[ctrl] - data.qpos[index.robot_qpos[: index.n_arm]]
     shares = grasp_jacobian(data, run.cfg.robot)[:, dofs] * off
@@ -59,10 +60,11 @@ def find_cause(run: Run, state: State) -> str:
     text = f"{name} is {abs(off[worst]):.3g} {unit} off"
     force, most = data.actuator_force[servo], model.actuator_forcerange[servo].max()
     if model.actuator_forcelimited[servo] and abs(force) > 0.99 * most:
-        text += f" with its servo's largest force, {most:.3g} {newton} (robot.servos.{name}.effort)"
+        text += f" at its servo's largest force, {most:.3g} {newton} (robot.servos.{name}.effort)"
 
+    # Loads on it
     def load(rows: np.ndarray) -> float:
-        """Of some constraint rows on the joint."""
+        """Of some constraint rows."""
         out = np.zeros(model.nv)
         mujoco.mj_mulJacTVec(model, data, out, np.where(rows, data.efc_force, 0.0))
         return float(out[dof])
@@ -77,7 +79,11 @@ def find_cause(run: Run, state: State) -> str:
     contacts = [contact for contact in data.contact if contact.efc_address >= 0]
     ends = [*(contact.efc_address for contact in contacts[1:]), data.nefc]
     for contact, end in zip(contacts, ends, strict=True):
-        cause = _touch(run.cfg, model, contact)
+        (ours, one), (scene, other) = _sides(run, contact)
+        cause = f"{one} presses on {other}"
+        if ours == scene:
+            bodies = (model.body(model.geom_bodyid[geom]).name for geom in contact.geom)
+            cause += f": robot.exclude=[[{','.join(bodies)}]]"
         here = (rows >= contact.efc_address) & (rows < end)
         loads[cause] = loads.get(cause, 0.0) + load(here)
     cause, against = min(loads.items(), key=lambda item: item[1] * np.sign(off[worst]))
@@ -86,36 +92,32 @@ def find_cause(run: Run, state: State) -> str:
 
 def start_contacts(run: Run) -> Iterator[str]:
     """Where the robot is inside of the scene as the nominal episode starts, a line each."""
-    model, data = run.stage.model, mujoco.MjData(run.stage.model)
+    data = mujoco.MjData(run.stage.model)
     data.qpos[:] = run.nominal.episode.start[0]
-    mujoco.mj_fwdPosition(model, data)
-    depths: dict[tuple[str, ...], float] = {}
+    mujoco.mj_fwdPosition(run.stage.model, data)
+    depths: dict[tuple[str, str], float] = {}
     for contact in data.contact:
-        owners = [_owner(run.cfg, model, geom) for geom in contact.geom]
-        if len({scene for _, scene in owners}) == 2:
-            names = tuple(name for name, _ in sorted(owners, key=lambda owner: owner[1]))
-            depths[names] = min(depths.get(names, 0.0), contact.dist)
+        (ours, name), (scene, other) = _sides(run, contact)
+        if ours != scene:
+            depths[name, other] = min(depths.get((name, other), -_DEEP), contact.dist)
     for (name, other), depth in depths.items():
         if depth < -_DEEP:
-            yield f"{name} starts {-1e3 * depth:.1f} mm inside {other}: change robot.home or the scene"
+            yield f"{name} starts {-1e3 * depth:.1f} mm inside {other}: another robot.home"
 
 
-def _touch(cfg: Config, model: mujoco.MjModel, contact: mujoco.MjContact) -> str:
-    """The two that touch, and the way out where both are the robot's."""
-    owners = [_owner(cfg, model, geom) for geom in contact.geom]
-    text = f"{owners[1][0]} presses on {owners[0][0]}"
-    if any(scene for _, scene in owners):
-        return text
-    bodies = [model.body(model.geom_bodyid[geom]).name for geom in contact.geom]
-    return f"{text}: robot.exclude=[[{','.join(bodies)}]]"
-
-
-def _owner(cfg: Config, model: mujoco.MjModel, number: int) -> tuple[str, bool]:
-    """The name of a geom's body, of the world's the geom's too; and whether it is the scene's."""
-    geom, body = model.geom(number), model.geom_bodyid[number]
-    name, root = model.body(body).name, model.body(model.body_rootid[body]).name
-    if name != WORLD:
-        return name, root in cfg.scene.objects
-    mesh = model.mesh(geom.dataid[0]).name if geom.dataid[0] >= 0 else ""
-    scene = geom.name in scene_names(cfg.scene)
-    return geom.name if scene else f"world's {geom.name or mesh or f'geom {number}'}", scene
+def _sides(run: Run, contact: mujoco.MjContact) -> list[tuple[bool, str]]:
+    """Whether each of two that touch is the scene's, and its body, or geom of the world; the
+    robot's first.
+    """
+    model, cfg = run.stage.model, run.cfg
+    sides = []
+    for number in contact.geom:
+        geom, body = model.geom(number), model.geom_bodyid[number]
+        name, root = (model.body(n).name for n in (body, model.body_rootid[body]))
+        scene = root in cfg.scene.objects
+        if name == WORLD:
+            scene = geom.name in scene_names(cfg.scene)
+            mesh = model.mesh(geom.dataid[0]).name if geom.dataid[0] >= 0 else ""
+            name = geom.name if scene else f"world's {geom.name or mesh or f'geom {number}'}"
+        sides.append((scene, name))
+    return sorted(sides, key=lambda side: side[0])
