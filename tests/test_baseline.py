@@ -1,4 +1,4 @@
-"""Gate *baseline* sees a scene that is not as configured, and an arm that is not where it is sent."""
+"""Gate *baseline*: a scene that is not as configured, and an arm that is not where it is sent."""
 
 import re
 from collections.abc import Callable
@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import mujoco
+import numpy as np
 import pytest
-from compositions import load_config
+from compositions import load_config, refusal
 from environments import Patch
 
 import mjstack
@@ -16,6 +17,7 @@ from mjstack.config.schema import Config
 from mjstack.drivers import driver
 from mjstack.gates.scene_physics import scene_faults
 from mjstack.report.record import GateResult
+from mjstack.robots.guest import gravity_sag
 from mjstack.scene import build_model
 from mjstack.scene.build import add_scene
 

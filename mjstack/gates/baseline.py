@@ -37,7 +37,6 @@ def run_baseline(run: Run) -> list[GateResult]:
         worst = max(errors, key=errors.__getitem__)
         metrics["waypoint_error_m"] = errors[worst]
         metrics["ik_error_m"] = float(episode.ik_error.max())
-        metrics["path_error_m"] = run.stage.planner.path_error()
         # Beyond half of it a hand over an object and one at it cannot be told apart
         thresholds["waypoint_error_m"] = 0.5 * cfg.robot.approach_height
         thresholds["ik_error_m"] = cfg.controller.ik_tolerance
