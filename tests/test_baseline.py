@@ -160,8 +160,8 @@ def test_contacts_of_the_scene_that_are_switched_off_are_seen() -> None:
     spec.add_exclude(bodyname1="world", bodyname2="red")
     spec.add_pair(geomname1="red", geomname2="blue")
     assert list(scene_faults(cfg, spec.compile())) == [
-        "contacts of world and red are off",
-        "contacts of red and blue have their values",
+        "world and red have an exclude or a pair of contacts, configured none",
+        "red and blue have an exclude or a pair of contacts, configured none",
     ]
 
 
@@ -199,11 +199,11 @@ def test_the_waypoint_error_is_the_arms(passed: GateResult) -> None:
 def test_sag_is_compensated_or_named(tmp_path: Path) -> None:
     soft = arm_file(tmp_path, ('gravcomp="1"', ""), ('kp="5000" kv="140"', 'kp="500" kv="40"'))
     held = baseline(arm=soft)
-    note = "robot.gravcomp=auto: on; without it the hand sags 15.9 mm at home (auto: on above 2 mm)"
-    assert note in held.details
+    note = "gravity compensation on (robot.gravcomp=auto; auto: from 2 mm on); without it the hand"
+    assert held.details[0] == f"robot's file: {note} sags 15.9 mm at home"
     assert held.status == "pass"
     sagged = baseline("robot.gravcomp=false", arm=soft)
-    assert "robot.gravcomp=false: off" in sagged.details[0]
+    assert "gravity compensation off (robot.gravcomp=false" in sagged.details[0]
     assert sagged.metrics["waypoint_error_m"] > 0.015 > held.metrics["waypoint_error_m"]
     text = r"the arm is \d\d\.\d mm off its target as \w+ ends: lift is 0\.0\d+ m off; gravity:"
     assert re.search(f"{text} robot.gravcomp=true, or a stiffer servo", sagged.details[1])
@@ -264,7 +264,7 @@ def test_a_start_inside_of_the_table_is_named() -> None:
         "robot.home=[-0.8,1.6,0.0,0.0,0.045,0.045]", "scene.table_center=[0.41,0,0.03]"
     )
     assert re.search(
-        r"left_finger starts \d+\.\d mm inside table: another robot.home", str(result.details)
+        r"at the start left_finger presses on table, \d+\.\d mm deep: another", str(result.details)
     )
 
 

@@ -5,7 +5,7 @@ from mjstack.gates.scene_physics import scene_faults
 from mjstack.gates.tracking import find_cause, start_contacts, waypoint_errors
 from mjstack.report.record import GateResult, Status
 from mjstack.robots import read_robot
-from mjstack.robots.guest import SAG, gravity_note, left_behind
+from mjstack.robots.guest import SAG, left_behind
 from mjstack.scene.build import scene_names
 
 
@@ -32,7 +32,7 @@ def run_baseline(run: Run) -> list[GateResult]:
         "peak_constraint_rows": int(sim.peak_constraints[0]),
     }
     thresholds = run.stage.check.thresholds()
-    causes = list(start_contacts(run))
+    causes = start_contacts(run)
     if errors := waypoint_errors(run):
         worst = max(errors, key=errors.__getitem__)
         metrics["waypoint_error_m"] = errors[worst]
@@ -58,8 +58,7 @@ def run_baseline(run: Run) -> list[GateResult]:
     result.metrics = metrics
     result.beyond = beyond
     result.notes["backend"] = sim.description
-    spec = read_robot(cfg.robot, cfg.model)
-    lines = left_behind(spec, cfg.robot, run.stage.model, scene_names(cfg.scene))
-    result.details += [f"robot's file: {line}" for line in lines]
-    result.details += [*filter(None, [gravity_note(spec, cfg.robot, run.stage.model)]), *causes]
+    names = scene_names(cfg.scene)
+    lines = left_behind(read_robot(cfg.robot, cfg.model), cfg.robot, run.stage.model, names)
+    result.details += [*(f"robot's file: {line}" for line in lines), *causes]
     return [result]

@@ -43,32 +43,30 @@ def scene_faults(cfg: Config, model: mujoco.MjModel) -> Iterator[str]:
 def _field_faults(cfg: Config, model: mujoco.MjModel, expected: mujoco.MjModel) -> Iterator[str]:
     for name in [name for name in dir(expected.opt) if not name.startswith("_")]:
         if getattr(cfg.solver, name, "") is not None:  # else the robot's file has it
-            values = (getattr(m.opt, name) for m in (model, expected))
-            yield from _fault(f"option {name}", *values)
+            value, configured = (getattr(m.opt, name) for m in (model, expected))
+            yield from _fault(f"option {name}", value, configured)
     elements = _elements(model, expected)
     for owner, rows_of in _elements(expected, expected).items():
         for kind, rows in rows_of.items():
-            found = elements[owner][kind]
-            if len(found) != len(rows):
-                yield f"{owner} has {len(found)} {kind} for collisions, configured {len(rows)}"
+            numbers = elements[owner][kind]
+            if len(numbers) != len(rows):
+                yield f"{owner} has {len(numbers)} {kind} for collisions, configured {len(rows)}"
                 continue
             for name in [name for name in dir(expected) if name.startswith(f"{kind}_")]:
                 if not _IGNORED.match(name):
                     key = name.removeprefix(f"{kind}_")
                     known = hasattr(cfg.scene.objects.get(owner), key)
                     key = f"scene.objects.{owner}.{key}" if known else ""
-                    values = getattr(model, name)[found], getattr(expected, name)[rows]
-                    yield from _fault(f"{owner} {name}", *values, key)
-    bodies, geoms = (
-        {number for rows in elements.values() for number in rows.get(kind, ())}
-        for kind in ("body", "geom")
-    )
-    for pair in (divmod(int(signature), 1 << 16) for signature in model.exclude_signature):
-        if not bodies.isdisjoint(pair):
-            yield f"contacts of {' and '.join(model.body(n).name for n in pair)} are off"
-    for pair in zip(model.pair_geom1, model.pair_geom2, strict=True):
-        if not geoms.isdisjoint(pair):
-            yield f"contacts of {' and '.join(model.geom(n).name for n in pair)} have their values"
+                    value, configured = getattr(model, name)[numbers], getattr(expected, name)[rows]
+                    yield from _fault(f"{owner} {name}", value, configured, key)
+    excluded = [divmod(int(signature), 1 << 16) for signature in model.exclude_signature]
+    pairs = {"body": excluded, "geom": zip(model.pair_geom1, model.pair_geom2, strict=True)}
+    for kind in pairs:
+        scene_numbers = {number for rows in elements.values() for number in rows.get(kind, ())}
+        for pair in pairs[kind]:
+            if not scene_numbers.isdisjoint(pair):
+                names = " and ".join(getattr(model, kind)(number).name for number in pair)
+                yield f"{names} have an exclude or a pair of contacts, configured none"
 
 
 def _elements(model: mujoco.MjModel, scene: mujoco.MjModel) -> dict[str, dict[str, np.ndarray]]:
@@ -126,5 +124,5 @@ def _fault(name: str, value: Any, expected: Any, key: str = "") -> Iterator[str]
     least = 1e-9 * np.max(np.abs(expected), initial=0.0)
     if not np.allclose(value, expected, rtol=1e-6, atol=least):
         numbers = (np.where(np.abs(v) < least, 0.0, v).ravel() for v in (value, expected))
-        found, wanted = (" ".join(f"{number:.6g}" for number in row) for row in numbers)
-        yield f"{name} {found}, configured {wanted}{key and f' ({key})'}"
+        text, configured = (" ".join(f"{number:.6g}" for number in row) for row in numbers)
+        yield f"{name} {text}, configured {configured}{key and f' ({key})'}"

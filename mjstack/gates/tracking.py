@@ -1,7 +1,5 @@
 """Whether the arm goes where it is sent, and otherwise the cause."""
 
-from collections.abc import Iterator
-
 import mujoco
 import numpy as np
 
@@ -11,11 +9,13 @@ from mjstack.robots.guest import WORLD, grasp_jacobian
 from mjstack.scene.build import scene_names
 
 _DEEP = 1e-4  # m: contacts at rest are less deep
-_KIND = mujoco.mjtConstraint
+_KINDS = mujoco.mjtConstraint
 _CAUSES = {  # of loads, by the kind of constraint that makes them
-    "an equality of the robot's file holds it": (_KIND.mjCNSTR_EQUALITY,),
-    "it is at the end of its range": (_KIND.mjCNSTR_LIMIT_JOINT, _KIND.mjCNSTR_LIMIT_TENDON),
-    "dry friction holds it": (_KIND.mjCNSTR_FRICTION_DOF, _KIND.mjCNSTR_FRICTION_TENDON),
+    int(_KINDS.mjCNSTR_EQUALITY): "an equality of the robot's file holds it",
+    int(_KINDS.mjCNSTR_FRICTION_DOF): "dry friction holds it",
+    int(_KINDS.mjCNSTR_FRICTION_TENDON): "dry friction of a tendon holds it",
+    int(_KINDS.mjCNSTR_LIMIT_JOINT): "it is at the end of its range",
+    int(_KINDS.mjCNSTR_LIMIT_TENDON): "a tendon is at the end of its range",
 }
 
 
@@ -63,61 +63,52 @@ def find_cause(run: Run, state: State) -> str:
         text += f" at its servo's largest force, {most:.3g} {newton} (robot.servos.{name}.effort)"
 
     # Loads on it
-    def load(rows: np.ndarray) -> float:
-        """Of some constraint rows."""
-        out = np.zeros(model.nv)
-        mujoco.mj_mulJacTVec(model, data, out, np.where(rows, data.efc_force, 0.0))
-        return float(out[dof])
-
     gravcomp = "" if model.body_gravcomp.any() else "robot.gravcomp=true, or "
     loads = {
         f"gravity: {gravcomp}a stiffer servo": data.qfrc_passive[dof] - data.qfrc_bias[dof],
         "it still moves: more seconds": model.actuator_biasprm[servo][2] * data.qvel[dof],
-        **{cause: load(np.isin(data.efc_type, kinds)) for cause, kinds in _CAUSES.items()},
     }
-    rows = np.arange(data.nefc)
-    contacts = [contact for contact in data.contact if contact.efc_address >= 0]
-    ends = [*(contact.efc_address for contact in contacts[1:]), data.nefc]
-    for contact, end in zip(contacts, ends, strict=True):
-        (ours, one), (scene, other) = _sides(run, contact)
-        cause = f"{one} presses on {other}"
-        if ours == scene:
-            bodies = (model.body(model.geom_bodyid[geom]).name for geom in contact.geom)
-            cause += f": robot.exclude=[[{','.join(bodies)}]]"
-        here = (rows >= contact.efc_address) & (rows < end)
-        loads[cause] = loads.get(cause, 0.0) + load(here)
-    cause, against = min(loads.items(), key=lambda item: item[1] * np.sign(off[worst]))
-    return f"{text}; {cause} ({abs(against):.3g} {newton})"
+    torque = np.zeros(model.nv)
+    for row, kind in enumerate(data.efc_type.tolist()):
+        cause = _CAUSES.get(kind) or _touch(run, data.contact[data.efc_id[row]])
+        force_of_row = np.where(np.arange(data.nefc) == row, data.efc_force, 0.0)
+        mujoco.mj_mulJacTVec(model, data, torque, force_of_row)
+        loads[cause] = loads.get(cause, 0.0) + torque[dof]
+    cause, load = min(loads.items(), key=lambda item: item[1] * np.sign(off[worst]))
+    return f"{text}; {cause} ({abs(load):.3g} {newton})"
 
 
-def start_contacts(run: Run) -> Iterator[str]:
-    """Where the robot is inside of the scene as the nominal episode starts, a line each."""
+def start_contacts(run: Run) -> list[str]:
+    """List where the robot is inside of the scene as the nominal episode starts, a line each."""
     data = mujoco.MjData(run.stage.model)
     data.qpos[:] = run.nominal.episode.start[0]
     mujoco.mj_fwdPosition(run.stage.model, data)
-    depths: dict[tuple[str, str], float] = {}
+    depths: dict[str, float] = {}
     for contact in data.contact:
-        (ours, name), (scene, other) = _sides(run, contact)
-        if ours != scene:
-            depths[name, other] = min(depths.get((name, other), -_DEEP), contact.dist)
-    for (name, other), depth in depths.items():
-        if depth < -_DEEP:
-            yield f"{name} starts {-1e3 * depth:.1f} mm inside {other}: another robot.home"
+        text = _touch(run, contact, alike="")
+        depths[text] = max(depths.get(text, 0.0), -contact.dist)
+    return [
+        f"at the start {text}, {1e3 * depth:.1f} mm deep: another robot.home"
+        for text, depth in depths.items()
+        if text and depth > _DEEP
+    ]
 
 
-def _sides(run: Run, contact: mujoco.MjContact) -> list[tuple[bool, str]]:
-    """Whether each of two that touch is the scene's, and its body, or geom of the world; the
-    robot's first.
+def _touch(run: Run, contact: mujoco.MjContact, alike: str = "{}: robot.exclude=[[{},{}]]") -> str:
+    """Words for a contact, the robot's body first, geoms of the world by their names; ``alike`` is
+    for two of the robot, or of the scene.
     """
-    model, cfg = run.stage.model, run.cfg
+    model = run.stage.model
     sides = []
     for number in contact.geom:
         geom, body = model.geom(number), model.geom_bodyid[number]
         name, root = (model.body(n).name for n in (body, model.body_rootid[body]))
-        scene = root in cfg.scene.objects
+        label, in_scene = name, root in run.cfg.scene.objects
         if name == WORLD:
-            scene = geom.name in scene_names(cfg.scene)
+            in_scene = geom.name in scene_names(run.cfg.scene)
             mesh = model.mesh(geom.dataid[0]).name if geom.dataid[0] >= 0 else ""
-            name = geom.name if scene else f"world's {geom.name or mesh or f'geom {number}'}"
-        sides.append((scene, name))
-    return sorted(sides, key=lambda side: side[0])
+            label = geom.name if in_scene else f"world's {geom.name or mesh or f'geom {number}'}"
+        sides.append((in_scene, name == WORLD, name, label))
+    (first, _, *robot), (second, _, *obstacle) = sorted(sides)
+    text = f"{robot[1]} presses on {obstacle[1]}"
+    return alike.format(text, obstacle[0], robot[0]) if first == second else text
