@@ -85,7 +85,7 @@ def start_contacts(run: Run) -> list[str]:
     mujoco.mj_fwdPosition(run.stage.model, data)
     depths: dict[str, float] = {}
     for contact in data.contact:
-        text = _touch(run, contact, alike="")
+        text = _touch(run, contact, same_side="")
         depths[text] = max(depths.get(text, 0.0), -contact.dist)
     return [
         f"at the start {text}, {1e3 * depth:.1f} mm deep: another robot.home"
@@ -94,8 +94,10 @@ def start_contacts(run: Run) -> list[str]:
     ]
 
 
-def _touch(run: Run, contact: mujoco.MjContact, alike: str = "{}: robot.exclude=[[{},{}]]") -> str:
-    """Words for a contact, the robot's body first, geoms of the world by their names; ``alike`` is
+def _touch(
+    run: Run, contact: mujoco.MjContact, same_side: str = "{}: robot.exclude=[[{},{}]]"
+) -> str:
+    """Words for a contact, the robot's body first, geoms of the world by their names; ``same_side`` is
     for two of the robot, or of the scene.
     """
     model = run.stage.model
@@ -111,4 +113,4 @@ def _touch(run: Run, contact: mujoco.MjContact, alike: str = "{}: robot.exclude=
         sides.append((in_scene, name == WORLD, name, label))
     (first, _, *robot), (second, _, *obstacle) = sorted(sides)
     text = f"{robot[1]} presses on {obstacle[1]}"
-    return alike.format(text, obstacle[0], robot[0]) if first == second else text
+    return same_side.format(text, obstacle[0], robot[0]) if first == second else text
