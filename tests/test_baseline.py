@@ -217,6 +217,10 @@ def narrow(model: mujoco.MjModel) -> None:
     model.jnt_range[model.joint("shoulder").id] = [-0.9, -0.7]
 
 
+def bound(model: mujoco.MjModel) -> None:
+    model.actuator_ctrlrange[model.actuator("shoulder").id] = [-0.9, -0.7]
+
+
 def weaken(model: mujoco.MjModel) -> None:
     model.body_gravcomp[:] = 0.0
     model.actuator_forcerange[model.actuator("lift").id] = [-6.0, 6.0]
@@ -226,6 +230,7 @@ def weaken(model: mujoco.MjModel) -> None:
     ("alter", "message"),
     [
         (jam, r"shoulder is 0\.\d+ rad off.*; dry friction holds it"),
+        (bound, r"shoulder is 0\.\d+ rad off; its servo's range bounds its target -?\d\.\d+ to -0"),
         (narrow, r"shoulder is 0\.\d+ rad off.*; it is at the end of its range"),
         (weaken, r"lift is 0\.\d+ m off at its servo's largest force, 6 N \(robot.servos.lift.eff"),
     ],

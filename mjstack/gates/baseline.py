@@ -32,8 +32,8 @@ def run_baseline(run: Run) -> list[GateResult]:
         "peak_constraint_rows": int(sim.peak_constraints[0]),
     }
     thresholds = run.stage.check.thresholds()
-    causes = start_contacts(run)
-    if errors := waypoint_errors(run):
+    causes = start_contacts(run.stage, episode.start[0])
+    if errors := waypoint_errors(run.stage, run.nominal.states, run.nominal.targets):
         worst = max(errors, key=errors.__getitem__)
         metrics["waypoint_error_m"] = errors[worst]
         metrics["ik_error_m"] = float(episode.ik_error.max())
@@ -41,7 +41,8 @@ def run_baseline(run: Run) -> list[GateResult]:
         thresholds["waypoint_error_m"] = 0.5 * cfg.robot.approach_height
         thresholds["ik_error_m"] = cfg.controller.ik_tolerance
         if errors[worst] > SAG:
-            cause = find_cause(run, run.nominal.states[run.stage.phase(worst).stop - 1])
+            end = run.stage.phase(worst).stop - 1
+            cause = find_cause(run.stage, run.nominal.states[end], run.nominal.targets[end])
             miss = f"the arm is {1e3 * errors[worst]:.1f} mm off its target as {worst} ends"
             causes.insert(0, f"{miss}: {cause}")
         if not errors[worst] <= thresholds["waypoint_error_m"]:

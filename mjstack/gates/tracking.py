@@ -1,10 +1,12 @@
 """Whether the arm goes where it is sent, and otherwise the cause."""
 
+from collections.abc import Mapping
+
 import mujoco
 import numpy as np
 
 from mjstack.episodes.rollout import State
-from mjstack.episodes.run import Run
+from mjstack.episodes.stage import Stage
 from mjstack.robots.guest import WORLD, grasp_jacobian
 from mjstack.scene.build import scene_names
 
@@ -19,47 +21,55 @@ _CAUSES = {  # of loads, by the kind of constraint that makes them
 }
 
 
-def waypoint_errors(run: Run) -> dict[str, float]:
+def waypoint_errors(
+    stage: Stage, states: Mapping[int, State], targets: Mapping[int, np.ndarray]
+) -> dict[str, float]:
     """Distance of the grasp point at the end of each phase of the nominal episode from where the
-    arm's joint targets would have it [m]; fingers count as they are.
+    arm's joint targets would have it [m]; fingers count as they are. States and joint targets are
+    by step.
     """
-    index = run.stage.index
-    data = mujoco.MjData(run.stage.model)
-    qpos, ctrl = index.robot_qpos[: index.n_arm], index.ctrl[: index.n_arm]
+    index, data = stage.index, mujoco.MjData(stage.model)
 
     def grasp_point() -> np.ndarray:
-        mujoco.mj_kinematics(run.stage.model, data)
+        mujoco.mj_kinematics(stage.model, data)
         return data.site_xpos[index.grasp_sites].mean(axis=0)
 
     errors = {}
-    for phase in run.stage.phases:
-        state = run.nominal.states[phase.stop - 1]
-        data.qpos[:] = state.qpos[0]
+    for phase in stage.phases:
+        data.qpos[:] = states[phase.stop - 1].qpos[0]
         reached = grasp_point()
-        data.qpos[qpos] = state.ctrl[0][ctrl]
+        arm = index.robot_qpos[: index.n_arm]
+        data.qpos[arm] = targets[phase.stop - 1][: index.n_arm]
         errors[phase.name] = float(np.linalg.norm(grasp_point() - reached))
     return errors
 
 
-def find_cause(run: Run, state: State) -> str:
+def find_cause(stage: Stage, state: State, target: np.ndarray) -> str:
     """The joint that holds the grasp point farthest off its target in a state of one world, and the
     largest load on it against its servo.
     """
-    index, model, data = run.stage.index, run.stage.model, mujoco.MjData(run.stage.model)
+    index, model, data = stage.index, stage.model, mujoco.MjData(stage.model)
     data.qpos[:], data.qvel[:], data.ctrl[:] = (values[0] for values in state)
     mujoco.mj_forward(model, data)
 
     # The joint
-    dofs, ctrl = index.robot_qvel[: index.n_arm], index.ctrl[: index.n_arm]
-    off = data.ctrl[ctrl] - data.qpos[index.robot_qpos[: index.n_arm]]
-    shares = grasp_jacobian(data, run.cfg.robot)[:, dofs] * off
+    dofs = index.robot_qvel[: index.n_arm]
+    off = (target - data.qpos[index.robot_qpos])[: index.n_arm]
+    shares = grasp_jacobian(data, stage.cfg.robot)[:, dofs] * off
     worst = int(np.argmax(np.linalg.norm(shares, axis=0)))
-    dof, servo, name = dofs[worst], ctrl[worst], run.cfg.robot.arm_joints[worst]
-    turns = model.jnt_type[model.dof_jntid[dof]] == mujoco.mjtJoint.mjJNT_HINGE
+    dof, servo, name = dofs[worst], index.ctrl[worst], stage.cfg.robot.arm_joints[worst]
+    joint = model.dof_jntid[dof]
+    turns = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
     unit, newton = ("rad", "N m") if turns else ("m", "N")
     text = f"{name} is {abs(off[worst]):.3g} {unit} off"
-    force, most = data.actuator_force[servo], model.actuator_forcerange[servo].max()
-    if model.actuator_forcelimited[servo] and abs(force) > 0.99 * most:
+    if not np.isclose(bounded := data.ctrl[servo], target[worst], atol=1e-5):
+        return f"{text}; its servo's range bounds its target {target[worst]:.3g} to {bounded:.3g}"
+    most = np.inf
+    if model.actuator_forcelimited[servo]:
+        most = model.actuator_forcerange[servo].max()
+    if model.jnt_actfrclimited[joint]:
+        most = min(most, model.jnt_actfrcrange[joint].max())
+    if abs(data.qfrc_actuator[dof]) > 0.99 * most:
         text += f" at its servo's largest force, {most:.3g} {newton} (robot.servos.{name}.effort)"
 
     # Loads on it
@@ -70,7 +80,7 @@ def find_cause(run: Run, state: State) -> str:
     }
     torque = np.zeros(model.nv)
     for row, kind in enumerate(data.efc_type.tolist()):
-        cause = _CAUSES.get(kind) or _touch(run, data.contact[data.efc_id[row]])
+        cause = _CAUSES.get(kind) or _touch(stage, data.contact[data.efc_id[row]])
         force_of_row = np.where(np.arange(data.nefc) == row, data.efc_force, 0.0)
         mujoco.mj_mulJacTVec(model, data, torque, force_of_row)
         loads[cause] = loads.get(cause, 0.0) + torque[dof]
@@ -78,14 +88,14 @@ def find_cause(run: Run, state: State) -> str:
     return f"{text}; {cause} ({abs(load):.3g} {newton})"
 
 
-def start_contacts(run: Run) -> list[str]:
-    """List where the robot is inside of the scene as the nominal episode starts, a line each."""
-    data = mujoco.MjData(run.stage.model)
-    data.qpos[:] = run.nominal.episode.start[0]
-    mujoco.mj_fwdPosition(run.stage.model, data)
+def start_contacts(stage: Stage, start: np.ndarray) -> list[str]:
+    """List where the robot is inside of the scene at a start of shape ``(nq,)``, a line each."""
+    data = mujoco.MjData(stage.model)
+    data.qpos[:] = start
+    mujoco.mj_fwdPosition(stage.model, data)
     depths: dict[str, float] = {}
     for contact in data.contact:
-        text = _touch(run, contact, same_side="")
+        text = _touch(stage, contact, same_side="")
         depths[text] = max(depths.get(text, 0.0), -contact.dist)
     return [
         f"at the start {text}, {1e3 * depth:.1f} mm deep: another robot.home"
@@ -95,19 +105,19 @@ def start_contacts(run: Run) -> list[str]:
 
 
 def _touch(
-    run: Run, contact: mujoco.MjContact, same_side: str = "{}: robot.exclude=[[{},{}]]"
+    stage: Stage, contact: mujoco.MjContact, same_side: str = "{}: robot.exclude=[[{},{}]]"
 ) -> str:
-    """Words for a contact, the robot's body first, geoms of the world by their names; ``same_side`` is
-    for two of the robot, or of the scene.
+    """Words for a contact, the robot's body first, geoms of the world by their names; ``same_side``
+    is for two of the robot, or of the scene.
     """
-    model = run.stage.model
+    model = stage.model
     sides = []
     for number in contact.geom:
         geom, body = model.geom(number), model.geom_bodyid[number]
         name, root = (model.body(n).name for n in (body, model.body_rootid[body]))
-        label, in_scene = name, root in run.cfg.scene.objects
+        label, in_scene = name, root in stage.cfg.scene.objects
         if name == WORLD:
-            in_scene = geom.name in scene_names(run.cfg.scene)
+            in_scene = geom.name in scene_names(stage.cfg.scene)
             mesh = model.mesh(geom.dataid[0]).name if geom.dataid[0] >= 0 else ""
             label = geom.name if in_scene else f"world's {geom.name or mesh or f'geom {number}'}"
         sides.append((in_scene, name == WORLD, name, label))
