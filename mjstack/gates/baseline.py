@@ -32,7 +32,8 @@ def run_baseline(run: Run) -> list[GateResult]:
         "peak_constraint_rows": int(sim.peak_constraints[0]),
     }
     thresholds = run.stage.check.thresholds()
-    causes = start_contacts(run.stage, episode.start[0])
+    contacts = start_contacts(run.stage, episode.start[0])
+    causes: list[str] = []
     if errors := waypoint_errors(run.stage, run.nominal.states, run.nominal.targets):
         worst = max(errors, key=errors.__getitem__)
         metrics["waypoint_error_m"] = errors[worst]
@@ -44,7 +45,7 @@ def run_baseline(run: Run) -> list[GateResult]:
             end = run.stage.phase(worst).stop - 1
             cause = find_cause(run.stage, run.nominal.states[end], run.nominal.targets[end])
             miss = f"the arm is {1e3 * errors[worst]:.1f} mm off its target as {worst} ends"
-            causes.insert(0, f"{miss}: {cause}")
+            causes = [f"{miss}: {cause}", *contacts]
         if not errors[worst] <= thresholds["waypoint_error_m"]:
             status = Status.failed
             reason = reason or "failed"
@@ -61,5 +62,5 @@ def run_baseline(run: Run) -> list[GateResult]:
     result.notes["backend"] = sim.description
     names = scene_names(cfg.scene)
     lines = left_behind(read_robot(cfg.robot, cfg.model), cfg.robot, run.stage.model, names)
-    result.details += [*(f"robot's file: {line}" for line in lines), *causes]
+    result.details += [*(f"robot's file: {line}" for line in lines), *(causes or contacts)]
     return [result]
