@@ -280,8 +280,11 @@ def test_exclude_and_gravcomp_take_names_and_words(tmp_path: Path) -> None:
     near = "robot.exclude: body 'left_fingr' does not exist. Did you mean 'left_finger'?"
     refusal(lambda: build_model(scara("robot.exclude=[[left_fingr,hand]]")), near)
     refusal(lambda: build_model(scara("robot.exclude=[[red,hand]]")), "robot.exclude: body 'red'")
-    for pair in ("[hand]", "[hand,hand]", "[hand,world,base]"):
-        refusal(lambda pair=pair: build_model(scara(f"robot.exclude=[{pair}]")), "expected two")
+    for pair in ("[hand]", "[hand,hand]", "[hand,world,base]", "hand,world"):
+        refusal(
+            lambda pair=pair: build_model(scara(f"robot.exclude=[{pair}]")),
+            "expected pairs of bodies",
+        )
     refusal(lambda: scara("robot.gravcomp=maybe"), "robot.gravcomp=maybe: expected one of auto")
     own = build_model(scara())
     assert build_model(scara("robot.gravcomp=true")).body_gravcomp.sum() == 7
