@@ -10,6 +10,7 @@ import numpy as np
 from mjstack.config.mjcf import (
     FREE,
     attach_guest,
+    compile_scene,
     describe,
     fix_masses,
     option_names,
@@ -17,13 +18,14 @@ from mjstack.config.mjcf import (
     scenery,
 )
 from mjstack.config.schema import RobotCfg
-from mjstack.errors import MjstackError, require_names
+from mjstack.errors import ConfigError, MjstackError, require_names
 
 WORLD = "world"  # MuJoCo's name of the body that never moves
 
 # Figures of the solver that the group `solver` leaves to the robot's file where they are null
 _SOLVER = ("iterations", "ls_iterations", "impratio", "tolerance")
 _CONFIGURED = (*_SOLVER, "timestep", "integrator", "cone")  # by groups timing and solver
+SAG = 0.002  # m: how far off its target a hand is of which gravity, or a report, takes no notice
 _WRAPS = (mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER)
 PREFIX = "robot_"
 _NAMED = ("geoms", "bodies", "cameras")  # elements that a scene has too
@@ -52,7 +54,13 @@ def as_guest(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) ->
     fresh.modelname = spec.modelname
     for element in _strangers(spec, robot):
         spec.delete(element)
-    bodies = {body.name for body in spec.bodies}
+    bodies = [body.name for body in spec.bodies]
+    for pair in robot.exclude:
+        if not isinstance(pair, list) or len(pair) != 2 or len({*map(str, pair)}) != 2:
+            expected = "pairs of bodies, such as [[world, link1]]"
+            raise ConfigError("robot.exclude", robot.exclude, expected)
+        require_names("robot.exclude: body", map(str, pair), bodies)
+        spec.add_exclude(bodyname1=str(pair[0]), bodyname2=str(pair[1]))
     for camera in [c for c in spec.cameras if c.targetbody and c.targetbody not in bodies]:
         spec.delete(camera)
     geoms = {geom.name for geom in spec.geoms}
@@ -67,6 +75,44 @@ def as_guest(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) ->
     base = fresh.worldbody.add_frame(pos=robot.base.pos, quat=robot.base.quat)
     attach_guest(fresh, spec, base, "")
     return fresh
+
+
+def compile_robot_scene(spec: mujoco.MjSpec, robot: RobotCfg) -> mujoco.MjModel:
+    """Compile a scene with a robot, whose gravity is compensated as its profile says."""
+    model = compile_scene(spec)
+    bodies = [low for name in robot.joints for low in _below(_tree(spec.joint(name).parent))]
+    compensated = any(body.gravcomp for body in bodies)
+    if robot.gravcomp == "auto":
+        changed = not compensated and gravity_sag(model, robot) > SAG
+    else:
+        changed = robot.gravcomp or compensated
+    if changed:
+        for body in bodies:
+            body.gravcomp = float(bool(robot.gravcomp))
+        model = compile_scene(spec)
+    return model
+
+
+def gravity_sag(model: mujoco.MjModel, robot: RobotCfg) -> float:
+    """How far off its target at home gravity moves the grasp point where nothing compensates it
+    [m], by the stiffness of the arm's servos.
+    """
+    data = mujoco.MjData(model)
+    for name, value in zip(robot.joints, robot.home, strict=True):
+        data.joint(name).qpos = value
+    mujoco.mj_forward(model, data)
+    dofs = [int(model.joint(name).dofadr[0]) for name in robot.arm_joints]
+    stiffness = [-model.actuator(name).biasprm[1] for name in robot.arm_joints]
+    lowered = (data.qfrc_spring - data.qfrc_bias)[dofs] / stiffness
+    return float(np.linalg.norm(grasp_jacobian(data, robot)[:, dofs] @ lowered))
+
+
+def grasp_jacobian(data: mujoco.MjData, robot: RobotCfg) -> np.ndarray:
+    """The grasp point's translational Jacobian, shape ``(3, nv)``."""
+    jac = np.zeros((2, 3, data.model.nv))
+    for part, site in zip(jac, robot.grasp_sites, strict=True):
+        mujoco.mj_jacSite(data.model, data, part, None, data.site(site).id)
+    return jac.mean(axis=0)
 
 
 @contextmanager
@@ -95,6 +141,11 @@ def left_behind(
     """
     strangers = _strangers(spec, robot)
     yield from _options_left(spec, model)
+    if robot.gravcomp != "auto" or not any(body.gravcomp for body in spec.bodies):
+        state = "on" if model.body_gravcomp.any() else "off"
+        sag = f"without it the hand sags {1e3 * gravity_sag(model, robot):.1f} mm at home"
+        value = f"robot.gravcomp={robot.gravcomp}".lower()
+        yield f"gravity compensation {state} ({value}; auto: from {1e3 * SAG:g} mm on); {sag}"
     if strangers:
         yield f"left out: {describe(strangers)}"
     names = set(_clashes(spec, reserved)) - {e.name for e in strangers}

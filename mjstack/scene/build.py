@@ -13,7 +13,6 @@ import numpy as np
 
 from mjstack.config.mjcf import (
     attach_guest,
-    compile_scene,
     fix_masses,
     free_body,
     measure,
@@ -23,7 +22,7 @@ from mjstack.config.mjcf import (
 from mjstack.config.schema import BoxCfg, CameraCfg, Config, ObjectCfg, SceneCfg
 from mjstack.errors import ConfigError, UnknownName, require_names
 from mjstack.robots import robot_spec
-from mjstack.robots.guest import WORLD, mujoco_errors
+from mjstack.robots.guest import WORLD, compile_robot_scene, mujoco_errors
 
 TABLE = "table"
 CAPSULE_TURN = np.array([math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0])
@@ -58,16 +57,25 @@ def scene_names(scene: SceneCfg) -> set[str]:
 
 
 def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> mujoco.MjModel:
-    """Add the scene to a robot and compile it.
+    """Add the scene to a robot and compile it; arguments as of `add_scene`.
+
+    Returns:
+        The compiled model; its ``qpos0`` has the objects at their nominal positions.
+    """
+    add_scene(spec, cfg, visuals=visuals)
+    model = compile_robot_scene(spec, cfg.robot)
+    _require_clear(model, cfg.scene)
+    return model
+
+
+def add_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> None:
+    """Add the scene to a robot.
 
     Args:
         spec: The robot; it is changed in place.
         cfg: Table, objects and perhaps a box, the physics timestep, the solver's settings (``None``
             keeps the robot file's own), and the jaws, whose force on each object a sensor measures.
         visuals: Keep geoms that only pictures need, and add a disc for each place.
-
-    Returns:
-        The compiled model; its ``qpos0`` has the objects at their nominal positions.
     """
     scene = cfg.scene
     solver = cfg.solver
@@ -138,9 +146,6 @@ def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> m
         spec.visual.quality.shadowsize = 1024  # without a GPU, MuJoCo's 4096 doubles the time
     else:
         spec.compiler.discardvisual = True
-    model = compile_scene(spec)
-    _require_clear(model, scene)
-    return model
 
 
 def force_sensor(first: str, second: str) -> str:
