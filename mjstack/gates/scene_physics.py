@@ -8,6 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from mjstack.config.mjcf import compile_scene
 from mjstack.config.schema import Config
 from mjstack.scene.build import TABLE, add_scene
 
@@ -26,10 +27,11 @@ def scene_faults(cfg: Config, model: mujoco.MjModel) -> Iterator[str]:
     spec = mujoco.MjSpec()
     bare = replace(cfg.scene, cameras={})
     add_scene(spec, replace(cfg, robot=replace(cfg.robot, jaw_bodies=[]), scene=bare))
-    expected = spec.compile()
+    expected = compile_scene(spec)
     shapes = {TABLE: (bare.table_half, bare.table_friction)}
     for name, thing in bare.objects.items():
-        shapes |= {name + end: (p.size, thing.friction) for end, p in thing.pieces.items()}
+        friction = thing.friction or []  # null: a file's own, which has no pieces
+        shapes |= {name + end: (p.size, friction) for end, p in thing.pieces.items()}
         if not thing.fixed and thing.mass is not None:
             expected.body(name).mass = thing.mass
     for name, (size, friction) in shapes.items():  # not as `add_scene` has understood them
@@ -59,14 +61,22 @@ def _field_faults(cfg: Config, model: mujoco.MjModel, expected: mujoco.MjModel) 
                     key = f"scene.objects.{owner}.{key}" if known else ""
                     value, configured = getattr(model, name)[numbers], getattr(expected, name)[rows]
                     yield from _fault(f"{owner} {name}", value, configured, key)
+    configured_pairs = _pairs(expected)  # of fixtures
+    for (kind, names), pair in _pairs(model).items():
+        scene_numbers = {number for rows in elements.values() for number in rows.get(kind, ())}
+        if not scene_numbers.isdisjoint(pair) and (kind, names) not in configured_pairs:
+            yield f"{names} have an exclude or a pair of contacts, configured none"
+
+
+def _pairs(model: mujoco.MjModel) -> dict[tuple[str, str], tuple[int, int]]:
+    """Numbers of bodies without contacts, and of pairs of geoms, by kind and names."""
     excluded = [divmod(int(signature), 1 << 16) for signature in model.exclude_signature]
     pairs = {"body": excluded, "geom": zip(model.pair_geom1, model.pair_geom2, strict=True)}
-    for kind in pairs:
-        scene_numbers = {number for rows in elements.values() for number in rows.get(kind, ())}
-        for pair in pairs[kind]:
-            if not scene_numbers.isdisjoint(pair):
-                names = " and ".join(getattr(model, kind)(number).name for number in pair)
-                yield f"{names} have an exclude or a pair of contacts, configured none"
+    return {
+        (kind, " and ".join(getattr(model, kind)(number).name for number in pair)): pair
+        for kind in pairs
+        for pair in pairs[kind]
+    }
 
 
 def _elements(model: mujoco.MjModel, scene: mujoco.MjModel) -> dict[str, dict[str, np.ndarray]]:
