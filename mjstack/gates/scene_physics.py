@@ -29,7 +29,8 @@ def scene_faults(cfg: Config, model: mujoco.MjModel) -> Iterator[str]:
     expected = spec.compile()
     shapes = {TABLE: (bare.table_half, bare.table_friction)}
     for name, thing in bare.objects.items():
-        shapes |= {name + end: (p.size, thing.friction) for end, p in thing.pieces.items()}
+        friction = thing.friction or []  # null of a file alone, which has no pieces
+        shapes |= {name + end: (p.size, friction) for end, p in thing.pieces.items()}
         if not thing.fixed and thing.mass is not None:
             expected.body(name).mass = thing.mass
     for name, (size, friction) in shapes.items():  # not as `add_scene` has understood them
