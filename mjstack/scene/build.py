@@ -11,9 +11,9 @@ import mujoco
 import numpy as np
 
 from mjstack.config.schema import BoxCfg, CameraCfg, Config, ObjectCfg, SceneCfg
-from mjstack.errors import ConfigError, MjstackError, UnknownName
+from mjstack.errors import ConfigError, UnknownName
 from mjstack.robots import read_mjcf, robot_spec
-from mjstack.robots.guest import WORLD, compile_scene
+from mjstack.robots.guest import WORLD, compile_scene, mujoco_errors
 
 TABLE = "table"
 CAPSULE_TURN = np.array([math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0])
@@ -33,15 +33,12 @@ def build_model(cfg: Config, *, visuals: bool = False) -> mujoco.MjModel:
     Raises:
         MjstackError: The robot's file does not fit the scene, such as one with a geom named table.
     """
-    spec = robot_spec(cfg.robot, cfg.model, scene_names(cfg.scene))
-    try:
-        return build_scene(spec, cfg, visuals=visuals)
-    except ValueError as error:
-        problem = ", ".join(str(error).removeprefix("Error: ").splitlines())
-        raise MjstackError(
-            f"robot {cfg.robot.name} in scene {cfg.scene.name}: {problem}. Correct the robot's file"
-            " or the scene, whose names (floor, table and the objects) the robot cannot have."
-        ) from error
+    with mujoco_errors(f"{cfg.robot.name} in scene {cfg.scene.name}"):
+        spec = robot_spec(cfg.robot, cfg.model, scene_names(cfg.scene))
+        model = build_scene(spec, cfg, visuals=visuals)
+    for friction in (model.geom_friction, model.pair_friction):  # as contacts have it
+        friction[:] = friction.clip(min=mujoco.mjMINMU)  # MJWarp warns of less
+    return model
 
 
 def scene_names(scene: SceneCfg) -> set[str]:
