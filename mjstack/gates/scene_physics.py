@@ -30,7 +30,7 @@ def scene_faults(cfg: Config, model: mujoco.MjModel) -> Iterator[str]:
     expected = compile_scene(spec)
     shapes = {TABLE: (bare.table_half, bare.table_friction)}
     for name, thing in bare.objects.items():
-        friction = thing.friction or []  # null: a file's own, which has no pieces
+        friction = thing.friction or []  # null of a file alone, which has no pieces
         shapes |= {name + end: (p.size, friction) for end, p in thing.pieces.items()}
         if not thing.fixed and thing.mass is not None:
             expected.body(name).mass = thing.mass
