@@ -43,8 +43,8 @@ class Posture:
         commanded: Addresses in qpos of the commanded joints, shape ``(n,)``.
         columns: Addresses that a command determines besides, those that follow and those off
             qpos0, shape ``(m,)``.
-        coupled: Addresses of commanded joints that follow earlier ones, shape ``(c,)``; below, m is
-            m + c.
+        coupled: Numbers of the commanded joints that follow earlier ones, shape ``(c,)``; below,
+            they are among the m.
         leader: Number of the commanded joint that each of them follows, shape ``(m,)``.
         low: Where the leader's range begins [rad, m], shape ``(m,)``.
         step: Distance of two knots [rad, m], shape ``(m,)``.
@@ -69,7 +69,8 @@ class Posture:
         self._springs = (m.jnt_dofadr[plain], m.jnt_qposadr[plain])
         self._spring[self._springs[0]] = m.qpos_spring[self._springs[1]]
 
-        self._moves = np.array([self._moved_by(k) for k in range(m.neq)])
+        moves = [self._moved_by(k) for k in range(m.neq)]
+        self._moves = np.reshape(moves, (m.neq, m.nv))
 
         self.rest = m.qpos0.copy()
         for k in range(m.nnumeric):
@@ -96,9 +97,10 @@ class Posture:
             tables.setdefault(int(column), constant)
         for address in self.commanded[leaders]:
             tables.pop(int(address), None)
-        self.coupled = np.array([c for c in self.commanded if c in tables], dtype=int)
-        self.columns = np.array([c for c in tables if c not in self.coupled], dtype=int)
-        rows = [tables[c] for c in (*self.columns, *self.coupled)]
+        coupled = [k for k, address in enumerate(self.commanded) if address in tables]
+        self.coupled = np.array(coupled, dtype=int)
+        self.columns = np.array([c for c in tables if c not in self.commanded], dtype=int)
+        rows = [tables[c] for c in (*self.columns, *self.commanded[self.coupled])]
         leader, low, step, value, slope = zip(*rows, strict=True) if rows else [()] * 5
         self.leader = np.array(leader, dtype=int)
         self.low, self.step = np.array(low), np.array(step)
@@ -112,6 +114,13 @@ class Posture:
         command = torch.from_numpy(np.asarray(command, dtype=float))
         qpos[self.columns] = self.follow(command)[0][: len(self.columns)].numpy()
         return qpos
+
+    def agree(self, command: ndarray) -> ndarray:
+        """Commands [rad, m], shape ``(..., n)``, with coupled joints where earlier ones have them."""
+        command = np.array(command, dtype=float)
+        follow, _ = self.follow(torch.from_numpy(command))
+        command[..., self.coupled] = follow[..., len(self.columns) :].numpy()
+        return command
 
     def follow(self, command: Tensor) -> tuple[Tensor, Tensor]:
         """Positions [rad, m] at ``columns`` and then ``coupled``, and their derivatives by their
@@ -256,7 +265,9 @@ class Posture:
             if not pulls.any():
                 break
             jac, pos, equal = jac[~pulls], pos[~pulls], equal[~pulls]
-        return step, np.abs(pos).max(initial=0.0), jac[equal | (push > 1e-9)]
+        off = np.abs(pos[equal]).max(initial=0.0)
+        holds = equal | (push > 1e-9) & (off < _NEAR)  # a range may cut the way off
+        return step, np.abs(pos).max(initial=0.0), jac[holds]
 
     def _shares(self, qpos: ndarray, held: ndarray) -> ndarray:
         """How far each degree of freedom moves with each held one, shape ``(nv, len(held))``."""
