@@ -39,14 +39,13 @@ def build_chain(model: mujoco.MjModel, robot: RobotCfg) -> tuple[Chain, Shape]:
     # Columns of the joint targets: the joint of each, those that move, and their limits
     columns = {model.joint(name).id: (column, -1) for column, name in enumerate(robot.joints)}
     moved = [robot.arm_joints.index(name) for name in robot.ik_joints]
-    coupling = posture(model, robot.joints)
-    follows = [*coupling.columns, *coupling.commanded[coupling.coupled]]
-    for row, (address, leader) in enumerate(zip(follows, coupling.leader, strict=True)):
+    coupling = posture(model, tuple(robot.joints))
+    for row, (address, leader) in enumerate(zip(coupling.follows, coupling.leader, strict=True)):
         joint = int(np.flatnonzero(model.jnt_qposadr == address)[0])
-        own, _ = columns.get(joint, (-1, -1))
-        if own < 0 or own in moved:
+        column, _ = columns.get(joint, (-1, -1))
+        if column < 0 or column in moved:
             columns[joint] = (int(leader), row)
-        moved = [column for column in moved if column != own]
+    moved = [column for column in moved if column not in coupling.coupled]
     limits = np.tile(np.array([[-np.inf], [np.inf]], dtype=np.float32), len(robot.joints))
     ranges = joint_limits(model, [robot.joints[column] for column in moved])
     for side, values in enumerate(ranges):
@@ -106,7 +105,6 @@ def build_chain(model: mujoco.MjModel, robot: RobotCfg) -> tuple[Chain, Shape]:
     chain.table_low = wp.array(coupling.low, dtype=float)
     chain.table_step = wp.array(coupling.step, dtype=float)
     chain.table_value = wp.array2d(coupling.value, dtype=float)
-    chain.table_slope = wp.array2d(coupling.slope, dtype=float)
     moving = [c in moved for c in column]  # or goes along
     ik_links = tuple(m and row < 0 for m, row in zip(moving, rows, strict=True))
     leaders = tuple(
@@ -228,7 +226,7 @@ class BatchedIk:
         self._settings = [iterations, guided, _DAMPING, _MAX_STEP, *gains, near]
 
         # Commanded joints that follow ik joints
-        self._coupling = coupling = posture(model, robot.joints)
+        self._coupling = coupling = posture(model, tuple(robot.joints))
         leaders = coupling.leader[len(coupling.columns) :]
         follows = np.isin(leaders, [robot.joints.index(name) for name in robot.ik_joints])
         self._coupled = Columns(coupling.coupled[follows], self.device)
