@@ -49,7 +49,9 @@ class GraspPointTask(mink.Task):
 class _Frozen(mink.DofFreezingTask):
     """Hold degrees of freedom; those that follow a moving joint go along."""
 
-    def __init__(self, configuration: mink.Configuration, coupling: Posture, moving: ndarray) -> None:
+    def __init__(
+        self, configuration: mink.Configuration, coupling: Posture, moving: ndarray
+    ) -> None:
         """Take the numbers of the commanded joints that move."""
         model = configuration.model
         addresses = model.jnt_qposadr[model.dof_jntid]

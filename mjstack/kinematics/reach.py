@@ -140,7 +140,6 @@ class PointReach:
         rows = np.where(self._hinges[:, None], np.cross(axes, tip[:, None] - anchors), axes)
         return rows.swapaxes(1, 2), tip
 
-
     def _forward_native(self, q: ndarray) -> tuple[ndarray, ndarray]:
         assert self._native is not None
         data, home = self._native

@@ -105,7 +105,11 @@ class Posture:
         self.columns = np.array([c for c in tables if c not in self.commanded], dtype=int)
         rows = [tables[c] for c in (*self.columns, *self.commanded[self.coupled])]
         leader, low, step, value = zip(*rows, strict=True) if rows else ((), (), (), ())
-        self.leader, self.low, self.step = np.array(leader, dtype=int), np.array(low), np.array(step)
+        self.leader, self.low, self.step = (
+            np.array(leader, dtype=int),
+            np.array(low),
+            np.array(step),
+        )
         self.value = np.reshape(value, (-1, KNOTS))
         self._tensors: dict[tuple, list[Tensor]] = {}
 
@@ -123,7 +127,7 @@ class Posture:
         return qpos
 
     def agree(self, command: ArrayLike) -> ndarray:
-        """Commands [rad, m], shape ``(..., n)``, with coupled joints where earlier ones have them."""
+        """Commands [rad, m], shape ``(..., n)``, in which coupled joints follow earlier ones."""
         command = np.array(command, dtype=float)
         follow, _ = self.follow(torch.from_numpy(command))
         command[..., self.coupled] = follow[..., len(self.columns) :].numpy()
@@ -196,7 +200,9 @@ class Posture:
             while True:
                 at = self._addresses[loose]
                 stiff = np.diag(self._stiffness[loose] + 1e-4)  # else the shortest way
-                system = np.block([[stiff, jac[:, loose].T], [jac[:, loose], np.zeros((len(error),) * 2)]])
+                system = np.block(
+                    [[stiff, jac[:, loose].T], [jac[:, loose], np.zeros((len(error),) * 2)]]
+                )
                 pull = self._stiffness[loose] * (self._model.qpos_spring[at] - qpos[at])
                 step = np.linalg.lstsq(system, np.concatenate((pull, -error)), rcond=1e-11)[0]
                 step = step[: len(at)]

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from mjstack.config.schema import RobotCfg, SceneCfg
 from mjstack.errors import ConfigError, require_names
+from mjstack.math import lowest_point, quat_mul, quat_to_matrix
 from mjstack.robots.jaws import Jaws
 from mjstack.robots.posture import posture
-from mjstack.math import lowest_point, quat_mul, quat_to_matrix
 from mjstack.scene.build import CAPSULE_TURN, WORLD, force_sensor
 from mjstack.sim.simulation import Columns
 
@@ -173,13 +173,15 @@ class SceneIndex:
 def _idle_servos(
     model: mujoco.MjModel, commanded: np.ndarray, rest: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Position servos of joints that have no command, and commands that hold these where they are."""
+    """Position servos of joints without a command, and commands that hold these at rest."""
     servos = np.setdiff1d(np.arange(model.nu), commanded)
     joint = model.actuator_trntype[servos] == int(mujoco.mjtTrn.mjTRN_JOINT)
     bias = model.actuator_biasprm[servos]
     servos = servos[joint & (bias[:, 1] < 0.0) & (model.actuator_gainprm[servos, 0] != 0.0)]
     bias = model.actuator_biasprm[servos]
-    length = model.actuator_gear[servos, 0] * rest[model.jnt_qposadr[model.actuator_trnid[servos, 0]]]
+    length = (
+        model.actuator_gear[servos, 0] * rest[model.jnt_qposadr[model.actuator_trnid[servos, 0]]]
+    )
     return servos, -(bias[:, 0] + bias[:, 1] * length) / model.actuator_gainprm[servos, 0]
 
 
@@ -206,7 +208,9 @@ def gripper_targets(
     ``widths`` are those of the objects across the jaws [m]; None is for the open gripper.
     """
     jaws = jaws_of(model, robot)
-    opened = jaws.opened if robot.gripper_open is None else np.array(robot.gripper_open, dtype=float)
+    opened = (
+        jaws.opened if robot.gripper_open is None else np.array(robot.gripper_open, dtype=float)
+    )
     probed = robot.gripper_closed is None
     closed = np.array(jaws.shut if probed else robot.gripper_closed, dtype=float)
     wide = np.array(widths, dtype=float)  # None is NaN
