@@ -107,7 +107,7 @@ def test_a_finger_that_follows_has_its_place(kind: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("sim", ["native", pytest.param("mjwarp", marks=pytest.mark.full)])
 def test_a_follower_starts_in_its_place(sim: str, tmp_path: Path) -> None:
     cfg = follower(tmp_path, "wrong sign")
-    overrides = [f"sim={sim}", "nworld=4", "reset=randomized", "reset.joints.params.gripper=0.003"]
+    overrides = [f"sim={sim}", "nworld=4", "reset=randomized", "+reset.joints.params.gripper=0.003"]
     options = [f"robot.{key}={value}" for key, value in LEFT.items()]
     search = f"hydra.searchpath=[file://{SCARA}/conf]"
     options = [o.replace(" ", "").replace("'", "") for o in options]
@@ -116,6 +116,10 @@ def test_a_follower_starts_in_its_place(sim: str, tmp_path: Path) -> None:
     left, right = (env.sim.qpos[:, env.sim.model.joint(n).qposadr[0]] for n in ("left", "right"))
     assert len(set(left.tolist())) == 4
     torch.testing.assert_close(right, -left, atol=1e-7, rtol=0.0)
+
+
+IDLE = '<body name="mast"><joint name="mast" axis="0 1 0" range="0.5 2"/><inertial mass="0.1" '
+IDLE += 'pos="0 0 0" diaginertia="1e-3 1e-3 1e-3"/></body><body name="base">'
 
 
 COUPLINGS = {
@@ -167,17 +171,18 @@ def test_inverse_kinematics_takes_what_follows_along(kind: str, tmp_path: Path) 
 
 
 def test_a_joint_that_follows_two_is_refused(tmp_path: Path) -> None:
-    pairs = (
-        (FINGERS, '<tendon tendon1="t" polycoef="0 0 0 0 0"/>'),
-        (
-            "<equality>",
-            '<tendon><fixed name="t"><joint joint="left" coef="1"/><joint joint="shoulder"'
-            ' coef="0.01"/><joint joint="right" coef="-1"/></fixed></tendon><equality>',
-        ),
+    joints = "".join(
+        f'<joint joint="{name}" coef="{coef}"/>'
+        for name, coef in (("mast", 1), ("shoulder", 0.5), ("elbow", 0.5))
     )
-    servo = '<position name="left" class="finger" joint="left"/>'
-    cfg = changed(tmp_path, (servo, ""), *pairs, **LEFT | {"gripper_joints": ["right"]})
-    line = "joint left follows shoulder and right"
+    tendon = f'<tendon><fixed name="t">{joints}</fixed></tendon><equality>'
+    pairs = (
+        ('<body name="base">', IDLE.replace("0.5 2", "-9 9")),
+        (FINGERS, '<tendon tendon1="t" polycoef="0 0 0 0 0"/>'),
+        ("<equality>", tendon),
+    )
+    cfg = changed(tmp_path, *pairs)
+    line = "joint mast follows shoulder and elbow"
     refusal(lambda: GraspIk(cfg.robot, cfg.model, tolerance=1e-4), line)
 
 
@@ -187,8 +192,6 @@ def test_a_value_that_the_equalities_do_not_allow_is_refused(tmp_path: Path) -> 
     refusal(lambda: GraspIk(cfg.robot, cfg.model, tolerance=1e-4), line, kind=ConfigError)
 
 
-IDLE = '<body name="mast"><joint name="mast" axis="0 1 0" range="0.5 2"/><inertial mass="0.1" '
-IDLE += 'pos="0 0 0" diaginertia="1e-3 1e-3 1e-3"/></body><body name="base">'
 MAST = '<actuator><position name="mast" joint="mast" kp="5" kv="1" inheritrange="1"/>'
 KEY = '<keyframe><key name="home" qpos="1.2 0 1 0 0 0 0"/></keyframe></mujoco>'
 
