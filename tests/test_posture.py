@@ -10,9 +10,9 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from arm_file import MJCF, SCARA, changed, scara
 from compositions import refusal
 from ik_arm import Arm
-from test_guest import MJCF, SCARA, changed, scara
 
 from mjstack import load_config, make_env
 from mjstack.config.schema import Config
