@@ -28,10 +28,10 @@ def jaw_members(parents: Mapping[str, str], jaws: Sequence[str]) -> dict[str, li
         if name not in roots and parent in roots:
             roots[name] = roots[parent]
     carriers = set()
-    for parent in map(parents.get, jaws):
-        while parent is not None:
-            carriers.add(parent)
-            parent = parents.get(parent)
+    for jaw in jaws:
+        while jaw in parents:
+            jaw = parents[jaw]
+            carriers.add(jaw)
     members = {jaw: [name for name, root in roots.items() if root == jaw] for jaw in jaws}
     return {jaw: [jaw] if jaw in carriers else bodies for jaw, bodies in members.items()}
 
