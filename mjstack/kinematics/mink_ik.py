@@ -8,10 +8,11 @@ import mujoco
 import numpy as np
 from numpy import ndarray
 
+from mjstack.config.mjcf import compile_scene
 from mjstack.config.schema import ModelCfg, RobotCfg
 from mjstack.errors import ConfigError
 from mjstack.robots import robot_spec
-from mjstack.robots.guest import compile_scene, mujoco_errors
+from mjstack.robots.guest import mujoco_errors
 from mjstack.robots.posture import Posture, posture
 from mjstack.scene.index import locked_home
 

@@ -8,6 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from mjstack.config.mjcf import set_range
 from mjstack.config.schema import RobotCfg, ServoCfg
 from mjstack.errors import ConfigError, MjstackError, UnknownName, require_names
 from mjstack.robots.guest import PREFIX
@@ -26,11 +27,9 @@ def prepare_servos(spec: mujoco.MjSpec, robot: RobotCfg) -> None:
     Raises:
         MjstackError: A joint has no range, or a servo cannot be had with the same force.
     """
-    for name, (low, high) in robot.ranges.items():
+    for name, ends in robot.ranges.items():
         require_names("robot.ranges: joint", [name], robot.joints)
-        joint = spec.joint(name)
-        joint.range = np.divide([low, high], _unit(joint))
-        joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
+        set_range(spec.joint(name), ends)
     for name in robot.servos:
         if name not in robot.joints:
             problem = UnknownName("robot.servos: joint", name, robot.joints)

@@ -7,8 +7,9 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from mjstack.config.mjcf import read_mjcf
 from mjstack.config.schema import ModelCfg, RobotCfg
-from mjstack.errors import ConfigError, MjstackError, first_line, require_names
+from mjstack.errors import ConfigError, MjstackError, require_names
 from mjstack.robots.guest import as_guest
 from mjstack.robots.servos import prepare_servos
 
@@ -54,22 +55,6 @@ def read_robot(robot: RobotCfg, model: ModelCfg) -> mujoco.MjSpec:
     for number, body in enumerate(spec.bodies):
         body.name = body.name or f"unnamed_{number}"  # bodies are told apart by their names
     return spec
-
-
-def read_mjcf(path: str | Path, fix: str) -> mujoco.MjSpec:
-    """Load an MJCF file.
-
-    Args:
-        path: The file.
-        fix: What to do where it cannot be read.
-
-    Raises:
-        MjstackError: It cannot.
-    """
-    try:
-        return mujoco.MjSpec.from_file(str(path))
-    except (ValueError, FileNotFoundError) as error:
-        raise MjstackError(f"{path} cannot be read: {first_line(error)}. {fix}") from error
 
 
 def _file_path(robot: RobotCfg) -> Path:

@@ -74,6 +74,7 @@ class SceneIndex:
         fixed: Position [m] and quaternion of every object that does not.
         bodies: Body index of every object.
         geoms: Geom indices of every object.
+        joints: qpos and qvel address of every hinge and slide of a fixture, by its name.
         jaw_force: First sensordata address of each jaw's force on an object (3 numbers), by the
             object's name.
         jaw_columns: All numbers of these forces, side by side in sensordata, by the object's name.
@@ -87,7 +88,7 @@ class SceneIndex:
         self._tensors: dict[tuple[torch.device, torch.dtype], RobotTensors] = {}
         self.posture = posture(model, tuple(robot.joints))
         wide = robot.closed_width or _WIDTH
-        narrowest = min([wide, *(thing.width for thing in scene.free.values())])
+        narrowest = min([wide, *(thing.grip_width for thing in scene.free.values())])
         self._grips = gripper_targets(model, robot, [None, narrowest])
         self.robot_qpos = model.jnt_qposadr[joints]
         self.robot_qvel = model.jnt_dofadr[joints]
@@ -120,8 +121,14 @@ class SceneIndex:
             if name not in self.objects
         }
         self.geoms = {
-            name: np.flatnonzero(model.geom_bodyid == body).tolist()
+            name: np.flatnonzero(model.body_rootid[model.geom_bodyid] == body).tolist()
             for name, body in self.bodies.items()
+        }
+        fixtures = [self.bodies[name] for name in self.fixed]
+        hung = np.isin(model.body_rootid[model.jnt_bodyid], fixtures)
+        self.joints = {
+            model.joint(n).name: (int(model.jnt_qposadr[n]), int(model.jnt_dofadr[n]))
+            for n in np.flatnonzero(hung & (model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE)))
         }
         self._constants: dict[tuple, Tensor] = {}
         host = torch.device("cpu")  # side by side, so that no device has anything of them
