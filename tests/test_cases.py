@@ -198,12 +198,11 @@ CASES = {
         [*compiler('fusestatic="false"').pairs, TOOL],
         {"approach_body": "tool"},
     ),
-    "c04_follower": Case([*DOUBLE, FOLLOWS], FOLLOWER, right=DOUBLED, branch="posture"),
+    "c04_follower": Case([*DOUBLE, FOLLOWS], FOLLOWER, right=DOUBLED),
     "c04_follower_neg": Case(
         [*DOUBLE, *MIRRORED],
         FOLLOWER,
         right=DOUBLED | {"fingers": [0.045, -0.045]},
-        branch="posture",
     ),
     "c04_both_named": Case([*DOUBLE, FOLLOWS], line="actuators of joint right=none"),
     "c05_general255": Case(
@@ -245,7 +244,6 @@ CASES = {
         [*tendon(1, 0, GRIP), FOLLOWS],
         FOLLOWER,
         right=DOUBLED,
-        branch="posture",
     ),
     "c06_gear_minus": Case(
         [servo("shoulder", 'kp="900" kv="50" gear="-1" forcerange="-60 60" inheritrange="0"')]
@@ -360,7 +358,6 @@ CASES = {
     "c21_unlisted": Case(
         [("<worldbody>", f"<worldbody>{MAST}")],
         check=lambda env: mast_is_within_its_range(env),
-        branch="posture",
     ),
     "c22_degree": Case(
         [

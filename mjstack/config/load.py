@@ -180,6 +180,7 @@ def compose(overrides: Sequence[str], run_mode: RunMode = RunMode.RUN) -> DictCo
             files = [*loader.files[id(cfg)], (Path(), _set_values(overrides))]
             _drop_inherited(cfg, [values for _, values in files])
             _locate_files(cfg, files)
+            _keep_exact(cfg, [values for _, values in files])
             complete_terms(cfg, overrides)
     except (HydraException, OmegaConfBaseException, AssertionError, TypeError, ValueError) as error:
         raise explain(error, overrides) from error
@@ -245,6 +246,17 @@ def _drop_inherited(cfg: DictConfig, files: Sequence[Mapping[str, object]]) -> N
             with open_dict(cfg):
                 for key in owner[name].keys() - params[section]:
                     del owner[name][key]
+
+
+def _keep_exact(cfg: DictConfig, files: Sequence[Mapping[str, object]]) -> None:
+    """Joint targets of closed jaws that replace the robot's own are for any object, unless a width
+    comes with them or after them. Arguments as of `_drop_inherited`.
+    """
+    closed, width = "robot.gripper_closed", "robot.closed_width"
+    settings = [source for source in files if source.keys() & {closed, width}]
+    targets = [number for number, source in enumerate(settings) if closed in source]
+    if targets and targets[-1] > 0 and not any(width in s for s in settings[targets[-1] :]):
+        cfg.robot.closed_width = None
 
 
 def load_saved(path: Path) -> Config:

@@ -7,6 +7,7 @@ from typing import Any
 
 import mujoco
 
+from mjstack.robots import posture
 from mjstack.sim.warp_setup import wp
 
 HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
@@ -16,6 +17,7 @@ SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
 # approached without running into a dead end at the limits (from home, over the reBot's whole reach,
 # 97 % instead of 91 % are found); a near one converges fast.
 FAR_DAMPING = wp.constant(0.1)
+KNOTS = wp.constant(posture.KNOTS)
 NAN = wp.constant(float("nan"))
 
 
@@ -42,6 +44,10 @@ class Chain:
     first_site: wp.vec3
     second_site: wp.vec3
     approach: wp.vec3  # of unit length
+    row: wp.array[int]  # of the tables, by link; -1 where the joint's position is its column's
+    table_low: wp.array[float]  # tables of joints that follow, see `Posture`
+    table_step: wp.array[float]
+    table_value: wp.array2d[float]
 
 
 @dataclass(frozen=True)
@@ -52,6 +58,7 @@ class Shape:
 
     kinds: tuple[int, ...]  # HINGE or SLIDE, of each link
     moved: tuple[bool, ...]  # whether inverse kinematics moves it; of the trunk alone
+    leader: tuple[int, ...]  # number of the moved link that it follows, or -1
     trunk: int
     fork: int
     end: int
@@ -67,6 +74,27 @@ def turn(pose: wp.transform, axis: wp.vec3, kind: int, value: float) -> wp.trans
 
 
 @wp.func
+def position(chain: Chain, link: int, x: float) -> wp.vec2:
+    """Position of a link's joint, and its derivative by x, where its column's is x."""
+    row = chain.row[link]
+    if row < 0:
+        return wp.vec2(x, 1.0)
+    step = chain.table_step[row]
+    at = wp.clamp((x - chain.table_low[row]) / step, 0.0, float(KNOTS - 1))
+    knot = wp.clamp(int(at) - 1, 0, KNOTS - 4)  # the first of four: a cubic, as in `Posture`
+    t = at - float(knot)
+    a = chain.table_value[row, knot]
+    b = chain.table_value[row, knot + 1]
+    c = chain.table_value[row, knot + 2]
+    first = b - a
+    second = c - 2.0 * b + a
+    third = (chain.table_value[row, knot + 3] - a) - 3.0 * (c - b)
+    value = a + t * (first + (t - 1.0) / 2.0 * (second + (t - 2.0) / 3.0 * third))
+    slope = first + (t - 0.5) * second + (t * (t / 2.0 - 1.0) + 1.0 / 3.0) * third
+    return wp.vec2(value, slope / step)
+
+
+@wp.func
 def follow(
     chain: Chain, q: wp.array2d[float], w: int, first: int, last: int, start: wp.transform
 ) -> wp.transform:
@@ -74,7 +102,8 @@ def follow(
     pose = start
     for i in range(first, last):
         frame = wp.transform_multiply(pose, chain.frame[i])
-        pose = turn(frame, chain.axis[i], chain.kind[i], q[w, chain.column[i]])
+        value = position(chain, i, q[w, chain.column[i]])[0]
+        pose = turn(frame, chain.axis[i], chain.kind[i], value)
     return pose
 
 
@@ -118,7 +147,7 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
     Joints behind the last moved one, such as the wrist's roll and the fingers, are followed once
     per solve. An iteration then follows the END links up to it.
     """
-    END = max(i + 1 for i, moved in enumerate(shape.moved) if moved)
+    END = max(i + 1 for i, moved in enumerate(shape.moved) if moved or shape.leader[i] >= 0)
     Values = wp.types.vector(length=END, dtype=float)
     Rows = wp.types.matrix(shape=(END, 3), dtype=float)  # a vector per link
 
@@ -216,6 +245,12 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
             # Forward kinematics
             anchors = Rows()
             axes = Rows()
+            slopes = Values()
+            for i in range(END):
+                if wp.static(shape.leader[i] >= 0):
+                    pair = position(chain, i, q[wp.static(shape.leader[i])])
+                    q[i] = pair[0]
+                    slopes[i] = pair[1]
             link = wp.transform(wp.vec3(), wp.quat_identity())
             for i in range(END):
                 pose = wp.transform_multiply(link, chain.frame[i])
@@ -239,6 +274,12 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
                         if wp.static(shape.kinds[i] == HINGE):
                             direction = wp.cross(direction, midpoint - anchors[i])
                         jacobian[i] = direction
+                for i in range(END):
+                    if wp.static(shape.leader[i] >= 0):
+                        direction = axes[i]
+                        if wp.static(shape.kinds[i] == HINGE):
+                            direction = wp.cross(direction, midpoint - anchors[i])
+                        jacobian[wp.static(shape.leader[i])] += slopes[i] * direction
                 # Null-space motion, and the step
                 guide = Values()
                 if iteration < guided:
@@ -248,6 +289,10 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
                             guide[i] = posture_gain * (home[i] - q[i])
                             if wp.static(shape.kinds[i] == HINGE):
                                 guide[i] += approach_gain * wp.dot(axes[i], lever)
+                    for i in range(END):
+                        if wp.static(shape.leader[i] >= 0 and shape.kinds[i] == HINGE):
+                            turned = slopes[i] * wp.dot(axes[i], lever)
+                            guide[wp.static(shape.leader[i])] += approach_gain * turned
                 step = find_step(jacobian, q, guide, low, high, error, damping)
                 largest = wp.float32(0.0)
                 for i in range(END):

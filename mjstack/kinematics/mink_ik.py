@@ -1,5 +1,6 @@
 """Inverse kinematics with mink on a model of the robot alone: the reference, which plans grasps."""
 
+import copy
 import math
 
 import mink
@@ -12,11 +13,13 @@ from mjstack.config.schema import ModelCfg, RobotCfg
 from mjstack.errors import ConfigError
 from mjstack.robots import robot_spec
 from mjstack.robots.guest import mujoco_errors
+from mjstack.robots.posture import Posture, posture
 from mjstack.scene.index import locked_home
 
 _POSTURE_COST = 1e-3  # pulls the redundant joints home; moves the grasp point by micrometres
 _ITERATIONS = 60  # at most, per solve
 _CONVERGED = 0.1  # share of the tolerance: Newton's method squares the error, so that is enough
+_APART = 1e-4  # [rad, m] that a joint value may be off an equality
 _MAX_STEP = 0.3  # [rad, m] per iteration: a far target is approached on one branch of solutions
 
 
@@ -44,6 +47,30 @@ class GraspPointTask(mink.Task):
         return self._jac.mean(axis=0)
 
 
+class _Frozen(mink.DofFreezingTask):
+    """Hold degrees of freedom; those that follow a moving joint go along."""
+
+    def __init__(
+        self, configuration: mink.Configuration, coupling: Posture, moving: ndarray
+    ) -> None:
+        """Take the numbers of the commanded joints that move."""
+        model = configuration.model
+        addresses = model.jnt_qposadr[model.dof_jntid]
+        self._columns = [addresses.tolist().index(c) for c in coupling.commanded[moving]]
+        super().__init__(model, np.setdiff1d(np.arange(model.nv), self._columns).tolist())
+        self._coupling = coupling
+        self._moving = moving
+        self.along = bool(np.isin(coupling.leader, moving).any())
+
+    def compute_jacobian(self, configuration: mink.Configuration) -> ndarray:
+        """Rows of the identity, less the slopes of what goes along, shape ``(frozen, nv)``."""
+        jacobian = super().compute_jacobian(configuration).copy()
+        if self.along:
+            shares = self._coupling.shares(configuration.q[self._coupling.commanded])
+            jacobian[:, self._columns] -= shares[self.dof_indices][:, self._moving]
+        return jacobian
+
+
 class GraspIk:
     """Arm positions that bring the grasp point to a target at a given gripper opening."""
 
@@ -57,25 +84,21 @@ class GraspIk:
             self.model = compile_scene(spec)
         self.tolerance = tolerance
         joints = [self.model.joint(name).id for name in robot.joints]
-        for key in ("home", "gripper_open", "gripper_closed"):
-            values = getattr(robot, key)
-            for name, value in zip(robot.joints[-len(values) :], values, strict=True):
-                low, high = self.model.joint(name).range
-                if not low <= value <= high:
-                    raise ConfigError(
-                        f"robot.{key} of {name}", value, f"a value within [{low:.4g}, {high:.4g}]"
-                    )
         self._qpos = self.model.jnt_qposadr[joints]
+        self._coupling = posture(self.model, tuple(robot.joints))
         self.home = locked_home(robot)
+        self._check(robot)
         self._configuration = mink.Configuration(self.model)
-        moving = {int(self.model.joint(name).dofadr[0]) for name in robot.ik_joints}
-        frozen = [dof for dof in range(self.model.nv) if dof not in moving]
+        moving = np.array([robot.joints.index(name) for name in robot.ik_joints])
+        moving = np.setdiff1d(moving, self._coupling.coupled)
+        self._frozen = _Frozen(self._configuration, self._coupling, moving)
         self._task = GraspPointTask(
             [self.model.site(name).id for name in robot.grasp_sites], self.model.nv
         )
         self._posture = mink.PostureTask(self.model, cost=_POSTURE_COST)
-        self._limits = [mink.ConfigurationLimit(self.model, gain=1.0)]
-        self._constraints = [mink.DofFreezingTask(self.model, frozen)]
+        limited = copy.copy(self.model)
+        limited.jnt_limited[np.setdiff1d(np.arange(self.model.njnt), joints)] = False
+        self._limits = [mink.ConfigurationLimit(limited, gain=1.0)]
         self._posture.set_target(self._to_qpos(self.home))
 
     def solve(self, target: ndarray, start: ndarray) -> tuple[ndarray, float]:
@@ -97,12 +120,15 @@ class GraspIk:
                     solver="daqp",
                     damping=1e-9,
                     limits=self._limits,
-                    constraints=self._constraints,
+                    constraints=[self._frozen],
                 )
             except mink.NoSolutionFound:
                 break
             largest = float(np.abs(step).max())
             configuration.integrate_inplace(step * min(1.0, _MAX_STEP / max(largest, 1e-12)), 1.0)
+            if self._frozen.along:
+                command = self._coupling.agree(configuration.q[self._qpos])
+                configuration.update(self._to_qpos(command))
             left = float(np.linalg.norm(self._task.compute_error(configuration)))
             # The pull towards home can end in oscillations, farther from the target.
             if left < distance:
@@ -110,6 +136,8 @@ class GraspIk:
                 distance = left
             if distance < _CONVERGED * self.tolerance:
                 break
+        if math.isinf(distance):
+            distance = float(np.linalg.norm(self._task.compute_error(configuration)))
         return nearest, distance
 
     def grasp_point(self, q: ndarray) -> ndarray:
@@ -118,6 +146,29 @@ class GraspIk:
         return self._task.compute_error(self._configuration) + self._task.target
 
     def _to_qpos(self, q: ndarray) -> ndarray:
-        qpos = self.model.qpos0.copy()
-        qpos[self._qpos] = q
-        return qpos
+        return self._coupling.qpos(q)
+
+    def _check(self, robot: RobotCfg) -> None:
+        """Raise a ConfigError for a joint value that the robot's file does not allow."""
+        poses = {
+            "home": (robot.joints, robot.home),
+            "start": (robot.joints, robot.start),
+            "locked": (list(robot.locked), list(robot.locked.values())),
+            "gripper_open": (robot.gripper_joints, robot.gripper_open),
+            "gripper_closed": (robot.gripper_joints, robot.gripper_closed),
+        }
+        for key, (names, values) in poses.items():
+            command = self.home.copy()
+            columns = [robot.joints.index(name) for name in names]
+            if values is not None:
+                command[columns] = values
+            allowed = self._coupling.agree(command)
+            for k, name in zip(columns, names, strict=True):
+                low, high = self.model.joint(name).range
+                if not low <= command[k] <= high:
+                    expected = f"a value within [{low:.4g}, {high:.4g}]"
+                elif abs(command[k] - allowed[k]) > _APART:
+                    expected = f"{allowed[k]:.4g}, as the file's equalities have it"
+                else:
+                    continue
+                raise ConfigError(f"robot.{key} of {name}", float(command[k]), expected)

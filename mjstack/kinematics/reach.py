@@ -11,6 +11,7 @@ import numpy as np
 from numpy import ndarray
 
 from mjstack.config.schema import RobotCfg
+from mjstack.robots.posture import posture
 from mjstack.scene.index import joint_limits, locked_home
 
 _ITERATIONS = 60  # at most, per start
@@ -36,17 +37,22 @@ class PointReach:
         data = mujoco.MjData(model)
         home = locked_home(robot)
         home[len(robot.arm_joints) :] = gripper
-        data.qpos[[model.joint(name).qposadr[0] for name in robot.joints]] = home
+        self._coupling = coupling = posture(model, tuple(robot.joints))
+        data.qpos[:] = coupling.qpos(home)
         mujoco.mj_kinematics(model, data)
+        moving = {robot.joints.index(name) for name in robot.ik_joints} - {*coupling.coupled}
         joints = sorted(
-            (model.joint(name).id for name in robot.ik_joints),
+            (model.joint(robot.joints[k]).id for k in moving),
             key=lambda j: int(model.jnt_bodyid[j]),
         )
+        self._native = (data, home) if moving & {*coupling.leader} else None
+        self._columns = [robot.joints.index(model.joint(joint).name) for joint in joints]
         self._hinges = model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE
         self._home = data.qpos[model.jnt_qposadr[joints]]
         self._anchors = data.xanchor[joints].copy()
         self._axes = data.xaxis[joints].copy()
         sites = [model.site(name).id for name in robot.grasp_sites]
+        self._sites = sites
         self.tip = data.site_xpos[sites].mean(axis=0)  # the grasp point at home [m], ``(3,)``
         self._low, self._high = joint_limits(model, [model.joint(j).name for j in joints])
 
@@ -112,8 +118,10 @@ class PointReach:
         ``(n, 3)``.
 
         A product of exponentials: each joint moves the links after it about, or along, its axis at
-        home.
+        home. Where joints follow these, MuJoCo computes both.
         """
+        if self._native is not None:
+            return self._forward_native(q)
         n, joints = q.shape
         rotation = np.tile(np.eye(3), (n, 1, 1))
         shift = np.zeros((n, 3))
@@ -131,6 +139,22 @@ class PointReach:
         tip = rotation @ self.tip + shift
         rows = np.where(self._hinges[:, None], np.cross(axes, tip[:, None] - anchors), axes)
         return rows.swapaxes(1, 2), tip
+
+    def _forward_native(self, q: ndarray) -> tuple[ndarray, ndarray]:
+        assert self._native is not None
+        data, home = self._native
+        command = home.copy()
+        jacobians, tips = np.empty((len(q), 3, q.shape[1])), np.empty((len(q), 3))
+        jac = np.empty((2, 3, data.model.nv))
+        for k, command[self._columns] in enumerate(q):
+            data.qpos[:] = self._coupling.qpos(command)
+            mujoco.mj_kinematics(data.model, data)
+            mujoco.mj_comPos(data.model, data)
+            for site, rows in zip(self._sites, jac, strict=True):
+                mujoco.mj_jacSite(data.model, data, rows, None, site)
+            jacobians[k] = jac.mean(axis=0) @ self._coupling.shares(command)[:, self._columns]
+            tips[k] = data.site_xpos[self._sites].mean(axis=0)
+        return jacobians, tips
 
 
 def _rotations(axis: ndarray, angles: ndarray) -> ndarray:

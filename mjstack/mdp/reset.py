@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 from typing_extensions import override
@@ -15,6 +16,7 @@ from mjstack.math import quat_from_yaw, quat_mul
 from mjstack.mdp.geometry import Pose, robot, write_robot
 from mjstack.mdp.starts.placement import GAP, Placement, may_meet, require_reach
 from mjstack.mdp.starts.randomization import Elements, Randomized, bounds
+from mjstack.robots.jaws import jaw_bodies
 from mjstack.scene.index import joint_limits
 from mjstack.sim.simulation import Columns
 
@@ -28,7 +30,9 @@ def home(env: EnvView, mask: Tensor, *, pose: Pose = "home") -> None:
 
 @offers("reset term", joint_noise=True)
 class JointNoise:
-    """Adds uniform noise to the robot's joint positions and targets, within the joints' ranges."""
+    """Adds uniform noise to the robot's joint positions and targets, within the joints' ranges, and
+    as equalities between them allow.
+    """
 
     # The manager sets the term's own label, so that two of them draw different numbers
     label = "reset.joints"
@@ -43,6 +47,12 @@ class JointNoise:
         """
         self._width = torch.full_like(robot(env).home, gripper)
         self._width[: env.index.n_arm] = arm
+        posture = env.index.posture
+        first = len(posture.columns)
+        moved = self._width.cpu().numpy() > 0.0
+        moved = moved[posture.coupled] | moved[posture.leader[first:]]
+        self._coupled = Columns(posture.coupled[moved], env.device)
+        self._rows = Columns(first + np.flatnonzero(moved), env.device)
         limits = joint_limits(env.sim.model, env.cfg.robot.joints)
         self._low, self._high = (torch.from_numpy(limit).to(self._width) for limit in limits)
 
@@ -50,7 +60,10 @@ class JointNoise:
         """Write qpos and ctrl."""
         noise = random_uniform(env, self.label, self._width.shape[0])
         command = robot(env).ctrl.read(env.sim.ctrl) + self._width * noise
-        write_robot(env, mask, torch.clamp(command, self._low, self._high))
+        command = torch.clamp(command, self._low, self._high)
+        if self._rows.indices:
+            self._coupled.write(command, self._rows.read(env.index.posture.follow(command)[0]))
+        write_robot(env, mask, command)
 
 
 @uses_fields("qpos0")
@@ -245,8 +258,8 @@ class ObjectFriction(Randomized):
         """Take the smallest and largest coefficient."""
         self.ends = bounds("sliding", sliding)
         model = env.sim.model
-        bodies = [model.body(name).id for name in env.cfg.robot.jaw_bodies]
-        jaws = [g for g in range(model.ngeom) if model.geom_bodyid[g] in bodies]
+        bodies = np.concatenate(jaw_bodies(model, env.cfg.robot.jaw_bodies))
+        jaws = np.flatnonzero(np.isin(model.geom_bodyid, bodies)).tolist()
         grip = [g for g in jaws if model.geom_priority[g] > 0]  # objects have 0
         level = [model.geom("table").id, *(g for g in jaws if g not in grip)]
         geoms = {name: env.index.geoms[name] for name in env.index.objects}

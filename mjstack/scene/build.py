@@ -23,6 +23,7 @@ from mjstack.config.schema import BoxCfg, CameraCfg, Config, ObjectCfg, SceneCfg
 from mjstack.errors import ConfigError, UnknownName, require_names
 from mjstack.robots import robot_spec
 from mjstack.robots.guest import WORLD, compile_robot_scene, mujoco_errors
+from mjstack.robots.jaws import jaw_members
 
 TABLE = "table"
 CAPSULE_TURN = np.array([math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0])
@@ -89,9 +90,11 @@ def add_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> Non
     for name in ("iterations", "ls_iterations", "impratio", "tolerance"):
         if (value := getattr(solver, name)) is not None:
             setattr(option, name, value)
+    parents = {body.name: body.parent.name for body in spec.bodies[1:]}
+    members = jaw_members(parents, jaw_bodies)
     if solver.gripper_condim is not None:
-        for jaw in jaw_bodies:
-            for geom in spec.body(jaw).geoms:
+        for name in itertools.chain(*members.values()):
+            for geom in spec.body(name).geoms:
                 geom.condim = solver.gripper_condim
 
     # Bodies
@@ -111,7 +114,13 @@ def add_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> Non
         pairs += [(WORLD, name) for name in scene.objects]
         pairs += itertools.combinations(scene.objects, 2)
     body = mujoco.mjtObj.mjOBJ_BODY
-    trees = {n: mujoco.mjtObj.mjOBJ_XBODY for n, thing in scene.objects.items() if thing.file}
+    subtree = mujoco.mjtObj.mjOBJ_XBODY
+    trees = {n: subtree for n, thing in scene.objects.items() if thing.file}
+    trees |= {
+        jaw: subtree
+        for jaw, bodies in members.items()
+        if any(spec.body(b).geoms for b in bodies[1:])
+    }
     for first, second in pairs:  # the net contact force [N]: 3 numbers, world frame
         spec.add_sensor(
             name=force_sensor(first, second),

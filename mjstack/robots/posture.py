@@ -1,0 +1,229 @@
+"""Where all joints of a robot are, from the commanded ones, as its file couples them.
+
+`posture(model, joints)` takes a compiled model and names of commanded joints. It finds which other
+joints follow them by equalities of any kind (joint, tendon, connect, weld), once and in native
+MuJoCo, and keeps a table of each over its leader's range:
+
+    >>> fingers = posture(model, ("left",))
+    >>> fingers.qpos([0.042])  # (nq,): followers and idle joints in their places
+"""
+
+import copy
+from collections.abc import Sequence
+from functools import lru_cache
+
+import mujoco
+import numpy as np
+import torch
+from numpy import ndarray
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from mjstack.errors import MjstackError
+
+REST = "rest/"
+"""Prefix of a model's numeric field with the position of a joint that has no command."""
+KNOTS = 129
+"""Positions in a table, over the leader's range."""
+_STEPS = 50  # of a projection, at most
+_MAX_STEP = 0.3  # [rad, m] per step
+_EXACT = 1e-10  # [rad, m] a smaller step ends it
+_ERROR = 1e-6  # [rad, m] of an equality that does not hold
+_MOTION = 1e-9  # [rad, m] less is rounding
+
+
+class Posture:
+    """Positions of all hinges and slides of a model, from those of the commanded ones.
+
+    A joint that follows is where the equalities have it, and springs and ranges where these leave
+    it free. Any other one keeps its place in the file's home keyframe, or qpos0, within its range.
+
+    Attributes:
+        rest: Positions at which joints without a leader stay, shape ``(nq,)``.
+        commanded: Addresses in qpos of the commanded joints, shape ``(n,)``.
+        columns: Addresses that a command determines besides: of what follows, and of what is off
+            qpos0, shape ``(m,)``.
+        coupled: Numbers of the commanded joints that follow earlier ones; below, m includes them.
+        leader: Number of the commanded joint that each follows, shape ``(m,)``.
+        low: Where the leader's range begins [rad, m], shape ``(m,)``.
+        step: Distance of two knots [rad, m], shape ``(m,)``.
+        value: Position at each knot [rad, m], shape ``(m, KNOTS)``.
+    """
+
+    def __init__(self, model: mujoco.MjModel, joints: Sequence[str]) -> None:
+        """Probe a model; a MjstackError if a joint follows several commanded ones at once."""
+        self._model = m = copy.copy(model)
+        m.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+        for name in ("CONTACT", "LIMIT", "FRICTIONLOSS"):  # equalities remain
+            m.opt.disableflags |= int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}"))
+        self._data = mujoco.MjData(m)
+        plain = np.flatnonzero(m.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE))
+        self._dofs, self._addresses = m.jnt_dofadr[plain], m.jnt_qposadr[plain]
+        limits = np.where(m.jnt_limited[plain, None], m.jnt_range[plain], [-np.inf, np.inf])
+        self._low, self._high = limits.T
+        self._stiffness = m.jnt_stiffness[plain] / max(m.jnt_stiffness.max(initial=0.0), 1e-9)
+        numbers = [m.joint(name).id for name in joints]
+        self.commanded = m.jnt_qposadr[numbers]
+
+        # Rest
+        self.rest = m.qpos0.copy()
+        for name in (m.numeric(k).name for k in range(m.nnumeric)):
+            if name.startswith(REST):
+                first = m.joint(name.removeprefix(REST)).qposadr[0]
+                self.rest[first : first + len(m.numeric(name).data)] = m.numeric(name).data
+        idle = ~np.isin(self._addresses, self.commanded)
+        at = self._addresses[idle]
+        self.rest[at] = np.clip(self.rest[at], self._low[idle], self._high[idle])
+        named = m.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)
+        named = np.concatenate((m.eq_obj1id[named], m.eq_obj2id[named]))
+        self._linked = np.isin(plain, named)
+        # Joints before both ends of an equality have the Jacobian of its error, which is 0 here
+        self._linked |= (np.abs(self._rows(m.qpos0)[0]) > 1e-6).any(axis=0)
+        self.rest = self._settle(self.rest, self.commanded)
+
+        # Tables
+        tables: dict[int, tuple[int, float, float, ndarray]] = {}
+        for k, address in enumerate(self.commanded):
+            if address in tables or not self._linked[self._addresses == address].any():
+                continue
+            positions = self._walk(int(address), k + 1)
+            low, high = positions[[0, -1], address]
+            moved = np.ptp(positions, axis=0) > _MOTION
+            moved[address] = False
+            for column in np.flatnonzero(moved).tolist():
+                if column in tables:
+                    name = m.joint(int(np.flatnonzero(m.jnt_qposadr == column)[0])).name
+                    leaders = f"{joints[tables[column][0]]} and {joints[k]}"
+                    problem = f"joint {name} follows {leaders}, expected one of them"
+                    fix = "Leave the other out of arm_joints and gripper_joints"
+                    raise MjstackError(problem, fix)
+                tables[column] = (k, low, (high - low) / (KNOTS - 1), positions[:, column])
+        for column in np.flatnonzero(np.abs(self.rest - m.qpos0) > _MOTION).tolist():
+            if column not in self.commanded:
+                tables.setdefault(column, (0, 0.0, 1.0, np.full(KNOTS, self.rest[column])))
+        coupled = [k for k, address in enumerate(self.commanded) if address in tables]
+        self.coupled = np.array(coupled, dtype=int)
+        self.columns = np.array([c for c in tables if c not in self.commanded], dtype=int)
+        rows = [tables[c] for c in (*self.columns, *self.commanded[self.coupled])]
+        leader, low, step, value = zip(*rows, strict=True) if rows else ((), (), (), ())
+        self.leader, self.low, self.step = (
+            np.array(leader, dtype=int),
+            np.array(low),
+            np.array(step),
+        )
+        self.value = np.reshape(value, (-1, KNOTS))
+        self._tensors: dict[tuple, list[Tensor]] = {}
+
+    @property
+    def follows(self) -> ndarray:
+        """Addresses of the joints of all rows of the tables, shape ``(m,)``."""
+        return np.concatenate((self.columns, self.commanded[self.coupled]))
+
+    def qpos(self, command: ArrayLike) -> ndarray:
+        """All positions at a command [rad, m], shapes ``(nq,)`` and ``(n,)``."""
+        qpos = self.rest.copy()
+        qpos[self.commanded] = command
+        follow, _ = self.follow(torch.from_numpy(np.array(command, dtype=float)))
+        qpos[self.columns] = follow[: len(self.columns)].numpy()
+        return qpos
+
+    def agree(self, command: ArrayLike) -> ndarray:
+        """Commands [rad, m], shape ``(..., n)``, in which coupled joints follow earlier ones."""
+        command = np.array(command, dtype=float)
+        follow, _ = self.follow(torch.from_numpy(command))
+        command[..., self.coupled] = follow[..., len(self.columns) :].numpy()
+        return command
+
+    def shares(self, command: ndarray) -> ndarray:
+        """How far each degree of freedom moves with each commanded joint, shape ``(nv, n)``."""
+        shares = np.zeros((self._model.nv, len(self.commanded)))
+        dofs = dict(zip(self._addresses.tolist(), self._dofs.tolist(), strict=True))
+        shares[[dofs[c] for c in self.commanded], np.arange(len(self.commanded))] = 1.0
+        shares[[dofs[c] for c in self.commanded[self.coupled]]] = 0.0
+        _, slopes = self.follow(torch.from_numpy(command))
+        shares[[dofs[c] for c in self.follows], self.leader] = slopes.numpy()
+        return shares
+
+    def follow(self, command: Tensor) -> tuple[Tensor, Tensor]:
+        """Positions [rad, m] at ``columns`` and then of ``coupled``, and their derivatives by their
+        leaders' positions, of commands of shape ``(..., n)``; both of shape ``(..., m)``. After the
+        first call the host is not asked.
+        """
+        key = (command.device, command.dtype)
+        if key not in self._tensors:
+            tables = [torch.tensor(n).to(*key) for n in (self.low, self.step, self.value)]
+            rows = (self.leader, np.arange(len(self.leader)))
+            self._tensors[key] = tables + [torch.tensor(n, device=command.device) for n in rows]
+        low, step, value, leader, row = self._tensors[key]
+        at = ((command.index_select(-1, leader) - low) / step).clamp(0.0, KNOTS - 1.0)
+        knot = (at.floor() - 1.0).clamp(0.0, KNOTS - 4.0)  # the first of four: a cubic
+        t = at - knot
+        knot = knot.long()
+        a, b, c, d = (value[row, knot + k] for k in range(4))
+        first, second, third = b - a, c - 2.0 * b + a, (d - a) - 3.0 * (c - b)
+        position = a + t * (first + (t - 1.0) / 2.0 * (second + (t - 2.0) / 3.0 * third))
+        slope = first + (t - 0.5) * second + (t * (t / 2.0 - 1.0) + 1.0 / 3.0) * third
+        return position, slope / step
+
+    def _walk(self, address: int, count: int) -> ndarray:
+        """Positions while a joint goes over its range, shape ``(KNOTS, nq)``. Other commanded ones
+        stand, unless the equalities need those after the first few, of this count, to move.
+        """
+        ends = (self._low, self._high)
+        low, high = (float(end[self._addresses == address][0]) for end in ends)
+        if not np.isfinite(low):
+            low, high = -2.0 * np.pi, 2.0 * np.pi
+        knots = np.linspace(low, high, KNOTS)
+        first = int(np.abs(knots - self.rest[address]).argmin())
+        positions = np.empty((KNOTS, len(self.rest)))
+        for way in (range(first, KNOTS), range(first, -1, -1)):
+            qpos = self.rest.copy()
+            for knot in way:
+                qpos[address] = knots[knot]
+                qpos = self._settle(qpos, self.commanded)
+                if np.abs(self._rows(qpos)[1]).max(initial=0.0) > _ERROR:
+                    qpos = self._settle(qpos, self.commanded[:count])
+                positions[knot] = qpos
+        return positions
+
+    def _rows(self, qpos: ndarray) -> tuple[ndarray, ndarray]:
+        """Jacobian of the equalities, shape ``(rows, hinges and slides)``, and their errors."""
+        self._data.qpos[:] = qpos
+        mujoco.mj_fwdPosition(self._model, self._data)
+        size = self._data.nefc
+        jac = self._data.efc_J[: size * self._model.nv].reshape(size, self._model.nv)
+        return jac[:, self._dofs], self._data.efc_pos[:size].copy()
+
+    def _settle(self, qpos: ndarray, still: ndarray) -> ndarray:
+        """The nearest positions within ranges at which equalities hold, without a motion at some
+        addresses; of what is still free, where springs rest.
+        """
+        qpos = qpos.copy()
+        linked = np.flatnonzero(self._linked & ~np.isin(self._addresses, still))
+        for _ in range(_STEPS if linked.size else 0):
+            jac, error = self._rows(qpos)
+            loose = linked
+            while True:
+                at = self._addresses[loose]
+                stiff = np.diag(self._stiffness[loose] + 1e-4)  # else the shortest way
+                system = np.block(
+                    [[stiff, jac[:, loose].T], [jac[:, loose], np.zeros((len(error),) * 2)]]
+                )
+                pull = self._stiffness[loose] * (self._model.qpos_spring[at] - qpos[at])
+                step = np.linalg.lstsq(system, np.concatenate((pull, -error)), rcond=1e-11)[0]
+                step = step[: len(at)]
+                high, low = (qpos[at] >= self._high[loose]), (qpos[at] <= self._low[loose])
+                stopped = (high & (step > 0.0)) | (low & (step < 0.0))
+                if not stopped.any():
+                    break
+                loose = loose[~stopped]
+            largest = np.abs(step).max(initial=0.0)
+            moved = qpos[at] + step * min(1.0, _MAX_STEP / max(largest, _EXACT))
+            qpos[at] = np.clip(moved, self._low[loose], self._high[loose])
+            if largest < _EXACT:
+                break
+        return qpos
+
+
+posture = lru_cache(maxsize=8)(Posture)
+"""The posture of a model's commanded joints, a tuple, probed once per model."""
