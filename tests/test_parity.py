@@ -3,9 +3,10 @@
 import copy
 import math
 import re
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -29,7 +30,8 @@ from mjstack.gates.parity import (
 from mjstack.math import quat_mul
 from mjstack.report.record import GateResult, Status
 from mjstack.scene import build_model
-from mjstack.sim import make_simulation
+from mjstack.sim import Simulation, make_simulation
+from mjstack.sim.mjwarp import MjwarpSimulation
 
 SCENES = {"box": "stack", "cylinder": "lift", "box in the jaws": "peg"}
 OBJECT = "(red|blue|can|peg)"
@@ -48,13 +50,22 @@ def played(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     return run
 
 
-def compared(run: Run, change: Callable[[mujoco.MjModel, list[int]], None]) -> list[str]:
-    """Problems of a MJWarp world with a changed model."""
+def compared(
+    run: Run, change: Callable[[mujoco.MjModel, list[int]], None]
+) -> tuple[list[str], list[str]]:
+    """Problems of a MJWarp world with a changed model: of the model itself, and of its steps."""
     model = copy.copy(run.stage.model)
     change(model, [model.body(name).id for name in run.stage.index.objects])
     mjwarp = make_simulation(model, run.cfg, 1, backend=Backend.mjwarp, device="cpu")
     with closing(mjwarp):
-        return compare_states(run, mjwarp, GateResult(name="parity", status=Status.passed))
+        return split(run, mjwarp)
+
+
+def split(run: Run, mjwarp: Simulation) -> tuple[list[str], list[str]]:
+    """Problems of MJWarp's model, and of its steps."""
+    problems = compare_states(run, mjwarp, GateResult(name="parity", status=Status.passed))
+    own = [text for text in problems if text.startswith("model: ")]
+    return own, [text for text in problems if text not in own]
 
 
 def heavier(model: mujoco.MjModel, objects: list[int]) -> None:
@@ -104,11 +115,92 @@ def faster(model: mujoco.MjModel, objects: list[int]) -> None:
 def test_what_differs_is_caught_on_a_box_and_on_a_cylinder(
     change: Callable[[mujoco.MjModel, list[int]], None], caught: str | None, played: Run
 ) -> None:
-    problems = compared(played, change)
+    of_model, of_steps = compared(played, change)
     if caught is None:
-        assert problems == []
+        assert of_model == of_steps == []
     else:
-        assert re.search(caught, "; ".join(problems)), problems
+        assert re.search(caught, "; ".join(of_steps)), of_steps
+        assert bool(of_model) == (change is not faster)  # a time step is no array of the model
+
+
+class Uploaded(NamedTuple):
+    """A robot's reference episode, and its MJWarp world."""
+
+    run: Run
+    mjwarp: MjwarpSimulation
+
+    @contextmanager
+    def scaled(self, name: str, factor: float, *column: int) -> Iterator[None]:
+        """An array that MJWarp holds, with some numbers of all its rows or of one changed."""
+        array = getattr(self.mjwarp._m, name)
+        kept = array.numpy()
+        changed = kept.copy().reshape(getattr(self.run.stage.model, name).shape)
+        changed[..., *column] *= factor
+        array.assign(changed.reshape(kept.shape))
+        yield
+        array.assign(kept)
+
+
+@pytest.fixture(scope="module", params=["so101", "rebot"])
+def uploaded(request: pytest.FixtureRequest) -> Iterator[Uploaded]:
+    run = Run(Stage(load_config([f"robot={request.param}"])))
+    with closing(make_simulation(run.stage.model, run.cfg, 1, backend=Backend.mjwarp)) as mjwarp:
+        assert isinstance(mjwarp, MjwarpSimulation)
+        yield Uploaded(run, mjwarp)
+
+
+def test_two_healthy_arms_pass_within_the_limits_that_were_constants(uploaded: Uploaded) -> None:
+    """The limits of states that were compared with constants are at most those."""
+    step1 = {"qpos": 1e-6, "qvel": 1e-4, "xpos": 1e-6, "xquat": 1e-6, "site_xpos": 1e-6}
+    step1 |= {"qfrc_actuator": 1e-3, "contact_count": 0.0}
+    step50 = {"qpos": 1e-3, "qvel": 5e-2, "xpos": 5e-5, "xquat": 1e-3, "site_xpos": 5e-5}
+    step50 |= {"qfrc_actuator": 2e-2, "contact_count": 0.0}
+    result = GateResult(name="parity", status=Status.passed)
+    assert compare_states(uploaded.run, uploaded.mjwarp, result) == []
+    for name, limit in result.thresholds.items():
+        state, steps, field = name.split(".")
+        if state != "twisted":
+            assert limit <= {"step1": step1, "step50": step50}[steps][field], name
+
+
+@pytest.mark.full
+def test_the_gain_of_every_servo_shows(uploaded: Uploaded) -> None:
+    """Also that of a hand whose servo is at its target or at its limit in every episode's state."""
+    model = uploaded.run.stage.model
+    for number in range(model.nu):
+        joint = model.actuator(number).name
+        with uploaded.scaled("actuator_gainprm", 1.01, number, 0):
+            with uploaded.scaled("actuator_biasprm", 1.01, number, 1):
+                of_model, of_steps = split(uploaded.run, uploaded.mjwarp)
+        assert f"_biasprm of actuator {joint} is " in of_model[0]
+        assert any(f"in_motion, 1 steps: qfrc_actuator of {joint} " in text for text in of_steps)
+        assert of_steps[-1] == f"look first at {joint}: its servo, damping and range"
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("direction", ["slide", "torsion", "roll"])
+def test_every_direction_of_friction_shows(direction: str, uploaded: Uploaded) -> None:
+    """reBot's pads do not resist rolling: there the model alone differs."""
+    model = uploaded.run.stage.model
+    column = ["slide", "torsion", "roll"].index(direction)
+    with uploaded.scaled("geom_friction", 0.94, column):
+        of_model, of_steps = split(uploaded.run, uploaded.mjwarp)
+    assert "geom_friction of geom " in of_model[0]
+    rolls = (model.geom_condim == 6).any()
+    assert bool(of_steps) == (direction != "roll" or rolls)
+    if of_steps:
+        assert any("twisted, 1 steps: qvel of red " in text for text in of_steps)
+        assert of_steps[-1] == "look first at red: its shape, mass, friction and contacts"
+
+
+@pytest.mark.full
+def test_what_no_state_shows_is_found_in_the_model(uploaded: Uploaded) -> None:
+    for name in ("actuator_forcerange", "jnt_range", "geom_solimp", "dof_invweight0"):
+        with uploaded.scaled(name, 1.001):
+            of_model, _ = split(uploaded.run, uploaded.mjwarp)
+        assert re.fullmatch(rf"model: {name} of \w+ \w+ is \S+, natively \S+", of_model[0])
+        assert len(of_model) == 1
+    assert split(uploaded.run, uploaded.mjwarp) == ([], [])
 
 
 @pytest.mark.full
@@ -122,7 +214,7 @@ def test_the_reference_is_the_solution_where_native_mujoco_stops_short(played: R
         model.opt.tolerance = tolerance
         with closing(make_simulation(model, played.cfg, 1, backend=Backend.native)) as sim:
             ends.append(end_state(sim, state, 1))
-    limit = played.cfg.gate.parity.step1["qvel"]
+    limit = 5e-5  # of the gate
     stopped, converged = (float(differences(end, ends[-1])["qvel"].max()) for end in ends[:2])
     assert stopped > 100.0 * limit
     assert converged < 1e-3 * limit
@@ -189,7 +281,8 @@ def test_ends_of_all_joints_but_the_robots_are_compared(
     ends = [model.qpos0.copy() for _ in range(2)]
     mujoco.mj_integratePos(model, ends[0], change, 1.0)
     nominal = SimpleNamespace(world=SimpleNamespace(qpos=ends[1][None]))
-    run = SimpleNamespace(cfg=cfg, stage=SimpleNamespace(model=model), nominal=nominal)
+    stage = SimpleNamespace(model=model, play=lambda sim, reset: None)  # all end where they start
+    run = SimpleNamespace(cfg=cfg, stage=stage, nominal=nominal)
     result = GateResult(name="parity", status=Status.passed)
     found, lines = _compare_ends(run, ends[0], result)  # type: ignore[arg-type]
     assert found == [f"{text} from native's" for text in problems]
