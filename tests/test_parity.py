@@ -133,12 +133,14 @@ class Uploaded(NamedTuple):
     def scaled(self, name: str, factor: float, *column: int) -> Iterator[None]:
         """An array that MJWarp holds, with some numbers of all its rows or of one changed."""
         array = getattr(self.mjwarp._m, name)
-        kept = array.numpy()
+        kept = array.numpy().copy()
         changed = kept.copy().reshape(getattr(self.run.stage.model, name).shape)
         changed[..., *column] *= factor
         array.assign(changed.reshape(kept.shape))
-        yield
-        array.assign(kept)
+        try:
+            yield
+        finally:
+            array.assign(kept)
 
 
 @pytest.fixture(scope="module", params=["so101", "rebot"])
@@ -169,9 +171,11 @@ def test_the_gain_of_every_servo_shows(uploaded: Uploaded) -> None:
     model = uploaded.run.stage.model
     for number in range(model.nu):
         joint = model.actuator(number).name
-        with uploaded.scaled("actuator_gainprm", 1.01, number, 0):
-            with uploaded.scaled("actuator_biasprm", 1.01, number, 1):
-                of_model, of_steps = split(uploaded.run, uploaded.mjwarp)
+        with (
+            uploaded.scaled("actuator_gainprm", 1.01, number, 0),
+            uploaded.scaled("actuator_biasprm", 1.01, number, 1),
+        ):
+            of_model, of_steps = split(uploaded.run, uploaded.mjwarp)
         assert f"_biasprm of actuator {joint} is " in of_model[0]
         assert any(f"in_motion, 1 steps: qfrc_actuator of {joint} " in text for text in of_steps)
         assert of_steps[-1] == f"look first at {joint}: its servo, damping and range"

@@ -32,7 +32,10 @@ _CONVERGED = 1e-12  # tolerance of the solver in float64
 _CONVERGED_FLOAT32 = 1e-8  # of what float32 can still tell
 _ROUNDED = {1: 32, 50: 16}  # worlds, by steps
 _ROUNDED_EPISODES = 8
-_SIZES = {"qvel": 300.0, "contact_count": 0.0}  # of numbers whose rounding is allowed; of others 2
+_LEAST_SIZES = {
+    "qvel": 300.0,
+    "qfrc_actuator": 100.0,
+}  # whose rounding is allowed; else 2
 _SLIDES = {int(mujoco.mjtJoint.mjJNT_FREE): 3, int(mujoco.mjtJoint.mjJNT_SLIDE): 1}  # else turns
 _WIDTHS = {"xpos": 3, "xquat": 4, "site_xpos": 3}
 _CAPTURED = 10  # steps of a graph: one of fifty takes longer to capture than to run
@@ -120,9 +123,11 @@ def compare_states(run: Run, mjwarp: Simulation, result: GateResult) -> list[str
             apart = differences(ends, end_state(mjwarp, state, steps))
             ranges = differences(ends, end_state(rounded[steps], state, steps))
             for field in COMPARED:
-                size = _SIZES.get(field, 2.0)
-                size *= max(1.0, float(ends[field].abs().max()) / max(size, 1.0))
-                allowed = multiples[steps] * (ranges[field] + UNIT * size)
+                rounding = 0.0
+                if field != "contact_count":
+                    largest = float(ends[field].abs().max())
+                    rounding = UNIT * max(largest, _LEAST_SIZES.get(field, 2.0))
+                allowed = multiples[steps] * (ranges[field] + rounding)
                 worst = int((apart[field] / allowed.clamp(min=1e-30)).argmax())
                 error, limit = float(apart[field][worst]), float(allowed[worst])
                 key = f"{name}.step{steps}.{field}"

@@ -32,7 +32,8 @@ class RoundedSimulation(NativeSimulation):
     ) -> None:
         """Arguments as of `NativeSimulation`; ``fields`` are values of one world, which all get."""
         super().__init__(model, nworld, fields=FIELD_NAMES)
-        self.batch.expand("opt.tolerance")[:] = max(model.opt.tolerance, _TOLERANCE)
+        tolerances = np.geomspace(max(model.opt.tolerance, _TOLERANCE), _TOLERANCE, nworld)
+        self.batch.expand("opt.tolerance")[:] = tolerances
         self._generator = torch.Generator().manual_seed(0)
         for name, values in (fields or {}).items():
             self.fields[name].copy_(values)
