@@ -152,7 +152,7 @@ BAD_VALUES = [
     ("robot.locked.wrist_roll=nan", "robot.locked.wrist_roll=nan"),
     ("scene.objects.red.xy=[nan,0]", "scene.objects.red.xy=[nan, 0]"),
     ("scene.table_half=[-1,1,1]", "3 numbers above 0 [m]"),
-    ("gate.parity.step_ranges=nan", "gate.parity.step_ranges=nan"),
+    ("gate.parity.step1_ranges=nan", "gate.parity.step1_ranges=nan"),
     ("timing.decimation=0", "timing.decimation=0"),
     ("timing.decimation=11", "expected 0.02 s, because task.control_hz=50. Change both together"),
     ("timing.physics_dt=nan", "timing.physics_dt"),

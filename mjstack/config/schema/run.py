@@ -148,14 +148,14 @@ class ParityCfg(GateFuncCfg):
     """States from which both step: a name, and the phase at whose end the state is taken. Empty:
     the first phase, the one after the first grasp (without grasps, the last with a closed gripper),
     and the last. A driver without phases has those after each third of its episode instead."""
-    step_ranges: float = spec(ge=0.0)
+    step1_ranges: float = spec(ge=0.0)
     """Largest difference after one physics step, in ranges of native MuJoCo that rounds."""
-    episode_ranges: float = spec(ge=0.0)
-    """The same after 50 physics steps, and after the whole task."""
+    step50_ranges: float = spec(ge=0.0)
+    """The same after 50 physics steps."""
     object_position: float = spec(unit="m", ge=0.0)
-    """Largest difference of an object's position after the whole task, if that is more."""
+    """Largest difference of an object's position after the whole task."""
     object_rotation_deg: float = spec(unit="deg", ge=0.0)
-    """Largest difference of an object's orientation after the whole task, if that is more."""
+    """Largest difference of an object's orientation after the whole task."""
     images: str | None = None
     """With cameras: ``parity_images.npz`` of a run elsewhere, whose images are compared with native
     MuJoCo's instead of images that MJWarp draws here."""
