@@ -5,6 +5,8 @@ import math
 import re
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from importlib.util import find_spec
+from pathlib import Path
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -239,6 +241,59 @@ def test_a_turn_that_nothing_shows_is_none(shape: str, axis: list[float], expect
     start = torch.tensor([0.5, 0.5, 0.5, 0.5], dtype=torch.float64)
     half = torch.tensor([math.cos(0.15), *(math.sin(0.15) * x for x in axis)], dtype=torch.float64)
     assert turn_between(shape, start, quat_mul(start, half)) == pytest.approx(expected, abs=1e-12)
+
+
+LINKAGE = """
+name: droid
+title: FR3 with a Robotiq 2F-85, of package tabletask
+arm_joints: [joint1, joint2, joint3, joint4, joint5, joint6, joint7]
+gripper_joints: [right_driver_joint, left_driver_joint]
+jaw_bodies: [right_pad, left_pad]
+home: [0.0, -0.11101, 0.0, -2.27058, 0.0, 2.15905, 0.0, 0.05, 0.05]
+gripper_open: [0.05, 0.05]
+gripper_closed: [0.6, 0.6]
+approach_body: base
+approach_axis: [0.0, 0.0, 1.0]
+grasp_sites: [palm_a, palm_b]
+grasp_parts: {palm_a: [base], palm_b: [base]}
+grasp_pos: {palm_a: [0.0, 0.022, 0.145], palm_b: [0.0, -0.022, 0.145]}
+roll_joint: joint7
+yaw_alignment: 1.0
+approach_gain: 0.5
+finger_room: 0.02
+locked: {joint3: 0.0, joint5: 0.0, joint7: 0.0}
+placements:
+  stack:
+    table_center: [0.5, 0.0, 0.012]
+    table_half: [0.18, 0.3, 0.012]
+    objects: {red: [0.5, -0.1], blue: [0.5, 0.1]}
+    random_xy: [0.03, 0.03]
+"""
+
+
+@pytest.mark.full
+def test_a_stranger_s_linkage_passes_and_its_faults_show(tmp_path: Path) -> None:
+    """Its light links are off by more than the 1e-4 rad/s that was the limit of every robot."""
+    package = find_spec("tabletask")
+    if package is None or package.origin is None:
+        pytest.skip("package tabletask, which has the robot's file, is not installed")
+    file = Path(package.origin).parent / "mujoco/robots/assets/droid/model.xml"
+    (tmp_path / "robot").mkdir()
+    (tmp_path / "robot/droid.yaml").write_text(f"{LINKAGE}file: {file}\n", encoding="utf-8")
+    run = Run(Stage(mjstack.load_config(["robot=droid"], config_dir=tmp_path)))
+    with closing(make_simulation(run.stage.model, run.cfg, 1, backend=Backend.mjwarp)) as mjwarp:
+        assert isinstance(mjwarp, MjwarpSimulation)
+        arm = Uploaded(run, mjwarp)
+        result = GateResult(name="parity", status=Status.passed)
+        assert compare_states(run, mjwarp, result) == []
+        off = [value for name, value in result.metrics.items() if name.endswith("step1.qvel")]
+        assert max(off) > 1e-4
+        for joint in (0, 7):  # the last are the fingers'
+            with arm.scaled("actuator_gainprm", 1.01, joint, 0):
+                of_steps = split(run, mjwarp)[1]
+            assert of_steps[-1].startswith(f"look first at {run.cfg.robot.joints[joint]}: ")
+        with arm.scaled("geom_friction", 0.94, 0):
+            assert split(run, mjwarp)[1]
 
 
 JOINTS = """
