@@ -108,12 +108,21 @@ def lowest_point(pos: Tensor, quat: Tensor, shape: str, size: Sequence[float]) -
     elif shape == "cylinder":
         across = norm(up[..., :2])
         reach = size[0] * across + size[1] * up[..., 2].abs()
+    elif shape == "hull":  # of points, their coordinates one after the other
+        reach = -(up[..., None, :] * _constant(size, up.device, up.dtype)).sum(-1).amin(-1)
     elif len(set(size)) == 1:  # a cube
         reach = size[0] * up.abs().sum(-1)
     else:
         x, y, z = up.abs().unbind(-1)
         reach = size[0] * x + size[1] * y + size[2] * z
     return pos[..., 2] - reach
+
+
+@cache
+def _constant(points: tuple[float, ...], device: torch.device, dtype: torch.dtype) -> Tensor:
+    """Points [m], shape ``(n, 3)``, copied once: a captured step may not copy from the host."""
+    with torch.inference_mode(False):
+        return torch.tensor(points, dtype=dtype, device=device).view(-1, 3)
 
 
 def describe_tensor(value: object) -> str:

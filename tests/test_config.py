@@ -206,7 +206,7 @@ def test_a_bad_value_is_one_line(override: str, words: str) -> None:
 
 BAD = [
     (["scene.objects.red.xy=[0.33]"], "a list of 2 numbers [m], or scene.objects.red.pos with 3"),
-    (["scene.objects.red.file=none.xml"], "red.file=none.xml: expected an MJCF file"),
+    (["scene.objects.red.file=none.xml"], "none.xml: expected an MJCF file; there is no such"),
     (["gate.seeds=3"], "'seeds'"),
     (["hydra.searchpath=[pkg://mine.conf]"], "pkg:/mine.conf: there is no such folder"),
     (["job=collect", "job.episode=3"], "Did you mean 'job.episodes'?"),

@@ -88,7 +88,7 @@ def test_the_gates_pass(example: str, robot: str, gates: str, tmp_path: Path) ->
         own = {"in_motion", "swung", "twisted"}
         assert compared == {"before_contact", "in_contact", "at_end", *own}
     if "parity" in results and example == "drawer":
-        assert 0.0 < results["parity"]["metrics"]["final.drawer.position_m"] < 0.002
+        assert 0.0 < results["parity"]["metrics"]["final.cabinet_drawer.position_m"] < 0.002
         assert "drawer ends 0." in results["parity"]["reason"]
 
 
@@ -188,7 +188,7 @@ def test_the_cabinet_stands_where_the_handle_is_drawn_and_its_cube_stays_in_it()
     cube = env.index.objects["cube"][0]
     env.sim.qpos[1, cube] -= 0.2
     env.sim.qpos[2, cube] -= 0.06
-    env.sim.qpos[2, env.sim.model.joint("drawer").qposadr[0]] = 0.06
+    env.sim.qpos[2, env.sim.model.joint("cabinet_drawer").qposadr[0]] = 0.06
     played = play_episode(env, Still(cfg))
     failing = stage.check.rules.failing(played.result.failed.numpy())
     assert failing == {"OPEN": [0, 1, 3], "INSIDE": [1]}

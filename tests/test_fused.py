@@ -189,11 +189,15 @@ def test_contact_rows(condim: int, njmax: int, device: str) -> None:
     most = 0
     for _ in random_states(worlds, 4, 40, speed=1.0):
         written = []
-        for make in (mjw.make_constraint, constraints.make_constraint):
+        for stages in (
+            (mjw.make_constraint,),
+            (constraints.noncontact_rows, constraints.contact_rows),
+        ):
             for name in names:
                 getattr(worlds.d.efc, name).fill_(-7)
             with wp.ScopedDevice(worlds.device):
-                make(worlds.m, worlds.d)
+                for stage in stages:
+                    stage(worlds.m, worlds.d)
                 wp.synchronize_device(worlds.device)
             address = worlds.d.contact.efc_address.numpy()[: int(worlds.d.nacon.numpy()[0]), 0]
             world = worlds.d.contact.worldid.numpy()

@@ -1,12 +1,14 @@
 """Smooth dynamics in three kernels end where MJWarp's own stages do."""
 
 import math
+from functools import partial
 
 import mujoco
 import numpy as np
 import pytest
 import torch
 import warp as wp
+from arms import model_of
 from environments import Patch, configure, fused_sim
 
 from mjstack.sim.fused import smooth
@@ -15,10 +17,11 @@ from mjstack.sim.mujoco_warp import mjw
 N = 3
 POSES = (
     *("xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis", "geom_xpos", "geom_xmat"),
-    *("site_xpos", "site_xmat", "subtree_com", "cinert", "cdof"),
+    *("site_xpos", "site_xmat", "subtree_com", "cinert", "cdof", "ten_length", "ten_J"),
 )
 FORCES = (
-    *("M", "cvel", "cdof_dot", "act_dot", "actuator_length", "actuator_velocity"),
+    *("M", "cvel", "cdof_dot", "ten_velocity"),
+    *("act_dot", "actuator_length", "actuator_velocity"),
     *("actuator_force", "qfrc_bias", "qfrc_passive", "qfrc_actuator", "qfrc_smooth", "qacc_smooth"),
 )
 STATE = ("qpos", "qvel", "act", "qacc_warmstart", "time", "overflow")
@@ -62,6 +65,13 @@ PARTS = """
         <joint name="e" axis="0 0 1" armature=".01"/><geom size=".02"/>
       </body>
     </body>
+    <body pos="-.2 .4 .5">
+      <joint name="ball" type="ball" pos="0 .02 0" stiffness=".3" damping=".02" armature=".01"/>
+      <geom type="capsule" size=".02" fromto="0 0 0 .1 .1 0"/>
+      <body pos=".1 .1 0">
+        <joint type="ball" damping=".01"/><geom size=".02" pos=".05 0 0" mass=".1"/>
+      </body>
+    </body>
     <body name="tool" pos=".5 -.3 .6" euler="30 20 10">
       <freejoint/><geom type="capsule" size=".02" fromto="0 0 0 .2 .1 0"/>
       <body pos="0 0 .1"><geom size=".03"/></body>
@@ -73,7 +83,8 @@ PARTS = """
     <motor joint="b" gear=".5"/>
     <intvelocity joint="c" kp="30" actrange="-.1 .1"/>
     <general joint="d" dyntype="filter" dynprm=".05" gaintype="affine" gainprm="1 .2 -.3"
-             biastype="affine" biasprm=".1 -.5 -.02" actearly="true"/>
+             biastype="affine" biasprm=".1 -.5 -.02" actearly="true" gear="1.5" armature=".01"
+             damping=".02 .01 .005"/>
     <general joint="e" dyntype="filterexact" dynprm=".03" gainprm=".01"/>
     <general joint="e" gaintype="affine" gainprm=".01 0 -.02"/>
   </actuator>
@@ -107,12 +118,8 @@ def compare(m: mjw.Model, d: mjw.Data) -> None:
     """All stages from one state: each has what MJWarp's stages before it have written."""
     moving = m.body_weldid.numpy()[m.geom_bodyid.numpy()] != 0
     stages = (
-        (POSES, smooth.positions, (mjw.kinematics, mjw.com_pos)),
-        (
-            FORCES,
-            smooth.forces,
-            (mjw.crb, mjw.transmission, mjw.fwd_velocity, mjw.fwd_actuation, accelerate),
-        ),
+        (POSES, smooth.positions, (mjw.kinematics, mjw.com_pos, mjw.tendon)),
+        (FORCES, smooth.forces, (inertia, mjw.transmission, mjw.fwd_velocity, *FORWARD)),
         (STATE, smooth.advance, (mjw.collision, mjw.make_constraint, mjw.solve, mjw.implicit)),
     )
     for names, fused, stock in stages:
@@ -136,8 +143,12 @@ def compare(m: mjw.Model, d: mjw.Data) -> None:
             getattr(d, name).assign(stock_values[name])
 
 
-def accelerate(m: mjw.Model, d: mjw.Data) -> None:
-    mjw.fwd_acceleration(m, d, factorize=True)
+def inertia(m: mjw.Model, d: mjw.Data) -> None:
+    mjw.crb(m, d)
+    mjw._src.smooth.tendon_armature(m, d)
+
+
+FORWARD = (mjw.fwd_actuation, partial(mjw.fwd_acceleration, factorize=True))
 
 
 @pytest.mark.parametrize("args", [("robot=so101",), ("robot=rebot",), ("robot=so101", "task=box")])
@@ -181,7 +192,19 @@ def test_robots(args: tuple[str, ...], device: str) -> None:
 )
 def test_parts(boxes: int, off: str, device: str) -> None:
     flags = [getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}") for name in off.split()]
-    model = parts(boxes, sum(map(int, flags)))
+    throw_and_compare(parts(boxes, sum(map(int, flags))), device)
+
+
+@pytest.mark.parametrize("off", ["", "ACTUATION", "DAMPER", "SPRING"])
+def test_tendons(off: str, device: str) -> None:
+    """With limits, springs, dampers, armature, and several servos at one."""
+    model = model_of("pulled")
+    if off:
+        model.opt.disableflags |= getattr(mujoco.mjtDisableBit, f"mjDSBL_{off}")
+    throw_and_compare(model, device)
+
+
+def throw_and_compare(model: mujoco.MjModel, device: str) -> None:
     generator = torch.Generator().manual_seed(0)
     with wp.ScopedDevice(device):
         m = mjw.put_model(model)
@@ -251,17 +274,16 @@ def change(spec: mujoco.MjSpec, name: str, **values: object) -> None:
     [
         (
             lambda spec: setattr(spec.joint("d"), "type", mujoco.mjtJoint.mjJNT_BALL),
-            "there are ball joints; actuators drive other things than hinges and slides",
+            "actuators drive other things than hinges, slides and tendons",
         ),
         (
             lambda spec: change(spec, "b", trntype=mujoco.mjtTrn.mjTRN_SITE, target="tip"),
-            "actuators drive other things than hinges and slides",
+            "actuators drive other things than hinges, slides and tendons",
         ),
         (
             lambda spec: change(spec, "b", gaintype=mujoco.mjtGain.mjGAIN_USER),
             "actuators have dynamics, gains or biases of special kinds",
         ),
-        (lambda spec: change(spec, "b", armature=0.1), "actuators have damping or armature"),
         (lambda spec: setattr(spec.option, "density", 1.2), "there is a fluid"),
     ],
 )

@@ -50,7 +50,7 @@ PATHS: dict[str, dict[str, str] | None] = {
     },
     "mdp/reset.py": {
         "": "home _write_objects",
-        "JointNoise JointZeros JitterObjects RandomizeObjects": "__call__",
+        "JointNoise JointZeros JitterObjects RandomizeObjects FixtureJoints": "__call__",
         "ObjectMass ObjectFriction ActuatorGains": "read write",
     },
     "mdp/starts/randomization.py": {"Randomized": "__call__", "Elements": "scale"},
@@ -197,7 +197,9 @@ def host_accesses(function: ast.FunctionDef) -> list[str]:
 def test_a_captured_step_does_not_touch_the_host(path: str) -> None:
     found = functions(ast.parse((ROOT / path).read_text()))
     groups = PATHS[path]
-    names = list(found)
+    # A cached function copies once, before the capture
+    cached = {n for n, node in found.items() if "cache" in map(ast.unparse, node.decorator_list)}
+    names = [name for name in found if name not in cached]
     if groups is not None:
         names = [
             f"{owner}.{name}".lstrip(".")

@@ -38,6 +38,7 @@ SIGNATURES = {
         "primitive_collisions_types primitive_collisions_func"
     ),
     "math.upper_trid_index": "n i j",
+    "smooth.tendon_armature": "m d",
     "smooth._geom_local_to_global": (
         "body_rootid body_weldid body_mocapid geom_bodyid geom_pos geom_quat xpos_in xquat_in "
         "geom_xpos_out geom_xmat_out"

@@ -45,6 +45,54 @@ def test_the_file_is_relative_to_the_yaml_that_names_it() -> None:
     assert scara().robot.file == str(SCARA / "scara.xml")
 
 
+BESIDE = """# @package _global_
+task: {params: {mug: ../../mug.xml}}
+scene:
+  objects:
+    rack: {fixed: true, xy: [0.3, 0.1], file: ../../mug.xml}
+    mug: {fixed: true, xy: [0.3, 0.1], file: "${task.params.mug}"}
+    copy: {fixed: true, xy: [0.3, 0.1], file: "${robot.file}"}
+"""
+
+
+@pytest.mark.parametrize("folders", [("alpha", "beta"), ("beta", "alpha")])
+def test_each_file_is_beside_the_yaml_that_names_it(
+    tmp_path: Path, monkeypatch: Patch, folders: tuple[str, str]
+) -> None:
+    """With files of the same name beside each folder, and from groups of any depth."""
+    profile = (SCARA / "conf/robot/scara.yaml").read_text()
+    for name in folders:
+        conf = tmp_path / name / "conf"
+        (conf / "experiment").mkdir(parents=True)
+        (conf / "experiment" / f"{name}_mugs.yaml").write_text(BESIDE)
+        for group, up in (("robot", "../.."), ("robot/vendor", "../../..")):
+            (conf / group).mkdir(parents=True, exist_ok=True)
+            (conf / group / f"{name}.yaml").write_text(profile.replace("../..", up))
+        for file in ("scara.xml", "mug.xml"):
+            shutil.copy(SCARA / "scara.xml", tmp_path / name / file)
+    monkeypatch.chdir(tmp_path / "alpha")
+    search = f"hydra.searchpath=[{','.join(f'file://{tmp_path / n}/conf' for n in folders)}]"
+    alpha, beta = tmp_path / "alpha", tmp_path / "beta"
+    for choice in ("beta", "vendor/beta"):
+        assert load_config([search, f"robot={choice}"]).files == {
+            "robot.file": str(beta / "scara.xml")
+        }
+    cfg = load_config([search, "robot=beta", "experiment=alpha_mugs"])
+    assert cfg.files == {
+        "robot.file": str(beta / "scara.xml"),
+        "scene.objects.rack.file": str(alpha / "mug.xml"),
+        "scene.objects.mug.file": str(alpha / "mug.xml"),
+        "scene.objects.copy.file": str(beta / "scara.xml"),
+    }
+    # An override's is relative to the working folder.
+    wall = "+scene.objects.wall={fixed: true, xy: [0.3, 0.1], file: mug.xml}"
+    cfg = load_config([search, "robot=beta", "robot.file=scara.xml", wall])
+    assert cfg.files == {
+        "robot.file": str(alpha / "scara.xml"),
+        "scene.objects.wall.file": str(alpha / "mug.xml"),
+    }
+
+
 @pytest.mark.full
 def test_the_file_can_be_absolute_or_relative_to_the_working_folder(
     tmp_path: Path, monkeypatch: Patch
@@ -70,7 +118,7 @@ def test_a_profile_without_start_title_and_ik_joints_gets_them() -> None:
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["robot.file=arm.xml"], "robot.file=arm.xml: expected an MJCF file"),
+        (["robot.file=arm.xml"], "/arm.xml: expected an MJCF file; there is no such file"),
         (["robot.file=/no/folder/arm.xml"], "robot.file=/no/folder/arm.xml: expected an MJCF file"),
         (["robot.name=mine"], "robot.file=null: expected the MJCF file of robot mine"),
         (["model=menagerie", "robot.menagerie_name=''"], "robot.menagerie_name=: expected"),

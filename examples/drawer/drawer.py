@@ -7,10 +7,12 @@ import torch
 from mjstack.config.fields import spec
 from mjstack.managers import EnvView, uses_fields
 from mjstack.mdp.geometry import place_xy
-from mjstack.mdp.observation import grasp_point_pos
+from mjstack.mdp.observation import fixture_pos, fixture_vel, grasp_point_pos
 from mjstack.tasks.check import EpisodeCheck, Rule
 from mjstack.tasks.parts import InWindow
 from mjstack.tasks.view import Step
+
+JOINT = "cabinet_drawer"
 
 
 @uses_fields("body_pos")
@@ -26,19 +28,9 @@ def move_cabinet(env: EnvView, mask: torch.Tensor) -> None:
     torch.where(mask[:, None], moved.to(cube), cube, out=cube)
 
 
-def opening(env: EnvView) -> torch.Tensor:
-    """How far the drawer is open [m], shape ``(nworld,)``."""
-    return env.sim.qpos[:, env.sim.model.joint("drawer").qposadr[0]]
-
-
-def speed(env: EnvView) -> torch.Tensor:
-    """How fast it opens [m/s], shape ``(nworld,)``."""
-    return env.sim.qvel[:, env.sim.model.joint("drawer").dofadr[0]]
-
-
 def to_handle(env: EnvView) -> torch.Tensor:
     """From the grasp point to the handle [m], shape ``(nworld, 3)``."""
-    return env.sim.xpos[:, env.sim.model.body("handle").id] - grasp_point_pos(env)
+    return env.sim.xpos[:, env.sim.model.body("cabinet_handle").id] - grasp_point_pos(env)
 
 
 def near(env: EnvView, *, scale: float) -> torch.Tensor:
@@ -48,13 +40,13 @@ def near(env: EnvView, *, scale: float) -> torch.Tensor:
 
 def progress(env: EnvView, *, open: float, stop: float) -> torch.Tensor:
     """Reward for how far the drawer is open, as a fraction of ``open`` [m]; 0 from ``stop`` on."""
-    at = opening(env)
+    at = fixture_pos(env, joint=JOINT)
     return (at / open).clamp(0.0, 1.0) * (at <= stop)
 
 
 def force(env: EnvView, name: str) -> torch.Tensor:
     """Net force on the cabinet or the handle [N], shape ``(nworld,)``."""
-    first = int(env.sim.model.sensor(name).adr[0])
+    first = int(env.sim.model.sensor(f"cabinet_{name}").adr[0])
     return torch.linalg.vector_norm(env.sim.sensordata[:, first : first + 3], dim=1)
 
 
@@ -77,10 +69,10 @@ class DrawerCheck(EpisodeCheck):
         whole = self.cfg.task.episode_steps
 
         def still(step: Step) -> torch.Tensor:
-            return (speed(step.view.env).abs() <= t.speed)[:, None]
+            return fixture_vel(step.view.env, joint=JOINT)[:, None].abs() <= t.speed
 
         def on_rail(step: Step) -> torch.Tensor:
-            return (opening(step.view.env) <= t.stop)[:, None]
+            return step.joint(JOINT) <= t.stop
 
         def alone(step: Step) -> torch.Tensor:
             return (force(step.view.env, "cabinet") == 0.0)[:, None]
@@ -96,7 +88,7 @@ class DrawerCheck(EpisodeCheck):
 
     def is_open(self, step: Step) -> torch.Tensor:
         """Whether the drawer is open, shape ``(nworld, 1)``."""
-        return (opening(step.view.env) >= self.t.open)[:, None]
+        return step.joint(JOINT) >= self.t.open
 
     def let_go(self, step: Step) -> torch.Tensor:
         """Whether nothing touches the handle, shape ``(nworld, 1)``."""
@@ -105,8 +97,8 @@ class DrawerCheck(EpisodeCheck):
     def inside(self, step: Step) -> torch.Tensor:
         """Whether the cube is between the drawer's walls, shape ``(nworld, 3)``."""
         env = step.view.env
-        middle = env.sim.site_xpos[:, env.sim.model.site("inside").id]
-        half = step.view.constant(*env.sim.model.site("inside").size)
+        middle = env.sim.site_xpos[:, env.sim.model.site("cabinet_inside").id]
+        half = step.view.constant(*env.sim.model.site("cabinet_inside").size)
         return (step.center("cube") - middle).abs() <= half
 
     def placed(self, step: Step) -> torch.Tensor:
@@ -115,4 +107,4 @@ class DrawerCheck(EpisodeCheck):
 
     def trace(self, step: Step) -> dict[str, torch.Tensor]:
         """Values for a replay."""
-        return {"open_m": opening(step.view.env)}
+        return {"open_m": step.joint(JOINT)[:, 0]}

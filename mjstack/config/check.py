@@ -11,6 +11,7 @@ from mjstack.config.fields import check_fields
 from mjstack.config.functions import offered
 from mjstack.config.schema import OUTPUTS, SHAPES, Config, SceneCfg, TermCfg
 from mjstack.errors import ConfigError, require_names
+from mjstack.files import MESHES
 
 _DEVICE = re.compile(r"auto|cpu|cuda:\d+")
 _DEVICES = re.compile(r"all|[1-9]\d*")
@@ -128,8 +129,17 @@ def _scene(cfg: Config) -> Checks:
     for name, thing in scene.objects.items():
         key = f"scene.objects.{name}"
         made = bool(thing.parts or thing.file)
-        yield f"{key}.mass", thing.mass is None and not thing.fixed, "a number [kg]: it moves"
-        yield f"{key}.fixed", made and not thing.fixed, "true, because it has parts or a file"
+        wrong = (thing.mass, thing.density) == (None, None) and not thing.fixed
+        wrong &= thing.file is None or thing.file.lower().endswith(MESHES)
+        yield f"{key}.mass", wrong, "a number [kg], or a density: it moves"
+        wrong = thing.density is not None and (thing.mass is not None or thing.fixed)
+        yield f"{key}.density", wrong, "null, because it has a mass or is fixed"
+        wrong = bool(thing.file) and thing.fixed and thing.mass is not None
+        yield f"{key}.mass", wrong, "null: masses of a fixture are its file's"
+        wrong = bool(thing.parts) and not thing.fixed
+        yield f"{key}.fixed", wrong, "true, because it has parts"
+        wrong = bool(thing.joints) and not (thing.file and thing.fixed)
+        yield f"{key}.joints", wrong, "{}, because it is no fixture from a file"
         shapes = [(key, thing)] * (not made)
         for where, shape in shapes + [(f"{key}.parts.{n}", p) for n, p in thing.parts.items()]:
             count, words = SHAPES[shape.shape]
@@ -141,9 +151,11 @@ def _scene(cfg: Config) -> Checks:
             low = scene.table_top + thing.half_height
             expected = f"a height of at least {low:.4f} m in the world, or xy alone"
             yield f"{key}.pos", not thing.fixed and thing.pos[2] < low - 1e-6, expected
-        edge = 0.0 if made else thing.footprint
-        if not made and thing.shape == "box" and thing.upright:
-            edge = min(thing.size[:2])
+        edge = 0.0 if thing.fixed and made else thing.footprint
+        if thing.shape == "box" and thing.upright:
+            edge = min(edge, *thing.size[:2])
+        if thing.fixed and thing.pos is not None:
+            continue
         yield from _on_table(scene, f"{key}.xy", thing.xy, (edge, edge))
     for name, place in scene.places.items():
         yield "scene.places", name in scene.objects, "names that no object has"

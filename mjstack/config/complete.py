@@ -1,6 +1,7 @@
 """Complete a composed configuration: terms as dataclasses, and what follows from other values."""
 
 import copy
+import os
 import re
 from dataclasses import fields
 from functools import cache, reduce
@@ -12,7 +13,6 @@ from omegaconf.errors import OmegaConfBaseException
 
 from mjstack.config import schema
 from mjstack.config.fields import accepted, check_fields
-from mjstack.config.session import config_folders
 from mjstack.errors import ConfigError, TermError, require_names
 
 # Terms are untyped in the schema: OmegaConf would not let a command line add one to a typed dict.
@@ -37,7 +37,7 @@ _values: dict[tuple[type, str], Any] = {}  # of terms by their content: most are
 def complete(cfg: schema.Config) -> None:
     """Give every term its type, and fill in the robot and the phases that gates name, in place. A
     term that is null is left out. A MjstackError if a term has an unknown key, lacks one, or a
-    value has the wrong type; or if ``robot.file`` is in none of the folders.
+    value has the wrong type; or if there is no such MJCF file.
     """
     cfg.view = cfg.view.lower()  # YAML's false and true
     for name in vars(cfg.gate).keys() - {field.name for field in fields(cfg.gate)}:
@@ -52,7 +52,7 @@ def complete(cfg: schema.Config) -> None:
     robot.title = robot.title or robot.name
     robot.start = robot.start or list(robot.home)
     robot.ik_joints = robot.ik_joints or [n for n in robot.arm_joints if n not in robot.locked]
-    robot.file = _find_file("robot.file", robot.file, "robot")
+    robot.file = _find_file("robot.file", robot.file)
     _complete_scene(cfg.scene)
     for camera in cfg.scene.cameras.values():
         camera.pose = camera.pose or robot.wrist_camera
@@ -94,7 +94,7 @@ def typed(key: str, node: Any, kind: type) -> Any:
 
 
 def _complete_scene(scene: schema.SceneCfg) -> None:
-    """Find the files of fixed objects, and turn all positions into the world's."""
+    """Find and measure the files of objects, and turn all positions into the world's."""
     check_fields("scene", scene)
     origin = [0.0, 0.0, 0.0]
     if scene.frame == "table":
@@ -104,12 +104,24 @@ def _complete_scene(scene: schema.SceneCfg) -> None:
     def in_world(at: list[float]) -> list[float]:
         return [a + b for a, b in zip(at, origin, strict=False)]
 
+    if any(thing.file for thing in scene.objects.values()):
+        from mjstack.config.mjcf import measure  # loads mujoco
+
+        measure.cache_clear()  # files may have changed
     for name, thing in scene.objects.items():
         key = f"scene.objects.{name}"
-        thing.file = _find_file(f"{key}.file", thing.file, "scene", "task")
+        thing.file = _find_file(f"{key}.file", thing.file)
         if thing.parts or thing.file:
+            size = [1e-4] * 3  # of no account: its parts are what others meet
+            if thing.file and not thing.fixed:
+                size = measure(thing.file, fixed=False).half
+            if thing.size not in ([], size) and (thing.file or thing.fixed):
+                raise ConfigError(f"{key}.size", thing.size, "[], because it has parts or a file")
             thing.shape = "box"
-            thing.size = [1e-4] * 3  # of no account: its parts are what others meet
+            thing.size = size
+        if thing.file is None:
+            thing.friction = thing.friction or [1.0, 0.005, 0.0005]
+            thing.color = thing.color or [0.6, 0.6, 0.6, 1.0]
         if thing.pos is not None:
             thing.pos = in_world(thing.pos)
             thing.xy = thing.pos[:2]
@@ -124,16 +136,11 @@ def _complete_scene(scene: schema.SceneCfg) -> None:
         scene.box.center = in_world(scene.box.center)
 
 
-def _find_file(key: str, file: str | None, *groups: str) -> str | None:
-    """An MJCF file, absolute: below groups of the search path, or the working folder."""
-    if file is None:
-        return None
-    folders = [folder / group for folder in config_folders() for group in groups]
-    paths = dict.fromkeys(str((folder / file).resolve()) for folder in [*folders, Path()])
-    for path in paths:
-        if Path(path).is_file():
-            return path
-    raise ConfigError(key, file, f"an MJCF file; there is no {' and no '.join(paths)}")
+def _find_file(key: str, file: str | None) -> str | None:
+    """An MJCF file, absolute."""
+    if file is not None and not Path(file).is_file():
+        raise ConfigError(key, os.path.abspath(file), "an MJCF file; there is no such file")
+    return file and os.path.abspath(file)
 
 
 def _choose_phases(cfg: schema.Config) -> None:

@@ -4,6 +4,8 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +24,14 @@ SHIPPED = Path(__file__).parents[1] / "policies"  # verified policies that come 
 
 
 def config_content(cfg: Config, without: Iterable[str] = ()) -> dict[str, Any]:
-    """The whole configuration in JSON's types, with the SHA-256 of the robot's file, of each starts
+    """The whole configuration in JSON's types, with the SHA-256 of each MJCF file, of each starts
     file and of the policy in place of its path; a ConfigError if one cannot be read. Some keys at
     its top may be left out.
     """
     config: dict[str, Any] = json.loads(json.dumps(asdict(cfg)))
-    if cfg.robot.file is not None:
-        config["robot"]["file"] = _content("robot.file", cfg.robot.file)
+    for key, file in cfg.files.items():
+        *path, last = key.split(".")
+        reduce(getitem, path, config)[last] = _content(key, file)
     for key in (*_OF_THE_CALL, *without):
         del config[key]
     if cfg.policy is None:  # hashes without one are older than it

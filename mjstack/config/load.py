@@ -64,6 +64,8 @@ _REPLAYED = {
 # Overrides by the key where a choice of a group goes, such as gate.success.reset=jitter
 _CHOICE = re.compile(r"^(?:gate\.\w+\.|job\.)(reset|observation)=(?!null$)[\w,]+$")
 
+_WHOLE = re.compile(r"\$\{([\w.]+)\}")  # an interpolation of a key, alone
+
 # Interpolations: ${NAME:ARGUMENT,...} is the value of a function of these and of the configuration.
 _RESOLVERS: dict[str, Callable] = {
     "steps": _control_steps,
@@ -175,7 +177,9 @@ def compose(overrides: Sequence[str], run_mode: RunMode = RunMode.RUN) -> DictCo
         )
         if run_mode is RunMode.RUN:
             check_added(session.without_hydra(cfg), overrides)
-            _drop_inherited(cfg, loader.files[id(cfg)], overrides)
+            files = [*loader.files[id(cfg)], (Path(), _set_values(overrides))]
+            _drop_inherited(cfg, [values for _, values in files])
+            _locate_files(cfg, files)
             complete_terms(cfg, overrides)
     except (HydraException, OmegaConfBaseException, AssertionError, TypeError, ValueError) as error:
         raise explain(error, overrides) from error
@@ -184,22 +188,44 @@ def compose(overrides: Sequence[str], run_mode: RunMode = RunMode.RUN) -> DictCo
     return cfg
 
 
-def _drop_inherited(
-    cfg: DictConfig, files: Sequence[Mapping[str, object]], overrides: Sequence[str]
-) -> None:
-    """Leave a term, and the check, whose ``func`` a file or an override swaps with the parameters
-    that are given with the new one or after it: those of the other function are not its own.
-    ``files`` are the keys and values of each, in the order of composition.
-    """
+def _set_values(overrides: Sequence[str]) -> dict[str, object]:
+    """Keys and values of overrides."""
     typed: dict[str, object] = {}
     for override in map(parse, own_overrides(overrides)):
         value: Any = None if override.is_delete() else override.value()
         typed |= {override.key_or_group: value}
         typed |= dict(session.list_items(value, f"{override.key_or_group}."))
+    return typed
+
+
+def _locate_files(cfg: DictConfig, files: Sequence[tuple[Path, Mapping[str, object]]]) -> None:
+    """Make the paths of MJCF files absolute: each is relative to the YAML that names it last, or,
+    where an override does, to the working folder. ``files`` are the folder, keys and values of
+    each, in the order of composition.
+    """
+    objects = OmegaConf.select(cfg, "scene.objects", default={})
+    for key in ("robot.file", *(f"scene.objects.{name}.file" for name in objects)):
+        value = OmegaConf.select(cfg, key, throw_on_missing=False)
+        if not isinstance(value, str):
+            continue
+        source = key
+        named = [(folder, values[source]) for folder, values in files if source in values]
+        while named and (match := _WHOLE.fullmatch(str(named[-1][1]))):  # takes another key's value
+            source = match[1]
+            named = [(folder, values[source]) for folder, values in files if source in values]
+        folder = named[-1][0] if named else Path()
+        OmegaConf.update(cfg, key, os.path.abspath(folder / value))
+
+
+def _drop_inherited(cfg: DictConfig, files: Sequence[Mapping[str, object]]) -> None:
+    """Leave a term, and the check, whose ``func`` a file or an override swaps with the parameters
+    that are given with the new one or after it: those of the other function are not its own.
+    ``files`` are the keys and values of each, in the order of composition.
+    """
     functions: dict[str, object] = {}  # by the mapping of their parameters
     params: dict[str, set[str]] = {}
     swapped = set()
-    for source in (*files, typed):
+    for source in files:
         for key, value in source.items():
             term, _, name = key.rpartition(".")
             section = term if term == "task.check" else f"{term}.params"
@@ -243,11 +269,9 @@ def load_saved(path: Path) -> Config:
             if not error.key.endswith(".file"):
                 raise
             raise MjstackError(f"{error} {session.add_folder(path)}") from error
-        files = {"robot.file": cfg.robot.file}
-        files |= {f"scene.objects.{k}.file": thing.file for k, thing in cfg.scene.objects.items()}
         folders = [folder.parent for folder in session.config_folders()]
-        for key, file in files.items():
-            if file is not None and not any(map(Path(file).is_relative_to, folders)):
+        for key, file in cfg.files.items():
+            if not any(map(Path(file).is_relative_to, folders)):
                 advice = session.folder_advice([Path(file).parent])
                 problem = f"{key}={file}: expected a file beside a folder of the search path"
                 raise MjstackError(problem, f"If you trust it, add {advice}")

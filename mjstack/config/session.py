@@ -45,7 +45,7 @@ PROVIDER = "mjstack.search_path"  # of added entries, in a run's .hydra/hydra.ya
 # An override that adds an entry to a mapping by names, of which the schema knows the type
 _ENTRY = re.compile(
     r"\++((?:scene\.(?:objects|places|cameras)|controller\.phases|robot\.(?:placements|servos))"
-    r"\.\w+(?:\.parts\.\w+)?)[.=]"
+    r"\.\w+(?:\.(?:parts|joints)\.\w+)?)[.=]"
 )
 
 _added: ContextVar[tuple[Path, ...]] = ContextVar("search path", default=())
@@ -237,16 +237,18 @@ class _Folders(SearchPathPlugin):
 
 def _compose_once(loader: Any) -> None:
     """Let a loader of Hydra return the composition of an earlier call with the same overrides, and
-    keep in ``loader.files``, by the composition's id, the keys and values of each file behind it.
+    keep in ``loader.files``, by the composition's id, the folder, keys and values of each file
+    behind it.
     """
     load, load_file = loader.load_configuration, loader._load_single_config
     composed: dict[tuple, DictConfig] = {}
-    files: list[dict[str, object]] = []
+    files: list[tuple[Path, dict[str, object]]] = []
     loader.files = {}
 
     def load_one_file(default: Any, repo: Any) -> ConfigResult:
         result = load_file(default, repo)
-        files.append(dict(list_items(result.config)))
+        path = Path(str(result.path).partition("://")[2], default.config_path)
+        files.append((path.parent, dict(list_items(result.config))))
         return result
 
     def load_once(*, overrides: list[str], run_mode: RunMode, **options: Any) -> DictConfig:

@@ -42,13 +42,13 @@ class JointTrajectory:
         knots: Commands, shape ``(nworld, n, nu)``.
         weights: Weights of the knots of each step's phase, shape ``(steps, k)``.
         numbers: Which knots those are, shape ``(steps, k)``, int64.
-        waypoint_error: Largest distance [m] from a target at any knot, shape ``(nworld,)``.
+        ik_error: Largest distance [m] from a target at any knot, shape ``(nworld,)``.
     """
 
     knots: Tensor
     weights: Tensor
     numbers: Tensor
-    waypoint_error: ndarray
+    ik_error: ndarray
 
     def to(self, device: torch.device, dtype: torch.dtype) -> "JointTrajectory":
         """The same trajectory on a device."""
@@ -129,17 +129,6 @@ class OpenLoopPlanner:
         if nworld > 1:
             self._plans.append((sources_xy.copy(), trajectory))
         return trajectory
-
-    def path_error(self) -> float:
-        """Largest distance [m] of the nominal plan's grasp point from its straight path."""
-        trajectory = self.plan(self._xy[None])
-        (ends,) = self._targets(self._xy[None])
-        worst = 0.0
-        for step, (number, s) in enumerate(self._progress()):
-            start, end = ends[number : number + 2]
-            at = self.ik.grasp_point(trajectory.command(step)[0].numpy())
-            worst = max(worst, float(np.linalg.norm(at - (start + s * (end - start))[:3])))
-        return worst
 
     def _solve_nominal(self, q: ndarray, target: ndarray) -> tuple[ndarray, ndarray]:
         """Solve one world with mink."""

@@ -12,7 +12,7 @@ from mjstack.envs import Env
 from mjstack.episodes.motion import draw_seen, world_fields
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.recorder import Snapshots, WorldRecorder
-from mjstack.episodes.rollout import Episode, Observer, State
+from mjstack.episodes.rollout import Episode, Hook, Observer, State
 from mjstack.episodes.stage import Stage, TextHook
 from mjstack.managers.episode import required_fields
 from mjstack.managers.view import offers
@@ -39,13 +39,15 @@ class NominalRun:
         sim: Its world.
         episode: The episode.
         world: Its recording.
-        states: At the ends of the phases that gate *parity* compares, by step.
+        states: At the ends of phases, and of steps that gate *parity* compares, by step.
+        targets: Joint targets there, as the driver gave them, before servos' ranges bound them.
     """
 
     sim: Simulation
     episode: Episode
     world: WorldRecorder
     states: dict[int, State]
+    targets: dict[int, np.ndarray]
 
 
 @dataclass(eq=False, kw_only=True, slots=True)
@@ -114,10 +116,20 @@ class Run:
         fields = required_fields(reset)
         sim = make_simulation(stage.model, self.cfg, 1, backend=Backend.native, fields=fields)
         world = WorldRecorder()
-        snapshots = Snapshots(self.parity_steps.values())
+        ends = {phase.stop - 1 for phase in stage.phases}
+        snapshots = Snapshots(ends.union(self.parity_steps.values()))
+        actions: list[np.ndarray] = []
+        sent = Hook(lambda step, sim: actions.append(sent.env.action[0].double().numpy().copy()))
         viewers = () if "parity" in self.cfg.gates else self.viewers
-        episode = stage.play(sim, reset, [*viewers, world, snapshots])
-        return NominalRun(sim=sim, episode=episode, world=world, states=snapshots.states)
+        episode = stage.play(sim, reset, [*viewers, world, snapshots, sent])
+        states = snapshots.states
+        modes = [(t.params.get("joints"), t.params.get("mode")) for t in stage.action.values()]
+        absolute = modes == [("arm", "absolute"), ("gripper", "absolute")]
+        targets = {
+            step: actions[step] if absolute else state.ctrl[0][stage.index.ctrl]
+            for step, state in states.items()
+        }
+        return NominalRun(sim=sim, episode=episode, world=world, states=states, targets=targets)
 
     @property
     def parity_steps(self) -> dict[str, int]:

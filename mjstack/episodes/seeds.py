@@ -181,7 +181,8 @@ def _worlds(tally: EpisodeTally, run: Run) -> Worlds:
             x, _ = objects[name]
             ways = [(world.label, world.failed, world.qpos[:, x : x + 2]) for world in moving]
         xy = places[plotted, :2]
-        worlds.maps.append(Map(title=name, xy=xy, table=table, ways=ways, marks=marks))
+        base = run.stage.index.base
+        worlds.maps.append(Map(title=name, xy=xy, table=table, ways=ways, marks=marks, base=base))
     return worlds
 
 
@@ -200,7 +201,7 @@ def _record(stage: Stage, batch: Batch, monitor: FailureMonitor | None) -> Episo
             "qpos": sim.qpos.cpu().numpy().copy(),
             "start_qpos": episode.start,
             **{f"value.{name}": values for name, values in episode.values.items()},
-            "measured.waypoint_error_m": episode.waypoint_error,
+            "measured.ik_error_m": episode.ik_error,
             "measured.peak_contacts": sim.peak_contacts.cpu().numpy().copy(),
             "measured.peak_constraint_rows": sim.peak_constraints.cpu().numpy().copy(),
             **({"start_places": np.stack([*places.values()], 1)} if places else {}),

@@ -69,7 +69,8 @@ class CollectPlan:
         gib = cfg.job.buffer_gib
         provenance = run_provenance(stage)
         # They differ between calls that make the same episodes.
-        del provenance["date"], provenance["config_sha256"]
+        for key in ("date", "config_sha256", "files"):
+            provenance.pop(key, None)
         spec = make_spec(env, cfg, provenance)
         step = 4 * sum(column.dim for column in spec.features.values() if column.dtype == "float32")
         if spec.videos:
@@ -218,7 +219,7 @@ def make_spec(env: Env, cfg: Config, provenance: Mapping[str, Any]) -> DatasetSp
     config = episode_config(cfg)
     job: CollectJobCfg = cfg.job
     units = joint_units(env)
-    lerobot = LerobotUnits(env.index.n_arm, env.index.ctrl_range).units
+    lerobot = LerobotUnits(env.index.n_arm, env.index.servo_range).units
     positions = Feature(
         dtype="float32",
         names=tuple(f"{name}.pos" for name in cfg.robot.joints),

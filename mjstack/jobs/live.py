@@ -26,6 +26,7 @@ _FIRST = 16  # worlds that are shown at first
 _TEXT = 200  # characters of a text, at most
 _GRACE = 3.0  # s in which a page that is loaded anew comes back
 _COLORS = ("#4478b8", "#c93434", "#1a7f4b", "#9a6700", "#7b4ab8", "#1f8a99", "#b8447f", "#656d76")
+_GREY = (0.6, 0.6, 0.6)
 _HEIGHT = "height above the table [mm]"
 _REAL = "real time"
 _FAST = "as fast as it runs"
@@ -225,7 +226,8 @@ class LiveView(Observer):
         for number, name in enumerate(values):
             color = _COLORS[number % len(_COLORS)]
             if title == _HEIGHT:  # the object's own
-                rgb = (round(255 * part) for part in self.env.cfg.scene.objects[name].color[:3])
+                rgba = self.env.cfg.scene.objects[name].color or _GREY
+                rgb = (round(255 * part) for part in rgba[:3])
                 color = f"rgb({', '.join(map(str, rgb))})"
             series.append({"label": name, "stroke": color, "width": 2})
         self._plots[key] = self._server.gui.add_uplot(

@@ -348,6 +348,7 @@ def run_provenance(stage: Stage) -> Provenance:
         "config_sha256": config_hash(config),
         "model_sha256": hashlib.sha256(model_bytes(stage.model).hex().encode()).hexdigest(),
         "starts_schema": SCHEMA,
+        **({"files": stage.cfg.files} if stage.cfg.files else {}),
         **({"unused_terms": stage.cfg.unused_terms} if stage.cfg.unused_terms else {}),
         **({"policy": config["policy"]} if stage.cfg.policy else {}),
     }

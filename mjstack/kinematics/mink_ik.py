@@ -7,10 +7,11 @@ import mujoco
 import numpy as np
 from numpy import ndarray
 
+from mjstack.config.mjcf import compile_scene
 from mjstack.config.schema import ModelCfg, RobotCfg
 from mjstack.errors import ConfigError
 from mjstack.robots import robot_spec
-from mjstack.robots.guest import compile_scene
+from mjstack.robots.guest import mujoco_errors
 from mjstack.scene.index import locked_home
 
 _POSTURE_COST = 1e-3  # pulls the redundant joints home; moves the grasp point by micrometres
@@ -50,9 +51,10 @@ class GraspIk:
         """Compile the robot without a scene, from its description ``model``; ``tolerance`` is the
         distance that counts as reached [m].
         """
-        spec = robot_spec(robot, model)
-        spec.compiler.discardvisual = True
-        self.model = compile_scene(spec)
+        with mujoco_errors(robot.name):
+            spec = robot_spec(robot, model)
+            spec.compiler.discardvisual = True
+            self.model = compile_scene(spec)
         self.tolerance = tolerance
         joints = [self.model.joint(name).id for name in robot.joints]
         for key in ("home", "gripper_open", "gripper_closed"):

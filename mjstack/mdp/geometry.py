@@ -64,7 +64,7 @@ def above_table(env: EnvView, name: str) -> Tensor:
     """Height of an object's lowest point over the table [m], ``(nworld,)``; only to be read."""
     pose = pose_w(env, name)
     thing = env.cfg.scene.objects[name]
-    low = lowest_point(pose[:, :3], pose[:, 3:], thing.shape, thing.size)
+    low = lowest_point(pose[:, :3], pose[:, 3:], *thing.form)
     return low - env.cfg.scene.table_top
 
 

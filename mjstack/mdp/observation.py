@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from mjstack.errors import require_names
 from mjstack.managers.term import shared
 from mjstack.managers.view import EnvView, ignores_success, offers
 from mjstack.mdp.geometry import jaw_forces, place_xy, pose_w, robot
@@ -134,6 +135,22 @@ def object_velocity(env: EnvView, *, object: str) -> Tensor:
     if object in env.index.fixed:
         return env.index.constant([0.0] * 6, env.sim.qvel).expand(env.nworld, -1)
     return env.sim.part("qvel", env.index.object_columns(object)[1])
+
+
+@ignores_success
+@offers("observation term")
+def fixture_pos(env: EnvView, *, joint: str) -> Tensor:
+    """Position of a fixture's joint [rad, m], shape ``(nworld,)``. Not to be written into."""
+    require_names("joint of a fixture", [joint], env.index.joints)
+    return env.sim.part("qpos", env.index.joints[joint][0])
+
+
+@ignores_success
+@offers("observation term")
+def fixture_vel(env: EnvView, *, joint: str) -> Tensor:
+    """Velocity of a fixture's joint [rad/s, m/s], shape ``(nworld,)``. Not to be written into."""
+    require_names("joint of a fixture", [joint], env.index.joints)
+    return env.sim.part("qvel", env.index.joints[joint][1])
 
 
 @_in("N")

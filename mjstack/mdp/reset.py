@@ -1,7 +1,7 @@
 """Reset terms: they write starts into masked worlds, from the model's nominal values."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -9,7 +9,7 @@ from typing_extensions import override
 
 from mjstack.config.fields import NotNegative, Repeats
 from mjstack.config.functions import offered
-from mjstack.errors import ParameterError
+from mjstack.errors import ParameterError, require_names
 from mjstack.managers.view import EnvView, offers, random_uniform, uses_fields, zero_rows
 from mjstack.math import quat_from_yaw, quat_mul
 from mjstack.mdp.geometry import Pose, robot, write_robot
@@ -164,6 +164,35 @@ class RandomizeObjects:
         candidates = torch.cat((first[..., 1:], more), dim=2).unflatten(2, (-1, 2))
         offsets, _ = self._placement.choose(candidates)
         _write_objects(env, mask, self._poses, offsets, self._yaw * first[..., 0])
+
+
+@offers("reset term")
+class FixtureJoints:
+    """Puts joints of fixtures anywhere in ranges, at rest."""
+
+    label = "reset.fixtures"
+
+    def __init__(self, env: EnvView, *, joints: Mapping[str, Sequence[float]]) -> None:
+        """Take the smallest and largest position of each joint [rad, m], by its name."""
+        require_names("joints: joint of a fixture", joints, env.index.joints)
+        model = env.sim.model
+        for name, ends in joints.items():
+            joint = model.joint(name).id
+            span = model.jnt_range[joint] if model.jnt_limited[joint] else (-math.inf, math.inf)
+            if len(ends) != 2 or not span[0] <= ends[0] <= ends[1] <= span[1]:
+                expected = f"two numbers in {span[0]:g} to {span[1]:g}, the smaller one first"
+                raise ParameterError(f"joints.{name}", list(ends), expected)
+        places = [env.index.joints[name] for name in joints]
+        self._qpos, self._qvel = (Columns(at, env.device) for at in zip(*places, strict=True))
+        low, high = env.sim.qpos.new_tensor(list(joints.values())).unbind(1)
+        self._middle = 0.5 * (low + high)
+        self._half = 0.5 * (high - low)
+
+    def __call__(self, env: EnvView, mask: Tensor) -> None:
+        """Write qpos and qvel."""
+        draws = random_uniform(env, self.label, len(self._half))
+        self._qpos.write_masked(env.sim.qpos, mask, self._middle + self._half * draws)
+        self._qvel.write_masked(env.sim.qvel, mask, torch.zeros_like(draws))
 
 
 @uses_fields("body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0")

@@ -1,6 +1,5 @@
 """A robot as a guest in a scene: what of its file comes along, and what stays behind."""
 
-import warnings
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -8,16 +7,27 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from mjstack.config.mjcf import (
+    FREE,
+    attach_guest,
+    compile_scene,
+    describe,
+    fix_masses,
+    option_names,
+    read_object,
+    scenery,
+)
 from mjstack.config.schema import RobotCfg
-from mjstack.errors import MjstackError, require_names
+from mjstack.errors import ConfigError, MjstackError, require_names
 
 WORLD = "world"  # MuJoCo's name of the body that never moves
 
 # Figures of the solver that the group `solver` leaves to the robot's file where they are null
 _SOLVER = ("iterations", "ls_iterations", "impratio", "tolerance")
 _CONFIGURED = (*_SOLVER, "timestep", "integrator", "cone")  # by groups timing and solver
-_FREE = mujoco.mjtJoint.mjJNT_FREE
-_PREFIX = "robot_"
+SAG = 0.002  # m: how far off its target a hand is of which gravity, or a report, takes no notice
+_WRAPS = (mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER)
+PREFIX = "robot_"
 _NAMED = ("geoms", "bodies", "cameras")  # elements that a scene has too
 _NAMING = {  # elements with the names of others
     "pairs": ("geomname1", "geomname2"),
@@ -33,7 +43,7 @@ _FLAGS = {"disableflags": mujoco.mjtDisableBit, "enableflags": mujoco.mjtEnableB
 
 def as_guest(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) -> mujoco.MjSpec:
     """A fresh scene with the robot in it. Its compiler settings act on its bodies alone, and its
-    options, sizes, keyframes, lights, floors and free bodies stay behind.
+    options, sizes, keyframes, lights, floors, free and mocap bodies stay behind.
 
     Args:
         spec: The robot; it is changed in place, and goes on to live in the scene.
@@ -44,7 +54,13 @@ def as_guest(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) ->
     fresh.modelname = spec.modelname
     for element in _strangers(spec, robot):
         spec.delete(element)
-    bodies = {body.name for body in spec.bodies}
+    bodies = [body.name for body in spec.bodies]
+    for pair in robot.exclude:
+        if not isinstance(pair, list) or len(pair) != 2 or len({*map(str, pair)}) != 2:
+            expected = "pairs of bodies, such as [[world, link1]]"
+            raise ConfigError("robot.exclude", robot.exclude, expected)
+        require_names("robot.exclude: body", map(str, pair), bodies)
+        spec.add_exclude(bodyname1=str(pair[0]), bodyname2=str(pair[1]))
     for camera in [c for c in spec.cameras if c.targetbody and c.targetbody not in bodies]:
         spec.delete(camera)
     geoms = {geom.name for geom in spec.geoms}
@@ -53,37 +69,63 @@ def as_guest(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) ->
             spec.delete(pair)
     _rename(spec, robot, reserved)
     if spec.compiler.settotalmass > 0.0:  # it counts all bodies of a compilation
-        _fix_masses(spec)
-    for name in _fields(spec.option):
-        if name in _SOLVER:
-            setattr(fresh.option, name, getattr(spec.option, name))
-        else:
-            setattr(spec.option, name, getattr(fresh.option, name))
-    with _without_prefix():
-        base = fresh.worldbody.add_frame(pos=robot.base.pos, quat=robot.base.quat)
-        fresh.attach(spec, frame=base, prefix="")
+        fix_masses(spec)
+    for name in _SOLVER:
+        setattr(fresh.option, name, getattr(spec.option, name))
+    base = fresh.worldbody.add_frame(pos=robot.base.pos, quat=robot.base.quat)
+    attach_guest(fresh, spec, base, "")
     return fresh
 
 
-def compile_scene(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compile a scene with a guest."""
-    with _without_prefix():
-        return spec.compile()
+def compile_robot_scene(spec: mujoco.MjSpec, robot: RobotCfg) -> mujoco.MjModel:
+    """Compile a scene with a robot, whose gravity is compensated as its profile says."""
+    model = compile_scene(spec)
+    bodies = [low for name in robot.joints for low in _below(_tree(spec.joint(name).parent))]
+    compensated = any(body.gravcomp for body in bodies)
+    if robot.gravcomp == "auto":
+        changed = not compensated and gravity_sag(model, robot) > SAG
+    else:
+        changed = robot.gravcomp or compensated
+    if changed:
+        for body in bodies:
+            body.gravcomp = float(bool(robot.gravcomp))
+        model = compile_scene(spec)
+    return model
+
+
+def gravity_sag(model: mujoco.MjModel, robot: RobotCfg) -> float:
+    """How far off its target at home gravity moves the grasp point where nothing compensates it
+    [m], by the stiffness of the arm's servos.
+    """
+    data = mujoco.MjData(model)
+    for name, value in zip(robot.joints, robot.home, strict=True):
+        data.joint(name).qpos = value
+    mujoco.mj_forward(model, data)
+    dofs = [int(model.joint(name).dofadr[0]) for name in robot.arm_joints]
+    stiffness = [-model.actuator(name).biasprm[1] for name in robot.arm_joints]
+    lowered = (data.qfrc_spring - data.qfrc_bias)[dofs] / stiffness
+    return float(np.linalg.norm(grasp_jacobian(data, robot)[:, dofs] @ lowered))
+
+
+def grasp_jacobian(data: mujoco.MjData, robot: RobotCfg) -> np.ndarray:
+    """The grasp point's translational Jacobian, shape ``(3, nv)``."""
+    jac = np.zeros((2, 3, data.model.nv))
+    for part, site in zip(jac, robot.grasp_sites, strict=True):
+        mujoco.mj_jacSite(data.model, data, part, None, data.site(site).id)
+    return jac.mean(axis=0)
 
 
 @contextmanager
-def _without_prefix() -> Iterator[None]:
-    """Silence MuJoCo's warning that names without a prefix may spoil a file that is written: none
-    is written.
-    """
-    hook = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda text: None)
+def mujoco_errors(robot: str) -> Iterator[None]:
+    """Raise MuJoCo's errors as those of a robot, alone or in a scene."""
     try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "Attaching a spec with an empty prefix")
-            yield
-    finally:
-        mujoco.set_mju_user_warning(hook)
+        yield
+    except ValueError as error:
+        problem = ", ".join(str(error).removeprefix("Error: ").splitlines())
+        raise MjstackError(
+            f"robot {robot}: {problem}. Correct the robot's file or the scene, whose names (floor,"
+            " table and the objects) the robot cannot have."
+        ) from error
 
 
 def left_behind(
@@ -97,8 +139,32 @@ def left_behind(
         model: The compiled scene.
         reserved: As of `as_guest`.
     """
+    strangers = _strangers(spec, robot)
+    yield from _options_left(spec, model)
+    if robot.gravcomp != "auto" or not any(body.gravcomp for body in spec.bodies):
+        state = "on" if model.body_gravcomp.any() else "off"
+        sag = f"without it the hand sags {1e3 * gravity_sag(model, robot):.1f} mm at home"
+        value = f"robot.gravcomp={robot.gravcomp}".lower()
+        yield f"gravity compensation {state} ({value}; auto: from {1e3 * SAG:g} mm on); {sag}"
+    if strangers:
+        yield f"left out: {describe(strangers)}"
+    names = set(_clashes(spec, reserved)) - {e.name for e in strangers}
+    if names:
+        yield f"renamed to {PREFIX}NAME: {', '.join(sorted(names))}"
+
+
+def object_left_behind(file: str, model: mujoco.MjModel, *, fixed: bool) -> Iterator[str]:
+    """List requests of an object's file that the compiled scene does not follow, a line each."""
+    spec, left = read_object(file, fixed=fixed)
+    yield from _options_left(spec, model)
+    if left:
+        yield f"left out: {left}"
+
+
+def _options_left(spec: mujoco.MjSpec, model: mujoco.MjModel) -> Iterator[str]:
+    """List options and flags of a file that the compiled scene does not have, a line each."""
     fresh = mujoco.MjSpec().option
-    for name in _fields(fresh):
+    for name in option_names(fresh):
         asked, default, there = (getattr(o, name) for o in (spec.option, fresh, model.opt))
         if name in _CONFIGURED or np.array_equal(asked, default) or np.array_equal(asked, there):
             continue
@@ -112,30 +178,22 @@ def left_behind(
                 yield f"flags {', '.join(bits)}"
         else:
             yield f"option {name} {_text(asked)}: the scene has {_text(there)}"
-    strangers = [
-        f"{type(e).__name__[3:].lower()} {e.name}".strip() for e in _strangers(spec, robot)
-    ]
-    if strangers:
-        yield f"left out: {', '.join(sorted(set(strangers)))}"
-    names = set(_clashes(spec, reserved)) - {e.name for e in _strangers(spec, robot)}
-    if names:
-        yield f"renamed to {_PREFIX}NAME: {', '.join(sorted(names))}"
 
 
 def _strangers(spec: mujoco.MjSpec, robot: RobotCfg) -> list[Any]:
     """Elements of the file that are not the robot: all outside of ``robot.root`` if that is given,
-    else floors, lights, and bodies that are free; and keyframes, which fit no scene.
+    else floors, lights, and bodies that are free or mocap; and keyframes, which fit no scene.
     """
     world = spec.worldbody
-    planes = [geom for geom in world.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]
     joints = {name: spec.joint(name) for name in robot.joints}
     trees = {_tree(joint.parent).name for joint in joints.values()}
     free = [
         body
         for body in world.bodies
-        if body.name not in trees and any(j.type == _FREE for b in _below(body) for j in b.joints)
+        if body.name not in trees
+        and any(b.mocap or any(j.type == FREE for j in b.joints) for b in _below(body))
     ]
-    out = [*spec.keys, *world.lights, *planes, *free]
+    out = [*scenery(spec), *free]
     if robot.root:
         require_names("robot.root: body", [robot.root], [body.name for body in spec.bodies])
         root = spec.body(robot.root)
@@ -173,7 +231,9 @@ def _clashes(spec: mujoco.MjSpec, reserved: Collection[str]) -> list[str]:
 def _rename(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) -> None:
     """Put a prefix in front of names that the scene needs, and wherever they are named."""
     clashes = _clashes(spec, reserved)
-    profile = {*robot.joints, *robot.jaw_bodies, *robot.grasp_sites, robot.approach_body}
+    paths = [wrap for tendon in spec.tendons for wrap in tendon.path]
+    wraps = [wrap.target.name for wrap in paths if wrap.type in _WRAPS]  # they keep their names
+    profile = {*robot.joints, *robot.jaw_bodies, *robot.grasp_sites, robot.approach_body, *wraps}
     if names := profile & set(clashes):
         raise MjstackError(
             f"robot {robot.name}: the scene has {', '.join(sorted(names))} too, expected other"
@@ -183,27 +243,8 @@ def _rename(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) -> 
         for element in getattr(spec, kind):
             for field in ("name", *_NAMING.get(kind, ())):
                 if getattr(element, field) in clashes:
-                    setattr(element, field, _PREFIX + getattr(element, field))
-
-
-def _fields(option: object) -> list[str]:
-    return [name for name in dir(option) if not name.startswith("_")]
+                    setattr(element, field, PREFIX + getattr(element, field))
 
 
 def _text(value: Any) -> str:
     return " ".join(f"{number:g}" for number in np.ravel(value))
-
-
-def _fix_masses(spec: mujoco.MjSpec) -> None:
-    """Give bodies the masses and inertias that they have when the robot is compiled alone."""
-    alone = spec.copy()
-    alone.compiler.fusestatic = False  # the same bodies
-    model = alone.compile()
-    for body, twin in zip(spec.bodies[1:], alone.bodies[1:], strict=True):
-        body.explicitinertial = True
-        body.mass = model.body_mass[twin.id]
-        for name in ("inertia", "ipos", "iquat"):
-            setattr(body, name, getattr(model, f"body_{name}")[twin.id])
-        body.fullinertia = [np.nan, *[0.0] * 5]  # none
-    spec.compiler.settotalmass = -1.0
-    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO

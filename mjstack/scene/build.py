@@ -4,16 +4,25 @@ set before compilation.
 
 import itertools
 import math
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
 import mujoco
 import numpy as np
 
+from mjstack.config.mjcf import (
+    attach_guest,
+    fix_masses,
+    free_body,
+    measure,
+    read_object,
+    set_range,
+)
 from mjstack.config.schema import BoxCfg, CameraCfg, Config, ObjectCfg, SceneCfg
-from mjstack.errors import ConfigError, MjstackError, UnknownName
-from mjstack.robots import read_mjcf, robot_spec
-from mjstack.robots.guest import WORLD, compile_scene
+from mjstack.errors import ConfigError, UnknownName, require_names
+from mjstack.robots import robot_spec
+from mjstack.robots.guest import WORLD, compile_robot_scene, mujoco_errors
 
 TABLE = "table"
 CAPSULE_TURN = np.array([math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0])
@@ -33,15 +42,12 @@ def build_model(cfg: Config, *, visuals: bool = False) -> mujoco.MjModel:
     Raises:
         MjstackError: The robot's file does not fit the scene, such as one with a geom named table.
     """
-    spec = robot_spec(cfg.robot, cfg.model, scene_names(cfg.scene))
-    try:
-        return build_scene(spec, cfg, visuals=visuals)
-    except ValueError as error:
-        problem = ", ".join(str(error).removeprefix("Error: ").splitlines())
-        raise MjstackError(
-            f"robot {cfg.robot.name} in scene {cfg.scene.name}: {problem}. Correct the robot's file"
-            " or the scene, whose names (floor, table and the objects) the robot cannot have."
-        ) from error
+    with mujoco_errors(f"{cfg.robot.name} in scene {cfg.scene.name}"):
+        spec = robot_spec(cfg.robot, cfg.model, scene_names(cfg.scene))
+        model = build_scene(spec, cfg, visuals=visuals)
+    for friction in (model.geom_friction, model.pair_friction):  # as contacts have it
+        friction[:] = friction.clip(min=mujoco.mjMINMU)  # MJWarp warns of less
+    return model
 
 
 def scene_names(scene: SceneCfg) -> set[str]:
@@ -51,16 +57,25 @@ def scene_names(scene: SceneCfg) -> set[str]:
 
 
 def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> mujoco.MjModel:
-    """Add the scene to a robot and compile it.
+    """Add the scene to a robot and compile it; arguments as of `add_scene`.
+
+    Returns:
+        The compiled model; its ``qpos0`` has the objects at their nominal positions.
+    """
+    add_scene(spec, cfg, visuals=visuals)
+    model = compile_robot_scene(spec, cfg.robot)
+    _require_clear(model, cfg.scene)
+    return model
+
+
+def add_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> None:
+    """Add the scene to a robot.
 
     Args:
         spec: The robot; it is changed in place.
         cfg: Table, objects and perhaps a box, the physics timestep, the solver's settings (``None``
             keeps the robot file's own), and the jaws, whose force on each object a sensor measures.
         visuals: Keep geoms that only pictures need, and add a disc for each place.
-
-    Returns:
-        The compiled model; its ``qpos0`` has the objects at their nominal positions.
     """
     scene = cfg.scene
     solver = cfg.solver
@@ -96,13 +111,14 @@ def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> m
         pairs += [(WORLD, name) for name in scene.objects]
         pairs += itertools.combinations(scene.objects, 2)
     body = mujoco.mjtObj.mjOBJ_BODY
+    trees = {n: mujoco.mjtObj.mjOBJ_XBODY for n, thing in scene.objects.items() if thing.file}
     for first, second in pairs:  # the net contact force [N]: 3 numbers, world frame
         spec.add_sensor(
             name=force_sensor(first, second),
             type=mujoco.mjtSensor.mjSENS_CONTACT,
-            objtype=body,
+            objtype=trees.get(first, body),
             objname=first,
-            reftype=body,
+            reftype=trees.get(second, body),
             refname=second,
             intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), _NETFORCE, 1],
         )
@@ -130,9 +146,6 @@ def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> m
         spec.visual.quality.shadowsize = 1024  # without a GPU, MuJoCo's 4096 doubles the time
     else:
         spec.compiler.discardvisual = True
-    model = compile_scene(spec)
-    _require_clear(model, scene)
-    return model
 
 
 def force_sensor(first: str, second: str) -> str:
@@ -153,24 +166,58 @@ def _add_object(spec: mujoco.MjSpec, name: str, thing: ObjectCfg, top: float) ->
     have its name; geoms of parts and what comes from a file begin with it.
     """
     height = top + thing.half_height if thing.pos is None else thing.pos[2]
-    body = spec.worldbody.add_body(name=name, pos=[*thing.xy, height], quat=thing.turned)
+    pose: dict[str, Any] = {"pos": [*thing.xy, height], "quat": thing.turned}
+    if thing.file is not None:
+        _attach_file(spec, name, thing, pose)
+        return
+    body = spec.worldbody.add_body(name=name, **pose)
     if not thing.fixed:
         body.add_freejoint(name=name)
     surface: dict[str, Any] = {"friction": thing.friction, "rgba": thing.color}
     if thing.mass is not None:
         surface["mass"] = thing.mass / max(1, len(thing.pieces))
+    elif thing.density is not None:
+        surface["density"] = thing.density
     for suffix, piece in thing.pieces.items():
         size = [*piece.size, 0.0, 0.0][:3]
         geom = _add_geom(body, name + suffix, piece.shape, size=size, pos=piece.pos, **surface)
         geom.quat = piece.turned
         if piece.shape == "capsule":
             mujoco.mju_mulQuat(geom.quat, piece.turned, CAPSULE_TURN)
-    if thing.file is not None:
-        key = f"scene.objects.{name}.file"
-        child = read_mjcf(thing.file, f"Correct the file ({key})")
-        if child.joints:
-            raise ConfigError(key, thing.file, "a file without joints, because it is fixed")
-        spec.attach(child, frame=body.add_frame(), prefix=f"{name}_")
+
+
+def _attach_file(spec: mujoco.MjSpec, name: str, thing: ObjectCfg, pose: Mapping[str, Any]) -> None:
+    """Add an object from a file, which moves about the middle of its box, or is fixed, with joints
+    of the file.
+    """
+    assert thing.file is not None
+    if thing.fixed:
+        child, _ = read_object(thing.file, fixed=True)
+        child.fuse_static()
+    else:
+        center = measure(thing.file, fixed=False).center
+        child = free_body(thing.file, name, -center, thing.density)
+        if thing.mass is not None:
+            child.compiler.settotalmass = thing.mass
+            fix_masses(child)
+    for geom in child.geoms:
+        if thing.friction is not None:
+            geom.friction = thing.friction
+        if thing.color is not None:
+            geom.rgba = thing.color
+            geom.material = ""
+    known = [joint.name for joint in child.joints]
+    require_names(f"scene.objects.{name}.joints: joint", thing.joints, known)
+    for joint, values in thing.joints.items():
+        if values.damping is not None:
+            child.joint(joint).damping[0] = values.damping
+        if values.range is not None:
+            set_range(child.joint(joint), values.range)
+    if thing.fixed:
+        body = spec.worldbody.add_body(name=name, **pose)
+        attach_guest(spec, child, body.add_frame(), f"{name}_")
+    else:
+        attach_guest(spec, child, spec.worldbody.add_frame(**pose), "")
 
 
 def _require_clear(model: mujoco.MjModel, scene: SceneCfg) -> None:

@@ -51,8 +51,11 @@ class SceneIndex:
         robot_qvel: qvel addresses in the same order.
         robot_range: Joint limits in the same order [rad, m], shape ``(n, 2)``.
         ctrl: Actuator indices in the same order.
-        ctrl_range: Limits of the joint targets in the same order, shape ``(n, 2)``.
+        ctrl_range: Limits of the joint targets in the same order, of `joint_limits`, shape
+            ``(n, 2)``.
+        servo_range: What the file's servos take, which LeRobot's units count in, shape ``(n, 2)``.
         n_arm: How many of them are the arm's.
+        base: x and y of the body that carries the arm, or, on the world, of its first one [m].
         grasp_sites: The two site indices whose midpoint is the grasp point.
         object_qpos: First qpos address of every object that moves, in the scene's order.
         object_qvel: First qvel address of each of them.
@@ -61,6 +64,7 @@ class SceneIndex:
         fixed: Position [m] and quaternion of every object that does not.
         bodies: Body index of every object.
         geoms: Geom indices of every object.
+        joints: qpos and qvel address of every hinge and slide of a fixture, by its name.
         jaw_force: First sensordata address of each jaw's force on an object (3 numbers), by the
             object's name.
         jaw_columns: All numbers of these forces, side by side in sensordata, by the object's name.
@@ -72,14 +76,24 @@ class SceneIndex:
         joints = [model.joint(name).id for name in robot.joints]
         self._robot = robot
         self._tensors: dict[tuple[torch.device, torch.dtype], RobotTensors] = {}
-        narrowest = min([robot.closed_width, *(thing.width for thing in scene.free.values())])
+        narrowest = min([robot.closed_width, *(thing.grip_width for thing in scene.free.values())])
         self._closed = gripper_targets(model, robot, [narrowest])[0]
         self.robot_qpos = model.jnt_qposadr[joints]
         self.robot_qvel = model.jnt_dofadr[joints]
         self.robot_range = model.jnt_range[joints]
         self.ctrl = np.array([model.actuator(name).id for name in robot.joints])
-        self.ctrl_range = model.actuator_ctrlrange[self.ctrl]
+        self.servo_range = model.actuator_ctrlrange[self.ctrl]
+        self.ctrl_range = np.stack(joint_limits(model, robot.joints), axis=1)
+        for name, (low, high) in zip(robot.joints, self.ctrl_range, strict=True):
+            if not low < high:
+                expected = f"one that meets its range {model.joint(name).range.tolist()}"
+                span = model.actuator(name).ctrlrange.tolist()
+                raise ConfigError(f"ctrlrange of joint {name}", span, expected)
         self.n_arm = len(robot.arm_joints)
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        first = model.jnt_bodyid[joints[0]]
+        self.base = data.xpos[model.body_parentid[first] or first, :2].tolist()
         self.grasp_sites = [model.site(name).id for name in robot.grasp_sites]
         self.objects = {
             name: (int(model.joint(name).qposadr[0]), int(model.joint(name).dofadr[0]))
@@ -94,8 +108,14 @@ class SceneIndex:
             if name not in self.objects
         }
         self.geoms = {
-            name: np.flatnonzero(model.geom_bodyid == body).tolist()
+            name: np.flatnonzero(model.body_rootid[model.geom_bodyid] == body).tolist()
             for name, body in self.bodies.items()
+        }
+        fixtures = [self.bodies[name] for name in self.fixed]
+        hung = np.isin(model.body_rootid[model.jnt_bodyid], fixtures)
+        self.joints = {
+            model.joint(n).name: (int(model.jnt_qposadr[n]), int(model.jnt_dofadr[n]))
+            for n in np.flatnonzero(hung & (model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE)))
         }
         self._constants: dict[tuple, Tensor] = {}
         host = torch.device("cpu")  # side by side, so that no device has anything of them

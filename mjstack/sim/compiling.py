@@ -56,13 +56,17 @@ def compile_step(
 
 def _stages(m: mjw.Model, plan: StepPlan) -> list[Stage]:
     """Stages of a step: collision, which shares no module with the others, then the slowest."""
-    rows = constraints if plan.name == "fused" else mjw
-    stages: list[Stage] = [rows.collision, mjw.sensor_acc, rows.solve, rows.make_constraint]
+    source = constraints if plan.name == "fused" else mjw
+    rows: list[Stage] = [mjw.make_constraint]
+    if plan.name == "fused" and not constraints.why_not_rows(m):
+        rows = [constraints.contact_rows, constraints.noncontact_rows]
+    stages: list[Stage] = [source.collision, mjw.sensor_acc, source.solve, *rows]
     stages += [mjw.sensor_pos, mjw.sensor_vel]
     stages.append(lambda m, d: mjw.reset_data(m, d, reset=wp.zeros(1, dtype=bool)))
     if plan.smooth:
         return [*stages, smooth.positions, smooth.forces, smooth.advance]
     stages += [mjw.kinematics, mjw.com_pos, mjw.crb, mjw.transmission, mjw.fwd_velocity]
+    stages += [mjw.tendon, mjw._src.smooth.tendon_armature]
     stages += [mjw.fwd_actuation, partial(mjw.fwd_acceleration, factorize=True)]
     if m.opt.integrator == mjw.IntegratorType.IMPLICITFAST:
         stages.append(mjw.implicit)

@@ -26,6 +26,7 @@ from mjstack.sim.fused.step import (
     plan_step,
     rearranged_forward,
     rearranged_step,
+    reset_worlds,
 )
 from mjstack.sim.graph import StepGraph, side_by_side
 from mjstack.sim.mjwarp_cameras import MjwarpCameras
@@ -177,7 +178,7 @@ class MjwarpSimulation(Simulation):
         else:
             self._mask.copy_(mask)
         with torch_stream_scope(self._device):
-            mjw.reset_data(self._m, self._d, reset=self._selected)
+            reset_worlds(self._m, self._d, self._selected)
         self._usage.clear(self._mask)
 
     @override

@@ -17,7 +17,7 @@ from mjstack.managers.term import known_values
 from mjstack.managers.view import EnvView
 from mjstack.math import atan2, lowest_point, norm, quat_to_matrix
 from mjstack.mdp.geometry import LOADED, gripper_opening, pose_w
-from mjstack.mdp.observation import object_velocity
+from mjstack.mdp.observation import fixture_pos, object_velocity
 from mjstack.scene.phases import Phase
 from mjstack.sim.simulation import Columns
 
@@ -196,7 +196,7 @@ class Step:
     @step_value
     def height(self) -> Tensor:
         """Height of the lowest point above the table [m], shape ``(nworld, objects)``."""
-        forms = [(thing.shape, thing.size) for thing in self.view.things]
+        forms = [thing.form for thing in self.view.things]
         if forms[1:] == forms[:-1]:  # all alike
             return lowest_point(self.pos, self.quat, *forms[0]) - self.view.top
         poses = zip(self.pos.unbind(1), self.quat.unbind(1), forms, strict=True)
@@ -241,6 +241,10 @@ class Step:
         if name not in view.objects:  # such as a fixture
             return pose_w(view.env, name)[:, :3].float()
         return self.pos[:, view.objects.index(name)]
+
+    def joint(self, name: str) -> Tensor:
+        """Position of a fixture's joint [rad, m], shape ``(nworld, 1)``."""
+        return fixture_pos(self.view.env, joint=name).float()[:, None]
 
     def tilt(self, name: str, axis: str = "z", *, either_end: bool = True) -> Tensor:
         """Angle of an object's axis from the vertical, at most 90 unless ``either_end`` is false

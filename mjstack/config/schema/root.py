@@ -94,3 +94,10 @@ class Config:
     """job=replay: 17; of seed 3, 3:17; success:3:17 where batch ran too; failing: all those."""
     unused_terms: list[str] = spec([])
     """Terms of the task that this job does not use, a line each; mjstack fills it in."""
+
+    @property
+    def files(self) -> dict[str, str]:
+        """Paths of its MJCF files, by key."""
+        named = {"robot.file": self.robot.file}
+        named |= {f"scene.objects.{n}.file": thing.file for n, thing in self.scene.objects.items()}
+        return {key: path for key, path in named.items() if path is not None}

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import mul
 
@@ -117,25 +118,41 @@ class PartCfg(ShapeCfg):
 
 
 @dataclass(slots=True)
+class JointCfg:
+    """A joint of a fixture, where it is to differ from the file's."""
+
+    damping: float | None = spec(None, unit="N s/m, N m s/rad", ge=0.0, le=1e6)
+    """Damping."""
+    range: list[float] | None = spec(None, unit="m, rad", length=2)
+    """Least and largest position."""
+
+
+@dataclass(slots=True)
 class ObjectCfg(ShapeCfg):
     """An object that stands on the table at the start, or is fixed to the world."""
 
     mass: float | None = spec(None, unit="kg", ge=1e-5, le=1000.0)
-    """Mass; a fixed object needs none."""
-    friction: list[float] = spec([1.0, 0.005, 0.0005], length=3, gt=0.0)
-    """Sliding, torsional and rolling coefficient."""
-    color: list[float] = spec([0.6, 0.6, 0.6, 1.0], length=4, ge=0.0, le=1.0)
-    """Red, green, blue and alpha, 0 to 1."""
+    """Mass. What is fixed needs none, and an MJCF file may have it."""
+    density: float | None = spec(None, unit="kg/m3", ge=1e-3, le=1e5)
+    """Density, in place of ``mass``."""
+    friction: list[float] | None = spec(None, length=3, gt=0.0)
+    """Sliding, torsional and rolling coefficient. null: the file's, or [1, 0.005, 0.0005]."""
+    color: list[float] | None = spec(None, length=4, ge=0.0, le=1.0)
+    """Red, green, blue and alpha, 0 to 1. null: the file's, or grey."""
+    width: float | None = spec(None, unit="m", gt=0.0)
+    """Width across the jaws that grasp it. null: its narrower side, seen from above."""
     xy: list[float] = spec([], unit="m")
-    """Nominal position of its centre, standing on the table."""
+    """Nominal position, standing on the table: of its centre, or a fixed file's origin."""
     pos: list[float] | None = spec(None, unit="m", length=3)
-    """Nominal position of its centre, in place of ``xy``: also over the table."""
+    """The same in x, y and z, in place of ``xy``: also over the table, fixed also beside it."""
     fixed: bool = False
     """Whether it is fixed to the world. Fixed objects may touch and overlap each other."""
     parts: dict[str, PartCfg] = spec({})
     """Shapes of a fixed object that has several, by name, in place of ``shape`` and ``size``."""
     file: str | None = None
-    """A fixed object's MJCF file, in place of them: relative to the YAML or the working folder."""
+    """Its MJCF file, or a mesh, in place of them: relative to the YAML or the working folder."""
+    joints: dict[str, JointCfg] = spec({})
+    """Joints of a fixed object's file, by their names there."""
 
     @property
     def pieces(self) -> dict[str, PartCfg]:
@@ -146,8 +163,25 @@ class ObjectCfg(ShapeCfg):
 
     @property
     def half_height(self) -> float:
-        """Height of the centre above what it stands on [m]; 0 of one made of parts."""
-        return 0.0 if self.parts or self.file else super(ObjectCfg, self).half_height
+        """Height of the centre above what it stands on [m], or of a fixed file's origin; 0 of one
+        made of parts.
+        """
+        if self.file is None:
+            return 0.0 if self.parts else super(ObjectCfg, self).half_height
+        from mjstack.config.mjcf import measure  # loads mujoco
+
+        solid = measure(self.file, fixed=self.fixed)
+        up = self.axes[2]
+        return -min(sum(map(mul, up, point)) for point in solid.points)
+
+    @property
+    def form(self) -> tuple[str, Sequence[float]]:
+        """Shape and sizes, as of `lowest_point`: of a file's, points of its hull."""
+        if self.file is None:
+            return self.shape, self.size
+        from mjstack.config.mjcf import measure
+
+        return "hull", tuple(itertools.chain(*measure(self.file, fixed=self.fixed).points))
 
     @property
     def has_faces(self) -> bool:
@@ -161,9 +195,9 @@ class ObjectCfg(ShapeCfg):
         return sorted((k for k in range(3) if k != up), key=lambda k: self.half[k])
 
     @property
-    def width(self) -> float:
+    def grip_width(self) -> float:
         """How wide it is across the jaws that grasp it from above [m]."""
-        return 2.0 * self.half[self.level_axes[0]]
+        return self.width or 2.0 * self.half[self.level_axes[0]]
 
     @property
     def oblong(self) -> bool:
@@ -242,8 +276,8 @@ class SceneCfg:
     table_half: list[float] = spec(unit="m", length=3, gt=0.0)
     """Half sizes of the table."""
     frame: str = spec("world", choices=("world", "table"))
-    """Where positions of objects and places count from: the arm's base, or the middle of the
-    table's top. Loading turns them into the world's."""
+    """Where positions of objects and places count from: the world's origin, at which an arm stands
+    by default, or the middle of the table's top. Loading turns them into the world's."""
     table_friction: list[float] = spec([1.0, 0.005, 0.0005], length=3, gt=0.0)
     """Sliding, torsional and rolling coefficient of the table."""
     random_xy: list[float] = spec([0.03, 0.03], unit="m", length=2, ge=0.0)

@@ -77,6 +77,7 @@ class Placement:
         mujoco.mj_comPos(model, data)
         collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
         bolted = model.body_weldid[model.geom_bodyid] == 0
+        bolted[[geom for name in env.index.fixed for geom in env.index.geoms[name]]] = True
         loose = np.isin(model.geom_bodyid, list(env.index.bodies.values()))
         arm = _arm_boxes(env.cfg, data, np.flatnonzero(collides & ~bolted & ~loose), noise)
         # Floor, the only plane in a scene, and table are left out.

@@ -16,11 +16,12 @@ from mjstack.files import read_npz, write_npz
 from mjstack.managers.view import EnvView, offers, uses_fields
 from mjstack.math import quat_mul
 from mjstack.mdp.geometry import Pose, place_xy, pose_w, robot, write_robot
-from mjstack.mdp.observation import joint_pos
+from mjstack.mdp.observation import fixture_pos, joint_pos
 from mjstack.mdp.reset import ActuatorGains, ObjectFriction, ObjectMass
 from mjstack.mdp.starts.placement import out_of_reach, world_boxes
 from mjstack.mdp.starts.randomization import Randomized, bounds
 from mjstack.scene.index import joint_limits
+from mjstack.sim.simulation import Columns
 
 _FLAT = 1e-5  # [m], and of a quaternion: how far off upright an object on the table may be
 _TOUCH = 1e-5  # [m] into each other: things that only touch
@@ -147,10 +148,14 @@ class FromStartsFile:
         ]
         scene = env.cfg.scene
         objects = list(env.index.objects)
-        joints = [f"joint_{name}" for name in env.cfg.robot.joints]
-        limits = joint_limits(env.sim.model, env.cfg.robot.joints)
+        model = env.sim.model
+        fixtures = [model.joint(name).id for name in env.index.joints]
+        joints = [f"joint_{name}" for name in (*env.cfg.robot.joints, *env.index.joints)]
+        open_ended = ~model.jnt_limited[fixtures, None].astype(bool)
+        spans = np.where(open_ended, [-np.inf, np.inf], model.jnt_range[fixtures]).T
+        limits = np.hstack((joint_limits(model, env.cfg.robot.joints), spans))
         ranges: dict[str, tuple[ArrayLike, ArrayLike]] = {}
-        ranges |= zip(joints, zip(*limits, strict=True), strict=True)
+        ranges |= zip(joints, map(tuple, limits.T), strict=True)
         for quantity in quantities:
             nominal = np.outer(quantity.nominal.cpu(), quantity.ends)
             ranges |= zip(quantity.columns, map(tuple, nominal), strict=True)
@@ -170,6 +175,7 @@ class FromStartsFile:
         # Starts, which have to be free and within reach
         values = table.take(joints)
         fallback = getattr(robot(env), pose).double().cpu().numpy()
+        fallback = np.concatenate((fallback, model.qpos0[model.jnt_qposadr[fixtures]]))
         command = np.where(np.isnan(values), fallback, values)
         starts = table.take(poses).reshape(table.worlds, len(objects), 6)
         _check_worlds(env, table, starts[:needed], command[:needed])  # those that are played
@@ -181,7 +187,8 @@ class FromStartsFile:
                 raise table.wrong(expected, fix, world, [f"{name}_xy"])
 
         # All of it on the device
-        self._command = _on(env, command)
+        self._command, self._fixtures = _on(env, command).tensor_split([len(env.index.ctrl)], 1)
+        self._columns = Columns(model.jnt_qposadr[fixtures], env.device)
         self._poses = _on(env, starts)
         self._quantities = [
             (quantity, torch.from_numpy(table.take(quantity.columns)).to(env.device))
@@ -195,6 +202,8 @@ class FromStartsFile:
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write qpos, ctrl and the model fields that the file has arrays for."""
         write_robot(env, mask, self._command.index_select(0, env.world))
+        fixtures = self._fixtures.index_select(0, env.world)
+        self._columns.write_masked(env.sim.qpos, mask, fixtures)
         poses = self._poses.index_select(0, env.world)
         for number, (address, _) in enumerate(env.index.objects.values()):
             xy, quat = poses[:, number].split((2, 4), dim=1)
@@ -242,6 +251,7 @@ def start_arrays(env: EnvView) -> dict[str, ndarray]:
         out[f"{name}_quat"] = pose[:, 3:]
     joints = [f"joint_{name}" for name in env.cfg.robot.joints]
     out |= zip(joints, joint_pos(env).unbind(1), strict=True)
+    out |= {f"joint_{name}": fixture_pos(env, joint=name) for name in env.index.joints}
     model = env.sim.model
     varying = {
         name
@@ -273,11 +283,12 @@ def _check_worlds(env: EnvView, table: StartsTable, starts: ndarray, command: nd
     scene = env.cfg.scene
     index = env.index
     data = mujoco.MjData(model)
+    addresses = [*index.robot_qpos, *(qpos for qpos, _ in index.joints.values())]
     owner = {geom: name for name, geoms in index.geoms.items() for geom in geoms}
     ground = model.geom("table").id
     for world, (objects, joints) in enumerate(zip(starts, command, strict=True)):
         data.qpos[:] = model.qpos0
-        data.qpos[index.robot_qpos] = joints
+        data.qpos[addresses] = joints
         for (name, (address, _)), start in zip(index.objects.items(), objects, strict=True):
             data.qpos[address : address + 2] = start[:2]
             data.qpos[address + 3 : address + 7] = start[2:]

@@ -3,12 +3,14 @@
 
 SHARED float h[NV * LD], acc[NV], qvel[NV];
 SHARED float slope[NA + 1];  // of actuators' forces at their joints, by the joints' velocity
-SHARED int driven[NA + 1], first[NV];
+SHARED int driven[NA + 1], first[NV];  // -1 - t: by tendon t
+SHARED float pull[NT * NV + 1], ten_slope[NT + 1];
 SHARED float free_acc[6 * NFREE + 1];
 SHARED bool solved[NFREE + 1];
 
 load(io.qvel, NV, qvel);
 load(io.efc_Ma, NV, acc);
+load_pulls(pull);
 for (int i = lane; i < NV; i += T) first[i] = io.M_colind.data[io.M_rowadr.data[i]];
 for (int e = lane; e < NV * LD; e += T) h[e] = 0.0f;
 SYNC();
@@ -25,7 +27,8 @@ const bool derivative = dampers && !(io.opt_disableflags & NO_ACTUATION);
 // How actuators' forces change with the velocity; not at all where a range cuts them off
 for (int u = lane; u < NA; u += T) {
   const float *gainprm = field(io.actuator_gainprm) + 10 * u;
-  const int joint = io.actuator_trnid.data[u][0], dof = io.jnt_dofadr.data[joint];
+  const int target = io.actuator_trnid.data[u][0];
+  const bool is_tendon = NT && io.actuator_trntype.data[u] == TENDON;
   const float gain = io.actuator_gaintype.data[u] == GAIN_AFFINE ? gainprm[2] : 0.0f;
   float value = 0.0f;
   if (io.actuator_biastype.data[u] == BIAS_AFFINE) value = field(io.actuator_biasprm)[10 * u + 2];
@@ -43,20 +46,33 @@ for (int u = lane; u < NA; u += T) {
     value += gain * control;
   }
   auto outside = [](float x, const float *range) { return x <= range[0] || x >= range[1]; };
-  const float force = of_world(io.actuator_force)[u], total = of_world(io.qfrc_actuator)[dof];
-  if (io.actuator_forcelimited.data[u] && outside(force, field(io.actuator_forcerange) + 2 * u))
+  const float *forces = of_world(io.actuator_force);
+  if (io.actuator_forcelimited.data[u] && outside(forces[u], field(io.actuator_forcerange) + 2 * u))
     value = 0.0f;
-  if (io.jnt_actfrclimited.data[joint] && outside(total, field(io.jnt_actfrcrange) + 2 * joint))
-    value = 0.0f;
+  if (is_tendon) {
+    driven[u] = -1 - target;
+    const float *range = field(io.tendon_actfrcrange) + 2 * target;
+    float total = 0.0f;
+    for (int o = 0; o < NA; ++o)
+      if (io.actuator_trntype.data[o] == TENDON && io.actuator_trnid.data[o][0] == target)
+        total += forces[o];
+    // The shares of the limit add up to it but for rounding.
+    const float low = range[0] + 1e-5f * fabsf(range[0]), high = range[1] - 1e-5f * fabsf(range[1]);
+    if (io.tendon_actfrclimited.data[target] && (total <= low || total >= high)) value = 0.0f;
+  } else {
+    const int dof = driven[u] = io.jnt_dofadr.data[target];
+    const float total = of_world(io.qfrc_actuator)[dof];
+    if (io.jnt_actfrclimited.data[target] && outside(total, field(io.jnt_actfrcrange) + 2 * target))
+      value = 0.0f;
+  }
   const float gear = field(io.actuator_gear)[6 * u];
-  driven[u] = dof;
   slope[u] = gear * gear * value;
 }
 
 // Damping of a degree of freedom as the inertia sees it
 auto damping = [&](int i) {
-  const float *shape = field(io.dof_dampingpoly) + 2 * i;
-  return dampers ? poly_slope(field(io.dof_damping)[i], shape, fabsf(qvel[i])) : 0.0f;
+  const Damping c = dof_damping(i);
+  return dampers ? poly_slope(c.k, c.p, fabsf(qvel[i])) : 0.0f;
 };
 
 // A free body that is a tree by itself has the derivative of its gyroscopic force as well: one
@@ -154,6 +170,20 @@ if ((io.opt_disableflags & nothing) == nothing) {
       if (driven[u] == i) total += slope[u];
     h[i * LD + i - first[i]] -= timestep * (total - damping(i));
   }
+  for (int t = lane; t < NT; t += T) {
+    const Damping c = tendon_damping(t);
+    const float speed = fabsf(of_world(io.ten_velocity)[t]);
+    float total = dampers ? poly_slope(c.k, c.p, speed) : 0.0f;
+    for (int u = 0; derivative && u < NA; ++u)
+      if (driven[u] == -1 - t) total -= slope[u];
+    ten_slope[t] = timestep * total;
+  }
+  SYNC();
+  for (int e = lane; NT && e < NC; e += T) {  // those that lie in the inertia's pattern
+    const int i = io.M_hinit_i.data[e], j = io.M_colind.data[e];
+    for (int t = 0; t < NT; ++t)
+      h[i * LD + j - first[i]] += ten_slope[t] * pull[t * NV + i] * pull[t * NV + j];
+  }
   SYNC();
   solve(first, h, acc);
   for (int e = lane; e < 6 * NFREE; e += T)
@@ -174,20 +204,16 @@ store(io.qvel, NV, qvel);
 for (int j = lane; j < NJNT; j += T) {
   float *q = of_world(io.qpos) + io.jnt_qposadr.data[j];
   const float *v = qvel + io.jnt_dofadr.data[j];
-  if (io.jnt_type.data[j] != FREE) {
-    q[0] += timestep * v[0];
-    continue;
-  }
-  for (int k = 0; k < 3; ++k) q[k] += timestep * v[k];
-  const V3 spin = vec(v, 1);
+  const int type = io.jnt_type.data[j], places = type == FREE ? 3 : type == BALL ? 0 : 1;
+  for (int k = 0; k < places; ++k) q[k] += timestep * v[k];
+  if (places == 1) continue;
+  q += places;
+  const V3 spin = vec(v + places, 0);
   const float size = length(spin);
   const V3 about = size > 0.0f ? spin * (1.0f / size) : V3{0.0f, 0.0f, 0.0f};
-  const Quat old = normalized(Quat{q[3], q[4], q[5], q[6]});
+  const Quat old = normalized(quat(q, 0));
   const Quat next = normalized(product(old, turn(about, timestep * size)));
-  q[3] = next.w;
-  q[4] = next.x;
-  q[5] = next.y;
-  q[6] = next.z;
+  put_quat(q, 0, next);
 }
 for (int i = lane; i < NV; i += T) of_world(io.qacc_warmstart)[i] = of_world(io.qacc)[i];
 if (lane == 0) {

@@ -86,21 +86,23 @@ def collision(m: mjw.Model, d: mjw.Data) -> None:
 
 
 def why_not_rows(m: mjw.Model) -> str:
-    """Why MJWarp writes the rows of contacts, and not `make_constraint`; empty if it does not."""
+    """Why MJWarp writes the rows of contacts, and not `contact_rows`; empty if it does not."""
     if m.opt.cone != mjw.ConeType.ELLIPTIC:
         return "cones are pyramidal"
     return "surfaces move" if m.flg_surfacevel else ""
 
 
-def make_constraint(m: mjw.Model, d: mjw.Data) -> None:
-    """`mujoco_warp.make_constraint`: rows of a dense model's elliptic contacts in one launch."""
-    flags = int(m.opt.disableflags)
-    contact = int(mjw.DisableBit.CONTACT)
-    if flags & (contact | int(mjw.DisableBit.CONSTRAINT)) or why_not_rows(m):
-        mjw.make_constraint(m, d)
-        return
-    opt = dataclasses.replace(m.opt, disableflags=flags | contact)
+def noncontact_rows(m: mjw.Model, d: mjw.Data) -> None:
+    """`mujoco_warp.make_constraint` without the rows of contacts, so it need not wait for them."""
+    flags = int(m.opt.disableflags) | int(mjw.DisableBit.CONTACT)
+    opt = dataclasses.replace(m.opt, disableflags=flags)
     mjw.make_constraint(dataclasses.replace(m, opt=opt), d)
+
+
+def contact_rows(m: mjw.Model, d: mjw.Data) -> None:
+    """Add the rows of a dense model's elliptic contacts to the others, in one launch."""
+    if m.opt.disableflags & (mjw.DisableBit.CONTACT | mjw.DisableBit.CONSTRAINT):
+        return
     device = d.qvel.device
     warps = 64 * device.sm_count if device.is_cuda else 1
     # So many blocks on a multiprocessor, though a few registers are spilled

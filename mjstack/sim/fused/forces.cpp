@@ -1,6 +1,6 @@
 // Inertia, velocities, all forces but the constraints', and the acceleration without constraints:
-// mujoco_warp.crb, transmission, fwd_velocity, fwd_actuation and fwd_acceleration. tree.cpp is
-// before it.
+// mujoco_warp.crb, tendon_armature, transmission, fwd_velocity, fwd_actuation and fwd_acceleration.
+// tree.cpp is before it.
 
 SHARED float inertia[10 * NBODY], composite[10 * NBODY];
 SHARED float motion[6 * NV], motion_rate[6 * NV], momentum[6 * NV];
@@ -9,11 +9,14 @@ SHARED float velocity[6 * NBODY], force[6 * NBODY];
 SHARED float qvel[NV], bias[NV], h[NV * LD], acc[NV];
 SHARED float torque[NA + 1];  // of actuators, at their joints
 SHARED int driven[NA + 1], first[NV];
+SHARED float pull[NT * NV + 1];
+SHARED float ten_speed[NT + 1], ten_passive[NT + 1], ten_driving[NT + 1], ten_armature[NT + 1];
 SHARED unsigned long long movers[NBODY];  // degrees of freedom that move a body, as bits
 
 load(io.cinert, 10 * NBODY, inertia);
 load(io.cdof, 6 * NV, motion);
 load(io.qvel, NV, qvel);
+load_pulls(pull);
 for (int i = lane; i < NV; i += T) first[i] = io.M_colind.data[io.M_rowadr.data[i]];
 for (int e = lane; e < NV * LD; e += T) h[e] = 0.0f;
 for (int b = lane; b < NBODY; b += T) {
@@ -46,8 +49,8 @@ for (int e = lane; e < 10 * NBODY; e += T) {
 for (int i = lane; i < NV; i += T) {
   const int joint = io.dof_jntid.data[i], start = io.jnt_dofadr.data[joint];
   const bool free = io.jnt_type.data[joint] == FREE;
-  // The three turns of a free joint are one: none changes the others' axes.
-  const int begin = free ? start + 3 : i;
+  // The three turns of a free joint or ball are one: none changes the others' axes.
+  const int begin = free ? start + 3 : io.jnt_type.data[joint] == BALL ? start : i;
   const unsigned long long bits = movers[io.dof_bodyid.data[i]], earlier = (1ull << begin) - 1ull;
   Spatial v{};
   auto add = [&](int k) { v = v + spatial(motion, k) * qvel[k]; };
@@ -87,23 +90,57 @@ store(io.cvel, 6 * NBODY, velocity);
 store(io.cdof_dot, 6 * NV, motion_rate);
 store(io.qfrc_bias, NV, bias);
 
+// Tendons: armature, springs and dampers
+const bool springs = !(io.opt_disableflags & NO_SPRING), dampers = !(io.opt_disableflags & NO_DAMPER);
+for (int t = lane; t < NT; t += T) {
+  float speed = 0.0f, total = 0.0f;
+  for (int k = 0; k < NV; ++k) speed += pull[t * NV + k] * qvel[k];
+  if (springs) {
+    const float length = of_world(io.ten_length)[t];
+    const float *rest = field(io.tendon_lengthspring) + 2 * t;
+    const float x = length > rest[1] ? length - rest[1] : length < rest[0] ? length - rest[0] : 0.0f;
+    total -= x * poly(field(io.tendon_stiffness)[t], field(io.tendon_stiffnesspoly) + 2 * t, x);
+  }
+  if (dampers) {
+    const Damping c = tendon_damping(t);
+    total -= speed * poly(c.k, c.p, fabsf(speed));
+  }
+  const int owner = io.tendon_actuatorid.data[t];
+  ten_armature[t] =
+      field(io.tendon_armature)[t] + actuator_sum(io.actuator_armature, 1, 0, owner, t, true);
+  ten_speed[t] = speed;
+  ten_passive[t] = total;
+  of_world(io.ten_velocity)[t] = speed;
+}
+SYNC();
+
 // The inertia
 for (int e = lane; e < NC; e += T) {
   const int i = io.M_hinit_i.data[e], j = io.M_colind.data[e];
-  const float armature = i == j ? field(io.dof_armature)[i] : 0.0f;
+  float armature = 0.0f;
+  if (i == j) {
+    const int joint = io.dof_jntid.data[i], owner = io.jnt_actuatorid.data[joint];
+    armature = field(io.dof_armature)[i];
+    armature += actuator_sum(io.actuator_armature, 1, 0, owner, joint, false);
+  }
+  for (int t = 0; t < NT; ++t)
+    armature += ten_armature[t] * pull[t * NV + i] * pull[t * NV + j];
   const float value = armature + inner(spatial(motion, j), spatial(momentum, i));
   h[i * LD + j - first[i]] = value;
   of_world(io.M)[e] = value;
 }
 
-// Actuators of joints
+// Actuators of joints and tendons
 const float timestep = field(io.opt_timestep)[0];
 const bool active = !(io.opt_disableflags & NO_ACTUATION);
 for (int u = lane; u < NA; u += T) {
-  const int joint = io.actuator_trnid.data[u][0], dof = io.jnt_dofadr.data[joint];
+  const int target = io.actuator_trnid.data[u][0];
+  const bool is_tendon = NT && io.actuator_trntype.data[u] == TENDON;
+  const int dof = is_tendon ? -1 : io.jnt_dofadr.data[target];
   const float gear = field(io.actuator_gear)[6 * u];
-  const float length = of_world(io.qpos)[io.jnt_qposadr.data[joint]] * gear;
-  const float speed = gear * qvel[dof];
+  const float length = gear * (is_tendon ? of_world(io.ten_length)[target]
+                                         : of_world(io.qpos)[io.jnt_qposadr.data[target]]);
+  const float speed = gear * (is_tendon ? ten_speed[target] : qvel[dof]);
   const int from = io.actuator_ctrladr.data[u];
   float control = 0.0f;
   if (io.actuator_ctrlnum.data[u] > 0) {
@@ -128,16 +165,40 @@ for (int u = lane; u < NA; u += T) {
   if (io.actuator_gaintype.data[u] == GAIN_AFFINE) gain = k[0] + k[1] * length + k[2] * speed;
   if (io.actuator_biastype.data[u] == BIAS_AFFINE) value = c[0] + c[1] * length + c[2] * speed;
   value = gain * control + value;
-  if (io.actuator_forcelimited.data[u]) {
+  if (!is_tendon && io.actuator_forcelimited.data[u]) {
     const float *range = field(io.actuator_forcerange) + 2 * u;
     value = wp::clamp(value, range[0], range[1]);
   }
   if (!active) value = 0.0f;
   driven[u] = dof;
-  torque[u] = gear * value;
+  torque[u] = is_tendon ? value : gear * value;
   of_world(io.actuator_length)[u] = length;
   of_world(io.actuator_velocity)[u] = speed;
   of_world(io.actuator_force)[u] = value;
+}
+SYNC();
+
+// Those of a tendon share its limit, before their own ones.
+for (int t = lane; t < NT; t += T) {
+  auto attached = [&](int u) { return driven[u] < 0 && io.actuator_trnid.data[u][0] == t; };
+  float total = 0.0f, driving = 0.0f;
+  for (int u = 0; u < NA; ++u)
+    if (attached(u)) total += torque[u];
+  float share = 1.0f;
+  if (io.tendon_actfrclimited.data[t] && total != 0.0f) {
+    const float *range = field(io.tendon_actfrcrange) + 2 * t;
+    if (total < range[0]) share = range[0] / total;
+    if (total > range[1]) share = range[1] / total;
+  }
+  for (int u = 0; u < NA; ++u) {
+    if (!attached(u)) continue;
+    const float *range = field(io.actuator_forcerange) + 2 * u;
+    float value = share * torque[u];
+    if (io.actuator_forcelimited.data[u]) value = wp::clamp(value, range[0], range[1]);
+    of_world(io.actuator_force)[u] = value;
+    driving += field(io.actuator_gear)[6 * u] * value;
+  }
+  ten_driving[t] = driving;
 }
 SYNC();
 
@@ -151,7 +212,6 @@ pushed = __any_sync(~0u, pushed);
 #endif
 
 // Passive forces, and the sum of all forces
-const bool springs = !(io.opt_disableflags & NO_SPRING), dampers = !(io.opt_disableflags & NO_DAMPER);
 for (int i = lane; i < NV; i += T) {
   const int joint = io.dof_jntid.data[i], b = io.dof_bodyid.data[i];
   const int end = b + io.body_subtreenum.data[b];
@@ -164,12 +224,14 @@ for (int i = lane; i < NV; i += T) {
   if (springs && (stiffness != 0.0f || curve[0] != 0.0f || curve[1] != 0.0f)) {
     const int adr = io.jnt_qposadr.data[joint];
     const float *q = of_world(io.qpos) + adr, *rest = field(io.qpos_spring) + adr;
-    if (io.jnt_type.data[joint] == FREE) {
+    const int type = io.jnt_type.data[joint], places = type == FREE ? 3 : 0;
+    if (type == FREE || type == BALL) {
       const int part = i - io.jnt_dofadr.data[joint];
       V3 away = vec(q, 0) - vec(rest, 0);
-      if (part >= 3) {
-        const Quat from{rest[3], -rest[4], -rest[5], -rest[6]};
-        const Quat d = product(from, normalized(Quat{q[3], q[4], q[5], q[6]}));
+      if (part >= places) {
+        const float *r = rest + places;
+        const Quat from{r[0], -r[1], -r[2], -r[3]};
+        const Quat d = product(from, normalized(quat(q + places, 0)));
         away = V3{d.x, d.y, d.z};
         const float sine = length(away);
         float angle = 2.0f * atan2f(sine, d.w);
@@ -184,8 +246,8 @@ for (int i = lane; i < NV; i += T) {
     }
   }
   if (dampers) {
-    const float *shape = field(io.dof_dampingpoly) + 2 * i;
-    damper = -qvel[i] * poly(field(io.dof_damping)[i], shape, fabsf(qvel[i]));
+    const Damping c = dof_damping(i);
+    damper = -qvel[i] * poly(c.k, c.p, fabsf(qvel[i]));
   }
   float lift = 0.0f;
   if (compensated && gravity != 0.0f && (springs || dampers)) {
@@ -208,13 +270,15 @@ for (int i = lane; i < NV; i += T) {
   if (NA && active) {
     for (int u = 0; u < NA; ++u)
       if (driven[u] == i) driving += torque[u];
+    for (int t = 0; t < NT; ++t) driving += pull[t * NV + i] * ten_driving[t];
     if (by_actuator) driving += lift;
     if (io.jnt_actfrclimited.data[joint]) {
       const float *range = field(io.jnt_actfrcrange) + 2 * joint;
       driving = wp::clamp(driving, range[0], range[1]);
     }
   }
-  const float passive = spring + damper + (by_actuator ? 0.0f : lift);
+  float passive = spring + damper + (by_actuator ? 0.0f : lift);
+  for (int t = 0; t < NT; ++t) passive += pull[t * NV + i] * ten_passive[t];
   const float total = passive - bias[i] + driving + of_world(io.qfrc_applied)[i] + applied;
   of_world(io.qfrc_passive)[i] = passive;
   of_world(io.qfrc_actuator)[i] = driving;

@@ -26,11 +26,12 @@ def _numbers(owner: Any, names: str, prefix: str = "", here: str = "") -> dict[s
 
 
 _CONSTANTS = {
-    **_numbers(mujoco.mjtJoint, "FREE SLIDE HINGE", "mjJNT_"),
+    **_numbers(mujoco.mjtJoint, "FREE BALL SLIDE HINGE", "mjJNT_"),
     **_numbers(mujoco.mjtConstraint, "ELLIPTIC FRICTIONLESS", "mjCNSTR_CONTACT_"),
     **_numbers(
         mujoco.mjtConstraintState, "SATISFIED QUADRATIC LINEARNEG LINEARPOS CONE", "mjCNSTRSTATE_"
     ),
+    **_numbers(mjw.TrnType, "TENDON"),
     **_numbers(mjw.DynType, "NONE INTEGRATOR FILTER FILTEREXACT"),
     **_numbers(mjw.GainType, "AFFINE", here="GAIN_"),
     **_numbers(mjw.BiasType, "AFFINE", here="BIAS_"),
@@ -118,6 +119,7 @@ def _sizes(m: mjw.Model, d: mjw.Data) -> dict[str, int]:
         "NC": m.nC,
         "NA": m.nactuator,
         "NACT": m.na,
+        "NT": m.ntendon,
         "BLOCK": largest_tree(m),
         "NVP": d.efc.J.shape[2],
         "NJ": padded_rows(d.njmax),

@@ -1,5 +1,5 @@
 // Poses of bodies, joints, geoms and sites, and what is computed about the trees' centres of mass:
-// mujoco_warp.kinematics and com_pos. tree.cpp is before it.
+// mujoco_warp.kinematics, com_pos, and tendon of fixed tendons. tree.cpp is before it.
 
 SHARED float xpos[3 * NBODY], xquat[4 * NBODY], xmat[9 * NBODY];
 SHARED float xipos[3 * NBODY], ximat[9 * NBODY], com[3 * NBODY], inertia[10 * NBODY];
@@ -38,7 +38,7 @@ for (int b = lane; b < NBODY; b += T) {
     if (type == SLIDE) {
       p = p + along * x;
     } else {
-      q = product(q, turn(direction, x));
+      q = product(q, type == BALL ? normalized(quat(at, 0)) : turn(direction, x));
       p = pivot - rotated(place, q);
     }
     put(anchor, j, pivot);
@@ -140,13 +140,27 @@ for (int j = lane; j < NJNT; j += T) {
   } else {
     for (int k = 0; k < 3; ++k) {
       const V3 unit{k == 0 ? 1.0f : 0.0f, k == 1 ? 1.0f : 0.0f, k == 2 ? 1.0f : 0.0f};
-      put_spatial(motion, dof + k, Spatial{zero, unit});
+      if (type == FREE) put_spatial(motion, dof + k, Spatial{zero, unit});
       const V3 column{xmat[9 * b + k], xmat[9 * b + 3 + k], xmat[9 * b + 6 + k]};
-      put_spatial(motion, dof + 3 + k, Spatial{column, cross(column, offset)});
+      put_spatial(motion, dof + k + (type == FREE ? 3 : 0), Spatial{column, cross(column, offset)});
     }
   }
 }
 SYNC();
+
+// Fixed tendons
+for (int t = lane; t < NT; t += T) {
+  const int start = io.tendon_adr.data[t], row = io.ten_J_rowadr.data[t];
+  float length = 0.0f;
+  for (int w = start; w < start + io.tendon_num.data[t]; ++w) {
+    const int joint = io.wrap_objid.data[w];
+    const float coefficient = io.wrap_prm.data[w];
+    length += coefficient * qpos[io.jnt_qposadr.data[joint]];
+    for (int k = row; k < row + io.ten_J_rownnz.data[t]; ++k)
+      if (io.ten_J_colind.data[k] == io.jnt_dofadr.data[joint]) of_world(io.ten_J)[k] = coefficient;
+  }
+  of_world(io.ten_length)[t] = length;
+}
 
 store(io.xpos, 3 * NBODY, xpos);
 store(io.xquat, 4 * NBODY, xquat);

@@ -11,7 +11,7 @@ from mjstack.sim.fused.launch import SHARED_BYTES, largest_tree, launch
 from mjstack.sim.mujoco_warp import mjw
 
 _AXES = (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
-_TRANSMISSIONS = (mjw.TrnType.JOINT, mjw.TrnType.JOINTINPARENT)
+_TRN = mjw.TrnType
 _DYN = mjw.DynType
 _KINDS = {
     "actuator_dyntype": (_DYN.NONE, _DYN.INTEGRATOR, _DYN.FILTER, _DYN.FILTEREXACT),
@@ -25,17 +25,17 @@ def why_not(m: mjw.Model) -> str:
     size = _shared_bytes(m)
     shared = f"bytes of shared memory, of {SHARED_BYTES:,}"
     joints = m.jnt_type.numpy()
-    of_joints = np.isin(m.actuator_trntype.numpy(), _TRANSMISSIONS)
+    transmissions = m.actuator_trntype.numpy()
+    of_joints = np.isin(transmissions, (_TRN.JOINT, _TRN.JOINTINPARENT))
     driven = joints[m.actuator_trnid.numpy()[of_joints, 0]]
     reasons = {
-        "there are ball joints": not _only(joints, (mujoco.mjtJoint.mjJNT_FREE, *_AXES)),
-        "actuators drive other things than hinges and slides": not (
-            of_joints.all() and _only(driven, _AXES)
+        "tendons are spatial": not _only(m.wrap_type.numpy(), (mujoco.mjtWrap.mjWRAP_JOINT,)),
+        "actuators drive other things than hinges, slides and tendons": not (
+            (of_joints | (transmissions == _TRN.TENDON)).all() and _only(driven, _AXES)
         ),
         "actuators have dynamics, gains or biases of special kinds": not all(
             _only(getattr(m, name).numpy(), kinds) for name, kinds in _KINDS.items()
         ),
-        "actuators have damping or armature": not _only(m.jnt_actuatorid.numpy(), (-1,)),
         "springs are plastic": m.nplastic > 0,
         "there is a fluid": m.has_fluid,
         "there are callbacks": any(vars(m.callback).values()),
@@ -45,15 +45,15 @@ def why_not(m: mjw.Model) -> str:
 
 
 def positions(m: mjw.Model, d: mjw.Data) -> None:
-    """`mujoco_warp.kinematics` and `com_pos` in one launch, for models to which `why_not` has no
-    objection.
+    """`mujoco_warp.kinematics`, `com_pos` and `tendon` in one launch, for models to which `why_not`
+    has no objection.
     """
     launch(("tree", "positions"), m, d)
 
 
 def forces(m: mjw.Model, d: mjw.Data) -> None:
-    """`mujoco_warp.crb`, `transmission`, `fwd_velocity`, `fwd_actuation` and `fwd_acceleration` in
-    one launch.
+    """`mujoco_warp.crb`, `tendon_armature`, `transmission`, `fwd_velocity`, `fwd_actuation` and
+    `fwd_acceleration` in one launch.
 
     It does not write what no later stage reads: crb, the factors of M, cacc, cfrc_int, the moments
     of actuators, and the parts of qfrc_passive.
@@ -76,4 +76,5 @@ def _shared_bytes(m: mjw.Model) -> int:
     poses = 58 * m.nbody + 6 * m.njnt + 6 * m.nv + 14 * m.ngeom + 12 * m.nsite + 32
     tree = largest_tree(m)
     rest = 34 * m.nbody + (33 + (tree | 1)) * m.nv + 2 * tree + 2 * m.nactuator + 64
+    rest += m.ntendon * (m.nv + 4)
     return 4 * max(poses, rest)

@@ -1,7 +1,8 @@
 """One physics step out of MJWarp's stages and the kernels here, arranged for a captured graph."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import mujoco
@@ -15,6 +16,8 @@ from mjstack.sim.graph import side_by_side
 from mjstack.sim.mujoco_warp import mjw, wp
 
 RELEASES = ("4.0.0",)  # of mujoco-warp that docs/design.md, "A new release", was done with
+VELOCITIES = ("cvel", "cdof_dot")
+"""Of bodies and of axes: the previous step's, until the smooth dynamics compute them anew."""
 _CONVERGED = 1e-8  # tolerance of the solver that float32 can still tell
 _STATES = 8
 _WORLDS = 8  # that are compared, at most: each is drawn on the host
@@ -31,6 +34,7 @@ class StepPlan:
 
     name: str = "stock"
     smooth: bool = False  # whether a fused step has smooth dynamics as three kernels
+    cameras: bool = False  # whether sensors read the poses of cameras
     reason: str = ""  # why the step is not faster; empty if nothing is left to MJWarp
 
     def __str__(self) -> str:
@@ -41,30 +45,26 @@ def plan_step(model: mujoco.MjModel, m: mjw.Model, d: mjw.Data) -> StepPlan:
     """The fastest step that does all that the model needs."""
     if reason := why_stock(model, m):
         return StepPlan(reason=reason)
+    cameras = mujoco.mjtObj.mjOBJ_CAMERA in (*model.sensor_objtype, *model.sensor_reftype)
+    plan = StepPlan("arranged", cameras=cameras)
     if reason := constraints.why_not(m, d):
-        return StepPlan("arranged", reason=reason)
+        return replace(plan, reason=reason)
     slower = {"contact rows": constraints.why_not_rows(m), "smooth dynamics": smooth.why_not(m)}
     reasons = [f"MJWarp's {part}, because {reason}" for part, reason in slower.items() if reason]
-    return StepPlan("fused", smooth=not slower["smooth dynamics"], reason="; ".join(reasons))
+    covered = not slower["smooth dynamics"]
+    return replace(plan, name="fused", smooth=covered, reason="; ".join(reasons))
 
 
 def why_stock(model: mujoco.MjModel, m: mjw.Model) -> str:
     """The features of a model that `rearranged_step` does not know, in a sentence; "" if none.
 
-    It leaves out cameras and lights, which nothing in the physics reads. Equalities between bodies
-    read velocities of the step before, adhesion reads contacts among the smooth forces, and sensors
-    of acceleration or of a camera need stages of their own.
+    Adhesion reads contacts among the smooth forces.
     """
-    sensed = (*model.sensor_objtype, *model.sensor_reftype)
     enabled = mujoco.mjtEnableBit.mjENBL_SLEEP | mujoco.mjtEnableBit.mjENBL_ENERGY
     integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     features = {
         "an integrator other than implicitfast": model.opt.integrator != integrator,
-        "tendons": model.ntendon,
         "flexes": model.nflex,
-        "equalities between bodies": (model.eq_type != mujoco.mjtEq.mjEQ_JOINT).any(),
-        "sensors of acceleration": m.sensor_rne_postconstraint or m.opt.run_rne_postconstraint,
-        "sensors of a camera": mujoco.mjtObj.mjOBJ_CAMERA in sensed,
         "adhesion": m.flg_adhesion or m.nacttrnbody,
         "delays": model.nhistory,
         "sleeping or energy": model.opt.enableflags & enabled,
@@ -91,6 +91,15 @@ def rearranged_forward(
     ``beside_kinematics`` is work that may run while the poses are computed.
     """
     stages = constraints if plan.name == "fused" else mjw
+    # Rows of equalities between bodies read the velocities of the previous step, which the smooth
+    # dynamics overwrite in the meantime.
+    previous = d
+    if links_bodies(m):
+        copies = {name: wp.empty_like(getattr(d, name)) for name in VELOCITIES}
+        previous = replace(d, **copies)
+        beside_kinematics += tuple(
+            partial(wp.copy, copy, getattr(d, name)) for name, copy in copies.items()
+        )
 
     def poses() -> None:
         if plan.smooth:
@@ -98,6 +107,11 @@ def rearranged_forward(
         else:
             mjw.kinematics(m, d)
             mjw.com_pos(m, d)
+            mjw.tendon(m, d)
+
+    def inertia() -> None:
+        mjw.crb(m, d)
+        mjw._src.smooth.tendon_armature(m, d)
 
     def forces() -> None:
         mjw.transmission(m, d)
@@ -108,21 +122,43 @@ def rearranged_forward(
         if plan.smooth:
             smooth.forces(m, d)
             return
-        side_by_side(device, forces, lambda: mjw.crb(m, d))
+        side_by_side(device, forces, inertia)
         mjw.fwd_acceleration(m, d, factorize=True)
 
     def contacts() -> None:
-        stages.collision(m, d)
-        stages.make_constraint(m, d)
+        if plan.name == "fused" and not constraints.why_not_rows(m):
+            rows = partial(constraints.noncontact_rows, m, previous)
+            side_by_side(device, partial(constraints.collision, m, d), rows)
+            constraints.contact_rows(m, d)
+        else:
+            stages.collision(m, d)
+            mjw.make_constraint(m, previous)
 
     side_by_side(device, poses, *beside_kinematics)
     side_by_side(device, contacts, dynamics)
     stages.solve(m, d)
     if sensors:
+        if plan.cameras:
+            mjw.camlight(m, d)
         d.sensordata.zero_()
         mjw.sensor_pos(m, d)
         mjw.sensor_vel(m, d)
         mjw.sensor_acc(m, d)
+
+
+def links_bodies(m: mjw.Model) -> bool:
+    """Whether there are connect or weld equalities."""
+    return m.eq_connect_adr.size + m.eq_wld_adr.size > 0
+
+
+def reset_worlds(m: mjw.Model, d: mjw.Data, worlds: wp.array) -> None:
+    """`mujoco_warp.reset_data` of the worlds of a mask, shape ``(nworld,)``, bool. They are at rest
+    then, as in MuJoCo: MJWarp leaves velocities, which equalities between bodies would read.
+    """
+    mjw.reset_data(m, d, reset=worlds)
+    if links_bodies(m):
+        for name in VELOCITIES:
+            wp.to_torch(getattr(d, name)).masked_fill_(wp.to_torch(worlds)[:, None, None], 0.0)
 
 
 def rearranged_step(
@@ -151,12 +187,13 @@ def disagreement(
     worst = 0.0
     try:
         d = mjw.make_data(model, nworld=nworld, nconmax=_CONTACTS, njmax=d.njmax)
+        all_worlds = wp.ones(nworld, dtype=bool)
         for _ in range(_STATES):
             states = np.stack([_draw(model, rng) for _ in range(nworld)])
             state = torch.tensor(states, dtype=torch.float32, device=device)
             ends = []
             for planned in (True, False):
-                mjw.reset_data(m, d)
+                reset_worlds(m, d, all_worlds)
                 wp.to_torch(d.qpos).copy_(state[:, : model.nq])
                 wp.to_torch(d.qvel).copy_(state[:, model.nq :])
                 if planned:

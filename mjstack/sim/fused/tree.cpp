@@ -5,8 +5,8 @@
 // written whole: neighbouring threads read and write neighbouring floats.
 //
 // Constants: NBODY, NJNT, NGEOM, NSITE, NBRANCH (from a root to a leaf), NFREE free bodies, NV, NC
-// elements of the inertia, NA actuators, NACT activations, BLOCK degrees of freedom of the largest
-// tree.
+// elements of the inertia, NA actuators, NACT activations, NT fixed tendons, BLOCK degrees of
+// freedom of the largest tree.
 
 constexpr float PI = 3.14159265f;
 const int world = warp;
@@ -128,6 +128,49 @@ auto cross_force = [&](const Spatial &v, const Spatial &f) {
 auto poly = [](float k, const float *p, float x) { return k + p[0] * x + p[1] * x * x; };
 auto poly_slope = [](float k, const float *p, float x) {
   return k + 2.0f * p[0] * x + 3.0f * p[1] * x * x;
+};
+
+// What actuators add to element k, of `width`, of a coefficient of their joint or tendon, whose owner
+// is -1 where none does
+auto actuator_sum = [&](const auto &array, int width, int k, int owner, int target, bool tendon) {
+  float total = 0.0f;
+  for (int u = 0; owner != -1 && u < NA; ++u) {
+    if (io.actuator_trnid.data[u][0] != target || (io.actuator_trntype.data[u] == TENDON) != tendon)
+      continue;
+    const float gear = field(io.actuator_gear)[6 * u];
+    total += gear * gear * field(array)[width * u + k];
+  }
+  return total;
+};
+
+// Damping of element i of an array, a coefficient with its polynomial
+struct Damping {
+  float k, p[2];
+};
+auto damping_at = [&](const auto &k, const auto &p, int i, int owner, int target, bool tendon) {
+  auto curve = [&](int e) {
+    return field(p)[2 * i + e] + actuator_sum(io.actuator_dampingpoly, 2, e, owner, target, tendon);
+  };
+  return Damping{field(k)[i] + actuator_sum(io.actuator_damping, 1, 0, owner, target, tendon),
+                 {curve(0), curve(1)}};
+};
+auto dof_damping = [&](int i) {
+  const int joint = io.dof_jntid.data[i], owner = io.jnt_actuatorid.data[joint];
+  return damping_at(io.dof_damping, io.dof_dampingpoly, i, owner, joint, false);
+};
+auto tendon_damping = [&](int t) {
+  const int owner = io.tendon_actuatorid.data[t];
+  return damping_at(io.tendon_damping, io.tendon_dampingpoly, t, owner, t, true);
+};
+
+// Tendons' lengths by the degrees of freedom, NV of each
+auto load_pulls = [&](float *pull) {
+  for (int e = lane; e < NT * NV; e += T) pull[e] = 0.0f;
+  SYNC();
+  for (int t = lane; t < NT; t += T) {
+    const int from = io.ten_J_rowadr.data[t], end = from + io.ten_J_rownnz.data[t];
+    for (int k = from; k < end; ++k) pull[t * NV + io.ten_J_colind.data[k]] = of_world(io.ten_J)[k];
+  }
 };
 
 // An activation one step later
