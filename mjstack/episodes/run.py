@@ -134,17 +134,17 @@ class Run:
     @property
     def parity_steps(self) -> dict[str, int]:
         """Steps after which gate *parity* takes its states, by their names: the last ones of
-        phases, the first of them also ``in_motion``, the second ``swung``; or, without phases, of
-        thirds of the episode, and the very first.
+        phases, the first of them also ``in_motion``, the second ``swung`` and ``twisted``; or,
+        without phases, of thirds of the episode, and the very first.
         """
         stage = self.stage
         if stage.phases:
             states = self.cfg.gate.parity.states
             ends = {name: stage.phase(phase).stop - 1 for name, phase in states.items()}
             first, second = [*ends.values(), *ends.values()][:2]
-            return {"in_motion": first, "swung": second, **ends}
+            return {"in_motion": first, "swung": second, "twisted": second, **ends}
         ends = {f"third_{k}": k * stage.episode_steps // 3 - 1 for k in (1, 2, 3)}
-        return {"in_motion": 0, "swung": ends["third_2"], **ends}
+        return {"in_motion": 0, **dict.fromkeys(("swung", "twisted"), ends["third_2"]), **ends}
 
     def draw(self, name: str, save: Callable[..., object], *args: object) -> None:
         """Draw a picture beside the report by a call with its path and ``args``, if there is a

@@ -2,7 +2,7 @@
 
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from dataclasses import asdict
 
@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mjstack.config.check import PARITY_FIELDS
 from mjstack.config.schema import Backend, Config
 from mjstack.episodes.recorder import WorldRecorder
 from mjstack.episodes.rollout import State, restore
@@ -22,18 +21,21 @@ from mjstack.math import quat_angle, quat_to_matrix
 from mjstack.report.record import GateResult, Status
 from mjstack.sim import Simulation, describe_overflow, make_simulation
 from mjstack.sim.native import NativeSimulation
+from mjstack.sim.rounded import UNIT, RoundedSimulation
 
+COMPARED = ("qpos", "qvel", "xpos", "xquat", "site_xpos", "qfrc_actuator", "contact_count")
 SWUNG = "swung"
-_SPINS = {"in_motion": 50.0, SWUNG: 0.0}  # rad/s; these states get velocities of the gate's own
-_SEARCHED = [
-    int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")) for kind in ("CYLINDER", "ELLIPSOID", "MESH")
-]
+TWISTED = "twisted"
+_SPINS = {"in_motion": 50.0, SWUNG: 0.0, TWISTED: 200.0}  # rad/s; states with the gate's own motion
+_OFF_TARGET = 0.1  # rad, m: of servos whose force has no limit
 _CONVERGED = 1e-12  # tolerance of the solver in float64
 _CONVERGED_FLOAT32 = 1e-8  # of what float32 can still tell
-_DISPLACED = 32  # worlds
-_PLACES = ("geom_pos", "geom_quat")
-_OFF = 1e-5  # m and parts of a quaternion: ten times the tolerance of MuJoCo's search
-_RANGES = 2.0
+_ROUNDED = {1: 32, 50: 16}  # worlds, by steps
+_ROUNDED_EPISODES = 8
+_LEAST_SIZES = {
+    "qvel": 300.0,
+    "qfrc_actuator": 100.0,
+}  # whose rounding is allowed; else 2
 _SLIDES = {int(mujoco.mjtJoint.mjJNT_FREE): 3, int(mujoco.mjtJoint.mjJNT_SLIDE): 1}  # else turns
 _WIDTHS = {"xpos": 3, "xquat": 4, "site_xpos": 3}
 _CAPTURED = 10  # steps of a graph: one of fifty takes longer to capture than to run
@@ -76,7 +78,7 @@ def _compare(run: Run, mjwarp: Simulation) -> GateResult:
         "peak_constraint_rows": int(mjwarp.peak_constraints[0]),
         "episode_s": episode.timing.seconds,
     }
-    apart, ends = _compare_ends(run, world.qpos[-1], result)
+    apart, ends = _compare_ends(run, world.qpos[-1], result, again=not problems)
     problems += apart
     if cfg.scene.cameras:
         problems += compare_images(run, result)
@@ -93,45 +95,44 @@ def _compare(run: Run, mjwarp: Simulation) -> GateResult:
 
 
 def compare_states(run: Run, mjwarp: Simulation, result: GateResult) -> list[str]:
-    """Step both backends from the same states of the reference episode; return the problems.
+    """Compare the models, and steps of both backends from the same states; return the problems.
 
-    Both solvers go on until they have converged: where they stop below the tolerance of the model
-    is chance, and may lie some hundred times the limits from the solution. Every number may be off
-    by the configured limit of its field and by twice the range of native MuJoCo's own, where
-    contacts of curved shapes lie a hundredth of a millimetre elsewhere.
+    The states are those of the reference episode, and some with the gate's own velocities and
+    commands. Both solvers go on until they have converged: where they stop below the tolerance of
+    the model is chance, and may lie some hundred times the limits from the solution. Every number
+    may be off by a multiple of what rounding makes of it in native MuJoCo.
     """
-    limits = run.cfg.gate.parity
     model = copy.copy(run.stage.model)
     model.opt.tolerance = _CONVERGED
     fields = run.nominal.sim.fields  # the task's own reset terms may have changed them
+    problems = compare_models(model, mjwarp, leave_out=fields)
     native = NativeSimulation(model, 1, fields=[*fields])
-    near = _displaced(model, fields)
     for name, values in fields.items():
         native.fields[name].copy_(values)
         mjwarp.fields[name].copy_(values)
+    rounded = {steps: RoundedSimulation(model, n, fields) for steps, n in _ROUNDED.items()}
     tolerance = mjwarp.solver_tolerance
     assert tolerance is not None
     configured = tolerance.clone()
     tolerance.fill_(_CONVERGED_FLOAT32)
-    problems = []
+    multiples = {1: run.cfg.gate.parity.step1_ranges, 50: run.cfg.gate.parity.step50_ranges}
     farthest = (False, 0.0, "")
-    for name, step in run.parity_steps.items():
-        state = run.nominal.states[step]
-        kinds = [(1, limits.step1), (50, limits.step50)]
-        if name in _SPINS:  # for one step alone
-            state = state._replace(qvel=_motion(model, state.qpos, _SPINS[name]))
-            del kinds[1]
-        for steps, largest in kinds:
+    for name, state, kinds in _states(run):
+        for steps in kinds:
             ends = end_state(native, state, steps)
             apart = differences(ends, end_state(mjwarp, state, steps))
-            ranges = differences(ends, end_state(near, state, steps)) if near else {}
-            for field, least in largest.items():
-                allowed = least + _RANGES * ranges.get(field, torch.zeros_like(apart[field]))
+            ranges = differences(ends, end_state(rounded[steps], state, steps))
+            for field in COMPARED:
+                rounding = 0.0
+                if field != "contact_count":
+                    largest = float(ends[field].abs().max())
+                    rounding = UNIT * max(largest, _LEAST_SIZES.get(field, 2.0))
+                allowed = multiples[steps] * (ranges[field] + rounding)
                 worst = int((apart[field] / allowed.clamp(min=1e-30)).argmax())
                 error, limit = float(apart[field][worst]), float(allowed[worst])
-                key = f"step{steps}.{field}"
-                result.metrics[f"{name}.{key}"] = error
-                result.thresholds[key if limit == least else f"{name}.{key}"] = limit
+                key = f"{name}.step{steps}.{field}"
+                result.metrics[key] = error
+                result.thresholds[key] = limit
                 if not error <= limit:
                     owner = _owner(model, field, worst)
                     text = f"{field} of {owner} differs by {error:.2g}, limit {limit:.2g}"
@@ -140,7 +141,7 @@ def compare_states(run: Run, mjwarp: Simulation, result: GateResult) -> list[str
                         ratio = math.inf if math.isnan(error) else error / limit
                         farthest = max(farthest, (name != SWUNG, ratio, owner))
     tolerance.copy_(configured)
-    for sim in filter(None, (native, near)):
+    for sim in (native, *rounded.values()):
         sim.close()
     if look := farthest[-1]:
         moves = look in run.stage.index.objects
@@ -149,37 +150,90 @@ def compare_states(run: Run, mjwarp: Simulation, result: GateResult) -> list[str
     return problems
 
 
-def _displaced(model: mujoco.MjModel, fields: Mapping[str, Tensor]) -> Simulation | None:
-    """Native worlds in which shapes whose contacts MuJoCo has to search for, such as cylinders, lie
-    elsewhere by less than a search in float32 can tell; None if there are no such shapes. The
-    fields are those of the one world.
-    """
-    solid = (model.geom_contype | model.geom_conaffinity) > 0
-    geoms = np.flatnonzero(np.isin(model.geom_type, _SEARCHED) & solid)
-    if not len(geoms):
-        return None
-    sim = NativeSimulation(model, _DISPLACED, fields=[*_PLACES, *fields])
-    for name, values in fields.items():
-        sim.fields[name].copy_(values)
-    generator = torch.Generator().manual_seed(0)
-    for name in _PLACES:
-        field = sim.fields[name]
-        shape = (_DISPLACED, len(geoms), field.shape[-1])
-        field[:, geoms] += _OFF * (2.0 * torch.rand(shape, generator=generator).double() - 1.0)
-    return sim
+def compare_models(
+    model: mujoco.MjModel, sim: Simulation, leave_out: Mapping[str, Tensor]
+) -> list[str]:
+    """A problem for each array of the model that the simulation holds otherwise than in float32."""
+    problems = []
+    for name, held in sim.model_values().items():
+        expected = getattr(model, name).astype(held.dtype)
+        different = np.argwhere((held != expected) & ~(np.isnan(held) & np.isnan(expected)))
+        if name in leave_out or not len(different):
+            continue
+        at = tuple(different[0])
+        owner = _element(model, name, int(at[0]))
+        problems.append(f"model: {name} of {owner} is {held[at]:.6g}, natively {expected[at]:.6g}")
+    return problems
 
 
-def _motion(model: mujoco.MjModel, qpos: np.ndarray, spin: float) -> np.ndarray:
-    """Velocities with which masses, friction and damping count, shape ``(1, nv)``: joints move to
-    the middle of their ranges, because one at its limit may be on either side of it in float32;
-    free objects spin about their z axes [rad/s].
+def _states(run: Run) -> Iterator[tuple[str, State, tuple[int, ...]]]:
+    """Name, state, and after how many steps it is compared."""
+    for name, step in run.parity_steps.items():
+        state = run.nominal.states[step]
+        if name in _SPINS:
+            yield name, _moved(run.stage.model, state, name), (1,)
+        else:
+            yield name, state, (1, 50)
+
+
+def _forward(model: mujoco.MjModel, state: State, **values: float) -> mujoco.MjData:
+    """Data of a state, with values in place of some of its parts."""
+    data = mujoco.MjData(model)
+    for name, numbers in state._asdict().items():
+        getattr(data, name)[:] = values.get(name, numbers[0])
+    mujoco.mj_forward(model, data)
+    return data
+
+
+def _moved(model: mujoco.MjModel, state: State, name: str) -> State:
+    """The state with velocities with which masses, friction and damping count: joints move to the
+    middle of their ranges, because one at its limit may be on either side of it in float32; free
+    objects spin about their z axes, or twisted in the jaws about the normal of the contacts. In
+    motion, servos are off their targets.
     """
-    qvel = np.ones((1, model.nv))
-    beyond = qpos[0, model.jnt_qposadr] > model.jnt_range.mean(1)
-    qvel[0, model.jnt_dofadr[beyond & (model.jnt_limited == 1)]] = -1.0
-    for dof in model.jnt_dofadr[model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)]:
-        qvel[0, dof : dof + 6] = [0.0, 0.0, 0.0, 0.0, 0.0, spin]
-    return qvel
+    data = _forward(model, state)
+    qvel = np.full((1, model.nv), float(name != TWISTED))
+    beyond = state.qpos[0, model.jnt_qposadr] > model.jnt_range.mean(1)
+    qvel[0, model.jnt_dofadr[beyond & (model.jnt_limited == 1)]] *= -1.0
+    bodies = model.geom_bodyid[data.contact.geom]
+    held = (model.body_weldid[bodies] > 0).all(1)
+    for joint in np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)):
+        body = model.jnt_bodyid[joint]
+        axis = np.array([0.0, 0.0, 1.0])
+        if name == TWISTED:
+            normals = data.contact.frame[held & (bodies == body).any(1), :3]
+            normal = np.linalg.eigh(normals.T @ normals)[1][:, -1]
+            axis = len(normals[:1]) * data.xmat[body].reshape(3, 3).T @ normal
+        dof = model.jnt_dofadr[joint]
+        qvel[0, dof : dof + 6] = [0.0, 0.0, 0.0, *(_SPINS[name] * axis)]
+    state = state._replace(qvel=qvel)
+    return state._replace(ctrl=_half_force(model, state)) if name == "in_motion" else state
+
+
+def _half_force(model: mujoco.MjModel, state: State) -> np.ndarray:
+    """Commands, shape ``(1, nu)``, with which servos make half of their largest force, in the
+    direction in which their range allows more: none shows its gain at its target or its limit.
+    """
+    free = copy.copy(model)
+    free.actuator_ctrllimited[:] = free.actuator_forcelimited[:] = 0
+    rest, more = (_forward(free, state, ctrl=u).actuator_force for u in (0.0, 1.0))
+    gain = more - rest
+    half = model.actuator_forcerange.T / 2.0
+    half = np.where(model.actuator_forcelimited, half, np.outer([-_OFF_TARGET, _OFF_TARGET], gain))
+    ctrl = np.clip((half - rest) / np.where(gain, gain, 1.0), *model.actuator_ctrlrange.T)
+    larger = np.abs(rest + gain * ctrl).argmax(0)
+    ctrl = np.take_along_axis(ctrl, larger[None], 0)
+    return np.where(gain * model.actuator_ctrllimited, ctrl, state.ctrl)
+
+
+def _element(model: mujoco.MjModel, field: str, index: int) -> str:
+    """Name of what a row of a model's array belongs to."""
+    kind = field.partition("_")[0]
+    if kind == "dof":
+        kind, index = "jnt", int(model.dof_jntid[index])
+    name = {"jnt": "joint", "cam": "camera", "eq": "equality", "mat": "material"}.get(kind, kind)
+    named = getattr(model, name, None)
+    return f"{name} {(named and named(index).name) or index}"
 
 
 def _owner(model: mujoco.MjModel, field: str, index: int) -> str:
@@ -195,37 +249,65 @@ def _owner(model: mujoco.MjModel, field: str, index: int) -> str:
     return model.joint(joint).name
 
 
-def _compare_ends(run: Run, end: np.ndarray, result: GateResult) -> tuple[list[str], list[str]]:
+def _compare_ends(
+    run: Run, end: np.ndarray, result: GateResult, *, again: bool
+) -> tuple[list[str], list[str]]:
     """Where objects, and joints that the robot does not command, are at the end of the task;
     returns the problems, and lines on the farthest object and the farthest of the other joints.
+
+    With ``again``, native MuJoCo plays the task in rounded worlds if one is off by more than the
+    limits: they may be off from where it is in the nearest of these instead.
     """
     limits = run.cfg.gate.parity
     allowed = {"position_m": limits.object_position, "rotation_deg": limits.object_rotation_deg}
     result.thresholds |= {f"final.{key}": limit for key, limit in allowed.items()}
-    model = run.stage.model
-    ends = (end, run.nominal.world.qpos[-1])
-    moved = np.empty(model.nv)
-    mujoco.mj_differentiatePos(model, moved, 1.0, *ends)
+
+    def shares(other: np.ndarray) -> dict[str, float]:
+        return {
+            name: float(np.max([v / max(allowed[key], 1e-30) for key, v in found.items()]))
+            for name, found in _ends_apart(run, end, other).items()
+        }
+
+    native = run.nominal.world.qpos[-1]
+    share = shares(native)
+    beyond = [name for name, value in share.items() if not value <= 1.0]
+    if beyond and again:
+        with closing(RoundedSimulation(run.stage.model, _ROUNDED_EPISODES)) as sim:
+            run.stage.play(sim, run.cfg.gate.baseline.reset)
+            every = [share, *map(shares, sim.qpos.numpy())]
+        share = {name: min(one[name] for one in every) for name in share}
+        worlds = f"one of {_ROUNDED_EPISODES} native worlds that round"
+        result.details += [f"{n} ends {share[n]:.2g} of the limit from {worlds}" for n in beyond]
     problems = []
     farthest: dict[bool, tuple[float, str]] = {}  # object, and other joint
+    for name, found in _ends_apart(run, end, native).items():
+        result.metrics |= {f"final.{name}.{key}": value for key, value in found.items()}
+        values = [(v, "deg") if "deg" in key else (1e3 * v, "mm") for key, v in found.items()]
+        text = f"{name} ends {' and '.join(f'{v:.2f} {unit}' for v, unit in values)} from native's"
+        problems += [] if share[name] <= 1.0 else [text]
+        other = name not in run.cfg.scene.objects
+        if share[name] > farthest.get(other, (-1.0, ""))[0]:
+            farthest[other] = (share[name], text)
+    return problems, [text for _, text in farthest.values()]
+
+
+def _ends_apart(run: Run, *ends: np.ndarray) -> dict[str, dict[str, float]]:
+    """How far objects and joints that the robot does not command are apart at two ends [m, deg]."""
+    model = run.stage.model
+    moved = np.empty(model.nv)
+    mujoco.mj_differentiatePos(model, moved, 1.0, *ends)
+    out = {}
     for number, kind in enumerate(model.jnt_type):
         name = model.joint(number).name or f"joint {number}"
         if name in run.cfg.robot.joints:
             continue
         slid, turned = np.split(moved[model.dof_jntid == number], [_SLIDES.get(int(kind), 0)])
-        pairs = zip(allowed, (slid, np.degrees(turned)), strict=True)
-        apart = {key: float(np.linalg.norm(part)) for key, part in pairs if part.size}
+        pairs = {"position_m": slid, "rotation_deg": np.degrees(turned)}
+        out[name] = {key: float(np.linalg.norm(part)) for key, part in pairs.items() if part.size}
         if thing := run.cfg.scene.objects.get(name):
             quats = [torch.from_numpy(q[model.jnt_qposadr[number] :][3:7]) for q in ends]
-            apart["rotation_deg"] = math.degrees(turn_between(thing.shape, *quats))
-        result.metrics |= {f"final.{name}.{key}": value for key, value in apart.items()}
-        values = [(v, "deg") if "deg" in key else (1e3 * v, "mm") for key, v in apart.items()]
-        text = f"{name} ends {' and '.join(f'{v:.2f} {unit}' for v, unit in values)} from native's"
-        share = float(np.max([v / max(allowed[key], 1e-30) for key, v in apart.items()]))
-        problems += [] if share <= 1.0 else [text]
-        if share > farthest.get(thing is None, (-1.0, ""))[0]:
-            farthest[thing is None] = (share, text)
-    return problems, [text for _, text in farthest.values()]
+            out[name]["rotation_deg"] = math.degrees(turn_between(thing.shape, *quats))
+    return out
 
 
 def turn_between(shape: str, a: Tensor, b: Tensor) -> float:
@@ -247,13 +329,13 @@ def end_state(sim: Simulation, state: State, steps: int) -> dict[str, Tensor]:
         sim.step(min(_CAPTURED, steps - first))
     sim.forward()
     sim.synchronize()
-    return {name: getattr(sim, name).double().cpu().clone() for name in PARITY_FIELDS}
+    return {name: getattr(sim, name).double().cpu().clone() for name in COMPARED}
 
 
 def differences(a: dict[str, Tensor], b: dict[str, Tensor]) -> dict[str, Tensor]:
     """Largest absolute difference over the worlds of every number of every field, each ``(n,)``."""
     out = {}
-    for name in PARITY_FIELDS:
+    for name in COMPARED:
         x, y = a[name], b[name]
         if name == "xquat":  # q and -q are one rotation
             y = torch.where((x * y).sum(-1, keepdim=True) < 0.0, -y, y)

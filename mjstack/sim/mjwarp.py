@@ -8,6 +8,7 @@ from functools import cache, partial
 from types import SimpleNamespace
 
 import mujoco
+import numpy as np
 import torch
 from torch import Tensor
 from typing_extensions import override
@@ -191,6 +192,15 @@ class MjwarpSimulation(Simulation):
             **named_options(opt),
             "box_box": "primitive" if primitive else "convex",
         }
+
+    @override
+    def model_values(self) -> dict[str, np.ndarray]:
+        values = {}
+        for name in dir(self.model):
+            held, array = getattr(self._m, name, None), getattr(self.model, name)
+            if isinstance(held, wp.array) and isinstance(array, np.ndarray) and array.size:
+                values[name] = held.numpy().ravel()[: array.size].reshape(array.shape)
+        return values
 
     @override
     def make_cameras(self, cameras: Mapping[str, CameraCfg]) -> Cameras:

@@ -275,6 +275,10 @@ class Simulation(ABC):
     def option_values(self) -> dict[str, float | int | str]:
         """The physics options as this backend holds them, by MuJoCo's names."""
 
+    def model_values(self) -> dict[str, np.ndarray]:
+        """The model's arrays as uploaded, by MuJoCo's names; none on native MuJoCo."""
+        return {}
+
     def synchronize(self) -> None:
         """Wait for the device. On native MuJoCo `step` returns when every thread has."""
         return

@@ -148,10 +148,10 @@ class ParityCfg(GateFuncCfg):
     """States from which both step: a name, and the phase at whose end the state is taken. Empty:
     the first phase, the one after the first grasp (without grasps, the last with a closed gripper),
     and the last. A driver without phases has those after each third of its episode instead."""
-    step1: dict[str, float] = spec(unit="SI", ge=0.0)
-    """Largest difference of each field after one physics step."""
-    step50: dict[str, float] = spec(unit="SI", ge=0.0)
-    """Largest difference of each field after 50 physics steps."""
+    step1_ranges: float = spec(ge=0.0)
+    """Largest difference after one physics step, in ranges of native MuJoCo that rounds."""
+    step50_ranges: float = spec(ge=0.0)
+    """The same after 50 physics steps."""
     object_position: float = spec(unit="m", ge=0.0)
     """Largest difference of an object's position after the whole task."""
     object_rotation_deg: float = spec(unit="deg", ge=0.0)
