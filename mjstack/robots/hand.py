@@ -10,6 +10,7 @@ _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)  # hinges follow; others are not an ar
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 _TENDON = int(mujoco.mjtTrn.mjTRN_TENDON)
 _JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+_BASE = 0.4  # m: a geom of the world that is all so near an arm is its base
 _FINGER = 3  # joints with a servo that a finger has at most; an arm has more
 
 
@@ -129,13 +130,17 @@ def _joints(model: mujoco.MjModel, bodies: list[int]) -> set[int]:
 
 
 def find_root(model: mujoco.MjModel, hand: Hand) -> int:
-    """The highest body below which, and at which, there is no joint but the hand's and its arm's;
-    0, for the whole file, if it has nothing else that has to stay behind.
+    """The highest body at and below which there is no joint but the hand's and its arm's; 0, for
+    the whole file, if there is nothing else in it than what a scene leaves out by itself, and the
+    arm's base.
     """
     mine = {*hand.arm} | _joints(model, list(hand.bodies))
     path = [*reversed([*ancestors(model, hand.palm)])]
-    clean = [b for b in path if _joints(model, _below(model, b)) <= mine]
-    root = clean[0]
+    root = next(b for b in path if _joints(model, _below(model, b)) <= mine)
     tops = np.flatnonzero(model.body_parentid == 0)[1:]
-    free = [t for t in tops if _FREE in model.jnt_type[_body_joints(model, t)]]
-    return 0 if root == path[0] and {*tops} <= {root, *free} else root
+    free = {t for t in tops if _FREE in model.jnt_type[_body_joints(model, t)]}
+    plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+    here = np.flatnonzero((model.geom_bodyid == 0) & ~plane)
+    far = np.linalg.norm(model.geom_pos[here] - model.body_pos[path[0]], axis=1)
+    large = (far + model.geom_rbound[here] > _BASE).any()
+    return 0 if root == path[0] and {*tops} <= {root, *free} and not large else root

@@ -153,9 +153,11 @@ class Fingers:
         model, data, palm = self.model, self._data, self._hand.palm
         last = self._hand.arm[-1]
         turn = data.xmat[palm].reshape(3, 3)
-        away = middle - self._to_palm(data.xanchor[last])
-        away = _unit(away - (away @ closing) * closing)
         hinge = model.jnt_type[last] == mujoco.mjtJoint.mjJNT_HINGE
+        body = self.points([*self._fixed])
+        origin = body.mean(axis=0) if len(body) and not hinge else self._to_palm(data.xanchor[last])
+        away = middle - origin
+        away = _unit(away - (away @ closing) * closing)
         axes = [*([turn.T @ data.xaxis[last]] if hinge else []), *np.eye(3)]
         for axis, near in zip(axes, [0.8] * hinge + [0.95] * 3, strict=True):
             if abs(axis @ away) > near and abs(axis @ closing) < 0.6:
