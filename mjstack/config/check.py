@@ -104,7 +104,9 @@ def _robot(cfg: Config) -> Checks:
     joints = len(robot.joints)
     lengths = {"home": joints, "start": joints, "gripper_open": grip, "gripper_closed": grip}
     for key, size in lengths.items():
-        yield f"robot.{key}", len(getattr(robot, key)) != size, f"{size} numbers, one per joint"
+        values = getattr(robot, key)
+        wrong = values is not None and len(values) != size
+        yield f"robot.{key}", wrong, f"{size} numbers, one per joint"
     wrong = abs(math.hypot(*robot.approach_axis) - 1.0) > 1e-3
     yield "robot.approach_axis", wrong, "a vector of length 1, such as [0, 0, -1]"
     for key in ("name", "menagerie_name", "menagerie_file"):  # they become paths
@@ -199,6 +201,7 @@ def _phases(cfg: Config) -> Checks:
     wrong = gain > 0 and controller.step_iterations < 4
     yield "controller.step_iterations", wrong, "at least 4 with a posture_gain or an approach_gain"
     phases = controller.phases
+    exact = cfg.robot.closed_width is None and cfg.robot.gripper_closed is not None
     names = list(phases)
     known = [*cfg.scene.objects, *cfg.scene.places]
     observed: set[str | None] = {*cfg.scene.places, None}
@@ -207,6 +210,8 @@ def _phases(cfg: Config) -> Checks:
         key = f"controller.phases.{name}"
         wrong = number == 0 and phase.anchor is None
         yield f"{key}.anchor", wrong, "an object or a place, as the phase is the first"
+        expected = "null, because robot.gripper_closed is for any object. Set robot.closed_width too"
+        yield f"{key}.width", exact and phase.width is not None, expected
         require_names(f"{key}.grasps: object that moves", [phase.grasps], cfg.scene.free)
         require_names(f"{key}.retry: phase", [phase.retry], phases)
         for role, source in (("anchor", phase.anchor), ("toward", phase.toward)):

@@ -176,6 +176,7 @@ def compose(overrides: Sequence[str], run_mode: RunMode = RunMode.RUN) -> DictCo
         if run_mode is RunMode.RUN:
             check_added(session.without_hydra(cfg), overrides)
             _drop_inherited(cfg, loader.files[id(cfg)], overrides)
+            _keep_exact(cfg, loader.files[id(cfg)], overrides)
             complete_terms(cfg, overrides)
     except (HydraException, OmegaConfBaseException, AssertionError, TypeError, ValueError) as error:
         raise explain(error, overrides) from error
@@ -191,15 +192,10 @@ def _drop_inherited(
     that are given with the new one or after it: those of the other function are not its own.
     ``files`` are the keys and values of each, in the order of composition.
     """
-    typed: dict[str, object] = {}
-    for override in map(parse, own_overrides(overrides)):
-        value: Any = None if override.is_delete() else override.value()
-        typed |= {override.key_or_group: value}
-        typed |= dict(session.list_items(value, f"{override.key_or_group}."))
     functions: dict[str, object] = {}  # by the mapping of their parameters
     params: dict[str, set[str]] = {}
     swapped = set()
-    for source in (*files, typed):
+    for source in (*files, _typed(overrides)):
         for key, value in source.items():
             term, _, name = key.rpartition(".")
             section = term if term == "task.check" else f"{term}.params"
@@ -219,6 +215,29 @@ def _drop_inherited(
             with open_dict(cfg):
                 for key in owner[name].keys() - params[section]:
                     del owner[name][key]
+
+
+def _typed(overrides: Sequence[str]) -> dict[str, object]:
+    """Keys and values of overrides."""
+    typed: dict[str, object] = {}
+    for override in map(parse, own_overrides(overrides)):
+        value: Any = None if override.is_delete() else override.value()
+        typed |= {override.key_or_group: value}
+        typed |= dict(session.list_items(value, f"{override.key_or_group}."))
+    return typed
+
+
+def _keep_exact(
+    cfg: DictConfig, files: Sequence[Mapping[str, object]], overrides: Sequence[str]
+) -> None:
+    """Joint targets of closed jaws that replace the robot's own are for any object, unless a width
+    comes with them or after them. Arguments as of `_drop_inherited`.
+    """
+    closed, width = "robot.gripper_closed", "robot.closed_width"
+    given = [source for source in (*files, _typed(overrides)) if source.keys() & {closed, width}]
+    targets = [number for number, source in enumerate(given) if closed in source]
+    if targets and targets[-1] > 0 and not any(width in s for s in given[targets[-1] :]):
+        cfg.robot.closed_width = None
 
 
 def load_saved(path: Path) -> Config:

@@ -14,7 +14,9 @@ from torch import Tensor
 from mjstack.config.schema import RobotCfg
 from mjstack.errors import ArgumentError, ConfigError, MjstackError
 from mjstack.kinematics.ik_kernels import HINGE, SLIDE, Chain, Shape, forward_kernel, solve_kernel
+from mjstack.robots.posture import posture
 from mjstack.scene.index import approach_body, joint_limits, locked_home
+from mjstack.sim.simulation import Columns
 from mjstack.sim.warp_setup import torch_stream_scope
 
 # m: with a gain, an iterate this close to the target replaces a closer one that came before
@@ -27,7 +29,7 @@ _MAX_STEP = 0.3  # [rad, m] largest change of any joint per iteration
 _NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
 
 _Pose = tuple[ndarray, ndarray]  # position and quaternion (wxyz)
-_Link = tuple[_Pose, ndarray, int, int]  # frame, axis, kind, column of the joint targets
+_Link = tuple[_Pose, ndarray, int, int, int]  # frame, axis, kind, column and row as in `Chain`
 
 
 def build_chain(model: mujoco.MjModel, robot: RobotCfg) -> tuple[Chain, Shape]:
@@ -35,10 +37,19 @@ def build_chain(model: mujoco.MjModel, robot: RobotCfg) -> tuple[Chain, Shape]:
     the current device, and its shape.
     """
     # Columns of the joint targets: the joint of each, those that move, and their limits
-    columns = {model.joint(name).id: column for column, name in enumerate(robot.joints)}
+    columns = {model.joint(name).id: (column, -1) for column, name in enumerate(robot.joints)}
     moved = [robot.arm_joints.index(name) for name in robot.ik_joints]
-    limits = np.tile(np.array([[-np.inf], [np.inf]], dtype=np.float32), len(columns))
-    for side, values in enumerate(joint_limits(model, robot.ik_joints)):
+    coupling = posture(model, robot.joints)
+    follows = [*coupling.columns, *coupling.commanded[coupling.coupled]]
+    for row, (address, leader) in enumerate(zip(follows, coupling.leader, strict=True)):
+        joint = int(np.flatnonzero(model.jnt_qposadr == address)[0])
+        own, _ = columns.get(joint, (-1, -1))
+        if own < 0 or own in moved:
+            columns[joint] = (int(leader), row)
+        moved = [column for column in moved if column != own]
+    limits = np.tile(np.array([[-np.inf], [np.inf]], dtype=np.float32), len(robot.joints))
+    ranges = joint_limits(model, [robot.joints[column] for column in moved])
+    for side, values in enumerate(ranges):
         limits[side, moved] = _round_inwards(values, 1.0 - 2.0 * side)
 
     # Links from the world to the jaws, and from there to each site
@@ -59,7 +70,7 @@ def build_chain(model: mujoco.MjModel, robot: RobotCfg) -> tuple[Chain, Shape]:
             for joint in range(first_joint, first_joint + model.body_jntnum[body]):
                 if joint in columns:
                     pose = _compose(pose, (model.jnt_pos[joint], _NO_TURN))
-                    links.append(_read_link(model, joint, pose, columns[joint]))
+                    links.append((*_read_link(model, joint, pose), *columns[joint]))
                     pose = (-model.jnt_pos[joint], _NO_TURN)
                     turned.clear()
             turned[body] = pose[1]
@@ -83,7 +94,7 @@ def build_chain(model: mujoco.MjModel, robot: RobotCfg) -> tuple[Chain, Shape]:
     end = extend(second_path[shared:], trunk)
     chain.second_site = wp.vec3(*_compose(end, (model.site_pos[second], _NO_TURN))[0])
     chain.end = len(links)
-    frames, axes, kinds, column = (list(values) for values in zip(*links, strict=True))
+    frames, axes, kinds, column, rows = (list(values) for values in zip(*links, strict=True))
     poses = [[*pos, *quat[1:], quat[0]] for pos, quat in frames]  # Warp: xyzw
     chain.frame = wp.array(poses, dtype=wp.transform)
     chain.axis = wp.array(axes, dtype=wp.vec3)
@@ -91,14 +102,26 @@ def build_chain(model: mujoco.MjModel, robot: RobotCfg) -> tuple[Chain, Shape]:
     chain.column = wp.array(column, dtype=int)
     chain.low = wp.array(limits[0, column], dtype=float)
     chain.high = wp.array(limits[1, column], dtype=float)
-    ik_links = tuple(c in moved for c in column)
-    if not any(ik_links) or any(ik_links[chain.trunk :]):
+    chain.row = wp.array(rows, dtype=int)
+    chain.table_low = wp.array(coupling.low, dtype=float)
+    chain.table_step = wp.array(coupling.step, dtype=float)
+    chain.table_value = wp.array2d(coupling.value, dtype=float)
+    chain.table_slope = wp.array2d(coupling.slope, dtype=float)
+    moving = [c in moved for c in column]  # or goes along
+    ik_links = tuple(m and row < 0 for m, row in zip(moving, rows, strict=True))
+    leaders = tuple(
+        next(k for k, c in enumerate(column) if c == column[i] and ik_links[k])
+        if moving[i] and not ik_links[i]
+        else -1
+        for i in range(len(column))
+    )
+    if not any(ik_links) or any(moving[chain.trunk :]):
         expected = f"joints that move both grasp sites, {' and '.join(robot.grasp_sites)}"
         raise ConfigError("robot.ik_joints", robot.ik_joints, expected)
-    return chain, Shape(tuple(kinds), ik_links, chain.trunk, chain.fork, chain.end)
+    return chain, Shape(tuple(kinds), ik_links, leaders, chain.trunk, chain.fork, chain.end)
 
 
-def _read_link(model: mujoco.MjModel, joint: int, pose: _Pose, column: int) -> _Link:
+def _read_link(model: mujoco.MjModel, joint: int, pose: _Pose) -> tuple[_Pose, ndarray, int]:
     """Read a joint whose frame at qpos0 is ``pose``; its frame at 0 is turned, or shifted, back by
     qpos0.
     """
@@ -117,7 +140,7 @@ def _read_link(model: mujoco.MjModel, joint: int, pose: _Pose, column: int) -> _
         back = (np.zeros(3), turn)
     else:
         back = (-zero * axis, turn)
-    return _compose(pose, back), axis, kind, column
+    return _compose(pose, back), axis, kind
 
 
 def _path(model: mujoco.MjModel, body: int) -> list[int]:
@@ -153,7 +176,7 @@ class BatchedIk:
 
     Joint positions are in the order of the robot's arm joints and then its gripper joints, in
     float32 or float64. Everything is in the world frame. Joints before the sites that the robot's
-    profile does not name stay at the model's qpos0.
+    profile does not name are where `Posture` has them.
 
     Example:
         >>> ik = BatchedIk(model, cfg.robot, nworld=64, device="cpu")
@@ -203,6 +226,13 @@ class BatchedIk:
         near = _NEAR if gained else -1.0
         gains = (posture_gain, approach_gain)
         self._settings = [iterations, guided, _DAMPING, _MAX_STEP, *gains, near]
+
+        # Commanded joints that follow ik joints
+        self._coupling = coupling = posture(model, robot.joints)
+        leaders = coupling.leader[len(coupling.columns) :]
+        follows = np.isin(leaders, [robot.joints.index(name) for name in robot.ik_joints])
+        self._coupled = Columns(coupling.coupled[follows], self.device)
+        self._rows = Columns(len(coupling.columns) + np.flatnonzero(follows), self.device)
 
         # The chain and all buffers, each a Warp array and a torch view of it
         with torch_stream_scope(self._device):
@@ -275,6 +305,9 @@ class BatchedIk:
             self._copy_in("approach", approach)
             names[3] = "approach"
         self._launch(self._kernel, names, self._settings, ["solution", "distance"])
+        if self._coupled.indices:
+            follow, _ = self._coupling.follow(self._view["solution"])
+            self._coupled.write(self._view["solution"], self._rows.read(follow))
         return self._view["solution"], self._view["distance"]
 
     def _launch(

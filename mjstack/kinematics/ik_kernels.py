@@ -42,6 +42,11 @@ class Chain:
     first_site: wp.vec3
     second_site: wp.vec3
     approach: wp.vec3  # of unit length
+    row: wp.array[int]  # of the tables, by link; -1 where the joint's position is its column's
+    table_low: wp.array[float]  # tables of joints that follow, see `Posture`
+    table_step: wp.array[float]
+    table_value: wp.array2d[float]
+    table_slope: wp.array2d[float]
 
 
 @dataclass(frozen=True)
@@ -52,6 +57,7 @@ class Shape:
 
     kinds: tuple[int, ...]  # HINGE or SLIDE, of each link
     moved: tuple[bool, ...]  # whether inverse kinematics moves it; of the trunk alone
+    leader: tuple[int, ...]  # number of the moved link that it follows, or -1
     trunk: int
     fork: int
     end: int
@@ -67,6 +73,26 @@ def turn(pose: wp.transform, axis: wp.vec3, kind: int, value: float) -> wp.trans
 
 
 @wp.func
+def position(chain: Chain, link: int, x: float) -> wp.vec2:
+    """Position of a link's joint, and its derivative by x, where its column's is x."""
+    row = chain.row[link]
+    if row < 0:
+        return wp.vec2(x, 1.0)
+    step = chain.table_step[row]
+    last = float(chain.table_value.shape[1] - 1)
+    at = wp.clamp((x - chain.table_low[row]) / step, 0.0, last)
+    knot = wp.min(int(at), int(last) - 1)
+    t = at - float(knot)
+    a = chain.table_value[row, knot]
+    rise = chain.table_value[row, knot + 1] - a
+    start = step * chain.table_slope[row, knot]
+    bend = start + step * chain.table_slope[row, knot + 1] - 2.0 * rise
+    lean = rise - start - bend
+    value = a + t * (start + t * (lean + t * bend))
+    return wp.vec2(value, (start + t * (2.0 * lean + 3.0 * t * bend)) / step)
+
+
+@wp.func
 def follow(
     chain: Chain, q: wp.array2d[float], w: int, first: int, last: int, start: wp.transform
 ) -> wp.transform:
@@ -74,7 +100,8 @@ def follow(
     pose = start
     for i in range(first, last):
         frame = wp.transform_multiply(pose, chain.frame[i])
-        pose = turn(frame, chain.axis[i], chain.kind[i], q[w, chain.column[i]])
+        value = position(chain, i, q[w, chain.column[i]])[0]
+        pose = turn(frame, chain.axis[i], chain.kind[i], value)
     return pose
 
 
@@ -118,7 +145,7 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
     Joints behind the last moved one, such as the wrist's roll and the fingers, are followed once
     per solve. An iteration then follows the END links up to it.
     """
-    END = max(i + 1 for i, moved in enumerate(shape.moved) if moved)
+    END = max(i + 1 for i, moved in enumerate(shape.moved) if moved or shape.leader[i] >= 0)
     Values = wp.types.vector(length=END, dtype=float)
     Rows = wp.types.matrix(shape=(END, 3), dtype=float)  # a vector per link
 
@@ -216,6 +243,12 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
             # Forward kinematics
             anchors = Rows()
             axes = Rows()
+            slopes = Values()
+            for i in range(END):
+                if wp.static(shape.leader[i] >= 0):
+                    pair = position(chain, i, q[wp.static(shape.leader[i])])
+                    q[i] = pair[0]
+                    slopes[i] = pair[1]
             link = wp.transform(wp.vec3(), wp.quat_identity())
             for i in range(END):
                 pose = wp.transform_multiply(link, chain.frame[i])
@@ -239,6 +272,12 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
                         if wp.static(shape.kinds[i] == HINGE):
                             direction = wp.cross(direction, midpoint - anchors[i])
                         jacobian[i] = direction
+                for i in range(END):
+                    if wp.static(shape.leader[i] >= 0):
+                        direction = axes[i]
+                        if wp.static(shape.kinds[i] == HINGE):
+                            direction = wp.cross(direction, midpoint - anchors[i])
+                        jacobian[wp.static(shape.leader[i])] += slopes[i] * direction
                 # Null-space motion, and the step
                 guide = Values()
                 if iteration < guided:
@@ -248,6 +287,10 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
                             guide[i] = posture_gain * (home[i] - q[i])
                             if wp.static(shape.kinds[i] == HINGE):
                                 guide[i] += approach_gain * wp.dot(axes[i], lever)
+                    for i in range(END):
+                        if wp.static(shape.leader[i] >= 0 and shape.kinds[i] == HINGE):
+                            turned = slopes[i] * wp.dot(axes[i], lever)
+                            guide[wp.static(shape.leader[i])] += approach_gain * turned
                 step = find_step(jacobian, q, guide, low, high, error, damping)
                 largest = wp.float32(0.0)
                 for i in range(END):

@@ -1,21 +1,25 @@
 """Inverse kinematics with mink on a model of the robot alone: the reference, which plans grasps."""
 
+import copy
 import math
 
 import mink
 import mujoco
 import numpy as np
+import torch
 from numpy import ndarray
 
 from mjstack.config.schema import ModelCfg, RobotCfg
 from mjstack.errors import ConfigError
 from mjstack.robots import robot_spec
 from mjstack.robots.guest import compile_scene
+from mjstack.robots.posture import Posture, posture
 from mjstack.scene.index import locked_home
 
 _POSTURE_COST = 1e-3  # pulls the redundant joints home; moves the grasp point by micrometres
 _ITERATIONS = 60  # at most, per solve
 _CONVERGED = 0.1  # share of the tolerance: Newton's method squares the error, so that is enough
+_APART = 1e-4  # [rad, m] that a joint value may be off an equality
 _MAX_STEP = 0.3  # [rad, m] per iteration: a far target is approached on one branch of solutions
 
 
@@ -43,6 +47,27 @@ class GraspPointTask(mink.Task):
         return self._jac.mean(axis=0)
 
 
+class _Held(mink.DofFreezingTask):
+    """Hold degrees of freedom, and let those that follow moving ones go along."""
+
+    def __init__(self, model: mujoco.MjModel, held: list[int], posture: Posture) -> None:
+        super().__init__(model, held)
+        self._posture = posture
+        addresses = model.jnt_qposadr[model.dof_jntid].tolist()
+        leaders = posture.commanded[posture.leader].tolist()
+        columns = [*posture.columns, *posture.commanded[posture.coupled]]
+        self._leading = [addresses.index(leader) for leader in leaders]
+        self._rows = [held.index(addresses.index(column)) for column in columns]
+
+    def compute_jacobian(self, configuration: mink.Configuration) -> ndarray:
+        """Rows of the identity, less the slopes of what follows, shape ``(held, nv)``."""
+        jacobian = super().compute_jacobian(configuration).copy()
+        if self._rows:
+            command = torch.from_numpy(configuration.q[self._posture.commanded])
+            jacobian[self._rows, self._leading] -= self._posture.follow(command)[1].numpy()
+        return jacobian
+
+
 class GraspIk:
     """Arm positions that bring the grasp point to a target at a given gripper opening."""
 
@@ -55,25 +80,22 @@ class GraspIk:
         self.model = compile_scene(spec)
         self.tolerance = tolerance
         joints = [self.model.joint(name).id for name in robot.joints]
-        for key in ("home", "gripper_open", "gripper_closed"):
-            values = getattr(robot, key)
-            for name, value in zip(robot.joints[-len(values) :], values, strict=True):
-                low, high = self.model.joint(name).range
-                if not low <= value <= high:
-                    raise ConfigError(
-                        f"robot.{key} of {name}", value, f"a value within [{low:.4g}, {high:.4g}]"
-                    )
         self._qpos = self.model.jnt_qposadr[joints]
+        self._coupling = posture(self.model, robot.joints)
         self.home = locked_home(robot)
+        self._check(robot)
         self._configuration = mink.Configuration(self.model)
-        moving = {int(self.model.joint(name).dofadr[0]) for name in robot.ik_joints}
+        coupled = [robot.joints[k] for k in self._coupling.coupled]
+        moving = {int(self.model.joint(n).dofadr[0]) for n in robot.ik_joints if n not in coupled}
         frozen = [dof for dof in range(self.model.nv) if dof not in moving]
         self._task = GraspPointTask(
             [self.model.site(name).id for name in robot.grasp_sites], self.model.nv
         )
         self._posture = mink.PostureTask(self.model, cost=_POSTURE_COST)
-        self._limits = [mink.ConfigurationLimit(self.model, gain=1.0)]
-        self._constraints = [mink.DofFreezingTask(self.model, frozen)]
+        limited = copy.copy(self.model)
+        limited.jnt_limited[np.setdiff1d(np.arange(self.model.njnt), joints)] = False
+        self._limits = [mink.ConfigurationLimit(limited, gain=1.0)]
+        self._constraints = [_Held(self.model, frozen, self._coupling)]
         self._posture.set_target(self._to_qpos(self.home))
 
     def solve(self, target: ndarray, start: ndarray) -> tuple[ndarray, float]:
@@ -101,6 +123,9 @@ class GraspIk:
                 break
             largest = float(np.abs(step).max())
             configuration.integrate_inplace(step * min(1.0, _MAX_STEP / max(largest, 1e-12)), 1.0)
+            if self._coupling.leader.size:
+                command = self._coupling.agree(configuration.q[self._qpos])
+                configuration.update(self._to_qpos(command))
             left = float(np.linalg.norm(self._task.compute_error(configuration)))
             # The pull towards home can end in oscillations, farther from the target.
             if left < distance:
@@ -108,6 +133,8 @@ class GraspIk:
                 distance = left
             if distance < _CONVERGED * self.tolerance:
                 break
+        if math.isinf(distance):
+            distance = float(np.linalg.norm(self._task.compute_error(configuration)))
         return nearest, distance
 
     def grasp_point(self, q: ndarray) -> ndarray:
@@ -116,6 +143,29 @@ class GraspIk:
         return self._task.compute_error(self._configuration) + self._task.target
 
     def _to_qpos(self, q: ndarray) -> ndarray:
-        qpos = self.model.qpos0.copy()
-        qpos[self._qpos] = q
-        return qpos
+        return self._coupling.qpos(q)
+
+    def _check(self, robot: RobotCfg) -> None:
+        """Raise a ConfigError for a joint value that the robot's file does not allow."""
+        grip = robot.gripper_joints
+        given = [
+            ("home", robot.joints, robot.home),
+            ("start", robot.joints, robot.start),
+            ("locked", list(robot.locked), list(robot.locked.values())),
+            ("gripper_open", grip, robot.gripper_open),
+            ("gripper_closed", grip, robot.gripper_closed),
+        ]
+        for key, names, values in given:
+            command = self.home.copy()
+            columns = [robot.joints.index(name) for name in names]
+            command[columns] = command[columns] if values is None else values
+            agreed = self._coupling.agree(command)
+            for k, name in zip(columns, names, strict=True):
+                low, high = self.model.joint(name).range
+                value = float(command[k])
+                if not low <= value <= high:
+                    expected = f"a value within [{low:.4g}, {high:.4g}]"
+                    raise ConfigError(f"robot.{key} of {name}", value, expected)
+                if abs(value - agreed[k]) > _APART:
+                    expected = f"{agreed[k]:.4g}, as the file's equalities have it"
+                    raise ConfigError(f"robot.{key} of {name}", value, expected)

@@ -23,10 +23,17 @@ LOADED = 1e-5  # N: a jaw that presses with more touches the object
 
 
 def write_robot(env: EnvView, mask: Tensor, command: Tensor) -> None:
-    """Put the masked worlds' robot at a command, shape ``(nworld, n)`` or ``(n,)``: qpos, ctrl."""
+    """Put the masked worlds' robot at a command, shape ``(nworld, n)`` or ``(n,)``: qpos, with all
+    joints that follow, and ctrl.
+    """
     tensors = robot(env)
+    if passive := len(tensors.passive.indices):
+        follow, _ = env.index.posture.follow(command.to(env.sim.qpos.dtype))
+        tensors.passive.write_masked(env.sim.qpos, mask, follow[..., :passive])
     tensors.qpos.write_masked(env.sim.qpos, mask, command)
     tensors.ctrl.write_masked(env.sim.ctrl, mask, command)
+    if tensors.idle.indices:
+        tensors.idle.write_masked(env.sim.ctrl, mask, tensors.idle_ctrl)
 
 
 def gripper_opening(env: EnvView) -> Tensor:

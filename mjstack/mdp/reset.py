@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 from typing_extensions import override
@@ -28,7 +29,9 @@ def home(env: EnvView, mask: Tensor, *, pose: Pose = "home") -> None:
 
 @offers("reset term", joint_noise=True)
 class JointNoise:
-    """Adds uniform noise to the robot's joint positions and targets, within the joints' ranges."""
+    """Adds uniform noise to the robot's joint positions and targets, within the joints' ranges, and
+    as equalities between them allow.
+    """
 
     # The manager sets the term's own label, so that two of them draw different numbers
     label = "reset.joints"
@@ -43,6 +46,12 @@ class JointNoise:
         """
         self._width = torch.full_like(robot(env).home, gripper)
         self._width[: env.index.n_arm] = arm
+        posture = env.index.posture
+        first = len(posture.columns)
+        moved = self._width.cpu().numpy() > 0.0
+        moved = moved[posture.coupled] | moved[posture.leader[first:]]
+        self._coupled = Columns(posture.coupled[moved], env.device)
+        self._rows = Columns(first + np.flatnonzero(moved), env.device)
         limits = joint_limits(env.sim.model, env.cfg.robot.joints)
         self._low, self._high = (torch.from_numpy(limit).to(self._width) for limit in limits)
 
@@ -50,7 +59,10 @@ class JointNoise:
         """Write qpos and ctrl."""
         noise = random_uniform(env, self.label, self._width.shape[0])
         command = robot(env).ctrl.read(env.sim.ctrl) + self._width * noise
-        write_robot(env, mask, torch.clamp(command, self._low, self._high))
+        command = torch.clamp(command, self._low, self._high)
+        if self._rows.indices:
+            self._coupled.write(command, self._rows.read(env.index.posture.follow(command)[0]))
+        write_robot(env, mask, command)
 
 
 @uses_fields("qpos0")

@@ -10,6 +10,7 @@ import numpy as np
 
 from mjstack.config.schema import RobotCfg
 from mjstack.errors import MjstackError, require_names
+from mjstack.robots.posture import REST
 
 WORLD = "world"  # MuJoCo's name of the body that never moves
 
@@ -42,6 +43,7 @@ def as_guest(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) ->
     """
     fresh = mujoco.MjSpec()
     fresh.modelname = spec.modelname
+    rest = _home_key(spec, robot)
     for element in _strangers(spec, robot):
         spec.delete(element)
     bodies = {body.name for body in spec.bodies}
@@ -62,6 +64,9 @@ def as_guest(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) ->
     with _without_prefix():
         base = fresh.worldbody.add_frame(pos=robot.base.pos, quat=robot.base.quat)
         fresh.attach(spec, frame=base, prefix="")
+    for joint in fresh.joints:
+        if joint.name in rest:
+            fresh.add_numeric(name=REST + joint.name, data=rest[joint.name])
     return fresh
 
 
@@ -149,6 +154,17 @@ def _strangers(spec: mujoco.MjSpec, robot: RobotCfg) -> list[Any]:
         )
         out = [*spec.keys, *world.lights, *world.geoms, *outside]
     return out
+
+
+def _home_key(spec: mujoco.MjSpec, robot: RobotCfg) -> dict[str, np.ndarray]:
+    """Positions in the file's keyframe ``home`` of joints that the profile does not name."""
+    idle = {joint.name for joint in spec.joints if joint.name} - {*robot.joints}
+    if not idle or "home" not in [key.name for key in spec.keys]:
+        return {}
+    model = spec.copy().compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key("home").id)
+    return {name: data.joint(name).qpos.copy() for name in idle}
 
 
 def _tree(body: mujoco.MjsBody) -> mujoco.MjsBody:

@@ -12,10 +12,14 @@ from torch import Tensor
 
 from mjstack.config.schema import RobotCfg, SceneCfg
 from mjstack.errors import ConfigError, require_names
+from mjstack.robots.jaws import Jaws, robot_jaws
+from mjstack.robots.posture import posture
 from mjstack.math import lowest_point, quat_mul, quat_to_matrix
 from mjstack.scene.build import CAPSULE_TURN, WORLD, force_sensor
 from mjstack.sim.simulation import Columns
 
+_GRIP = 20.0  # [N] of each jaw on an object, where the configuration has no joint target
+_WIDTH = 0.044  # [m] of an object, where there is none
 _SHAPES = {
     int(mujoco.mjtGeom.mjGEOM_SPHERE): "sphere",
     int(mujoco.mjtGeom.mjGEOM_CAPSULE): "capsule",
@@ -34,13 +38,16 @@ class RobotTensors:
     qvel: Columns
     ctrl: Columns
     gripper_qpos: Columns
+    passive: Columns  # of qpos, which a command determines too: `Posture.columns`
+    idle: Columns  # of ctrl: servos of joints that have no command
     range: Tensor  # limits of the joints
     ctrl_range: Tensor  # limits of the joint targets
     home: Tensor
     start: Tensor  # of environments, clear of the table
     gripper_open: Tensor
-    gripper_closed: Tensor  # around the scene's narrowest object, or ``robot.closed_width``
+    gripper_closed: Tensor  # around the narrowest of the scene's objects and that of closed_width
     gripper_travel: Tensor  # the open less the closed one
+    idle_ctrl: Tensor  # commands that hold those joints
 
 
 class SceneIndex:
@@ -50,6 +57,7 @@ class SceneIndex:
         robot_qpos: qpos addresses of the arm's and then the gripper's joints.
         robot_qvel: qvel addresses in the same order.
         robot_range: Joint limits in the same order [rad, m], shape ``(n, 2)``.
+        posture: Where all joints are, from the robot's.
         ctrl: Actuator indices in the same order.
         ctrl_range: Limits of the joint targets in the same order, shape ``(n, 2)``.
         n_arm: How many of them are the arm's.
@@ -72,12 +80,15 @@ class SceneIndex:
         joints = [model.joint(name).id for name in robot.joints]
         self._robot = robot
         self._tensors: dict[tuple[torch.device, torch.dtype], RobotTensors] = {}
-        narrowest = min([robot.closed_width, *(thing.width for thing in scene.free.values())])
-        self._closed = gripper_targets(model, robot, [narrowest])[0]
+        self.posture = posture(model, robot.joints)
+        wide = robot.closed_width or _WIDTH
+        narrowest = min([wide, *(thing.width for thing in scene.free.values())])
+        self._grips = gripper_targets(model, robot, [None, narrowest])
         self.robot_qpos = model.jnt_qposadr[joints]
         self.robot_qvel = model.jnt_dofadr[joints]
         self.robot_range = model.jnt_range[joints]
         self.ctrl = np.array([model.actuator(name).id for name in robot.joints])
+        self._idle = _idle_servos(model, self.ctrl, self.posture.rest)
         self.ctrl_range = model.actuator_ctrlrange[self.ctrl]
         self.n_arm = len(robot.arm_joints)
         self.grasp_sites = [model.site(name).id for name in robot.grasp_sites]
@@ -126,13 +137,17 @@ class SceneIndex:
         key = (device, dtype)
         if key not in self._tensors:
             gripper = self.robot_qpos[self.n_arm :]
-            addresses = (self.robot_qpos, self.robot_qvel, self.ctrl, gripper)
+            passive = self.posture.columns
+            idle, idle_ctrl = self._idle
+            addresses = (self.robot_qpos, self.robot_qvel, self.ctrl, gripper, passive, idle)
             columns = [Columns(a, device) for a in addresses]
             r = self._robot
-            poses = (r.home, r.start, r.gripper_open, self._closed)
+            poses = (r.home, r.start, *self._grips)
             ranges = (self.robot_range, self.ctrl_range)
             numbers = [torch.tensor(n, dtype=dtype, device=device) for n in (*ranges, *poses)]
             numbers.append(numbers[-2] - numbers[-1])
+            numbers.append(torch.from_numpy(idle_ctrl).to(device, dtype))
+            self.posture.follow(numbers[2])  # which moves its tables there
             self._tensors[key] = RobotTensors(*columns, *numbers)  # type: ignore[arg-type]
         return self._tensors[key]
 
@@ -153,6 +168,19 @@ class SceneIndex:
         return self._columns[name]
 
 
+def _idle_servos(
+    model: mujoco.MjModel, commanded: np.ndarray, rest: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Position servos of joints that have no command, and commands that hold these where they are."""
+    servos = np.setdiff1d(np.arange(model.nu), commanded)
+    joint = model.actuator_trntype[servos] == int(mujoco.mjtTrn.mjTRN_JOINT)
+    bias = model.actuator_biasprm[servos]
+    servos = servos[joint & (bias[:, 1] < 0.0) & (model.actuator_gainprm[servos, 0] != 0.0)]
+    bias = model.actuator_biasprm[servos]
+    length = model.actuator_gear[servos, 0] * rest[model.jnt_qposadr[model.actuator_trnid[servos, 0]]]
+    return servos, -(bias[:, 0] + bias[:, 1] * length) / model.actuator_gainprm[servos, 0]
+
+
 def joint_limits(model: mujoco.MjModel, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     """Narrower of each joint's range and its servo's: low and high limits [rad, m], each of shape
     ``(n,)``; infinite where there is none.
@@ -170,29 +198,42 @@ def gripper_targets(
 ) -> np.ndarray:
     """Joint targets of jaws closed around objects [rad, m], shape ``(n, n_gripper)``.
 
-    ``robot.gripper_closed`` is for ``robot.closed_width``. Around other objects the grasp sites are
-    as much nearer to each other, or farther apart, as far as the joints' ranges allow. ``widths``
-    are those of the objects across the jaws [m]; None is for the open gripper.
+    ``robot.gripper_closed`` is for ``robot.closed_width``. Around other objects the jaws are as
+    much nearer to each other, or farther apart, as far as the joints' ranges allow. Where no width
+    is given, it is for any object; where it is not given either, the jaws press with 20 N.
+    ``widths`` are those of the objects across the jaws [m]; None is for the open gripper.
     """
-    opened, closed = np.array([robot.gripper_open, robot.gripper_closed], dtype=float)
-    shares = np.linspace(-2.0, 1.0, 301)[:, None]  # of the way from closed (the 200th) to open
-    targets = np.clip(
-        closed + shares * (opened - closed), *joint_limits(model, robot.gripper_joints)
-    )
-    data = mujoco.MjData(model)
-    addresses = [int(model.joint(name).qposadr[0]) for name in robot.gripper_joints]
-    sites = [model.site(name).id for name in robot.grasp_sites]
-    apart = np.empty(len(targets))
-    for k, target in enumerate(targets):
-        data.qpos[addresses] = target
-        mujoco.mj_kinematics(model, data)
-        apart[k] = np.linalg.norm(np.subtract(*data.site_xpos[sites]))
-    closer = apart[200] - robot.closed_width
+    jaws = jaws_of(model, robot)
+    opened = jaws.opened if robot.gripper_open is None else np.array(robot.gripper_open, dtype=float)
+    given = robot.gripper_closed is not None
+    closed = np.array(robot.gripper_closed if given else jaws.shut, dtype=float)
     wide = np.array(widths, dtype=float)  # None is NaN
-    rows = np.stack([np.interp(closer + wide, apart, column) for column in targets.T], axis=1)
+    if given and robot.closed_width is None:
+        return np.where(np.isnan(wide)[:, None], opened, closed)
+    shares = np.linspace(-2.0, 1.0, 301)[:, None]  # of the way from closed (the 200th) to open
+    low, high = joint_limits(model, robot.gripper_joints)
+    targets = np.clip(closed + shares * (opened - closed), low, high)
+    if given:
+        apart = jaws.spread(targets) if jaws.carry_sites else jaws.gap(targets)
+        goal = apart[200] - robot.closed_width + wide
+    else:
+        apart = jaws.gap(targets)
+        servos = [model.actuator(name).id for name in robot.gripper_joints]
+        stiffness = model.actuator_gainprm[servos, 0] @ (opened - closed) ** 2
+        goal = wide - _GRIP * (apart[-1] - apart[200]) ** 2 / stiffness
+    if not jaws.carry_sites or not given:
+        apart = np.maximum.accumulate(apart)
+    rows = np.stack([np.interp(goal, apart, column) for column in targets.T], axis=1)
     rows[np.isnan(wide)] = opened
-    rows[wide == robot.closed_width] = closed
+    if given:
+        rows[wide == robot.closed_width] = closed
     return rows
+
+
+def jaws_of(model: mujoco.MjModel, robot: RobotCfg) -> Jaws:
+    """The robot's jaws, probed once per model."""
+    names = (robot.joints, robot.gripper_joints, robot.jaw_bodies, robot.grasp_sites)
+    return robot_jaws(model, *map(tuple, names))
 
 
 def locked_home(robot: RobotCfg) -> np.ndarray:

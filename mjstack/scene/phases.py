@@ -89,7 +89,7 @@ def build_phases(cfg: Config) -> list[Phase]:
             in_hand = True
         width = spec.width
         if width is None:
-            width = scene.objects[load].width if in_hand else cfg.robot.closed_width
+            width = scene.objects[load].width if in_hand else cfg.robot.closed_width or 0.0
         width = width if spec.gripper == "closed" else None
         phases.append(Phase(name, start, stop, spec, target, grasped, carried, width))
         start = stop

@@ -108,9 +108,10 @@ class RobotCfg:
     gripper_joints: list[str] = MISSING
     """Joints of the gripper."""
     jaw_bodies: list[str] = MISSING
-    """Bodies that touch a grasped object. A sensor measures the force of each on each object."""
+    """Bodies that touch a grasped object, each with all below it. A sensor measures the force of
+    each on each object."""
     grasp_sites: list[str] = spec(length=2)
-    """Two sites, one on each jaw. Their midpoint is the grasp point."""
+    """Two sites, on fingers, pads or palm, one at each jaw. Their midpoint is the grasp point."""
     grasp_parts: dict[str, list[str]] = spec({})
     """Where a grasp site goes that the file lacks: the mean of these geoms or bodies of one jaw."""
     grasp_pos: dict[str, Any] = spec({}, vectors=True, unit="m", length=3)
@@ -119,12 +120,14 @@ class RobotCfg:
     """Joint values at which a driven episode begins."""
     start: list[float] = spec([], unit="rad, m")
     """Joint values at which environments begin, clear of the table. Empty: ``home``."""
-    gripper_open: list[float] = spec(unit="rad, m")
-    """Joint targets of the open gripper."""
-    gripper_closed: list[float] = spec(unit="rad, m")
-    """Joint targets of the gripper around an object as wide as ``closed_width``."""
-    closed_width: float = spec(0.044, unit="m", gt=0.0)
-    """Width of that object. Around another one the jaws close as much nearer or farther."""
+    gripper_open: list[float] | None = spec(None, unit="rad, m")
+    """Joint targets of the open gripper. null: as far as the joints' ranges allow."""
+    gripper_closed: list[float] | None = spec(None, unit="rad, m")
+    """Joint targets of the gripper around an object as wide as ``closed_width``; around any object
+    where a task or the command line sets it alone. null: jaws press with 20 N, as far as they do."""
+    closed_width: float | None = spec(0.044, unit="m", gt=0.0)
+    """Width of the object that ``gripper_closed`` is for. Around another one the jaws close as much
+    nearer or farther. null: that target is for any object."""
     arm_force_limit: float | None = spec(None, unit="N m, N", gt=0.0)
     """Largest force of the arm's servos. null: the file's own."""
     servos: dict[str, ServoCfg] = spec({})

@@ -72,7 +72,7 @@ class Placement:
         radii = [thing.footprint for thing in objects]
         self._apart = [[a + b + gap for b in radii] for a in radii]
         data = mujoco.MjData(model)
-        data.qpos[env.index.robot_qpos] = pose
+        data.qpos[:] = env.index.posture.qpos(np.array(pose))
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)

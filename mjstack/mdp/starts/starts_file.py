@@ -171,6 +171,11 @@ class FromStartsFile:
         values = table.take(joints)
         fallback = getattr(robot(env), pose).double().cpu().numpy()
         command = np.where(np.isnan(values), fallback, values)
+        apart = np.abs(command - env.index.posture.agree(command))
+        if apart.max(initial=0.0) > _FLAT:
+            world, joint = (int(k) for k in np.unravel_index(apart.argmax(), apart.shape))
+            expected = f"a position that the file's equalities allow, {apart.max():.4g} from there"
+            raise table.wrong(expected, "Correct it", world, [joints[joint]])
         starts = table.take(poses).reshape(table.worlds, len(objects), 6)
         _check_worlds(env, table, starts[:needed], command[:needed])  # those that are played
         for number, name in enumerate(objects):
@@ -276,8 +281,7 @@ def _check_worlds(env: EnvView, table: StartsTable, starts: ndarray, command: nd
     owner = {geom: name for name, geoms in index.geoms.items() for geom in geoms}
     ground = model.geom("table").id
     for world, (objects, joints) in enumerate(zip(starts, command, strict=True)):
-        data.qpos[:] = model.qpos0
-        data.qpos[index.robot_qpos] = joints
+        data.qpos[:] = index.posture.qpos(joints)
         for (name, (address, _)), start in zip(index.objects.items(), objects, strict=True):
             data.qpos[address : address + 2] = start[:2]
             data.qpos[address + 3 : address + 7] = start[2:]
