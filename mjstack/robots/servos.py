@@ -57,15 +57,16 @@ def _find_servo(spec: mujoco.MjSpec, name: str, made: ServoCfg | None) -> mujoco
     if not low < high:
         expected = f"a range, in the file or as robot.ranges.{name}=[LOW,HIGH]"
         raise ConfigError(f"range of joint {name}", [float(low), float(high)], expected)
-    servos = [a for a in spec.actuators if a.trntype in _JOINT and a.target == name]
-    reason = _refusal(servos[0]) if len(servos) == 1 else ""
-    if len(servos) == 1 and not reason:
+    servos = _servos(spec, name)
+    reason = servo_problem(spec, name)
+    if not reason:
         servos[0].trntype = mujoco.mjtTrn.mjTRN_JOINT  # the same for hinges and slides
         _convert(servos[0])
         return servos[0]
     if made is None or made.stiffness is None or made.damping is None or made.effort is None:
         names = ", ".join(a.name or "unnamed" for a in servos) or "none"
-        expected = f"one <position> in the robot's file{reason and f' ({reason})'}, or"
+        because = f" ({reason})" if len(servos) == 1 else ""
+        expected = f"one <position> in the robot's file{because}, or"
         expected += f" stiffness, damping and effort in robot.servos.{name}"
         raise ConfigError(f"actuators of joint {name}", names, expected)
     for servo in servos:
@@ -85,6 +86,16 @@ def _add_servo(
     servo.set_to_position(kp=stiffness, kv=damping)
     servo.inheritrange = 0.0
     return servo
+
+
+def _servos(spec: mujoco.MjSpec, name: str) -> list[mujoco.MjsActuator]:
+    return [a for a in spec.actuators if a.trntype in _JOINT and a.target == name]
+
+
+def servo_problem(spec: mujoco.MjSpec, name: str) -> str:
+    """Why a joint's actuators are no servo of its position; empty if one is."""
+    servos = _servos(spec, name)
+    return _refusal(servos[0]) if len(servos) == 1 else f"it has {len(servos)} actuators"
 
 
 def _refusal(servo: mujoco.MjsActuator) -> str:

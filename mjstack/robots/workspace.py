@@ -20,7 +20,7 @@ _REACHED = 5e-4  # m
 _UPRIGHT = 0.26  # rad: the hand points down where its approach axis is so near
 _CUBE = 0.022  # m: half of its height
 _TOP = 0.024  # m: height of a table's top on the floor
-_GOOD = 1.6  # of 2: a table with such a score is taken
+_GOOD = 1.5  # of 2: a table with such a score is taken
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,8 @@ class Workspace:
         roll: Number of the arm's joint that turns the hand about its approach axis, or None.
         upright: Whether the arm's first joint turns about the vertical.
         tilt: Largest angle of the approach axis to the vertical at the objects [rad].
+        shoulder: Where the arm begins: the anchor of its first hinge [m].
+        lowest: Height of its lowest point at home [m].
     """
 
     azimuth: float
@@ -48,6 +50,8 @@ class Workspace:
     roll: int | None
     upright: bool
     tilt: float
+    shoulder: ndarray
+    lowest: float
 
 
 class _Arm:
@@ -167,7 +171,7 @@ def find_workspace(
             near = np.argsort(away + 9.0 * ~down)[:_SEEDS]
             if away[near[0]] + 9.0 * ~down[near[0]] > 0.5 * reach + 0.1:
                 continue
-            found = _try_table(arm, starts[near], center, azimuth, reach, upright)
+            found = _try_table(arm, starts[near], center, azimuth, shoulder, reach, upright)
             if found is not None:
                 best = max(best, (found[0] - cost, found[1]), key=lambda pair: pair[0])
         if best[1] is not None:
@@ -180,6 +184,7 @@ def _try_table(
     seeds: ndarray,
     center: ndarray,
     azimuth: float,
+    shoulder: ndarray,
     reach: float,
     upright: bool,
 ) -> tuple[float, Workspace] | None:
@@ -196,7 +201,8 @@ def _try_table(
         if left > _REACHED or tilt > 0.05 or any(np.abs(q - h).max() < 0.05 for h in homes):
             continue
         homes.append(q)
-        if _blocked(arm, q, center, apart):
+        lowest = _lowest(arm, q, center, apart)
+        if lowest is None:
             continue
         locked, roll = arm.choose_locked(q, upright)
         free = np.array([k not in locked for k in range(len(q))], dtype=float)
@@ -210,11 +216,11 @@ def _try_table(
         linear, _ = arm.jacobian(arm.pose(q)[0])
         bend = float(np.linalg.svd(linear[:, free > 0.0])[1][-1])
         score = room / 0.15 + min(bend, 0.15) / 0.15 - tilts
+        score -= 0.3 * float(np.mean(np.abs(q - 0.5 * (arm.low + arm.high)) / (arm.high - arm.low)))
         if best is None or score > best[0]:
-            space = Workspace(
-                azimuth, center, apart, height, q, locked, roll, upright, tilts
+            best = score, Workspace(
+                azimuth, center, apart, height, q, locked, roll, upright, tilts, shoulder, lowest
             )
-            best = (score, space)
         if best[0] >= _GOOD:
             break
     return best
@@ -235,22 +241,27 @@ def _walk(
             yield left, tilt, margin
 
 
-def _blocked(arm: _Arm, q: ndarray, center: ndarray, apart: float) -> bool:
-    """Whether an arm at home is in its own way, or a link but the hand's reaches into the table."""
+def _lowest(arm: _Arm, q: ndarray, center: ndarray, apart: float) -> float | None:
+    """Height of an arm's lowest point at home [m]; None if it is in its own way, or if a link but
+    the hand's reaches into the table.
+    """
     arm.pose(q)
     model, data = arm.model, arm.data
     hand = {arm.hand.palm, *arm.hand.bodies}
     links = {*ancestors(model, arm.hand.palm), *hand}
+    lowest = np.inf
     for geom in np.flatnonzero(model.geom_contype | model.geom_conaffinity):
         body = int(model.geom_bodyid[geom])
-        if model.body_weldid[body] == 0 or body not in links - hand:
+        if model.body_weldid[body] == 0 or body not in links:
             continue
         middle, half = model.geom_aabb[geom].reshape(2, 3)
         turn = data.geom_xmat[geom].reshape(3, 3)
         at = data.geom_xpos[geom] + turn @ middle
-        near = np.linalg.norm((at - center)[:2]) < apart + 0.1
-        if near and at[2] - np.abs(turn[2]) @ half < center[2]:
-            return True
+        bottom = float(at[2] - np.abs(turn[2]) @ half)
+        lowest = min(lowest, bottom)
+        if bottom < center[2] and np.linalg.norm((at - center)[:2]) < apart + 0.1:
+            return None
     mujoco.mj_collision(model, data)
     pairs = [model.geom_bodyid[c.geom].tolist() for c in data.contact if c.dist < -0.005]
-    return any({*pair} <= links and not {*pair} <= hand for pair in pairs)
+    blocked = any({*pair} <= links and not {*pair} <= hand for pair in pairs)
+    return None if blocked else lowest
