@@ -54,17 +54,19 @@ class _Held(mink.DofFreezingTask):
         super().__init__(model, held)
         self._posture = posture
         addresses = model.jnt_qposadr[model.dof_jntid].tolist()
-        leaders = posture.commanded[posture.leader].tolist()
+        leaders = [addresses.index(a) for a in posture.commanded[posture.leader]]
         columns = [*posture.columns, *posture.commanded[posture.coupled]]
-        self._leading = [addresses.index(leader) for leader in leaders]
-        self._rows = [held.index(addresses.index(column)) for column in columns]
+        self.follows = [k for k, leader in enumerate(leaders) if leader not in held]
+        self._leaders = [leaders[k] for k in self.follows]
+        self._rows = [held.index(addresses.index(columns[k])) for k in self.follows]
 
     def compute_jacobian(self, configuration: mink.Configuration) -> ndarray:
         """Rows of the identity, less the slopes of what follows, shape ``(held, nv)``."""
         jacobian = super().compute_jacobian(configuration).copy()
-        if self._rows:
+        if self.follows:
             command = torch.from_numpy(configuration.q[self._posture.commanded])
-            jacobian[self._rows, self._leading] -= self._posture.follow(command)[1].numpy()
+            slopes = self._posture.follow(command)[1].numpy()[self.follows]
+            jacobian[self._rows, self._leaders] = -slopes
         return jacobian
 
 
@@ -95,7 +97,7 @@ class GraspIk:
         limited = copy.copy(self.model)
         limited.jnt_limited[np.setdiff1d(np.arange(self.model.njnt), joints)] = False
         self._limits = [mink.ConfigurationLimit(limited, gain=1.0)]
-        self._constraints = [_Held(self.model, frozen, self._coupling)]
+        self._held = _Held(self.model, frozen, self._coupling)
         self._posture.set_target(self._to_qpos(self.home))
 
     def solve(self, target: ndarray, start: ndarray) -> tuple[ndarray, float]:
@@ -117,13 +119,13 @@ class GraspIk:
                     solver="daqp",
                     damping=1e-9,
                     limits=self._limits,
-                    constraints=self._constraints,
+                    constraints=[self._held],
                 )
             except mink.NoSolutionFound:
                 break
             largest = float(np.abs(step).max())
             configuration.integrate_inplace(step * min(1.0, _MAX_STEP / max(largest, 1e-12)), 1.0)
-            if self._coupling.leader.size:
+            if self._held.follows:
                 command = self._coupling.agree(configuration.q[self._qpos])
                 configuration.update(self._to_qpos(command))
             left = float(np.linalg.norm(self._task.compute_error(configuration)))

@@ -4,6 +4,7 @@ set before compilation.
 
 import itertools
 import math
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -74,10 +75,10 @@ def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> m
     for name in ("iterations", "ls_iterations", "impratio", "tolerance"):
         if (value := getattr(solver, name)) is not None:
             setattr(option, name, value)
+    members = {jaw: _jaw_members(spec.body(jaw), jaw_bodies) for jaw in jaw_bodies}
     if solver.gripper_condim is not None:
-        for jaw in jaw_bodies:
-            for geom in spec.body(jaw).geoms:
-                geom.condim = solver.gripper_condim
+        for geom in (g for bodies in members.values() for body in bodies for g in body.geoms):
+            geom.condim = solver.gripper_condim
 
     # Bodies
     world = spec.worldbody
@@ -96,12 +97,14 @@ def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> m
         pairs += [(WORLD, name) for name in scene.objects]
         pairs += itertools.combinations(scene.objects, 2)
     body = mujoco.mjtObj.mjOBJ_BODY
+    touching = {jaw: _touching(spec, jaw, bodies) for jaw, bodies in members.items()}
     for first, second in pairs:  # the net contact force [N]: 3 numbers, world frame
+        kind, name = touching.get(first, (body, first))
         spec.add_sensor(
             name=force_sensor(first, second),
             type=mujoco.mjtSensor.mjSENS_CONTACT,
-            objtype=body,
-            objname=first,
+            objtype=kind,
+            objname=name,
             reftype=body,
             refname=second,
             intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), _NETFORCE, 1],
@@ -133,6 +136,27 @@ def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> m
     model = compile_scene(spec)
     _require_clear(model, scene)
     return model
+
+
+def _jaw_members(body: mujoco.MjsBody, jaws: Sequence[str]) -> list[mujoco.MjsBody]:
+    """A jaw's body and all below it, without those of another jaw."""
+    below = [child for child in body.bodies if child.name not in jaws]
+    return [body, *(low for child in below for low in _jaw_members(child, jaws))]
+
+
+def _touching(
+    spec: mujoco.MjSpec, jaw: str, members: Sequence[mujoco.MjsBody]
+) -> tuple[mujoco.mjtObj, str]:
+    """Kind and name of what touches objects for a jaw: a body, or all below it."""
+    names = [b.name for b in members if any(g.contype or g.conaffinity for g in b.geoms)]
+    if len(members) == len(_jaw_members(spec.body(jaw), ())) and names not in ([], [jaw]):
+        return mujoco.mjtObj.mjOBJ_XBODY, jaw
+    if jaw in names or not names:
+        return mujoco.mjtObj.mjOBJ_BODY, jaw
+    if len(names) > 1:
+        expected = f"one of {', '.join(names)}, which collide, as it carries another jaw too"
+        raise ConfigError("robot.jaw_bodies", jaw, expected)
+    return mujoco.mjtObj.mjOBJ_BODY, names[0]
 
 
 def force_sensor(first: str, second: str) -> str:

@@ -276,7 +276,7 @@ def geom_corners(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray:
 
 
 def lowest_height(
-    model: mujoco.MjModel, bodies: Sequence[str], xpos: Tensor, xquat: Tensor
+    model: mujoco.MjModel, bodies: Sequence[str | int], xpos: Tensor, xquat: Tensor
 ) -> Tensor:
     """Height of the lowest point of the colliding geoms of some bodies, without those attached to
     them [m], shape ``(nworld,)``, from the poses of all bodies: positions [m], shape ``(nworld,

@@ -10,9 +10,11 @@ from torch import Tensor
 from typing_extensions import override
 
 from mjstack.config.fields import spec
+from mjstack.config.schema import RobotCfg
 from mjstack.errors import ConfigError, require_names
 from mjstack.managers.view import EnvView
 from mjstack.mdp.geometry import place_xy
+from mjstack.robots.jaws import jaw_members
 from mjstack.scene.index import lowest_height
 from mjstack.tasks import parts
 from mjstack.tasks.check import EpisodeCheck, Judgement, Rule
@@ -144,7 +146,7 @@ class BoxCheck(EpisodeCheck):
             *(grasp, lift, carry, drop, release, settled),
             _Order(self.objects, release),
             parts.InWindow("INSIDE", text, self.resting, t.window, measure=self.trace),
-            _JawClear(self.cfg.robot.jaw_bodies, self._high[2], t.jaw_clearance),
+            _JawClear(self.cfg.robot, self._high[2], t.jaw_clearance),
         ]
 
     def _during(self, *roles: str) -> list[list[str]]:
@@ -334,17 +336,18 @@ class _JawClear(Rule):
 
     at_end = True
 
-    def __init__(self, jaws: Sequence[str], rim: float, least: float) -> None:
+    def __init__(self, robot: RobotCfg, rim: float, least: float) -> None:
         super().__init__("JAW_CLEAR", "gripper too low at the end", expected=f"at least {least:g}")
         self.limits = [{"jaw_clearance_m": (least, math.inf)}]
-        self._jaws = jaws
+        self._robot = robot
         self._rim = rim
         self._least = least
 
     def judge(self, end: Step) -> Judgement:
         sim = end.view.env.sim
         sim.kinematics()
-        clearance = lowest_height(sim.model, self._jaws, sim.xpos, sim.xquat) - self._rim
+        jaws = [body for jaw in jaw_members(sim.model, self._robot.jaw_bodies) for body in jaw]
+        clearance = lowest_height(sim.model, jaws, sim.xpos, sim.xquat) - self._rim
         return clearance >= self._least, {"jaw_clearance_m": clearance}
 
 
