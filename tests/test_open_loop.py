@@ -110,12 +110,12 @@ def test_every_step_stays_on_its_straight_path(stage: Stage, trajectory: JointTr
         before = after
 
 
-def test_reported_waypoint_error_is_within_tolerance(
+def test_reported_ik_error_is_within_tolerance(
     stage: Stage, trajectory: JointTrajectory
 ) -> None:
-    assert trajectory.waypoint_error.shape == (3,)
-    assert (trajectory.waypoint_error <= stage.cfg.controller.ik_tolerance).all()
-    assert (trajectory.waypoint_error > 0).all()
+    assert trajectory.ik_error.shape == (3,)
+    assert (trajectory.ik_error <= stage.cfg.controller.ik_tolerance).all()
+    assert (trajectory.ik_error > 0).all()
 
 
 def test_commands_are_within_limits_and_do_not_jump(
@@ -199,7 +199,7 @@ def test_plan_does_not_depend_on_the_other_worlds(stage: Stage) -> None:
     for world in (0, 3, 8, 20, 23, 39):
         alone = planner.plan(xy[[world]])
         assert alone.knots.numpy().tobytes() == among.knots[[world]].numpy().tobytes()
-        assert alone.waypoint_error[0] == among.waypoint_error[world]
+        assert alone.ik_error[0] == among.ik_error[world]
         for step in range(0, 600, 37):
             assert (alone.command(step)[0] == among.command(step)[world]).all()
     assert planner.plan(xy) is among  # the last two batches are planned once

@@ -130,7 +130,7 @@ def episode_of(seconds: float) -> Episode:
         steps=5, seconds=seconds, warm_up_seconds=0.0, capture_seconds=0.0, captured=False
     )
     result: Any = SimpleNamespace(failed=torch.zeros(4), values={})
-    arrays = dict.fromkeys(("start", "waypoint_error", "retries"), np.zeros(4))
+    arrays = dict.fromkeys(("start", "ik_error", "retries"), np.zeros(4))
     return Episode(result=result, **arrays, places={}, timing=spent, description="some")
 
 

@@ -212,7 +212,7 @@ class OpenLoopDriver(Driver):
         """Take the trajectory, which must be on the device, and its phases, if it has any."""
         device = trajectory.knots.device
         super().__init__(len(trajectory.knots), len(trajectory.weights), device, phases)
-        self.error = torch.as_tensor(trajectory.waypoint_error, device=device)
+        self.error = torch.as_tensor(trajectory.ik_error, device=device)
         self._trajectory = trajectory
         numbers = [k for k, phase in enumerate(phases) for _ in range(phase.start, phase.stop)]
         self._phase_at = torch.tensor(numbers or [0] * self.steps, device=device)

@@ -42,13 +42,13 @@ class JointTrajectory:
         knots: Commands, shape ``(nworld, n, nu)``.
         weights: Weights of the knots of each step's phase, shape ``(steps, k)``.
         numbers: Which knots those are, shape ``(steps, k)``, int64.
-        waypoint_error: Largest distance [m] from a target at any knot, shape ``(nworld,)``.
+        ik_error: Largest distance [m] from a target at any knot, shape ``(nworld,)``.
     """
 
     knots: Tensor
     weights: Tensor
     numbers: Tensor
-    waypoint_error: ndarray
+    ik_error: ndarray
 
     def to(self, device: torch.device, dtype: torch.dtype) -> "JointTrajectory":
         """The same trajectory on a device."""

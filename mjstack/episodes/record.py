@@ -31,7 +31,7 @@ def circumstances(episode: Episode, monitor: FailureMonitor) -> dict[str, np.nda
     return {
         "retries": episode.retries,
         # NaN is not reached.
-        "unreachable": ~(episode.waypoint_error <= monitor.env.cfg.controller.ik_tolerance),
+        "unreachable": ~(episode.ik_error <= monitor.env.cfg.controller.ik_tolerance),
         **dict(zip(("sign", "sign_phase", "sign_step"), signs, strict=True)),
     }
 

@@ -189,7 +189,7 @@ class Episode:
         result: The check of every world.
         start: Positions before the first step, shape ``(nworld, nq)``, in the backend's precision.
         places: As of `start_places`.
-        waypoint_error: Largest distance from a target that inverse kinematics left [m], shape
+        ik_error: Largest distance from a target that inverse kinematics left [m], shape
             ``(nworld,)``.
         retries: Grasps that were tried again, shape ``(nworld,)``.
         timing: The rollout's.
@@ -199,7 +199,7 @@ class Episode:
     result: CheckResult
     start: np.ndarray
     places: dict[str, np.ndarray]
-    waypoint_error: np.ndarray
+    ik_error: np.ndarray
     retries: np.ndarray
     timing: RolloutTiming
     description: str
@@ -262,7 +262,7 @@ def play_episode(
         result=judge.result,
         start=start,
         places=places,
-        waypoint_error=driver.error.double().cpu().numpy(),
+        ik_error=driver.error.double().cpu().numpy(),
         retries=driver.retries.cpu().numpy(),
         timing=timing,
         description=env.sim.description,

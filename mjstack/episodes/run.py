@@ -39,7 +39,7 @@ class NominalRun:
         sim: Its world.
         episode: The episode.
         world: Its recording.
-        states: At the ends of the phases that gate *parity* compares, by step.
+        states: At the ends of phases, and of steps that gate *parity* compares, by step.
     """
 
     sim: Simulation
@@ -114,7 +114,8 @@ class Run:
         fields = required_fields(reset)
         sim = make_simulation(stage.model, self.cfg, 1, backend=Backend.native, fields=fields)
         world = WorldRecorder()
-        snapshots = Snapshots(self.parity_steps.values())
+        ends = {phase.stop - 1 for phase in stage.phases}
+        snapshots = Snapshots(ends.union(self.parity_steps.values()))
         viewers = () if "parity" in self.cfg.gates else self.viewers
         episode = stage.play(sim, reset, [*viewers, world, snapshots])
         return NominalRun(sim=sim, episode=episode, world=world, states=snapshots.states)

@@ -200,7 +200,7 @@ def _record(stage: Stage, batch: Batch, monitor: FailureMonitor | None) -> Episo
             "qpos": sim.qpos.cpu().numpy().copy(),
             "start_qpos": episode.start,
             **{f"value.{name}": values for name, values in episode.values.items()},
-            "measured.waypoint_error_m": episode.waypoint_error,
+            "measured.ik_error_m": episode.ik_error,
             "measured.peak_contacts": sim.peak_contacts.cpu().numpy().copy(),
             "measured.peak_constraint_rows": sim.peak_constraints.cpu().numpy().copy(),
             **({"start_places": np.stack([*places.values()], 1)} if places else {}),

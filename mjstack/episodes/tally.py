@@ -131,7 +131,7 @@ class EpisodeTally:
         values = self.values
         for metric, (value, side) in self.check.summaries.items():
             metrics[metric] = float(getattr(values[value], side)())
-        metrics["waypoint_error_max_m"] = float(self.array("measured.waypoint_error_m").max())
+        metrics["ik_error_max_m"] = float(self.array("measured.ik_error_m").max())
         for name in ("contacts", "constraint_rows"):
             metrics[f"peak_{name}_per_world"] = int(self.array(f"measured.peak_{name}").max())
         if self.several:

@@ -1,5 +1,6 @@
 """A robot as a guest in a scene: what of its file comes along, and what stays behind."""
 
+import copy
 import warnings
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
@@ -9,7 +10,7 @@ import mujoco
 import numpy as np
 
 from mjstack.config.schema import RobotCfg
-from mjstack.errors import MjstackError, require_names
+from mjstack.errors import ConfigError, MjstackError, require_names
 from mjstack.robots.posture import REST
 
 WORLD = "world"  # MuJoCo's name of the body that never moves
@@ -18,6 +19,7 @@ WORLD = "world"  # MuJoCo's name of the body that never moves
 _SOLVER = ("iterations", "ls_iterations", "impratio", "tolerance")
 _CONFIGURED = (*_SOLVER, "timestep", "integrator", "cone")  # by groups timing and solver
 _FREE = mujoco.mjtJoint.mjJNT_FREE
+SAG = 0.002  # m: how far off its target a hand is of which gravity, or a report, takes no notice
 _PREFIX = "robot_"
 _NAMED = ("geoms", "bodies", "cameras")  # elements that a scene has too
 _NAMING = {  # elements with the names of others
@@ -46,7 +48,12 @@ def as_guest(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) ->
     rest = _home_key(spec, robot)
     for element in _strangers(spec, robot):
         spec.delete(element)
-    bodies = {body.name for body in spec.bodies}
+    bodies = [body.name for body in spec.bodies]
+    for pair in robot.exclude:
+        require_names("robot.exclude: body", pair, bodies)
+        if len({*pair}) != 2 or len(pair) != 2:
+            raise ConfigError("robot.exclude", pair, "two bodies for each pair")
+        spec.add_exclude(bodyname1=pair[0], bodyname2=pair[1])
     for camera in [c for c in spec.cameras if c.targetbody and c.targetbody not in bodies]:
         spec.delete(camera)
     geoms = {geom.name for geom in spec.geoms}
@@ -70,10 +77,59 @@ def as_guest(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) ->
     return fresh
 
 
-def compile_scene(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compile a scene with a guest."""
+def compile_scene(spec: mujoco.MjSpec, robot: RobotCfg | None = None) -> mujoco.MjModel:
+    """Compile a scene with a guest; with a robot, whose gravity is compensated as it says."""
     with _without_prefix():
-        return spec.compile()
+        model = spec.compile()
+        if robot is None:
+            return model
+        bodies = [low for name in robot.joints for low in _below(_tree(spec.joint(name).parent))]
+        compensated = any(body.gravcomp for body in bodies)
+        if robot.gravcomp == "auto":
+            changed = not compensated and gravity_sag(model, robot) > SAG
+        else:
+            changed = robot.gravcomp or compensated
+        if changed:
+            for body in bodies:
+                body.gravcomp = float(bool(robot.gravcomp))
+            model = spec.compile()
+        return model
+
+
+def gravity_sag(model: mujoco.MjModel, robot: RobotCfg) -> float:
+    """How far off its target at home gravity moves the grasp point where nothing compensates it
+    [m], by the stiffness of the arm's servos.
+    """
+    model = copy.copy(model)
+    model.body_gravcomp[:] = 0.0
+    data = mujoco.MjData(model)
+    for name, value in zip(robot.joints, robot.home, strict=True):
+        data.joint(name).qpos = value
+    mujoco.mj_forward(model, data)
+    dofs = [int(model.joint(name).dofadr[0]) for name in robot.arm_joints]
+    stiffness = [-model.actuator(name).biasprm[1] for name in robot.arm_joints]
+    lowered = (data.qfrc_passive - data.qfrc_bias)[dofs] / stiffness
+    return float(np.linalg.norm(grasp_jacobian(data, robot)[:, dofs] @ lowered))
+
+
+def grasp_jacobian(data: mujoco.MjData, robot: RobotCfg) -> np.ndarray:
+    """The grasp point's translational Jacobian, shape ``(3, nv)``."""
+    jac = np.zeros((2, 3, data.model.nv))
+    for part, site in zip(jac, robot.grasp_sites, strict=True):
+        mujoco.mj_jacSite(data.model, data, part, None, data.site(site).id)
+    return jac.mean(axis=0)
+
+
+def gravity_note(spec: mujoco.MjSpec, robot: RobotCfg, model: mujoco.MjModel) -> str:
+    """Whether the robot's gravity is compensated, and why; empty where its file alone says so.
+    Arguments as of `left_behind`.
+    """
+    if robot.gravcomp == "auto" and any(body.gravcomp for body in spec.bodies):
+        return ""
+    state = "on" if model.body_gravcomp.any() else "off"
+    sag = f"without it the hand sags {1e3 * gravity_sag(model, robot):.1f} mm at home"
+    value = str(robot.gravcomp).lower()
+    return f"robot.gravcomp={value}: {state}; {sag} (auto: on above {1e3 * SAG:g} mm)"
 
 
 @contextmanager

@@ -52,16 +52,25 @@ def scene_names(scene: SceneCfg) -> set[str]:
 
 
 def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> mujoco.MjModel:
-    """Add the scene to a robot and compile it.
+    """Add the scene to a robot and compile it; arguments as of `add_scene`.
+
+    Returns:
+        The compiled model; its ``qpos0`` has the objects at their nominal positions.
+    """
+    add_scene(spec, cfg, visuals=visuals)
+    model = compile_scene(spec, cfg.robot)
+    _require_clear(model, cfg.scene)
+    return model
+
+
+def add_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> None:
+    """Add the scene to a robot.
 
     Args:
         spec: The robot; it is changed in place.
         cfg: Table, objects and perhaps a box, the physics timestep, the solver's settings (``None``
             keeps the robot file's own), and the jaws, whose force on each object a sensor measures.
         visuals: Keep geoms that only pictures need, and add a disc for each place.
-
-    Returns:
-        The compiled model; its ``qpos0`` has the objects at their nominal positions.
     """
     scene = cfg.scene
     solver = cfg.solver
@@ -133,9 +142,6 @@ def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> m
         spec.visual.quality.shadowsize = 1024  # without a GPU, MuJoCo's 4096 doubles the time
     else:
         spec.compiler.discardvisual = True
-    model = compile_scene(spec)
-    _require_clear(model, scene)
-    return model
 
 
 def _jaw_members(body: mujoco.MjsBody, jaws: Sequence[str]) -> list[mujoco.MjsBody]:

@@ -96,6 +96,11 @@ class RobotCfg:
     file, without floors, lights and free bodies."""
     base: BasePoseCfg = field(default_factory=BasePoseCfg)
     """Where the file's origin stands in the world, such as on a pedestal."""
+    gravcomp: Any = spec("auto", choices=("auto", True, False))
+    """Whether gravity of the robot's bodies is compensated. auto: as in its file, and where that
+    compensates none, if the hand would sag more than 2 mm at home."""
+    exclude: list[list[str]] = spec([])
+    """Pairs of the robot's bodies that do not collide, such as ``[world, link1]``."""
     menagerie_name: str = ""
     """The robot's folder in MuJoCo Menagerie, for ``model=menagerie``."""
     menagerie_file: str = ""
