@@ -55,7 +55,9 @@ def find_hands(model: mujoco.MjModel) -> list[Hand]:
 
     palms = [b for b in range(model.nbody) if is_palm(b)]
     palms = [b for b in palms if not any(p != b and p in below[b] for p in palms)]
-    hands = [_hand(model, palm, [b for sub in branches(palm) for b in sub], driven) for palm in palms]
+    hands = [
+        _hand(model, palm, [b for sub in branches(palm) for b in sub], driven) for palm in palms
+    ]
     taken = {b for palm in palms for b in below[palm]}
     leaves = [b for b in jointed if not any(b != j and j in below[b] for j in jointed)]
     for leaf in leaves:  # a jaw against the body that carries it

@@ -26,7 +26,11 @@ def write_new(args: Sequence[str], arm: str = "") -> tuple[list[Path], list[Gues
     of the names of the arm that counts.
     """
     kind, name = (*args, "", "")[:2]
-    if len(args) != (3 if kind == "robot" else 2) or kind not in _GROUPS or (arm and kind != "robot"):
+    if (
+        len(args) != (3 if kind == "robot" else 2)
+        or kind not in _GROUPS
+        or (arm and kind != "robot")
+    ):
         expected = "task, driver or action NAME, or robot NAME FILE.xml, such as new task lift"
         raise MjstackError(f"new {' '.join(args)}: expected {expected}.")
     folder = Path(name)
@@ -82,7 +86,9 @@ def _to_yaml(value: Any) -> str:
     try:
         value.encode()
     except UnicodeError as error:
-        raise MjstackError(f"the name {value!r} in it is no text. Rename it in the file.") from error
+        raise MjstackError(
+            f"the name {value!r} in it is no text. Rename it in the file."
+        ) from error
     if _PLAIN.fullmatch(value) and yaml.safe_load(value) == value:
         return value
     return yaml.safe_dump(value, default_style='"', allow_unicode=True, width=math.inf).rstrip()

@@ -1,6 +1,7 @@
 """The profile of a robot, guessed from its MJCF file."""
 
 import math
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,15 +10,22 @@ import mujoco
 import numpy as np
 from numpy import ndarray
 
+from mjstack.config.schema import ModelCfg, RobotCfg, ServoCfg
+from mjstack.config.schema.robot import BasePoseCfg
 from mjstack.errors import MjstackError
 from mjstack.robots.hand import Hand, find_hands, find_root
+from mjstack.robots.guest import compile_scene
+from mjstack.robots.posture import posture
 from mjstack.robots.servos import servo_problem
-from mjstack.robots.source import read_mjcf
+from mjstack.robots.source import read_mjcf, robot_spec
 from mjstack.robots.tips import Fingers, Grip
 from mjstack.robots.workspace import Workspace, find_workspace
 
 _WIDTH = 0.044  # m: of the cube that a closed gripper holds
-_SQUEEZE = 0.006  # m: how much nearer than that its target is
+_FORCE = 20.0  # N on a cube, as far as the jaws can close farther
+_LEAST = 5.0  # N
+_POSTURES = 30  # random ones
+_RUBS = 0.001  # m that links overlap
 _TURN = 6.283  # rad either way, for a hinge without a range
 _BANDWIDTH = 40.0  # rad/s of a servo that is made
 _FLOOR = 0.024  # m: a table's top, at least
@@ -53,10 +61,14 @@ def guess_profile(file: Path, arm: str = "") -> list[Guess]:
         raise MjstackError(f"{file} cannot be compiled: {error}") from error
     hands, problems = [], []
     for hand in find_hands(model):
-        ranges = _ranges(model, hand.gripper)
+        bare = [j for j in (*hand.arm, *hand.gripper) if not model.joint(j).name]
+        if bare:
+            body = model.body(model.jnt_bodyid[bare[0]]).name
+            problems.append(f"the joint of body {body} has no name")
+            continue
         try:
-            hands.append((hand, Fingers(spec, hand, ranges).measure(_WIDTH)))
-        except ValueError as error:
+            hands.append((hand, Fingers(spec, hand, _ranges(model, hand.gripper)).measure(_WIDTH)))
+        except (ValueError, MjstackError) as error:
             problems.append(f"{_label(model, hand)}: {error}")
     names = [model.body(hand.palm).name for hand, _ in hands]
     chosen = [pair for pair in hands if arm.lower() in _label(model, pair[0]).lower()]
@@ -68,10 +80,6 @@ def guess_profile(file: Path, arm: str = "") -> list[Guess]:
     if not chosen:
         raise MjstackError(f"--arm {arm}: expected a part of a name of {' or '.join(names)}.")
     hand, grip = chosen[0]
-    bare = [j for j in (*hand.arm, *hand.gripper) if not model.joint(j).name]
-    if bare:
-        body = model.body(model.jnt_bodyid[bare[0]]).name
-        raise MjstackError(f"{file}: the joint of body {body} has no name, expected one. Add it.")
     space = find_workspace(model, hand, grip, _ranges(model, hand.arm))
     if space is None:
         raise MjstackError(
@@ -79,13 +87,14 @@ def guess_profile(file: Path, arm: str = "") -> list[Guess]:
             " which the drivers' grasps from above need."
         )
     other = [name for name, pair in zip(names, hands, strict=True) if pair is not chosen[0]]
-    return [
+    guesses = [
         *_guess_joints(model, hand, other),
         *_guess_grip(model, hand, grip),
         *_guess_home(model, hand, grip, space),
         *_guess_servos(spec, model, hand, grip, space),
         *_guess_table(space),
     ]
+    return [*guesses, *_guess_scene(file, guesses, np.abs(grip.shut - grip.touching))]
 
 
 def _label(model: mujoco.MjModel, hand: Hand) -> str:
@@ -147,12 +156,12 @@ def _guess_grip(model: mujoco.MjModel, hand: Hand, grip: Grip) -> Iterator[Guess
     yield Guess("gripper_open", _numbers(grip.opened, 5), f"of {narrow} to {wide} mm, 85 at most")
 
 
-def _guess_home(
-    model: mujoco.MjModel, hand: Hand, grip: Grip, space: Workspace
-) -> Iterator[Guess]:
+def _guess_home(model: mujoco.MjModel, hand: Hand, grip: Grip, space: Workspace) -> Iterator[Guess]:
     home = [*_numbers(space.home), *_numbers(grip.opened)]
     why = f"hand down {100 * space.height:.0f} cm above the table's middle, by inverse kinematics"
-    yield Guess("home", home, f"{why}; off the vertical by {math.degrees(space.tilt):.0f} deg at most")
+    yield Guess(
+        "home", home, f"{why}; off the vertical by {math.degrees(space.tilt):.0f} deg at most"
+    )
     names = [model.joint(j).name for j in hand.arm]
     if space.locked:
         locked = {names[k]: round(float(space.home[k]), 4) for k in space.locked}
@@ -177,32 +186,65 @@ def _guess_servos(
     mujoco.mj_forward(model, data)
     inertia = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, inertia)
-    joints = [*hand.arm, *hand.gripper]
     tendons = {w.target.name for t in spec.tendons for w in t.path if w.target is not None}
+    travel = np.abs(grip.shut - grip.touching)
     servos = {}
-    left = float((np.abs(grip.shut - grip.touching) / np.abs(grip.shut - grip.opened)).min())
-    share = min(left, _SQUEEZE / grip.nearer)
-    for joint in joints:
+    for joint in (*hand.arm, *hand.gripper):
         name, dof = model.joint(joint).name, model.jnt_dofadr[joint]
         if not servo_problem(spec, name) or (joint in hand.gripper and name in tendons):
             continue
         mass, damping = inertia[dof, dof], model.dof_damping[dof]
-        force = max(_efforts(model, joint), 0.0)
-        floor = 40.0 if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE else 2000.0
-        if joint in hand.gripper:
-            lever = grip.nearer / float(np.abs(grip.shut - grip.opened).max())  # m for each unit
-            floor = 5000.0 * lever**2
-        stiffness = max(mass * _BANDWIDTH**2, 20.0 * damping, floor)
-        effort = force or max(3.0 * abs(data.qfrc_bias[dof]), 0.3 * stiffness, 1.0)
-        made = {"stiffness": stiffness, "damping": 2.0 * math.sqrt(stiffness * mass), "effort": effort}
-        servos[name] = {key: float(f"{value:.3g}") for key, value in made.items()}
+        hinge = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
+        stiffness = max(mass * _BANDWIDTH**2, 20.0 * damping, 40.0 if hinge else 2000.0)
+        if joint in hand.gripper:  # the way that is left has to make the force
+            stiffness = max(20.0 * damping, _FORCE * _WIDTH / float((travel**2).sum()))
+        effort = _effort(model, joint) or max(3.0 * abs(data.qfrc_bias[dof]), 0.3 * stiffness, 1.0)
+        made = (stiffness, 2.0 * math.sqrt(stiffness * mass), effort)
+        keys = ("stiffness", "damping", "effort")
+        servos[name] = {key: float(f"{v:.3g}") for key, v in zip(keys, made, strict=True)}
+    why = f"made where the file has no position servo: from the inertia, {_BANDWIDTH:g} rad/s"
     if servos:
-        yield Guess("servos", servos, f"the file has none: from inertia, {_BANDWIDTH:g} rad/s")
-    closed = grip.touching + share * (grip.shut - grip.opened)
-    yield Guess("gripper_closed", _numbers(closed, 5), "6 mm nearer than a cube of 44 mm lets them")
+        yield Guess("servos", servos, why)
 
 
-def _efforts(model: mujoco.MjModel, joint: int) -> float:
+def _guess_scene(file: Path, guesses: list[Guess], travel: ndarray) -> Iterator[Guess]:
+    """What only the compiled robot tells: stiffer servos where its own let a cube slip, and links
+    that touch each other in nearly every posture.
+    """
+    values = {guess.key: guess.value for guess in guesses if guess.key != "placements"}
+    servos = {name: ServoCfg(**servo) for name, servo in values.pop("servos", {}).items()}
+    base = BasePoseCfg(**values.pop("base", {}))
+    robot = RobotCfg(name="guess", file=str(file), servos=servos, base=base, **values)
+    model = compile_scene(robot_spec(robot, ModelCfg(source="builtin")))
+    gripper = [model.actuator(name).id for name in robot.gripper_joints]
+    gains, damping = model.actuator_gainprm[gripper, 0], -model.actuator_biasprm[gripper, 2]
+    force = float(gains @ travel**2) / _WIDTH
+    if force < _LEAST:
+        more = [
+            {
+                "stiffness": float(f"{_FORCE / force * k:.3g}"),
+                "damping": float(f"{_FORCE / force * d:.3g}"),
+            }
+            for k, d in zip(gains, damping, strict=True)
+        ]
+        stiffer = values.get("servos", {}) | dict(zip(robot.gripper_joints, more, strict=True))
+        yield Guess("servos", stiffer, f"the file's own press with {force:.1f} N, and a cube slips")
+    data = mujoco.MjData(model)
+    whole = posture(model, robot.joints)
+    joints = [model.joint(name).id for name in robot.arm_joints]
+    low, high = np.clip(model.jnt_range[joints], -np.pi, np.pi).T
+    count: Counter[tuple[str, ...]] = Counter()
+    for q in np.random.default_rng(0).uniform(low, high, (_POSTURES, len(low))):
+        data.qpos[:] = whole.qpos(np.concatenate((q, robot.gripper_open)))
+        mujoco.mj_fwdPosition(model, data)
+        bodies = [model.geom_bodyid[c.geom] for c in data.contact if c.dist < -_RUBS]
+        count.update({tuple(sorted(model.body(b).name for b in pair)) for pair in bodies})
+    always = [[*pair] for pair, times in sorted(count.items()) if times > 0.8 * _POSTURES]
+    if always:
+        yield Guess("exclude", always, "they touch in nearly every posture")
+
+
+def _effort(model: mujoco.MjModel, joint: int) -> float:
     """The largest force that the file gives a joint's motor [N m, N]; 0 if it says none."""
     for k in np.flatnonzero(model.actuator_trnid[:, 0] == joint):
         gear, limits = model.actuator_gear[k, 0], model.actuator_ctrlrange[k]
@@ -226,7 +268,9 @@ def _guess_table(space: Workspace) -> Iterator[Guess]:
     if space.azimuth or shift.any():
         quat = [math.cos(-0.5 * space.azimuth), 0.0, 0.0, math.sin(-0.5 * space.azimuth)]
         base = {"pos": _numbers(shift, 3), "quat": _numbers(quat, 6)}
-        yield Guess("base", base, "so that the table is ahead of the arm, and all is above the floor")
+        yield Guess(
+            "base", base, "so that the table is ahead of the arm, and all is above the floor"
+        )
     x, y = _numbers(turn @ space.center[:2] + shift[:2], 3)
     top = float(space.center[2] + shift[2])
     half = [round(min(0.14, max(0.09, distance - 0.1)) if distance > 0.15 else 0.14, 3)]

@@ -8,9 +8,13 @@ import numpy as np
 from numpy import ndarray
 
 from mjstack.robots.hand import Hand
+from mjstack.robots.posture import Posture
 
-_DEPTH = 0.016  # m that the tips reach beyond the grasp point: clear of a table under a small cube
-_EDGE = 0.004  # m from a tip's end at least
+# m that the tips reach beyond the grasp point: clear of a table under a small cube, and less where
+# the fingers are thick
+_DEPTHS = (0.016, 0.010, 0.005)
+_ROOM = 0.016  # m beside an object that is enough
+_EDGE = 0.002  # m from a tip's end at least
 _PLATE = [0.004, 0.004, 0.0005]  # m: half sizes of the patch of a surface that counts
 _FAR = 0.3  # m
 _WIDE = 0.085  # m: as far as jaws open, with room beside a cube
@@ -26,7 +30,6 @@ class Grip:
         touching: The same, where it touches the object.
         shut: The same, at the other end of their ranges.
         gap: Distance of the surfaces at both ends [m].
-        nearer: How much nearer they come from open to shut, at the touch, per share [m].
         point: Middle between the surfaces [m].
         closing: Unit vector from the first jaw to the second.
         approach: Unit vector from the wrist towards the tips.
@@ -38,7 +41,6 @@ class Grip:
     touching: ndarray
     shut: ndarray
     gap: tuple[float, float]
-    nearer: float
     point: ndarray
     closing: ndarray
     approach: ndarray
@@ -62,32 +64,21 @@ class Fingers:
         self._plate = model.geom(plate.name).id
         self._hand = hand
         self._ranges = ranges
-        model.opt.gravity[:] = 0.0
-        for flag in (mujoco.mjtDisableBit.mjDSBL_CONTACT, mujoco.mjtDisableBit.mjDSBL_ACTUATION):
-            model.opt.disableflags |= int(flag)
-        moving = np.flatnonzero(np.isin(model.jnt_bodyid, hand.bodies))
-        self._followers = [j for j in moving if j not in hand.gripper]
+        self._posture = Posture(model, [model.joint(j).name for j in (*hand.arm, *hand.gripper)])
+        self._arm = self._posture.rest[self._posture.commanded[: len(hand.arm)]]
         self._solid = np.flatnonzero((model.geom_contype | model.geom_conaffinity) != 0)
         palm = model.body_weldid[hand.palm]
         self._fixed = np.flatnonzero(model.body_weldid == palm) if palm else np.array([hand.palm])
 
     def settle(self, gripper: ndarray) -> None:
-        """Bring the gripper's joints to positions, and all that follows them to rest."""
-        model, data = self.model, self._data
-        follow = model.jnt_qposadr[self._followers]
-        dofs = model.jnt_dofadr[self._followers]
-        qpos = model.qpos0.copy()
-        qpos[model.jnt_qposadr[list(self._hand.gripper)]] = gripper
-        speed = np.zeros(len(dofs))
-        for _ in range(100 if self._followers else 1):
-            qpos[follow] = data.qpos[follow]
-            data.qpos[:] = qpos
-            data.qvel[:] = 0.0
-            data.qvel[dofs] = 0.9 * speed
-            if self._followers:
-                mujoco.mj_step(model, data)
-            speed = data.qvel[dofs].copy()
-        mujoco.mj_kinematics(model, data)
+        """Bring the gripper's joints to positions, and what follows them along."""
+        self._data.qpos[:] = self._posture.qpos(np.concatenate((self._arm, gripper)))
+        mujoco.mj_kinematics(self.model, self._data)
+
+    def _agree(self, gripper: ndarray) -> ndarray:
+        """The positions that coupled joints can have at once [rad, m]."""
+        whole = self._posture.agree(np.concatenate((self._arm, gripper)))
+        return whole[len(self._arm) :]
 
     def points(self, bodies: Sequence[int]) -> ndarray:
         """Points of the solid geoms of bodies in the palm's frame [m], shape ``(n, 3)``."""
@@ -134,7 +125,8 @@ class Fingers:
         if not right.all():
             opens = opens - moves[:, ~right].mean(axis=1)
         low, high = self._ranges.T
-        opened, shut = np.where(opens > 0.0, high, low), np.where(opens > 0.0, low, high)
+        opened = self._agree(np.where(opens > 0.0, high, low))
+        shut = self._agree(np.where(opens > 0.0, low, high))
         nearly = []  # shut: there a jaw on a hinge lies along the approach axis
         for share in (0.15, 0.0):
             self.settle(shut + share * (opened - shut))
@@ -144,7 +136,16 @@ class Fingers:
         approach = self._approach(nearly[1].mean(axis=0), _unit(away))
         closing = _unit(away - (away @ approach) * approach)
         frame = np.stack((np.cross(approach, closing), approach, closing), axis=1)
-        return self._grasp(width, (opened, shut), frame, (first, second))
+        grips = []
+        for depth in _DEPTHS:
+            grip = self._grasp(width, (opened, shut), frame, (first, second), depth)
+            if grip.gap[0] >= width + _ROOM:
+                return grip
+            grips.append(grip)
+        widest = max(grips, key=lambda grip: grip.gap[0])
+        if widest.gap[0] < width + 0.1 * _ROOM:
+            raise ValueError(f"its fingers open by {1e3 * widest.gap[0]:.0f} mm only")
+        return widest
 
     def _approach(self, middle: ndarray, closing: ndarray) -> ndarray:
         """Unit vector from the wrist to the fingers' middle, across the closing axis: along the
@@ -170,6 +171,7 @@ class Fingers:
         ends: tuple[ndarray, ndarray],
         frame: ndarray,
         sides: tuple[Sequence[int], Sequence[int]],
+        beyond: float,
     ) -> Grip:
         """Close the jaws around an object: where they touch it, near their tips."""
         opened, shut = ends
@@ -178,14 +180,14 @@ class Fingers:
             self.settle(opened + share * (shut - opened))
             clouds = [self.points(side) @ frame for side in sides]
             tops = [cloud[:, 1].max() for cloud in clouds]
-            depth = min(min(tops) - _EDGE, max(tops) - _DEPTH)
+            depth = min(min(tops) - _EDGE, max(tops) - beyond)
             tips = [cloud[cloud[:, 1] > depth - _EDGE] for cloud in clouds]
             start = np.array([tips[1][:, 0].mean(), depth, np.mean([t[:, 2].mean() for t in tips])])
-            gaps = np.array([self._gap(opened + s * (shut - opened), start, frame, sides)[0] for s in _SHARES])
+            gaps = np.array(
+                [self._gap(opened + s * (shut - opened), start, frame, sides)[0] for s in _SHARES]
+            )
             if gaps.min() > width - 0.01:
                 raise ValueError("its fingers do not close on each other")
-            if gaps.max() < width + 0.004:
-                raise ValueError(f"its fingers open by {1e3 * gaps.max():.0f} mm only")
             share = _last(gaps, width)
         wide = opened + _last(gaps, min(_WIDE, float(gaps.max()))) * (shut - opened)
         touching = opened + share * (shut - opened)
@@ -196,10 +198,9 @@ class Fingers:
             world = self._from_palm(frame @ (point + [0.0, 0.0, sign * width]))
             turn = self._data.xmat[jaw].reshape(3, 3)
             sites.append(turn.T @ (world - self._data.xpos[jaw]))
-        nearer = float(np.interp(share - 0.05, _SHARES, gaps) - np.interp(share + 0.05, _SHARES, gaps))
         gap = (float(gaps.max()), float(gaps.min()))
         point, (_, approach, closing) = frame @ point, frame.T
-        return Grip(wide, touching, shut, gap, 10.0 * nearer, point, closing, approach, jaws, sites)
+        return Grip(wide, touching, shut, gap, point, closing, approach, jaws, sites)
 
     def _gap(
         self, gripper: ndarray, start: ndarray, frame: ndarray, sides: Sequence[Sequence[int]]
@@ -247,9 +248,9 @@ def _corners(model: mujoco.MjModel, geom: int) -> ndarray:
 
 def _last(gaps: ndarray, gap: float) -> float:
     """The largest share of the way to shut at which the jaws are still so far apart."""
-    number = int(np.flatnonzero(gaps >= gap)[-1])
-    if number == len(gaps) - 1:
-        return 1.0
+    number = int(np.flatnonzero(gaps >= min(gap, gaps.max()))[-1])
+    if number == len(gaps) - 1 or gaps[number] < gap:
+        return float(_SHARES[number])
     rise = (gaps[number] - gap) / (gaps[number] - gaps[number + 1])
     return float(_SHARES[number] + rise * (_SHARES[1] - _SHARES[0]))
 
