@@ -10,12 +10,14 @@ from numpy import ndarray
 from mjstack.robots.hand import Hand
 from mjstack.robots.posture import Posture
 
-# m that the tips reach beyond the grasp point: clear of a table under a small cube, and less where
-# the fingers are thick
-_DEPTHS = (0.016, 0.010, 0.005)
+# m that the tips reach beyond the grasp point, clear of a table under a small cube, and half of the
+# height of what they grasp: less where the fingers are thick
+_DEPTHS = ((0.016, 0.013), (0.010, 0.013), (0.005, 0.013), (0.005, 0.004))
+_REACH = 0.018  # m that they may at most, which a jaw on a hinge changes as it opens
 _ROOM = 0.016  # m beside an object that is enough
 _EDGE = 0.002  # m from a tip's end at least
-_PLATE = [0.004, 0.004, 0.0005]  # m: half sizes of the patch of a surface that counts
+_PLATE = [0.004, 0.013, 0.0005]  # m: half sizes of the patch of a surface that counts
+_TIP = 0.004  # m of it that is beyond the grasp point; the rest is as high as an object there
 _FAR = 0.3  # m
 _WIDE = 0.085  # m: as far as jaws open, with room beside a cube
 _SHARES = np.linspace(0.0, 1.0, 33)  # of the way from open to shut
@@ -30,6 +32,7 @@ class Grip:
         touching: The same, where it touches the object.
         shut: The same, at the other end of their ranges.
         gap: Distance of the surfaces at both ends [m].
+        beyond: How far a tip reaches beyond the middle of the sites, open or around it [m].
         point: Middle between the surfaces [m].
         closing: Unit vector from the first jaw to the second.
         approach: Unit vector from the wrist towards the tips.
@@ -41,6 +44,7 @@ class Grip:
     touching: ndarray
     shut: ndarray
     gap: tuple[float, float]
+    beyond: float
     point: ndarray
     closing: ndarray
     approach: ndarray
@@ -112,6 +116,8 @@ class Fingers:
         closing = np.linalg.svd(ways.reshape(-1, 3))[2][0]
         along = centres @ closing
         right = along > 0.5 * (along.min() + along.max())
+        if right[0]:  # the first jaw is the one that the file has first
+            closing, right = -closing, ~right
         first = [body for body, far in zip(bodies, right, strict=True) if not far]
         second = [body for body, far in zip(bodies, right, strict=True) if far]
         if hand.one_finger:
@@ -137,15 +143,16 @@ class Fingers:
         closing = _unit(away - (away @ approach) * approach)
         frame = np.stack((np.cross(approach, closing), approach, closing), axis=1)
         grips = []
-        for depth in _DEPTHS:
+        for depth, self.model.geom_size[self._plate, 1] in _DEPTHS:
             grip = self._grasp(width, (opened, shut), frame, (first, second), depth)
-            if grip.gap[0] >= width + _ROOM:
-                return grip
             grips.append(grip)
-        widest = max(grips, key=lambda grip: grip.gap[0])
-        if widest.gap[0] < width + 0.1 * _ROOM:
-            raise ValueError(f"its fingers open by {1e3 * widest.gap[0]:.0f} mm only")
-        return widest
+            if grip.gap[0] >= width + _ROOM and grip.beyond <= _REACH:
+                break
+        else:
+            grip = max(grips, key=lambda grip: min(grip.gap[0], width + _ROOM) - grip.beyond)
+        if grip.gap[0] < width + 0.1 * _ROOM:
+            raise ValueError(f"its fingers open by {1e3 * max(grip.gap[0], 0.0):.0f} mm only")
+        return grip
 
     def _approach(self, middle: ndarray, closing: ndarray) -> ndarray:
         """Unit vector from the wrist to the fingers' middle, across the closing axis: along the
@@ -171,7 +178,7 @@ class Fingers:
         ends: tuple[ndarray, ndarray],
         frame: ndarray,
         sides: tuple[Sequence[int], Sequence[int]],
-        beyond: float,
+        depth: float,
     ) -> Grip:
         """Close the jaws around an object: where they touch it, near their tips."""
         opened, shut = ends
@@ -180,16 +187,17 @@ class Fingers:
             self.settle(opened + share * (shut - opened))
             clouds = [self.points(side) @ frame for side in sides]
             tops = [cloud[:, 1].max() for cloud in clouds]
-            depth = min(min(tops) - _EDGE, max(tops) - beyond)
-            tips = [cloud[cloud[:, 1] > depth - _EDGE] for cloud in clouds]
-            start = np.array([tips[1][:, 0].mean(), depth, np.mean([t[:, 2].mean() for t in tips])])
+            level = min(min(tops) - _EDGE, max(tops) - depth)
+            tips = [cloud[cloud[:, 1] > level - _EDGE] for cloud in clouds]
+            start = np.array([tips[1][:, 0].mean(), level, np.mean([t[:, 2].mean() for t in tips])])
             gaps = np.array(
                 [self._gap(opened + s * (shut - opened), start, frame, sides)[0] for s in _SHARES]
             )
             if gaps.min() > width - 0.01:
                 raise ValueError("its fingers do not close on each other")
             share = _last(gaps, width)
-        wide = opened + _last(gaps, min(_WIDE, float(gaps.max()))) * (shut - opened)
+        most = _WIDE - 0.015 * self._hand.one_finger  # it swings up as it opens
+        wide = opened + _last(gaps, min(most, float(gaps.max()))) * (shut - opened)
         touching = opened + share * (shut - opened)
         _, point, geoms = self._gap(touching, start, frame, sides)
         jaws = [int(self.model.geom_bodyid[geom]) for geom in geoms]
@@ -198,9 +206,18 @@ class Fingers:
             world = self._from_palm(frame @ (point + [0.0, 0.0, sign * width]))
             turn = self._data.xmat[jaw].reshape(3, 3)
             sites.append(turn.T @ (world - self._data.xpos[jaw]))
+        reaches = []
+        for state in (touching, wide):
+            self.settle(state)
+            ends = [
+                self._to_palm(self._data.xpos[jaw] + self._data.xmat[jaw].reshape(3, 3) @ site)
+                for jaw, site in zip(jaws, sites, strict=True)
+            ]
+            top = max((self.points(side) @ frame)[:, 1].max() for side in sides)
+            reaches.append(float(top - np.mean(ends, axis=0) @ frame[:, 1]))
         gap = (float(gaps.max()), float(gaps.min()))
         point, (_, approach, closing) = frame @ point, frame.T
-        return Grip(wide, touching, shut, gap, point, closing, approach, jaws, sites)
+        return Grip(wide, touching, shut, gap, max(reaches), point, closing, approach, jaws, sites)
 
     def _gap(
         self, gripper: ndarray, start: ndarray, frame: ndarray, sides: Sequence[Sequence[int]]
@@ -218,7 +235,8 @@ class Fingers:
     def _touch(self, point: ndarray, frame: ndarray, bodies: Sequence[int]) -> tuple[float, int]:
         """How far the nearest solid geom of some bodies is from the plate, and which it is."""
         model, data = self.model, self._data
-        data.geom_xpos[self._plate] = self._from_palm(point)
+        back = model.geom_size[self._plate, 1] - _TIP
+        data.geom_xpos[self._plate] = self._from_palm(point - back * frame[:, 1])
         turn = data.xmat[self._hand.palm].reshape(3, 3)
         data.geom_xmat[self._plate] = (turn @ frame).ravel()
         nearest = (_FAR, -1)

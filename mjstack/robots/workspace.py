@@ -17,7 +17,7 @@ _MAX_STEP = 0.3  # [rad, m] per iteration
 _SAMPLES = 3000  # random positions, of which those with the hand down are starts
 _SEEDS = (4, 16)  # of them, the second where the first lead nowhere
 _REACHED = 5e-4  # m
-_UPRIGHT = 0.26  # rad: the hand points down where its approach axis is so near
+_UPRIGHT = 0.5  # rad: the hand points down where its approach axis is so near
 _CUBE = 0.022  # m: half of its height
 _TOP = 0.024  # m: height of a table's top on the floor
 _GOOD = 1.5  # of 2: a table with such a score is taken
@@ -201,7 +201,7 @@ def _try_table(
     homes: list[ndarray] = []
     for seed in seeds:
         q, left, tilt = arm.solve(seed, middle, everything, side)
-        if left > _REACHED or tilt > 0.05 or any(np.abs(q - h).max() < 0.05 for h in homes):
+        if left > _REACHED or tilt > 0.3 or any(np.abs(q - h).max() < 0.05 for h in homes):
             continue
         homes.append(q)
         lowest = _lowest(arm, q, center, apart)
@@ -218,7 +218,7 @@ def _try_table(
         room = min(min(margin for _, _, margin in worst), 0.15)
         linear, _ = arm.jacobian(arm.pose(q)[0])
         bend = float(np.linalg.svd(linear[:, free > 0.0])[1][-1])
-        score = room / 0.15 + min(bend, 0.15) / 0.15 - tilts
+        score = room / 0.15 + min(bend, 0.15) / 0.15 - 1.5 * (tilt + tilts)
         score -= 0.6 * float(np.mean(np.abs(q - 0.5 * (arm.low + arm.high)) / (arm.high - arm.low)))
         if best is None or score > best[0]:
             best = (
@@ -258,7 +258,8 @@ def _walk(
         q = home
         for up in (_CUBE + height + 0.07, _CUBE):
             target = center + along * ahead + across * side + [0.0, 0.0, up]
-            q, left, tilt = arm.solve(q, target, free, None, 0.1)
+            q, _, _ = arm.solve(q, target, free, None, 0.1)
+            q, left, tilt = arm.solve(q, target, free, None, 0.0)  # as the point alone needs it
             margin = float((np.minimum(q - arm.low, arm.high - q) / span)[free > 0.0].min())
             yield left, tilt, margin
 
