@@ -123,7 +123,7 @@ def _dispatch(flags: Namespace, overrides: list[str]) -> int:
 
 
 def _write_new(args: list[str], arm: str) -> int:
-    """Write the files of `mjstack new`; a robot's guesses, its picture and gate *baseline* follow."""
+    """Write the files of `mjstack new`; for a robot, show guesses and picture, run *baseline*."""
     from mjstack.robots.new import write_new  # it loads MuJoCo
 
     paths, guesses = write_new(args, arm)

@@ -13,8 +13,8 @@ from numpy import ndarray
 from mjstack.config.schema import ModelCfg, RobotCfg, ServoCfg
 from mjstack.config.schema.robot import BasePoseCfg
 from mjstack.errors import MjstackError
-from mjstack.robots.hand import Hand, find_hands, find_root
 from mjstack.robots.guest import compile_scene
+from mjstack.robots.hand import Hand, find_hands, find_root
 from mjstack.robots.posture import posture
 from mjstack.robots.servos import servo_problem
 from mjstack.robots.source import read_mjcf, robot_spec

@@ -203,7 +203,7 @@ class Fingers:
         jaws = [int(self.model.geom_bodyid[geom]) for geom in geoms]
         sites = []
         for jaw, sign in zip(jaws, (-0.5, 0.5), strict=True):
-            world = self._from_palm(frame @ (point + [0.0, 0.0, sign * width]))
+            world = self._from_palm(frame @ (point + np.array([0.0, 0.0, sign * width])))
             turn = self._data.xmat[jaw].reshape(3, 3)
             sites.append(turn.T @ (world - self._data.xpos[jaw]))
         reaches = []

@@ -87,8 +87,8 @@ class _Arm:
         self, q: ndarray, target: ndarray, free: ndarray, across: ndarray | None, down: float = 0.2
     ) -> tuple[ndarray, float, float]:
         """Bring the grasp point to a target and the hand down, by some joints, from their positions
-        ``q``; the jaws close along ``across``, if that is given. Returns the positions, the distance
-        that is left [m], and the tilt [rad].
+        ``q``; the jaws close along ``across``, if that is given. Returns the positions, the
+        distance that is left [m], and the tilt [rad].
         """
         q = np.clip(q, self.low, self.high)
         vertical = np.array([0.0, 0.0, -1.0])
@@ -197,7 +197,7 @@ def _try_table(
     height = 0.1 if reach > 0.4 else 0.07
     everything = np.ones(len(arm.low))
     best: tuple[float, Workspace] | None = None
-    middle = center + [0.0, 0.0, _CUBE + height]
+    middle = center + np.array([0.0, 0.0, _CUBE + height])
     homes: list[ndarray] = []
     for seed in seeds:
         q, left, tilt = arm.solve(seed, middle, everything, side)
@@ -221,22 +221,8 @@ def _try_table(
         score = room / 0.15 + min(bend, 0.15) / 0.15 - 1.5 * (tilt + tilts)
         score -= 0.6 * float(np.mean(np.abs(q - 0.5 * (arm.low + arm.high)) / (arm.high - arm.low)))
         if best is None or score > best[0]:
-            best = (
-                score,
-                Workspace(
-                    azimuth,
-                    center,
-                    apart,
-                    height,
-                    q,
-                    locked,
-                    roll,
-                    upright,
-                    tilts,
-                    shoulder,
-                    lowest,
-                ),
-            )
+            arguments = (azimuth, center, apart, height, q, locked, roll, upright)
+            best = score, Workspace(*arguments, tilts, shoulder, lowest)
         if best[0] >= _GOOD:
             break
     return best
