@@ -1,5 +1,5 @@
-# `make run` runs the main job, `make test` checks what matters in minutes, `make test-all` runs every test. Each sets up
-# .venv on first use.
+# `make demo` shows a shipped policy, `make run` runs the main job, `make test` checks what matters in minutes,
+# `make test-all` runs every test. Each sets up .venv on first use.
 PYTHON ?= python3
 ARGS ?=
 VENV := .venv
@@ -9,7 +9,10 @@ READY_DEV := $(VENV)/.installed-dev
 READY_DOCS := $(VENV)/.installed-docs
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt
 
-.PHONY: run test test-rest test-long test-all test-lerobot fuzz docs dist setup clean
+.PHONY: demo run test test-rest test-long test-all test-lerobot fuzz docs dist setup clean
+
+demo: $(READY)
+	$(BIN)/mjstack demo $(ARGS)
 
 run: $(READY)
 	$(BIN)/python scripts/run.py robot=so101 nworld=32 $(ARGS)

@@ -18,7 +18,6 @@ if TYPE_CHECKING:  # the reference is made where MkDocs is not, too
     from mkdocs.config.defaults import MkDocsConfig
     from mkdocs.structure.files import Files
     from mkdocs.structure.nav import Navigation
-    from mkdocs.structure.pages import Page
 
 MARKER = "<!-- reference -->"
 
@@ -33,15 +32,14 @@ def on_config(config: MkDocsConfig, **_: Any) -> MkDocsConfig:
 
 
 def on_nav(nav: Navigation, config: MkDocsConfig, **_: Any) -> Navigation:
-    """Write llms.txt: a line for each page but those of the past, with its first sentence."""
+    """Write llms.txt: a line for each page, with its first sentence."""
     lines = [f"# {config.site_name}", "", f"> {config.site_description}", ""]
     for page in nav.pages:
         text = Path(page.file.abs_src_path or "").read_text(encoding="utf-8")
         first = re.search(r"(?m)^(?![#!<:]|\s*$|```).+(?:\n.+)*", text)
-        if not page.url.startswith("history/"):
-            words = " ".join(first[0].split()).partition(". ")[0].rstrip(".") if first else ""
-            address = (config.site_url or "") + page.url
-            lines.append(f"- [{page.title or page.file.name}]({address}): {words}".rstrip(": "))
+        words = " ".join(first[0].split()).partition(". ")[0].rstrip(".") if first else ""
+        address = (config.site_url or "") + page.url
+        lines.append(f"- [{page.title or page.file.name}]({address}): {words}".rstrip(": "))
     site = Path(config.site_dir)
     site.mkdir(parents=True, exist_ok=True)
     (site / "llms.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -57,13 +55,13 @@ def on_files(files: Files, config: MkDocsConfig, **_: Any) -> Files:
     return files
 
 
-def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
+def on_page_markdown(markdown: str, config: MkDocsConfig, **_: Any) -> str:
     """Put the reference in place of its marker, and have pictures of examples beside the pages.
 
-    The search shows pages of the past last.
+    Pages of docs/history are in the repository alone: without its address, a link keeps its words.
     """
-    if page.file.src_uri.startswith("history/"):
-        page.meta.setdefault("search", {})["boost"] = 0.1
+    target = rf"[\1]({config.repo_url}/blob/main/docs/\2)" if config.repo_url else r"\1"
+    markdown = re.sub(r"\[([^]]+)\]\((history/[^)]+)\)", target, markdown)
     markdown = re.sub(r"\.\./examples/\w+/(\w+\.png)", r"\1", markdown)
     return markdown.replace(MARKER, reference_markdown()) if MARKER in markdown else markdown
 

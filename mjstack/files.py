@@ -45,9 +45,8 @@ _KEY = "hydra.run.dir (job=collect, job=train: job.folder)"
 
 @contextmanager
 def reading(path: Path, fix: str) -> Iterator[None]:
-    """Raise a `FolderError` of one line for a file, or one of a folder, that is read inside and is
-    missing, damaged or none at all, as of `check_regular`: one of a run's folder, which may be a
-    stranger's, can hold anything. ``fix`` is a sentence without its full stop.
+    """Turn any error while a file, or a folder's files, of an untrusted folder are read inside into
+    a `FolderError` of one line. ``fix`` is a sentence without its full stop.
     """
     try:
         for file in path.rglob("*") if path.is_dir() else [path]:

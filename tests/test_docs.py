@@ -43,6 +43,18 @@ def test_the_search_has_pages_for_words_of_the_field(words: str) -> None:
     assert any(words.lower() in text.lower() for text in texts)
 
 
+def test_pages_are_short() -> None:
+    """A fact has one page, and a table of figures is read across: three or four columns."""
+    texts = {page.stem: page.read_text(encoding="utf-8") for page in PAGES[1:]}
+    assert sum(text.count("\n") for text in texts.values()) <= 3600
+    for name in ("benchmarks", "performance"):
+        rows = re.findall(r"(?m)^\|(.*)\|$", re.sub(r"\]\([^)]*\)", "]", texts[name]))
+        assert rows
+        for cells in (row.split("|") for row in rows):
+            assert len(cells) in (3, 4), cells
+            assert max(len(cell.strip()) for cell in cells) <= 90, cells
+
+
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: Patch) -> Iterator[Path]:
     """An empty working folder; modules that a page imports from it are forgotten afterwards."""

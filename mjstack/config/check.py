@@ -210,7 +210,9 @@ def _phases(cfg: Config) -> Checks:
         key = f"controller.phases.{name}"
         wrong = number == 0 and phase.anchor is None
         yield f"{key}.anchor", wrong, "an object or a place, as the phase is the first"
-        expected = "null, because robot.gripper_closed is for any object. Set robot.closed_width too"
+        expected = (
+            "null, because robot.gripper_closed is for any object. Set robot.closed_width too"
+        )
         yield f"{key}.width", exact and phase.width is not None, expected
         require_names(f"{key}.grasps: object that moves", [phase.grasps], cfg.scene.free)
         require_names(f"{key}.retry: phase", [phase.retry], phases)

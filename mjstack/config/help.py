@@ -188,8 +188,8 @@ def _table(rows: Mapping[str, str]) -> str:
 
 
 def list_text(kinds: Sequence[str]) -> str:
-    """What there is to choose from, of mjstack and of the search path, with a line each; of terms
-    alone also their parameters. Without kinds, all of them; an unknown one is an UnknownName.
+    """List the choices of mjstack and of the search path, a line each; terms alone with their
+    parameters. Without kinds, list all of them; an unknown one is an UnknownName.
     """
     require_names("list", kinds, _LISTED)
     lines = []

@@ -234,9 +234,9 @@ def _keep_exact(
     comes with them or after them. Arguments as of `_drop_inherited`.
     """
     closed, width = "robot.gripper_closed", "robot.closed_width"
-    given = [source for source in (*files, _typed(overrides)) if source.keys() & {closed, width}]
-    targets = [number for number, source in enumerate(given) if closed in source]
-    if targets and targets[-1] > 0 and not any(width in s for s in given[targets[-1] :]):
+    settings = [source for source in (*files, _typed(overrides)) if source.keys() & {closed, width}]
+    targets = [number for number, source in enumerate(settings) if closed in source]
+    if targets and targets[-1] > 0 and not any(width in s for s in settings[targets[-1] :]):
         cfg.robot.closed_width = None
 
 

@@ -250,7 +250,7 @@ class FeedbackDriver(Driver):
         )
 
     def _beyond(self, rolls: Tensor) -> Tensor:
-        """What rolls cost that are beyond the joint's range, from the nominal one [rad]."""
+        """Cost of rolls beyond the joint's range, from the nominal one [rad]."""
         low, high = self._rolls
         return _BEYOND * ((low - rolls).clamp(min=0.0) + (rolls - high).clamp(min=0.0))
 

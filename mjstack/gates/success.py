@@ -114,8 +114,8 @@ def run_success(run: Run) -> list[GateResult]:
 
 
 def find_doubts(distinct: int, episodes: int, successes: int, lost: int, rate: float) -> list[str]:
-    """What keeps an evaluation from showing a rate, a line each: how many of its starts differ, how
-    many of its episodes succeeded at their end, and how many reached the goal and lost it again.
+    """Reasons why an evaluation shows no rate, a line each: repeated starts, too few episodes, and
+    episodes that reached the goal and lost it again.
     """
     low, _ = wilson_interval(successes, episodes)
     bound = f"at least {format_percent(low)}, not {format_percent(rate)}"

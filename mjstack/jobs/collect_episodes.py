@@ -29,9 +29,9 @@ _MOST_RENDERED = 4096  # states at once
 
 
 def demonstration_channels(stage: Stage) -> list[Channels]:
-    """What is recorded of an episode of a dataset: before each step the measured joints, the
-    observation and, with cameras, the positions; then the joint targets that went to the actuators
-    and the reward for where they led. All float32.
+    """Channels of an episode of a dataset: before each step the measured joints, the observation
+    and, with cameras, the positions; after it the joint targets that went to the actuators and the
+    reward. All float32.
     """
 
     def read_before(env: Env, driver: Driver) -> Read:

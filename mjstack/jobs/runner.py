@@ -296,7 +296,7 @@ def check_job(cfg: Config, overrides: Sequence[str] = ()) -> CheckedJob:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Verification:
-    """What the gates found.
+    """Results of the gates.
 
     Attributes:
         status: ``pass`` if no gate failed and one passed, else ``fail``.

@@ -39,14 +39,12 @@ def build_chain(model: mujoco.MjModel, robot: RobotCfg) -> tuple[Chain, Shape]:
     # Columns of the joint targets: the joint of each, those that move, and their limits
     columns = {model.joint(name).id: (column, -1) for column, name in enumerate(robot.joints)}
     moved = [robot.arm_joints.index(name) for name in robot.ik_joints]
-    coupling = posture(model, robot.joints)
-    follows = [*coupling.columns, *coupling.commanded[coupling.coupled]]
-    for row, (address, leader) in enumerate(zip(follows, coupling.leader, strict=True)):
+    coupling = posture(model, tuple(robot.joints))
+    for row, (address, leader) in enumerate(zip(coupling.follows, coupling.leader, strict=True)):
         joint = int(np.flatnonzero(model.jnt_qposadr == address)[0])
-        own, _ = columns.get(joint, (-1, -1))
-        if own < 0 or own in moved:
+        if joint not in columns or columns[joint][0] in moved:
             columns[joint] = (int(leader), row)
-        moved = [column for column in moved if column != own]
+    moved = [column for column in moved if column not in coupling.coupled]
     limits = np.tile(np.array([[-np.inf], [np.inf]], dtype=np.float32), len(robot.joints))
     ranges = joint_limits(model, [robot.joints[column] for column in moved])
     for side, values in enumerate(ranges):
@@ -106,15 +104,10 @@ def build_chain(model: mujoco.MjModel, robot: RobotCfg) -> tuple[Chain, Shape]:
     chain.table_low = wp.array(coupling.low, dtype=float)
     chain.table_step = wp.array(coupling.step, dtype=float)
     chain.table_value = wp.array2d(coupling.value, dtype=float)
-    chain.table_slope = wp.array2d(coupling.slope, dtype=float)
     moving = [c in moved for c in column]  # or goes along
-    ik_links = tuple(m and row < 0 for m, row in zip(moving, rows, strict=True))
-    leaders = tuple(
-        next(k for k, c in enumerate(column) if c == column[i] and ik_links[k])
-        if moving[i] and not ik_links[i]
-        else -1
-        for i in range(len(column))
-    )
+    ik_links = tuple(c in moved and row < 0 for c, row in zip(column, rows, strict=True))
+    link = {c: k for k, c in enumerate(column) if ik_links[k]}
+    leaders = tuple(-1 if row < 0 else link.get(c, -1) for c, row in zip(column, rows, strict=True))
     if not any(ik_links) or any(moving[chain.trunk :]):
         expected = f"joints that move both grasp sites, {' and '.join(robot.grasp_sites)}"
         raise ConfigError("robot.ik_joints", robot.ik_joints, expected)
@@ -228,7 +221,7 @@ class BatchedIk:
         self._settings = [iterations, guided, _DAMPING, _MAX_STEP, *gains, near]
 
         # Commanded joints that follow ik joints
-        self._coupling = coupling = posture(model, robot.joints)
+        self._coupling = coupling = posture(model, tuple(robot.joints))
         leaders = coupling.leader[len(coupling.columns) :]
         follows = np.isin(leaders, [robot.joints.index(name) for name in robot.ik_joints])
         self._coupled = Columns(coupling.coupled[follows], self.device)

@@ -7,6 +7,7 @@ from typing import Any
 
 import mujoco
 
+from mjstack.robots import posture
 from mjstack.sim.warp_setup import wp
 
 HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
@@ -16,6 +17,7 @@ SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
 # approached without running into a dead end at the limits (from home, over the reBot's whole reach,
 # 97 % instead of 91 % are found); a near one converges fast.
 FAR_DAMPING = wp.constant(0.1)
+KNOTS = wp.constant(posture.KNOTS)
 NAN = wp.constant(float("nan"))
 
 
@@ -46,7 +48,6 @@ class Chain:
     table_low: wp.array[float]  # tables of joints that follow, see `Posture`
     table_step: wp.array[float]
     table_value: wp.array2d[float]
-    table_slope: wp.array2d[float]
 
 
 @dataclass(frozen=True)
@@ -79,17 +80,18 @@ def position(chain: Chain, link: int, x: float) -> wp.vec2:
     if row < 0:
         return wp.vec2(x, 1.0)
     step = chain.table_step[row]
-    last = float(chain.table_value.shape[1] - 1)
-    at = wp.clamp((x - chain.table_low[row]) / step, 0.0, last)
-    knot = wp.min(int(at), int(last) - 1)
+    at = wp.clamp((x - chain.table_low[row]) / step, 0.0, float(KNOTS - 1))
+    knot = wp.clamp(int(at) - 1, 0, KNOTS - 4)  # the first of four: a cubic, as in `Posture`
     t = at - float(knot)
     a = chain.table_value[row, knot]
-    rise = chain.table_value[row, knot + 1] - a
-    start = step * chain.table_slope[row, knot]
-    bend = start + step * chain.table_slope[row, knot + 1] - 2.0 * rise
-    lean = rise - start - bend
-    value = a + t * (start + t * (lean + t * bend))
-    return wp.vec2(value, (start + t * (2.0 * lean + 3.0 * t * bend)) / step)
+    b = chain.table_value[row, knot + 1]
+    c = chain.table_value[row, knot + 2]
+    first = b - a
+    second = c - 2.0 * b + a
+    third = (chain.table_value[row, knot + 3] - a) - 3.0 * (c - b)
+    value = a + t * (first + (t - 1.0) / 2.0 * (second + (t - 2.0) / 3.0 * third))
+    slope = first + (t - 0.5) * second + (t * (t / 2.0 - 1.0) + 1.0 / 3.0) * third
+    return wp.vec2(value, slope / step)
 
 
 @wp.func

@@ -6,7 +6,6 @@ import math
 import mink
 import mujoco
 import numpy as np
-import torch
 from numpy import ndarray
 
 from mjstack.config.schema import ModelCfg, RobotCfg
@@ -47,26 +46,27 @@ class GraspPointTask(mink.Task):
         return self._jac.mean(axis=0)
 
 
-class _Held(mink.DofFreezingTask):
-    """Hold degrees of freedom, and let those that follow moving ones go along."""
+class _Frozen(mink.DofFreezingTask):
+    """Hold degrees of freedom; those that follow a moving joint go along."""
 
-    def __init__(self, model: mujoco.MjModel, held: list[int], posture: Posture) -> None:
-        super().__init__(model, held)
-        self._posture = posture
-        addresses = model.jnt_qposadr[model.dof_jntid].tolist()
-        leaders = [addresses.index(a) for a in posture.commanded[posture.leader]]
-        columns = [*posture.columns, *posture.commanded[posture.coupled]]
-        self.follows = [k for k, leader in enumerate(leaders) if leader not in held]
-        self._leaders = [leaders[k] for k in self.follows]
-        self._rows = [held.index(addresses.index(columns[k])) for k in self.follows]
+    def __init__(
+        self, configuration: mink.Configuration, coupling: Posture, moving: ndarray
+    ) -> None:
+        """Take the numbers of the commanded joints that move."""
+        model = configuration.model
+        addresses = model.jnt_qposadr[model.dof_jntid]
+        self._columns = [addresses.tolist().index(c) for c in coupling.commanded[moving]]
+        super().__init__(model, np.setdiff1d(np.arange(model.nv), self._columns).tolist())
+        self._coupling = coupling
+        self._moving = moving
+        self.along = bool(np.isin(coupling.leader, moving).any())
 
     def compute_jacobian(self, configuration: mink.Configuration) -> ndarray:
-        """Rows of the identity, less the slopes of what follows, shape ``(held, nv)``."""
+        """Rows of the identity, less the slopes of what goes along, shape ``(frozen, nv)``."""
         jacobian = super().compute_jacobian(configuration).copy()
-        if self.follows:
-            command = torch.from_numpy(configuration.q[self._posture.commanded])
-            slopes = self._posture.follow(command)[1].numpy()[self.follows]
-            jacobian[self._rows, self._leaders] = -slopes
+        if self.along:
+            shares = self._coupling.shares(configuration.q[self._coupling.commanded])
+            jacobian[:, self._columns] -= shares[self.dof_indices][:, self._moving]
         return jacobian
 
 
@@ -83,13 +83,13 @@ class GraspIk:
         self.tolerance = tolerance
         joints = [self.model.joint(name).id for name in robot.joints]
         self._qpos = self.model.jnt_qposadr[joints]
-        self._coupling = posture(self.model, robot.joints)
+        self._coupling = posture(self.model, tuple(robot.joints))
         self.home = locked_home(robot)
         self._check(robot)
         self._configuration = mink.Configuration(self.model)
-        coupled = [robot.joints[k] for k in self._coupling.coupled]
-        moving = {int(self.model.joint(n).dofadr[0]) for n in robot.ik_joints if n not in coupled}
-        frozen = [dof for dof in range(self.model.nv) if dof not in moving]
+        moving = np.array([robot.joints.index(name) for name in robot.ik_joints])
+        moving = np.setdiff1d(moving, self._coupling.coupled)
+        self._frozen = _Frozen(self._configuration, self._coupling, moving)
         self._task = GraspPointTask(
             [self.model.site(name).id for name in robot.grasp_sites], self.model.nv
         )
@@ -97,7 +97,6 @@ class GraspIk:
         limited = copy.copy(self.model)
         limited.jnt_limited[np.setdiff1d(np.arange(self.model.njnt), joints)] = False
         self._limits = [mink.ConfigurationLimit(limited, gain=1.0)]
-        self._held = _Held(self.model, frozen, self._coupling)
         self._posture.set_target(self._to_qpos(self.home))
 
     def solve(self, target: ndarray, start: ndarray) -> tuple[ndarray, float]:
@@ -119,13 +118,13 @@ class GraspIk:
                     solver="daqp",
                     damping=1e-9,
                     limits=self._limits,
-                    constraints=[self._held],
+                    constraints=[self._frozen],
                 )
             except mink.NoSolutionFound:
                 break
             largest = float(np.abs(step).max())
             configuration.integrate_inplace(step * min(1.0, _MAX_STEP / max(largest, 1e-12)), 1.0)
-            if self._held.follows:
+            if self._frozen.along:
                 command = self._coupling.agree(configuration.q[self._qpos])
                 configuration.update(self._to_qpos(command))
             left = float(np.linalg.norm(self._task.compute_error(configuration)))
@@ -149,25 +148,25 @@ class GraspIk:
 
     def _check(self, robot: RobotCfg) -> None:
         """Raise a ConfigError for a joint value that the robot's file does not allow."""
-        grip = robot.gripper_joints
-        given = [
-            ("home", robot.joints, robot.home),
-            ("start", robot.joints, robot.start),
-            ("locked", list(robot.locked), list(robot.locked.values())),
-            ("gripper_open", grip, robot.gripper_open),
-            ("gripper_closed", grip, robot.gripper_closed),
-        ]
-        for key, names, values in given:
+        poses = {
+            "home": (robot.joints, robot.home),
+            "start": (robot.joints, robot.start),
+            "locked": (list(robot.locked), list(robot.locked.values())),
+            "gripper_open": (robot.gripper_joints, robot.gripper_open),
+            "gripper_closed": (robot.gripper_joints, robot.gripper_closed),
+        }
+        for key, (names, values) in poses.items():
             command = self.home.copy()
             columns = [robot.joints.index(name) for name in names]
-            command[columns] = command[columns] if values is None else values
-            agreed = self._coupling.agree(command)
+            if values is not None:
+                command[columns] = values
+            allowed = self._coupling.agree(command)
             for k, name in zip(columns, names, strict=True):
                 low, high = self.model.joint(name).range
-                value = float(command[k])
-                if not low <= value <= high:
+                if not low <= command[k] <= high:
                     expected = f"a value within [{low:.4g}, {high:.4g}]"
-                    raise ConfigError(f"robot.{key} of {name}", value, expected)
-                if abs(value - agreed[k]) > _APART:
-                    expected = f"{agreed[k]:.4g}, as the file's equalities have it"
-                    raise ConfigError(f"robot.{key} of {name}", value, expected)
+                elif abs(command[k] - allowed[k]) > _APART:
+                    expected = f"{allowed[k]:.4g}, as the file's equalities have it"
+                else:
+                    continue
+                raise ConfigError(f"robot.{key} of {name}", float(command[k]), expected)

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
-import torch
 from numpy import ndarray
 
 from mjstack.config.schema import RobotCfg
@@ -38,34 +37,24 @@ class PointReach:
         data = mujoco.MjData(model)
         home = locked_home(robot)
         home[len(robot.arm_joints) :] = gripper
-        self._coupling = coupling = posture(model, robot.joints)
+        self._coupling = coupling = posture(model, tuple(robot.joints))
         data.qpos[:] = coupling.qpos(home)
         mujoco.mj_kinematics(model, data)
-        driven = {robot.joints.index(name) for name in robot.ik_joints} - {*coupling.coupled}
-        # Links that move the grasp point: number of the ik joint, and row of what goes along with it
-        addresses = model.jnt_qposadr.tolist()
-        follows = [*coupling.columns, *coupling.commanded[coupling.coupled]]
-        links = {addresses.index(coupling.commanded[k]): (k, -1) for k in driven}
-        for row, (address, leader) in enumerate(zip(follows, coupling.leader, strict=True)):
-            if leader in driven:
-                links[addresses.index(address)] = (int(leader), row)
-        joints = sorted(links, key=lambda j: int(model.jnt_bodyid[j]))
-        carriers = _above(model, [model.site(name).id for name in robot.grasp_sites])
-        joints = [j for j in joints if links[j][1] < 0 or model.jnt_bodyid[j] in carriers]
-        own = [j for j in joints if links[j][1] < 0]
-        self._command = home
-        self._ik = [links[j][0] for j in own]
-        self._rows = np.array([links[j][1] for j in joints])
-        self._source = np.array([self._ik.index(links[j][0]) for j in joints])
-        self._hinges = model.jnt_type[own] == mujoco.mjtJoint.mjJNT_HINGE
-        self._home = data.qpos[model.jnt_qposadr[own]]
-        self._turns = model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE
-        self._zeros = data.qpos[model.jnt_qposadr[joints]]
+        moving = {robot.joints.index(name) for name in robot.ik_joints} - {*coupling.coupled}
+        joints = sorted(
+            (model.joint(robot.joints[k]).id for k in moving),
+            key=lambda j: int(model.jnt_bodyid[j]),
+        )
+        self._native = (data, home) if moving & {*coupling.leader} else None
+        self._columns = [robot.joints.index(model.joint(joint).name) for joint in joints]
+        self._hinges = model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE
+        self._home = data.qpos[model.jnt_qposadr[joints]]
         self._anchors = data.xanchor[joints].copy()
         self._axes = data.xaxis[joints].copy()
         sites = [model.site(name).id for name in robot.grasp_sites]
+        self._sites = sites
         self.tip = data.site_xpos[sites].mean(axis=0)  # the grasp point at home [m], ``(3,)``
-        self._low, self._high = joint_limits(model, [model.joint(j).name for j in own])
+        self._low, self._high = joint_limits(model, [model.joint(j).name for j in joints])
 
     def solve(self, points: ndarray) -> tuple[ndarray, ndarray]:
         """Bring the grasp point as near to each point [m], shape ``(n, 3)``, as possible, from a
@@ -88,13 +77,11 @@ class PointReach:
         """Home, other hinges bent by ``off`` [rad], a first upright one towards the points."""
         q = np.tile(self._home + off * self._hinges, (len(points), 1))
         q[:, 0] = self._home[0]
-        first = int((self._rows < 0).argmax())
-        up = self._axes[first, 2]
+        up = self._axes[0, 2]
         if abs(up) > 0.99 and self._hinges[0]:
             plane = np.array([1.0, 1.0j, 0.0])
-            anchor = self._anchors[first]
-            arm = (self.tip - anchor) @ plane
-            q[:, 0] += np.sign(up) * np.angle((points - anchor) @ plane * arm.conj())
+            arm = (self.tip - self._anchors[0]) @ plane
+            q[:, 0] += np.sign(up) * np.angle((points - self._anchors[0]) @ plane * arm.conj())
         return np.clip(q, self._low, self._high)
 
     def descend(self, start: ndarray, goals: ndarray) -> ndarray:
@@ -131,51 +118,43 @@ class PointReach:
         ``(n, 3)``.
 
         A product of exponentials: each joint moves the links after it about, or along, its axis at
-        home.
+        home. Where joints follow these, MuJoCo computes both.
         """
-        n, joints = len(q), len(self._rows)
-        values, slopes = self._positions(q)
+        if self._native is not None:
+            return self._forward_native(q)
+        n, joints = q.shape
         rotation = np.tile(np.eye(3), (n, 1, 1))
         shift = np.zeros((n, 3))
         axes = np.empty((n, joints, 3))
         anchors = np.empty((n, joints, 3))
         for k, (axis, anchor) in enumerate(zip(self._axes, self._anchors, strict=True)):
-            moved = values[:, k] - self._zeros[k]
+            moved = q[:, k] - self._home[k]
             axes[:, k] = rotation @ axis
             anchors[:, k] = rotation @ anchor + shift
-            if self._turns[k]:
+            if self._hinges[k]:
                 rotation = rotation @ _rotations(axis, moved)
                 shift = anchors[:, k] - rotation @ anchor
             else:
                 shift = shift + axes[:, k] * moved[:, None]
         tip = rotation @ self.tip + shift
-        rows = np.where(self._turns[:, None], np.cross(axes, tip[:, None] - anchors), axes)
-        jacobian = rows.swapaxes(1, 2)
-        if joints > q.shape[1]:
-            jacobian = (jacobian * slopes[:, None]) @ np.eye(q.shape[1])[self._source]
-        return jacobian, tip
+        rows = np.where(self._hinges[:, None], np.cross(axes, tip[:, None] - anchors), axes)
+        return rows.swapaxes(1, 2), tip
 
-    def _positions(self, q: ndarray) -> tuple[ndarray, ndarray]:
-        """Positions of the links' joints, and their derivatives by those of the ik joints."""
-        values, slopes = q[:, self._source], np.ones((len(q), len(self._rows)))
-        follows = self._rows >= 0
-        if follows.any():
-            command = np.tile(self._command, (len(q), 1))
-            command[:, self._ik] = q
-            both = self._coupling.follow(torch.from_numpy(command))
-            values[:, follows], slopes[:, follows] = (n.numpy()[:, self._rows[follows]] for n in both)
-        return values, slopes
-
-
-def _above(model: mujoco.MjModel, sites: list[int]) -> set[int]:
-    """Bodies that carry all of some sites."""
-    paths = []
-    for body in model.site_bodyid[sites]:
-        paths.append({int(body)})
-        while body:
-            body = model.body_parentid[body]
-            paths[-1].add(int(body))
-    return set.intersection(*paths)
+    def _forward_native(self, q: ndarray) -> tuple[ndarray, ndarray]:
+        assert self._native is not None
+        data, home = self._native
+        command = home.copy()
+        jacobians, tips = np.empty((len(q), 3, q.shape[1])), np.empty((len(q), 3))
+        jac = np.empty((2, 3, data.model.nv))
+        for k, command[self._columns] in enumerate(q):
+            data.qpos[:] = self._coupling.qpos(command)
+            mujoco.mj_kinematics(data.model, data)
+            mujoco.mj_comPos(data.model, data)
+            for site, rows in zip(self._sites, jac, strict=True):
+                mujoco.mj_jacSite(data.model, data, rows, None, site)
+            jacobians[k] = jac.mean(axis=0) @ self._coupling.shares(command)[:, self._columns]
+            tips[k] = data.site_xpos[self._sites].mean(axis=0)
+        return jacobians, tips
 
 
 def _rotations(axis: ndarray, angles: ndarray) -> ndarray:

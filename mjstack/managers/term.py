@@ -118,10 +118,9 @@ def in_one_pass(work: Callable[[], Result]) -> Result:
     """The result of work that does not change the state: a value that several terms need is
     computed once.
 
-    An inner pass knows what the outer one has computed so far, and keeps the rest to itself,
-    because it may be a branch of a captured graph. The values belong to a context, which Python
-    leaves however the work ends: a ``finally`` clause that Ctrl-C cuts short would leave old values
-    to every later step of the process.
+    A nested pass starts with the outer cache and does not write back: it may run as a parallel
+    branch of a CUDA graph. The values belong to a context, which Python leaves however the work
+    ends: a ``finally`` clause that Ctrl-C cuts short would leave old values to later steps.
     """
     context = copy_context()
     context.run(_pass_values.set, dict(_pass_values.get() or {}))
@@ -144,7 +143,7 @@ def branches(device: torch.device, *works: Callable[[], Any]) -> list[Any]:
 
 
 def known_values() -> dict[Any, Any]:
-    """What the current pass has computed, to read and to add to; outside a pass a new dict."""
+    """Values that the current pass has computed, to read and add to; outside a pass a new dict."""
     values = _pass_values.get()
     return {} if values is None else values
 

@@ -16,7 +16,7 @@ from mjstack.math import quat_from_yaw, quat_mul
 from mjstack.mdp.geometry import Pose, robot, write_robot
 from mjstack.mdp.starts.placement import GAP, Placement, may_meet, require_reach
 from mjstack.mdp.starts.randomization import Elements, Randomized, bounds
-from mjstack.robots.jaws import jaw_members
+from mjstack.robots.jaws import jaw_bodies
 from mjstack.scene.index import joint_limits
 from mjstack.sim.simulation import Columns
 
@@ -229,7 +229,7 @@ class ObjectFriction(Randomized):
         """Take the smallest and largest coefficient."""
         self.ends = bounds("sliding", sliding)
         model = env.sim.model
-        bodies = np.concatenate(jaw_members(model, env.cfg.robot.jaw_bodies))
+        bodies = np.concatenate(jaw_bodies(model, env.cfg.robot.jaw_bodies))
         jaws = np.flatnonzero(np.isin(model.geom_bodyid, bodies)).tolist()
         grip = [g for g in jaws if model.geom_priority[g] > 0]  # objects have 0
         level = [model.geom("table").id, *(g for g in jaws if g not in grip)]

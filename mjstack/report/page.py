@@ -72,7 +72,7 @@ class World:
 
 @dataclass(kw_only=True, slots=True)
 class Page:
-    """What a run shows besides its report.
+    """Motion that a run shows besides its report.
 
     Attributes:
         title: Robot and task.

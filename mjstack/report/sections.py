@@ -177,7 +177,7 @@ def _take_matrices(metrics: dict[str, float]) -> Iterator[Table]:
 def _beside_limits(
     metrics: Mapping[str, float], thresholds: Mapping[str, float], beyond: Sequence[str]
 ) -> Iterator[Table]:
-    """What was measured beside what is required, in red where a threshold broke."""
+    """Measured values beside their limits, in red where a threshold broke."""
     broken = {*beyond, *(name.rpartition(".")[2] for name in beyond)}
     required = {name: with_unit(name, value) for name, value in thresholds.items()}
     rows = []

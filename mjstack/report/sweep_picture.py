@@ -21,7 +21,7 @@ _RED = "#cc2a24"
 
 @dataclass(frozen=True, kw_only=True)
 class Plot:
-    """What a picture of a sweep shows.
+    """Content of a sweep's picture.
 
     Attributes:
         title: Above the panels.

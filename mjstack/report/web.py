@@ -170,9 +170,7 @@ def choose_worlds(parts: Mapping[str, Sequence[World]]) -> list[World]:
 
 
 def not_shown(model: mujoco.MjModel, worlds: Sequence[World]) -> list[str]:
-    """What differs from world to world and a page does not show, in a line; none if there is
-    nothing.
-    """
+    """Name in one line the differences between worlds that a page does not show, if any."""
     fields = {
         name
         for world in worlds

@@ -1,14 +1,13 @@
-"""Distance between a robot's jaws, as a function of the gripper's commands, in native MuJoCo.
+"""A robot's jaws: which bodies they are, and how far they are apart at the gripper's commands.
 
-`Jaws` takes a compiled model and names of joints, bodies and sites:
+`Jaws` takes a compiled model and tuples of names of joints, bodies and sites:
 
     >>> jaws = Jaws(model, joints, gripper_joints, jaw_bodies, grasp_sites)
     >>> jaws.opened, jaws.shut  # commands [rad, m] at the ends of the range
-    >>> jaws.gap(np.array([jaws.opened]))  # [m] between the pads, at the grasp point
+    >>> jaws.gap([jaws.opened])  # [m] between the pads, at the grasp point
 """
 
-from collections.abc import Callable, Sequence
-from functools import lru_cache
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import combinations, product
 
 import mujoco
@@ -17,29 +16,25 @@ from numpy import ndarray
 
 from mjstack.robots.posture import posture
 
-_MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
-_RAYS = (0.0, -0.004, 0.004, -0.008, 0.008)  # [m] beside the grasp point, where a pad is looked for
-_FAR = 1.0  # [m] distances are not measured beyond
+_BESIDE = 0.005  # [m] that a pad may be farther from the grasp point than another one
 
 
-def jaw_members(model: mujoco.MjModel, jaws: Sequence[str]) -> list[list[int]]:
-    """Bodies of each jaw: the named one and all below it, without those of a jaw further down."""
-    roots = {model.body(name).id: number for number, name in enumerate(jaws)}
-    members: list[list[int]] = [[] for _ in jaws]
-    for body in range(1, model.nbody):
-        above = body
-        while above and above not in roots:
-            above = int(model.body_parentid[above])
-        if above:
-            members[roots[above]].append(body)
-    return members
+def jaw_members(parents: Mapping[str, str], jaws: Sequence[str]) -> dict[str, list[str]]:
+    """Bodies of each jaw: the named one and all below it, without those of a jaw further down.
+    ``parents`` has each body's parent, in the order of the tree.
+    """
+    roots = {name: name for name in jaws}
+    for name, parent in parents.items():
+        if name not in roots and parent in roots:
+            roots[name] = roots[parent]
+    return {jaw: [name for name, root in roots.items() if root == jaw] for jaw in jaws}
 
 
-def jaw_geoms(model: mujoco.MjModel, jaws: Sequence[str]) -> list[ndarray]:
-    """Colliding geoms of each jaw."""
-    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    members = jaw_members(model, jaws)
-    return [np.flatnonzero(collides & np.isin(model.geom_bodyid, bodies)) for bodies in members]
+def jaw_bodies(model: mujoco.MjModel, jaws: Sequence[str]) -> list[list[int]]:
+    """Numbers of the bodies of each jaw of a compiled model."""
+    names = [model.body(body).name for body in range(model.nbody)]
+    parents = {name: names[model.body(name).parentid[0]] for name in names[1:]}
+    return [list(map(names.index, bodies)) for bodies in jaw_members(parents, jaws).values()]
 
 
 class Jaws:
@@ -48,7 +43,7 @@ class Jaws:
     Attributes:
         opened: Joint positions with the jaws as far apart as their ranges allow [rad, m].
         shut: Those at the ranges' other ends, of the same shape ``(n,)``.
-        carry_sites: Whether each of the two sites lies on a jaw, so that they move apart as it does.
+        carry_sites: Whether each site lies on a jaw of its own, so that they move apart as it does.
     """
 
     def __init__(
@@ -68,108 +63,71 @@ class Jaws:
             jaws: The bodies that touch a grasped object, each with what hangs below it.
             sites: The two sites whose midpoint is the grasp point.
         """
-        self._model = model
-        self._data = mujoco.MjData(model)
-        self._posture = posture(model, joints)
-        self._columns = [list(joints).index(name) for name in gripper]
-        self._geoms = jaw_geoms(model, jaws)
+        self._model, self._data = model, mujoco.MjData(model)
+        self._posture = posture(model, tuple(joints))
+        self._columns = [joints.index(name) for name in gripper]
         self._sites = [model.site(name).id for name in sites]
-        owners = [
-            {n for n, bodies in enumerate(jaw_members(model, jaws)) if model.site_bodyid[k] in bodies}
-            for k in self._sites
-        ]
-        self.carry_sites = all(owners) and owners[0] != owners[1]
+        members = jaw_bodies(model, jaws)
+        collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+        geoms = [np.flatnonzero(collides & np.isin(model.geom_bodyid, m)) for m in members]
+        self._pads = [part for part in geoms if part.size]
+        owners = [[body in m for m in members] for body in model.site_bodyid[self._sites]]
+        self.carry_sites = all(map(any, owners)) and owners[0] != owners[1]
+
+        # The ends of the way
+        command = self._posture.rest[self._posture.commanded]
         ranges = np.array([model.joint(name).range for name in gripper]).reshape(-1, 2)
-        middle = ranges.mean(axis=1)
-        self.opened, self.shut = ranges[:, 1].copy(), ranges[:, 0].copy()
+        self.shut, self.opened = ranges.T.copy()
         for k, ends in enumerate(ranges):
-            tries = np.tile(middle, (2, 1))
+            tries = np.tile(ranges.mean(axis=1), (2, 1))
             tries[:, k] = ends
-            low, high = self._each(tries, self._breadth)
+            low, high = self._measure(tries, self._breadth)
             if low > high:
                 self.opened[k], self.shut[k] = ends
-        ends = (self._posture.agree(self._whole(end)) for end in (self.opened, self.shut))
-        self.opened, self.shut = (end[self._columns] for end in ends)
-        self._posed(self.opened)
-        self._pads = self._find_pads()
+        for end in (self.opened, self.shut):
+            command[self._columns] = end
+            end[:] = self._posture.agree(command)[self._columns]
 
-    def gap(self, commands: ndarray) -> ndarray:
+        # Pads are beside the grasp point, between the open jaws
+        self._measure([self.opened], self._breadth)
+        point = self._data.site_xpos[self._sites].mean(axis=0)
+        for k, part in enumerate(self._pads):
+            turns = self._data.geom_xmat[part].reshape(-1, 3, 3)
+            local = np.einsum("nij,ni->nj", turns, point - self._data.geom_xpos[part])
+            middle, half = model.geom_aabb[part].reshape(-1, 2, 3).swapaxes(0, 1)
+            away = np.linalg.norm(np.maximum(np.abs(local - middle) - half, 0.0), axis=1)
+            self._pads[k] = part[away < away.min() + _BESIDE]
+
+    def gap(self, commands: Iterable[ndarray]) -> ndarray:
         """Distance of the pads, less than 0 where they overlap [m], shape ``(k,)``, at commands of
         the gripper's joints of shape ``(k, n)``.
         """
-        return self._each(commands, self._gap)
+        return self._measure(commands, self._gap)
 
-    def spread(self, commands: ndarray) -> ndarray:
+    def spread(self, commands: Iterable[ndarray]) -> ndarray:
         """Distance of the two sites [m], shape ``(k,)``, at commands as of `gap`."""
-        return self._each(commands, lambda: float(np.linalg.norm(np.subtract(*self._ends()))))
+        return self._measure(commands, self._spread)
 
-    def _each(self, commands: ndarray, measure: Callable[[], float]) -> ndarray:
-        return np.array([(self._posed(command), measure())[1] for command in commands])
+    def _measure(self, commands: Iterable[ndarray], distance: Callable[[], float]) -> ndarray:
+        values = []
+        for target in commands:
+            command = self._posture.rest[self._posture.commanded]
+            command[self._columns] = target
+            self._data.qpos[:] = self._posture.qpos(command)
+            mujoco.mj_kinematics(self._model, self._data)
+            values.append(distance())
+        return np.array(values)
 
-    def _whole(self, command: ndarray) -> ndarray:
-        whole = self._posture.rest[self._posture.commanded]
-        whole[self._columns] = command
-        return whole
-
-    def _posed(self, command: ndarray) -> None:
-        self._data.qpos[:] = self._posture.qpos(self._whole(command))
-        mujoco.mj_kinematics(self._model, self._data)
-
-    def _ends(self) -> ndarray:
-        return self._data.site_xpos[self._sites]
-
-    def _middles(self) -> list[ndarray]:
-        return [self._data.geom_xpos[geoms].mean(axis=0) for geoms in self._geoms if len(geoms)]
+    def _spread(self) -> float:
+        return float(np.linalg.norm(np.subtract(*self._data.site_xpos[self._sites])))
 
     def _breadth(self) -> float:
         """A distance that grows as the jaws open."""
-        if self.carry_sites:
-            return float(np.linalg.norm(np.subtract(*self._ends())))
-        pairs = combinations(self._middles(), 2)
-        return float(sum(np.linalg.norm(a - b) for a, b in pairs))
+        middles = [self._data.geom_xpos[part].mean(axis=0) for part in self._pads]
+        apart = [float(np.linalg.norm(a - b)) for a, b in combinations(middles, 2)]
+        return self._spread() if self.carry_sites else sum(apart)
 
     def _gap(self) -> float:
-        pairs = [pair for a, b in combinations(self._pads, 2) for pair in product(a, b)]
-        measured = (mujoco.mj_geomDistance(self._model, self._data, *p, _FAR, None) for p in pairs)
-        return min(measured, default=_FAR)
-
-    def _find_pads(self) -> list[list[int]]:
-        """The geoms of each jaw that are beside the grasp point, on the closing axis; all where
-        none is there.
-        """
-        ends = self._ends()
-        point = ends.mean(axis=0)
-        axis = ends[1] - ends[0]
-        middles = self._middles()
-        if np.linalg.norm(axis) < 1e-6 and len(middles) > 1:
-            axis = middles[1] - middles[0]
-        axis /= max(np.linalg.norm(axis), 1e-9)
-        across = np.linalg.svd(axis[None])[2][1:]
-        for offset in product(_RAYS, repeat=2):
-            start = point + np.array(offset) @ across
-            pads = [self._hit(geoms, start, axis) for geoms in self._geoms]
-            if all(pads):
-                return pads
-        return [geoms.tolist() for geoms in self._geoms]
-
-    def _hit(self, geoms: ndarray, start: ndarray, axis: ndarray) -> list[int]:
-        """The nearest of some geoms on a line through a point."""
-        model, data = self._model, self._data
-        far = {}
-        for geom, way in product(geoms.tolist(), (axis, -axis)):
-            shape = int(model.geom_type[geom])
-            pose = (data.geom_xpos[geom], data.geom_xmat[geom], model.geom_size[geom])
-            distance = (
-                mujoco.mj_rayMesh(model, data, geom, start, way)
-                if shape == _MESH
-                else mujoco.mju_rayGeom(*pose, start, way, shape)
-            )
-            if distance >= 0.0:
-                far[geom] = min(distance, far.get(geom, np.inf))
-        return [min(far, key=far.__getitem__)] if far else []
-
-
-@lru_cache(maxsize=8)
-def robot_jaws(model: mujoco.MjModel, *names: tuple[str, ...]) -> Jaws:
-    """`Jaws` of a model, probed once; its other arguments as tuples."""
-    return Jaws(model, *names)
+        pairs = [p for a, b in combinations(self._pads, 2) for p in product(a.tolist(), b.tolist())]
+        gaps = (mujoco.mj_geomDistance(self._model, self._data, *p, 1.0, None) for p in pairs)
+        return min(gaps, default=1.0)

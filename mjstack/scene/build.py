@@ -15,6 +15,7 @@ from mjstack.config.schema import BoxCfg, CameraCfg, Config, ObjectCfg, SceneCfg
 from mjstack.errors import ConfigError, MjstackError, UnknownName
 from mjstack.robots import read_mjcf, robot_spec
 from mjstack.robots.guest import WORLD, compile_scene
+from mjstack.robots.jaws import jaw_members
 
 TABLE = "table"
 CAPSULE_TURN = np.array([math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0])
@@ -84,10 +85,12 @@ def add_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> Non
     for name in ("iterations", "ls_iterations", "impratio", "tolerance"):
         if (value := getattr(solver, name)) is not None:
             setattr(option, name, value)
-    members = {jaw: _jaw_members(spec.body(jaw), jaw_bodies) for jaw in jaw_bodies}
+    parents = {body.name: body.parent.name for body in spec.bodies[1:]}
+    members = jaw_members(parents, jaw_bodies)
     if solver.gripper_condim is not None:
-        for geom in (g for bodies in members.values() for body in bodies for g in body.geoms):
-            geom.condim = solver.gripper_condim
+        for name in itertools.chain(*members.values()):
+            for geom in spec.body(name).geoms:
+                geom.condim = solver.gripper_condim
 
     # Bodies
     world = spec.worldbody
@@ -106,7 +109,8 @@ def add_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> Non
         pairs += [(WORLD, name) for name in scene.objects]
         pairs += itertools.combinations(scene.objects, 2)
     body = mujoco.mjtObj.mjOBJ_BODY
-    touching = {jaw: _touching(spec, jaw, bodies) for jaw, bodies in members.items()}
+    alone = {jaw: jaw_members(parents, [jaw])[jaw] == members[jaw] for jaw in jaw_bodies}
+    touching = {jaw: _touching(spec, jaw, members[jaw], alone[jaw]) for jaw in jaw_bodies}
     for first, second in pairs:  # the net contact force [N]: 3 numbers, world frame
         kind, name = touching.get(first, (body, first))
         spec.add_sensor(
@@ -144,21 +148,18 @@ def add_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> Non
         spec.compiler.discardvisual = True
 
 
-def _jaw_members(body: mujoco.MjsBody, jaws: Sequence[str]) -> list[mujoco.MjsBody]:
-    """A jaw's body and all below it, without those of another jaw."""
-    below = [child for child in body.bodies if child.name not in jaws]
-    return [body, *(low for child in below for low in _jaw_members(child, jaws))]
-
-
 def _touching(
-    spec: mujoco.MjSpec, jaw: str, members: Sequence[mujoco.MjsBody]
+    spec: mujoco.MjSpec, jaw: str, members: Sequence[str], alone: bool
 ) -> tuple[mujoco.mjtObj, str]:
-    """Kind and name of what touches objects for a jaw: a body, or all below it."""
-    names = [b.name for b in members if any(g.contype or g.conaffinity for g in b.geoms)]
-    if len(members) == len(_jaw_members(spec.body(jaw), ())) and names not in ([], [jaw]):
-        return mujoco.mjtObj.mjOBJ_XBODY, jaw
-    if jaw in names or not names:
+    """Kind and name of what touches objects for a jaw: a body; or all below it, if it carries no
+    other jaw.
+    """
+    geoms = {name: spec.body(name).geoms for name in members}
+    names = [name for name in members if any(g.contype or g.conaffinity for g in geoms[name])]
+    if jaw in names[:1] * (not alone or len(names) == 1) or not names:
         return mujoco.mjtObj.mjOBJ_BODY, jaw
+    if alone:
+        return mujoco.mjtObj.mjOBJ_XBODY, jaw
     if len(names) > 1:
         expected = f"one of {', '.join(names)}, which collide, as it carries another jaw too"
         raise ConfigError("robot.jaw_bodies", jaw, expected)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import combinations, product
 
 import mujoco
@@ -12,12 +13,13 @@ from torch import Tensor
 
 from mjstack.config.schema import RobotCfg, SceneCfg
 from mjstack.errors import ConfigError, require_names
-from mjstack.robots.jaws import Jaws, robot_jaws
-from mjstack.robots.posture import posture
 from mjstack.math import lowest_point, quat_mul, quat_to_matrix
+from mjstack.robots.jaws import Jaws
+from mjstack.robots.posture import posture
 from mjstack.scene.build import CAPSULE_TURN, WORLD, force_sensor
 from mjstack.sim.simulation import Columns
 
+_jaws = lru_cache(maxsize=8)(Jaws)
 _GRIP = 20.0  # [N] of each jaw on an object, where the configuration has no joint target
 _WIDTH = 0.044  # [m] of an object, where there is none
 _SHAPES = {
@@ -80,7 +82,7 @@ class SceneIndex:
         joints = [model.joint(name).id for name in robot.joints]
         self._robot = robot
         self._tensors: dict[tuple[torch.device, torch.dtype], RobotTensors] = {}
-        self.posture = posture(model, robot.joints)
+        self.posture = posture(model, tuple(robot.joints))
         wide = robot.closed_width or _WIDTH
         narrowest = min([wide, *(thing.width for thing in scene.free.values())])
         self._grips = gripper_targets(model, robot, [None, narrowest])
@@ -171,13 +173,15 @@ class SceneIndex:
 def _idle_servos(
     model: mujoco.MjModel, commanded: np.ndarray, rest: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Position servos of joints that have no command, and commands that hold these where they are."""
+    """Position servos of joints without a command, and commands that hold these at rest."""
     servos = np.setdiff1d(np.arange(model.nu), commanded)
     joint = model.actuator_trntype[servos] == int(mujoco.mjtTrn.mjTRN_JOINT)
     bias = model.actuator_biasprm[servos]
     servos = servos[joint & (bias[:, 1] < 0.0) & (model.actuator_gainprm[servos, 0] != 0.0)]
     bias = model.actuator_biasprm[servos]
-    length = model.actuator_gear[servos, 0] * rest[model.jnt_qposadr[model.actuator_trnid[servos, 0]]]
+    length = (
+        model.actuator_gear[servos, 0] * rest[model.jnt_qposadr[model.actuator_trnid[servos, 0]]]
+    )
     return servos, -(bias[:, 0] + bias[:, 1] * length) / model.actuator_gainprm[servos, 0]
 
 
@@ -204,28 +208,29 @@ def gripper_targets(
     ``widths`` are those of the objects across the jaws [m]; None is for the open gripper.
     """
     jaws = jaws_of(model, robot)
-    opened = jaws.opened if robot.gripper_open is None else np.array(robot.gripper_open, dtype=float)
-    given = robot.gripper_closed is not None
-    closed = np.array(robot.gripper_closed if given else jaws.shut, dtype=float)
+    opened = (
+        jaws.opened if robot.gripper_open is None else np.array(robot.gripper_open, dtype=float)
+    )
+    probed = robot.gripper_closed is None
+    closed = np.array(jaws.shut if probed else robot.gripper_closed, dtype=float)
     wide = np.array(widths, dtype=float)  # None is NaN
-    if given and robot.closed_width is None:
+    if not probed and robot.closed_width is None:
         return np.where(np.isnan(wide)[:, None], opened, closed)
     shares = np.linspace(-2.0, 1.0, 301)[:, None]  # of the way from closed (the 200th) to open
     low, high = joint_limits(model, robot.gripper_joints)
     targets = np.clip(closed + shares * (opened - closed), low, high)
-    if given:
-        apart = jaws.spread(targets) if jaws.carry_sites else jaws.gap(targets)
-        goal = apart[200] - robot.closed_width + wide
+    if jaws.carry_sites and not probed:
+        apart = jaws.spread(targets)
     else:
-        apart = jaws.gap(targets)
+        apart = np.maximum.accumulate(jaws.gap(targets))
+    goal = wide + apart[200] - (robot.closed_width or 0.0)
+    if probed:
         servos = [model.actuator(name).id for name in robot.gripper_joints]
         stiffness = model.actuator_gainprm[servos, 0] @ (opened - closed) ** 2
         goal = wide - _GRIP * (apart[-1] - apart[200]) ** 2 / stiffness
-    if not jaws.carry_sites or not given:
-        apart = np.maximum.accumulate(apart)
     rows = np.stack([np.interp(goal, apart, column) for column in targets.T], axis=1)
     rows[np.isnan(wide)] = opened
-    if given:
+    if not probed:
         rows[wide == robot.closed_width] = closed
     return rows
 
@@ -233,7 +238,7 @@ def gripper_targets(
 def jaws_of(model: mujoco.MjModel, robot: RobotCfg) -> Jaws:
     """The robot's jaws, probed once per model."""
     names = (robot.joints, robot.gripper_joints, robot.jaw_bodies, robot.grasp_sites)
-    return robot_jaws(model, *map(tuple, names))
+    return _jaws(model, *map(tuple, names))
 
 
 def locked_home(robot: RobotCfg) -> np.ndarray:

@@ -150,7 +150,7 @@ class NativeSimulation(Simulation):
 
     @property
     def _derived(self) -> list[np.ndarray]:
-        """What a step writes besides the state."""
+        """Arrays that a step writes besides the state."""
         return [*self._poses, *self._copies.values()]
 
     @property

@@ -14,7 +14,7 @@ from mjstack.config.schema import RobotCfg
 from mjstack.errors import ConfigError, require_names
 from mjstack.managers.view import EnvView
 from mjstack.mdp.geometry import place_xy
-from mjstack.robots.jaws import jaw_members
+from mjstack.robots.jaws import jaw_bodies
 from mjstack.scene.index import lowest_height
 from mjstack.tasks import parts
 from mjstack.tasks.check import EpisodeCheck, Judgement, Rule
@@ -346,7 +346,7 @@ class _JawClear(Rule):
     def judge(self, end: Step) -> Judgement:
         sim = end.view.env.sim
         sim.kinematics()
-        jaws = [body for jaw in jaw_members(sim.model, self._robot.jaw_bodies) for body in jaw]
+        jaws = [body for jaw in jaw_bodies(sim.model, self._robot.jaw_bodies) for body in jaw]
         clearance = lowest_height(sim.model, jaws, sim.xpos, sim.xquat) - self._rim
         return clearance >= self._least, {"jaw_clearance_m": clearance}
 

@@ -1,5 +1,5 @@
-"""What every learner does beside its loss: it counts steps, keeps a curve, saves policies and
-state, and goes on where it was stopped.
+"""Base class of the learners: it counts steps, keeps a curve, saves policies and state, and goes
+on where it was stopped.
 """
 
 import math

@@ -115,7 +115,7 @@ class VisionCfg:
 @dataclass(slots=True)
 class CloneJobCfg(TrainJobCfg):
     """A network learns to act as the expert does, from the expert's episodes and, in rounds, from
-    its answers in states to which the policy has led. Sizes are those of a round.
+    its labels in states to which the policy has led. Sizes are those of a round.
     """
 
     rounds: int = spec(ge=0, le=1000)
@@ -138,17 +138,17 @@ class CloneJobCfg(TrainJobCfg):
     dataset: str | None = spec(None)
     """Folder of a dataset from which it learns; null: from the expert, who plays now."""
     chunk: int = spec(unit="steps", ge=1, le=1000)
-    """Joint targets of one answer."""
+    """Joint targets of a chunk, which is one action."""
     execute: int = spec(unit="steps", ge=1, le=1000)
-    """Control steps between two answers."""
+    """Control steps between two queries."""
     warm_up: float = spec(0.0, ge=0.0, le=1.0)
     """Share of a round's batches in which the learning rate rises to ``learning_rate``, before a
     cosine brings it to 0."""
     max_grad_norm: float | None = spec(None, gt=0.0)
     """A longer gradient, of all weights, is cut to this length; null: none is."""
     loss: str = spec(choices=("squared", "absolute"))
-    """Error of a joint target. Where the expert's answer jumps, the least absolute error is one of
-    the answers, and the least squared one lies between them."""
+    """Error of a joint target. Where the expert's action jumps, an absolute error picks one of the
+    two actions, and a squared error averages them."""
     averaging: float = spec(ge=0.0, le=1.0)
     """Share of the policy's weights that a batch keeps: they are an average."""
     episodes: int = spec(unit="episodes", ge=1)
@@ -156,7 +156,7 @@ class CloneJobCfg(TrainJobCfg):
     batches: int = spec(ge=1)
     """Steps of the optimizer."""
     batch_size: int = spec(ge=1)
-    """Answers of a batch."""
+    """Labels of a batch."""
     save_every: int = spec(unit="batches", ge=1)
     """Batches between two saved policies."""
     input_noise: float = spec(ge=0.0)

@@ -129,7 +129,7 @@ class RobotCfg:
     """Joint targets of the open gripper. null: as far as the joints' ranges allow."""
     gripper_closed: list[float] | None = spec(None, unit="rad, m")
     """Joint targets of the gripper around an object as wide as ``closed_width``; around any object
-    where a task or the command line sets it alone. null: jaws press with 20 N, as far as they do."""
+    where a task or the command line sets it alone. null: the jaws press with 20 N."""
     closed_width: float | None = spec(0.044, unit="m", gt=0.0)
     """Width of the object that ``gripper_closed`` is for. Around another one the jaws close as much
     nearer or farther. null: that target is for any object."""

@@ -24,8 +24,8 @@ class TimingCfg:
     decimation: int = spec(unit="physics steps", ge=1, le=10_000)
     """Physics steps of one control step."""
     policy_decimation: int = spec(1, unit="control steps", ge=1, le=1000)
-    """Control steps in which an action of a policy is repeated, in training. A driver decides in
-    every control step; a policy that was trained so repeats its answers by itself."""
+    """Control steps in which an action of a policy is repeated. Only training uses this: in a gate
+    the policy's driver repeats each action."""
     control_hz: float = spec(50.0, unit="Hz", gt=0.0, le=1e6)
     """Control rate that these make: ``task.control_hz`` of the built-in tasks."""
     command_delay: int = spec(0, unit="control steps", ge=0, le=1000)
@@ -213,8 +213,8 @@ class ThroughputCfg(GateFuncCfg):
     repetitions: int = spec(ge=1, le=1000)
     """Repetitions of each measurement, at most."""
     precision: float = spec(0.01, ge=0.0)
-    """Repetitions end, from two on, as soon as half the range of their times is less, relative to
-    the median (env_step, cameras: of the time over that of physics)."""
+    """Stop, after at least two repetitions, when half the range of their times is below this share
+    of their median (env_step, cameras: of the ratio to physics)."""
     episodes: int = spec(ge=1, le=MOST_COUNT)
     """episode: repetitions at most."""
     steps: int = spec(unit="steps", ge=1, le=MOST_COUNT)

@@ -76,7 +76,7 @@ class TaskCfg:
     """Judges an episode: ``func`` names a subclass of ``EpisodeCheck``, the other keys are its
     thresholds; null: the task can be trained, not verified."""
     success: TermCfg | None = None
-    """Term that tells when the task is achieved; null: it never is."""
+    """Term that is true where the task is achieved; null: it never is."""
 
 
 @dataclass(slots=True)
