@@ -110,9 +110,7 @@ def test_every_step_stays_on_its_straight_path(stage: Stage, trajectory: JointTr
         before = after
 
 
-def test_reported_ik_error_is_within_tolerance(
-    stage: Stage, trajectory: JointTrajectory
-) -> None:
+def test_reported_ik_error_is_within_tolerance(stage: Stage, trajectory: JointTrajectory) -> None:
     assert trajectory.ik_error.shape == (3,)
     assert (trajectory.ik_error <= stage.cfg.controller.ik_tolerance).all()
     assert (trajectory.ik_error > 0).all()

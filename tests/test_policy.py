@@ -442,7 +442,7 @@ def test_every_gate_takes_a_policy(played: tuple[Path, Path], tmp_path: Path) ->
     gates = report(out)
     assert {"baseline", "batch", "throughput", "success"} <= set(gates)
     assert "not lifted" in gates["baseline"]["reason"]
-    assert "path_error_m" not in gates["baseline"]["metrics"]
+    assert "waypoint_error_m" not in gates["baseline"]["metrics"]
     for gate in ("batch", "success"):
         assert gates[gate]["metrics"]["episodes"] == 5
         assert gates[gate]["metrics"]["failed.LIFT"] == 5

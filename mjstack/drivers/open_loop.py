@@ -130,17 +130,6 @@ class OpenLoopPlanner:
             self._plans.append((sources_xy.copy(), trajectory))
         return trajectory
 
-    def path_error(self) -> float:
-        """Largest distance [m] of the nominal plan's grasp point from its straight path."""
-        trajectory = self.plan(self._xy[None])
-        (ends,) = self._targets(self._xy[None])
-        worst = 0.0
-        for step, (number, s) in enumerate(self._progress()):
-            start, end = ends[number : number + 2]
-            at = self.ik.grasp_point(trajectory.command(step)[0].numpy())
-            worst = max(worst, float(np.linalg.norm(at - (start + s * (end - start))[:3])))
-        return worst
-
     def _solve_nominal(self, q: ndarray, target: ndarray) -> tuple[ndarray, ndarray]:
         """Solve one world with mink."""
         command, distance = self.ik.solve(target[0], q[0])

@@ -12,7 +12,7 @@ from mjstack.envs import Env
 from mjstack.episodes.motion import draw_seen, world_fields
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.recorder import Snapshots, WorldRecorder
-from mjstack.episodes.rollout import Episode, Observer, State
+from mjstack.episodes.rollout import Episode, Hook, Observer, State
 from mjstack.episodes.stage import Stage, TextHook
 from mjstack.managers.episode import required_fields
 from mjstack.managers.view import offers
@@ -40,12 +40,14 @@ class NominalRun:
         episode: The episode.
         world: Its recording.
         states: At the ends of phases, and of steps that gate *parity* compares, by step.
+        targets: Joint targets there, as the driver gave them, before servos' ranges bound them.
     """
 
     sim: Simulation
     episode: Episode
     world: WorldRecorder
     states: dict[int, State]
+    targets: dict[int, np.ndarray]
 
 
 @dataclass(eq=False, kw_only=True, slots=True)
@@ -116,9 +118,22 @@ class Run:
         world = WorldRecorder()
         ends = {phase.stop - 1 for phase in stage.phases}
         snapshots = Snapshots(ends.union(self.parity_steps.values()))
+        actions: list[np.ndarray] = []
+        sent = Hook(lambda step, sim: actions.append(sent.env.action[0].double().numpy().copy()))
         viewers = () if "parity" in self.cfg.gates else self.viewers
-        episode = stage.play(sim, reset, [*viewers, world, snapshots])
-        return NominalRun(sim=sim, episode=episode, world=world, states=snapshots.states)
+        episode = stage.play(sim, reset, [*viewers, world, snapshots, sent])
+        states = snapshots.states
+        absolute = all(term.params.get("mode") == "absolute" for term in stage.action.values())
+        return NominalRun(
+            sim=sim,
+            episode=episode,
+            world=world,
+            states=states,
+            targets={
+                step: actions[step] if absolute else state.ctrl[0][stage.index.ctrl]
+                for step, state in states.items()
+            },
+        )
 
     @property
     def parity_steps(self) -> dict[str, int]:

@@ -5,7 +5,7 @@ from mjstack.gates.scene_physics import scene_faults
 from mjstack.gates.tracking import find_cause, start_contacts, waypoint_errors
 from mjstack.report.record import GateResult, Status
 from mjstack.robots import read_robot
-from mjstack.robots.guest import SAG, gravity_note, left_behind
+from mjstack.robots.guest import SAG, left_behind
 from mjstack.scene.build import scene_names
 
 
@@ -15,11 +15,10 @@ def run_baseline(run: Run) -> list[GateResult]:
     judge it, and where the arm went.
     """
     cfg = run.cfg
-    if faults := scene_faults(cfg, run.stage.model):
+    if faults := list(scene_faults(cfg, run.stage.model)):
         reason = f"the compiled scene is not as configured: {'; '.join(faults[:3])}"
-        result = GateResult(name="baseline", status=Status.failed, reason=reason)
-        result.details = faults
-        return [result]
+        failed = GateResult(name="baseline", status=Status.failed, reason=reason, details=faults)
+        return [failed]
     sim = run.nominal.sim
     episode = run.nominal.episode
     status, reason, metrics, beyond = run.judge_one(episode)
@@ -33,19 +32,20 @@ def run_baseline(run: Run) -> list[GateResult]:
         "peak_constraint_rows": int(sim.peak_constraints[0]),
     }
     thresholds = run.stage.check.thresholds()
-    causes = list(start_contacts(run))
-    if errors := waypoint_errors(run):
+    contacts = start_contacts(run.stage, episode.start[0])
+    causes: list[str] = []
+    if errors := waypoint_errors(run.stage, run.nominal.states, run.nominal.targets):
         worst = max(errors, key=errors.__getitem__)
         metrics["waypoint_error_m"] = errors[worst]
         metrics["ik_error_m"] = float(episode.ik_error.max())
-        metrics["path_error_m"] = run.stage.planner.path_error()
         # Beyond half of it a hand over an object and one at it cannot be told apart
         thresholds["waypoint_error_m"] = 0.5 * cfg.robot.approach_height
         thresholds["ik_error_m"] = cfg.controller.ik_tolerance
         if errors[worst] > SAG:
-            cause = find_cause(run, run.nominal.states[run.stage.phase(worst).stop - 1])
-            miss = f"the arm misses its target by {1e3 * errors[worst]:.1f} mm at the end of {worst}"
-            causes.insert(0, f"{miss}: {cause}")
+            end = run.stage.phase(worst).stop - 1
+            cause = find_cause(run.stage, run.nominal.states[end], run.nominal.targets[end])
+            miss = f"the arm is {1e3 * errors[worst]:.1f} mm off its target as {worst} ends"
+            causes = [f"{miss}: {cause}", *contacts]
         if not errors[worst] <= thresholds["waypoint_error_m"]:
             status = Status.failed
             reason = reason or "failed"
@@ -60,8 +60,7 @@ def run_baseline(run: Run) -> list[GateResult]:
     result.metrics = metrics
     result.beyond = beyond
     result.notes["backend"] = sim.description
-    spec = read_robot(cfg.robot, cfg.model)
-    lines = left_behind(spec, cfg.robot, run.stage.model, scene_names(cfg.scene))
-    result.details += [f"robot's file: {line}" for line in lines]
-    result.details += [*filter(None, [gravity_note(spec, cfg.robot, run.stage.model)]), *causes]
+    names = scene_names(cfg.scene)
+    lines = left_behind(read_robot(cfg.robot, cfg.model), cfg.robot, run.stage.model, names)
+    result.details += [*(f"robot's file: {line}" for line in lines), *(causes or contacts)]
     return [result]

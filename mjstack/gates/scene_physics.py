@@ -3,7 +3,6 @@
 import re
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import mujoco
@@ -16,10 +15,9 @@ _STEPS = 20  # of a fall
 _HEIGHT = 10.0  # m: clear of everything
 # Of mjModel: indices, values that follow from others, and looks
 _IGNORED = re.compile(r".*(id|adr|num|user|plugin|sameframe|rgba|group|shadow|M0|invweight0)$")
-_Elements = dict[tuple[str, str], slice]  # rows in arrays of mjModel, by kind and name
 
 
-def scene_faults(cfg: Config, model: mujoco.MjModel) -> list[str]:
+def scene_faults(cfg: Config, model: mujoco.MjModel) -> Iterator[str]:
     """List where a compiled scene is not as configured, a line each.
 
     Options and all fields of its own bodies, geoms and joints are held against the scene compiled
@@ -29,70 +27,63 @@ def scene_faults(cfg: Config, model: mujoco.MjModel) -> list[str]:
     bare = replace(cfg.scene, cameras={})
     add_scene(spec, replace(cfg, robot=replace(cfg.robot, jaw_bodies=[]), scene=bare))
     expected = spec.compile()
-    shapes = {TABLE: (cfg.scene.table_half, cfg.scene.table_friction)}
-    for name, thing in cfg.scene.objects.items():
+    shapes = {TABLE: (bare.table_half, bare.table_friction)}
+    for name, thing in bare.objects.items():
         shapes |= {name + end: (p.size, thing.friction) for end, p in thing.pieces.items()}
         if not thing.fixed and thing.mass is not None:
             expected.body(name).mass = thing.mass
     for name, (size, friction) in shapes.items():  # not as `add_scene` has understood them
         expected.geom(name).size[: len(size)] = size
         expected.geom(name).friction = friction
-    faults = [*_field_faults(cfg, model, expected)]
-    for name in cfg.scene.free:
-        faults += _fall_faults(cfg, model, expected, name)
-    return faults
+    yield from _field_faults(cfg, model, expected)
+    for name in bare.free:
+        yield from _fall_faults(cfg, model, expected, name)
 
 
-def _field_faults(
-    cfg: Config, model: mujoco.MjModel, expected: mujoco.MjModel
-) -> Iterator[str]:
+def _field_faults(cfg: Config, model: mujoco.MjModel, expected: mujoco.MjModel) -> Iterator[str]:
     for name in [name for name in dir(expected.opt) if not name.startswith("_")]:
         if getattr(cfg.solver, name, "") is not None:  # else the robot's file has it
-            yield from _fault(
-                f"option {name}", getattr(model.opt, name), getattr(expected.opt, name)
-            )
-    objects = cfg.scene.objects
+            value, configured = (getattr(m.opt, name) for m in (model, expected))
+            yield from _fault(f"option {name}", value, configured)
     elements = _elements(model, expected)
-    for (kind, owner), rows in _elements(expected, expected).items():
-        if (found := elements.get((kind, owner))) is None:
-            yield f"{kind} {owner} does not collide, configured to"
-            continue
-        for name in [name for name in dir(expected) if name.startswith(f"{kind}_")]:
-            if not _IGNORED.match(name):
-                values = getattr(model, name)[found], getattr(expected, name)[rows]
-                key = name.removeprefix(f"{kind}_")
-                key = f"scene.objects.{owner}.{key}" if hasattr(objects.get(owner), key) else ""
-                yield from _fault(f"{owner} {name}", *values, key)
-    bodies = {model.body(name).id for kind, name in elements if kind == "body"}
-    geoms = {rows.start for (kind, _), rows in elements.items() if kind == "geom"}
-    for signature in model.exclude_signature.tolist():
-        pair = (signature >> 16, signature & 0xFFFF)
-        if not bodies.isdisjoint(pair):
-            yield f"contacts of {model.body(pair[0]).name} and {model.body(pair[1]).name} are off"
-    for pair in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True):
-        if not geoms.isdisjoint(pair):
-            yield f"contacts of {model.geom(pair[0]).name} and {model.geom(pair[1]).name} are a pair"
+    for owner, rows_of in _elements(expected, expected).items():
+        for kind, rows in rows_of.items():
+            numbers = elements[owner][kind]
+            if len(numbers) != len(rows):
+                yield f"{owner} has {len(numbers)} {kind} for collisions, configured {len(rows)}"
+                continue
+            for name in [name for name in dir(expected) if name.startswith(f"{kind}_")]:
+                if not _IGNORED.match(name):
+                    key = name.removeprefix(f"{kind}_")
+                    known = hasattr(cfg.scene.objects.get(owner), key)
+                    key = f"scene.objects.{owner}.{key}" if known else ""
+                    value, configured = getattr(model, name)[numbers], getattr(expected, name)[rows]
+                    yield from _fault(f"{owner} {name}", value, configured, key)
+    excluded = [divmod(int(signature), 1 << 16) for signature in model.exclude_signature]
+    pairs = {"body": excluded, "geom": zip(model.pair_geom1, model.pair_geom2, strict=True)}
+    for kind in pairs:
+        scene_numbers = {number for rows in elements.values() for number in rows.get(kind, ())}
+        for pair in pairs[kind]:
+            if not scene_numbers.isdisjoint(pair):
+                names = " and ".join(getattr(model, kind)(number).name for number in pair)
+                yield f"{names} have an exclude or a pair of contacts, configured none"
 
 
-def _elements(model: mujoco.MjModel, scene: mujoco.MjModel) -> _Elements:
-    """Elements of a model that a scene without the robot has, too."""
-    out: _Elements = {}
-    geom_id = partial(mujoco.mj_name2id, model, mujoco.mjtObj.mjOBJ_GEOM)
-    for name in filter(None, (scene.geom(number).name for number in range(scene.ngeom))):
-        if (number := geom_id(name)) >= 0:
-            out["geom", name] = slice(number, number + 1)
+def _elements(model: mujoco.MjModel, scene: mujoco.MjModel) -> dict[str, dict[str, np.ndarray]]:
+    """Numbers of a model's elements that a scene without a robot has too, by name of the body, or
+    of the world's geom, and kind. Only geoms that collide: others may have been discarded.
+    """
+    collide = (model.geom_contype | model.geom_conaffinity) != 0
+    out = {}
+    for geom in (scene.geom(number).name for number in np.flatnonzero(scene.geom_bodyid == 0)):
+        number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, geom)
+        out[geom] = {"geom": np.flatnonzero(collide & (np.arange(model.ngeom) == number))}
     for name in filter(None, (scene.body(number).name for number in range(1, scene.nbody))):
-        body = model.body(name)
-        out["body", name] = slice(body.id, body.id + 1)
+        body = model.body(name).id
+        out[name] = {"body": np.array([body])}
+        out[name]["geom"] = np.flatnonzero(collide & (model.geom_bodyid == body))
         for kind in ("jnt", "dof"):
-            first, count = (int(getattr(body, f"{kind}{end}")[0]) for end in ("adr", "num"))
-            out[kind, name] = slice(first, first + count)
-        # Geoms without a name come from a file, of which visual ones may have been discarded
-        first, count = int(body.geomadr[0]), int(body.geomnum[0])
-        collide = (model.geom_contype | model.geom_conaffinity)[first : first + count]
-        unnamed = [n for n in first + np.flatnonzero(collide) if not model.geom(n).name]
-        for k, number in enumerate(unnamed):
-            out["geom", f"{name} geom {k}"] = slice(number, number + 1)
+            out[name][kind] = np.flatnonzero(getattr(model, f"{kind}_bodyid") == body)
     return out
 
 
@@ -107,7 +98,7 @@ def _fall_faults(
     def velocity(force: float = 0.0, torque: Any = (0.0, 0.0, 0.0)) -> np.ndarray:
         """Velocities of the end: of the centre [m/s], about the principal axes [rad/s]."""
         mujoco.mj_resetData(model, data)
-        data.qpos[int(model.joint(name).qposadr[0]) + 2] = _HEIGHT
+        data.joint(name).qpos[2] = _HEIGHT
         mujoco.mj_forward(model, data)
         axes = data.ximat[body].reshape(3, 3).copy()
         data.xfrc_applied[body] = [force, 0.0, 0.0, *axes @ torque]
@@ -120,13 +111,12 @@ def _fall_faults(
     fall = velocity()
     gravity = [*expected.opt.gravity, 0.0, 0.0, 0.0]
     yield from _fault(f"{name} falls with acceleration", fall / seconds, gravity)
-    mass = float(expected.body(name).mass[0])
-    inertia = expected.body(name).inertia
+    mass, inertia = float(expected.body(name).mass[0]), expected.body(name).inertia
     with np.errstate(divide="ignore"):  # of an object that does not move
         pushed = mass / (velocity(force=mass / seconds) - fall)[0]
         torques = np.diag(inertia) / seconds
         turned = inertia / [(velocity(torque=t) - fall)[3 + k] for k, t in enumerate(torques)]
-    yield from _fault(f"{name} as pushed: mass", pushed, mass)
+    yield from _fault(f"{name} as pushed: mass", pushed, mass, f"scene.objects.{name}.mass")
     yield from _fault(f"{name} as turned: inertia", turned, inertia)
 
 
@@ -134,5 +124,5 @@ def _fault(name: str, value: Any, expected: Any, key: str = "") -> Iterator[str]
     least = 1e-9 * np.max(np.abs(expected), initial=0.0)
     if not np.allclose(value, expected, rtol=1e-6, atol=least):
         numbers = (np.where(np.abs(v) < least, 0.0, v).ravel() for v in (value, expected))
-        found, wanted = (" ".join(f"{number:.6g}" for number in row) for row in numbers)
-        yield f"{name} {found}, configured {wanted}{key and f' ({key})'}"
+        text, configured = (" ".join(f"{number:.6g}" for number in row) for row in numbers)
+        yield f"{name} {text}, configured {configured}{key and f' ({key})'}"

@@ -1,121 +1,126 @@
 """Whether the arm goes where it is sent, and otherwise the cause."""
 
-from collections.abc import Iterator
+from collections.abc import Mapping
 
 import mujoco
 import numpy as np
 
-from mjstack.config.schema import Config
 from mjstack.episodes.rollout import State
-from mjstack.episodes.run import Run
+from mjstack.episodes.stage import Stage
 from mjstack.robots.guest import WORLD, grasp_jacobian
 from mjstack.scene.build import scene_names
 
 _DEEP = 1e-4  # m: contacts at rest are less deep
-_KIND = mujoco.mjtConstraint
+_KINDS = mujoco.mjtConstraint
 _CAUSES = {  # of loads, by the kind of constraint that makes them
-    "an equality of the robot's file holds it": (_KIND.mjCNSTR_EQUALITY,),
-    "it is at the end of its range": (_KIND.mjCNSTR_LIMIT_JOINT, _KIND.mjCNSTR_LIMIT_TENDON),
-    "dry friction holds it": (_KIND.mjCNSTR_FRICTION_DOF, _KIND.mjCNSTR_FRICTION_TENDON),
+    int(_KINDS.mjCNSTR_EQUALITY): "an equality of the robot's file holds it",
+    int(_KINDS.mjCNSTR_FRICTION_DOF): "dry friction holds it",
+    int(_KINDS.mjCNSTR_FRICTION_TENDON): "dry friction of a tendon holds it",
+    int(_KINDS.mjCNSTR_LIMIT_JOINT): "it is at the end of its range",
+    int(_KINDS.mjCNSTR_LIMIT_TENDON): "a tendon is at the end of its range",
 }
 
 
-def waypoint_errors(run: Run) -> dict[str, float]:
+def waypoint_errors(
+    stage: Stage, states: Mapping[int, State], targets: Mapping[int, np.ndarray]
+) -> dict[str, float]:
     """Distance of the grasp point at the end of each phase of the nominal episode from where the
-    arm's joint targets would have it [m]; fingers count as they are.
+    arm's joint targets would have it [m]; fingers count as they are. States and joint targets are
+    by step.
     """
-    index = run.stage.index
-    data = mujoco.MjData(run.stage.model)
-    qpos, ctrl = index.robot_qpos[: index.n_arm], index.ctrl[: index.n_arm]
+    index, data = stage.index, mujoco.MjData(stage.model)
 
     def grasp_point() -> np.ndarray:
-        mujoco.mj_kinematics(run.stage.model, data)
+        mujoco.mj_kinematics(stage.model, data)
         return data.site_xpos[index.grasp_sites].mean(axis=0)
 
     errors = {}
-    for phase in run.stage.phases:
-        state = run.nominal.states[phase.stop - 1]
-        data.qpos[:] = state.qpos[0]
+    for phase in stage.phases:
+        data.qpos[:] = states[phase.stop - 1].qpos[0]
         reached = grasp_point()
-        data.qpos[qpos] = state.ctrl[0][ctrl]
+        arm = index.robot_qpos[: index.n_arm]
+        data.qpos[arm] = targets[phase.stop - 1][: index.n_arm]
         errors[phase.name] = float(np.linalg.norm(grasp_point() - reached))
     return errors
 
 
-def find_cause(run: Run, state: State) -> str:
+def find_cause(stage: Stage, state: State, target: np.ndarray) -> str:
     """The joint that holds the grasp point farthest off its target in a state of one world, and the
     largest load on it against its servo.
     """
-    index, model, data = run.stage.index, run.stage.model, mujoco.MjData(run.stage.model)
+    index, model, data = stage.index, stage.model, mujoco.MjData(stage.model)
     data.qpos[:], data.qvel[:], data.ctrl[:] = (values[0] for values in state)
     mujoco.mj_forward(model, data)
-    dofs, ctrl = index.robot_qvel[: index.n_arm], index.ctrl[: index.n_arm]
-    off = data.ctrl[ctrl] - data.qpos[index.robot_qpos[: index.n_arm]]
-    shares = grasp_jacobian(data, run.cfg.robot)[:, dofs] * off
+
+    # The joint
+    dofs = index.robot_qvel[: index.n_arm]
+    off = (target - data.qpos[index.robot_qpos])[: index.n_arm]
+    shares = grasp_jacobian(data, stage.cfg.robot)[:, dofs] * off
     worst = int(np.argmax(np.linalg.norm(shares, axis=0)))
-    dof, servo, name = dofs[worst], ctrl[worst], run.cfg.robot.arm_joints[worst]
-    turns = model.jnt_type[model.dof_jntid[dof]] == mujoco.mjtJoint.mjJNT_HINGE
+    dof, servo, name = dofs[worst], index.ctrl[worst], stage.cfg.robot.arm_joints[worst]
+    joint = model.dof_jntid[dof]
+    turns = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
     unit, newton = ("rad", "N m") if turns else ("m", "N")
     text = f"{name} is {abs(off[worst]):.3g} {unit} off"
-    force, most = data.actuator_force[servo], model.actuator_forcerange[servo].max()
-    if model.actuator_forcelimited[servo] and abs(force) > 0.99 * most:
-        text += f" with its servo's largest force, {most:.3g} {newton} (robot.servos.{name}.effort)"
+    if not np.isclose(bounded := data.ctrl[servo], target[worst], atol=1e-5):
+        return f"{text}; its servo's range bounds its target {target[worst]:.3g} to {bounded:.3g}"
+    most = np.inf
+    if model.actuator_forcelimited[servo]:
+        most = model.actuator_forcerange[servo].max()
+    if model.jnt_actfrclimited[joint]:
+        most = min(most, model.jnt_actfrcrange[joint].max())
+    if abs(data.qfrc_actuator[dof]) > 0.99 * most:
+        text += f" at its servo's largest force, {most:.3g} {newton} (robot.servos.{name}.effort)"
 
-    def load(rows: np.ndarray) -> float:
-        """Of some constraint rows on the joint."""
-        out = np.zeros(model.nv)
-        mujoco.mj_mulJacTVec(model, data, out, np.where(rows, data.efc_force, 0.0))
-        return float(out[dof])
-
+    # Loads on it
     gravcomp = "" if model.body_gravcomp.any() else "robot.gravcomp=true, or "
     loads = {
         f"gravity: {gravcomp}a stiffer servo": data.qfrc_passive[dof] - data.qfrc_bias[dof],
         "it still moves: more seconds": model.actuator_biasprm[servo][2] * data.qvel[dof],
-        **{cause: load(np.isin(data.efc_type, kinds)) for cause, kinds in _CAUSES.items()},
     }
-    rows = np.arange(data.nefc)
-    contacts = [contact for contact in data.contact if contact.efc_address >= 0]
-    ends = [*(contact.efc_address for contact in contacts[1:]), data.nefc]
-    for contact, end in zip(contacts, ends, strict=True):
-        cause = _touch(run.cfg, model, contact)
-        here = (rows >= contact.efc_address) & (rows < end)
-        loads[cause] = loads.get(cause, 0.0) + load(here)
-    cause, against = min(loads.items(), key=lambda item: item[1] * np.sign(off[worst]))
-    return f"{text}; {cause} ({abs(against):.3g} {newton})"
+    torque = np.zeros(model.nv)
+    for row, kind in enumerate(data.efc_type.tolist()):
+        cause = _CAUSES.get(kind) or _touch(stage, data.contact[data.efc_id[row]])
+        force_of_row = np.where(np.arange(data.nefc) == row, data.efc_force, 0.0)
+        mujoco.mj_mulJacTVec(model, data, torque, force_of_row)
+        loads[cause] = loads.get(cause, 0.0) + torque[dof]
+    cause, load = min(loads.items(), key=lambda item: item[1] * np.sign(off[worst]))
+    return f"{text}; {cause} ({abs(load):.3g} {newton})"
 
 
-def start_contacts(run: Run) -> Iterator[str]:
-    """Where the robot is inside of the scene as the nominal episode starts, a line each."""
-    model, data = run.stage.model, mujoco.MjData(run.stage.model)
-    data.qpos[:] = run.nominal.episode.start[0]
-    mujoco.mj_fwdPosition(model, data)
-    depths: dict[tuple[str, ...], float] = {}
+def start_contacts(stage: Stage, start: np.ndarray) -> list[str]:
+    """List where the robot is inside of the scene at a start of shape ``(nq,)``, a line each."""
+    data = mujoco.MjData(stage.model)
+    data.qpos[:] = start
+    mujoco.mj_fwdPosition(stage.model, data)
+    depths: dict[str, float] = {}
     for contact in data.contact:
-        owners = [_owner(run.cfg, model, geom) for geom in contact.geom]
-        if len({scene for _, scene in owners}) == 2:
-            names = tuple(name for name, _ in sorted(owners, key=lambda owner: owner[1]))
-            depths[names] = min(depths.get(names, 0.0), contact.dist)
-    for (name, other), depth in depths.items():
-        if depth < -_DEEP:
-            yield f"{name} starts {-1e3 * depth:.1f} mm inside {other}: change robot.home or the scene"
+        text = _touch(stage, contact, same_side="")
+        depths[text] = max(depths.get(text, 0.0), -contact.dist)
+    return [
+        f"at the start {text}, {1e3 * depth:.1f} mm deep: another robot.home"
+        for text, depth in depths.items()
+        if text and depth > _DEEP
+    ]
 
 
-def _touch(cfg: Config, model: mujoco.MjModel, contact: mujoco.MjContact) -> str:
-    """The two that touch, and the way out where both are the robot's."""
-    owners = [_owner(cfg, model, geom) for geom in contact.geom]
-    text = f"{owners[1][0]} presses on {owners[0][0]}"
-    if any(scene for _, scene in owners):
-        return text
-    bodies = [model.body(model.geom_bodyid[geom]).name for geom in contact.geom]
-    return f"{text}: robot.exclude=[[{','.join(bodies)}]]"
-
-
-def _owner(cfg: Config, model: mujoco.MjModel, number: int) -> tuple[str, bool]:
-    """The name of a geom's body, of the world's the geom's too; and whether it is the scene's."""
-    geom, body = model.geom(number), model.geom_bodyid[number]
-    name, root = model.body(body).name, model.body(model.body_rootid[body]).name
-    if name != WORLD:
-        return name, root in cfg.scene.objects
-    mesh = model.mesh(geom.dataid[0]).name if geom.dataid[0] >= 0 else ""
-    scene = geom.name in scene_names(cfg.scene)
-    return geom.name if scene else f"world's {geom.name or mesh or f'geom {number}'}", scene
+def _touch(
+    stage: Stage, contact: mujoco.MjContact, same_side: str = "{}: robot.exclude=[[{},{}]]"
+) -> str:
+    """Words for a contact, the robot's body first, geoms of the world by their names; ``same_side``
+    is for two of the robot, or of the scene.
+    """
+    model = stage.model
+    sides = []
+    for number in contact.geom:
+        geom, body = model.geom(number), model.geom_bodyid[number]
+        name, root = (model.body(n).name for n in (body, model.body_rootid[body]))
+        label, in_scene = name, root in stage.cfg.scene.objects
+        if name == WORLD:
+            in_scene = geom.name in scene_names(stage.cfg.scene)
+            mesh = model.mesh(geom.dataid[0]).name if geom.dataid[0] >= 0 else ""
+            label = geom.name if in_scene else f"world's {geom.name or mesh or f'geom {number}'}"
+        sides.append((in_scene, name == WORLD, name, label))
+    (first, _, *robot), (second, _, *obstacle) = sorted(sides)
+    text = f"{robot[1]} presses on {obstacle[1]}"
+    return same_side.format(text, obstacle[0], robot[0]) if first == second else text

@@ -1,6 +1,5 @@
 """A robot as a guest in a scene: what of its file comes along, and what stays behind."""
 
-import copy
 import warnings
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
@@ -100,15 +99,13 @@ def gravity_sag(model: mujoco.MjModel, robot: RobotCfg) -> float:
     """How far off its target at home gravity moves the grasp point where nothing compensates it
     [m], by the stiffness of the arm's servos.
     """
-    model = copy.copy(model)
-    model.body_gravcomp[:] = 0.0
     data = mujoco.MjData(model)
     for name, value in zip(robot.joints, robot.home, strict=True):
         data.joint(name).qpos = value
     mujoco.mj_forward(model, data)
     dofs = [int(model.joint(name).dofadr[0]) for name in robot.arm_joints]
     stiffness = [-model.actuator(name).biasprm[1] for name in robot.arm_joints]
-    lowered = (data.qfrc_passive - data.qfrc_bias)[dofs] / stiffness
+    lowered = (data.qfrc_spring - data.qfrc_bias)[dofs] / stiffness
     return float(np.linalg.norm(grasp_jacobian(data, robot)[:, dofs] @ lowered))
 
 
@@ -118,18 +115,6 @@ def grasp_jacobian(data: mujoco.MjData, robot: RobotCfg) -> np.ndarray:
     for part, site in zip(jac, robot.grasp_sites, strict=True):
         mujoco.mj_jacSite(data.model, data, part, None, data.site(site).id)
     return jac.mean(axis=0)
-
-
-def gravity_note(spec: mujoco.MjSpec, robot: RobotCfg, model: mujoco.MjModel) -> str:
-    """Whether the robot's gravity is compensated, and why; empty where its file alone says so.
-    Arguments as of `left_behind`.
-    """
-    if robot.gravcomp == "auto" and any(body.gravcomp for body in spec.bodies):
-        return ""
-    state = "on" if model.body_gravcomp.any() else "off"
-    sag = f"without it the hand sags {1e3 * gravity_sag(model, robot):.1f} mm at home"
-    value = str(robot.gravcomp).lower()
-    return f"robot.gravcomp={value}: {state}; {sag} (auto: on above {1e3 * SAG:g} mm)"
 
 
 @contextmanager
@@ -173,6 +158,11 @@ def left_behind(
                 yield f"flags {', '.join(bits)}"
         else:
             yield f"option {name} {_text(asked)}: the scene has {_text(there)}"
+    if robot.gravcomp != "auto" or not any(body.gravcomp for body in spec.bodies):
+        state = "on" if model.body_gravcomp.any() else "off"
+        sag = f"without it the hand sags {1e3 * gravity_sag(model, robot):.1f} mm at home"
+        value = f"robot.gravcomp={robot.gravcomp}".lower()
+        yield f"gravity compensation {state} ({value}; auto: from {1e3 * SAG:g} mm on); {sag}"
     strangers = [
         f"{type(e).__name__[3:].lower()} {e.name}".strip() for e in _strangers(spec, robot)
     ]
