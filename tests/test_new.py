@@ -63,7 +63,7 @@ def test_a_robot_is_read_from_its_file(
     assert run(["new", "robot", f"fresh_{name}", str(ROOT / file)]) == 0
     printed = capsys.readouterr().out
     assert "pass baseline" in printed
-    assert "the last body that branches" in printed or "one jaw closes" in printed
+    assert "branches" in printed or "one jaw" in printed
     folder = here / f"fresh_{name}"
     assert (folder / "home.png").stat().st_size > 10_000 or "offscreen" in printed
     robot = mjstack.load_config([f"robot=fresh_{name}"], config_dir=folder / "conf").robot
@@ -148,9 +148,12 @@ KINDS: dict[str, tuple[dict[str, str], dict[str, object]]] = {
 }
 
 
+SCENE = mjstack.load_config().scene
+
+
 def guess(text: str, arm: str = "") -> dict[str, Any]:
     Path("arm.xml").write_text(text)
-    return {guess.key: guess.value for guess in guess_profile(Path("arm.xml"), arm)}
+    return {guess.key: guess.value for guess in guess_profile(Path("arm.xml"), SCENE, arm)}
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -189,9 +192,7 @@ def test_a_weak_gripper_gets_stiffer_servos(here: Path) -> None:
 
 def test_one_of_two_arms_is_chosen(here: Path) -> None:
     one, two = (
-        gantry([f"{side} {name}" for name in PLAIN]).replace(
-            'pos="0 0 0.5"', f'pos="0 {y} 0.5"'
-        )
+        gantry([f"{side} {name}" for name in PLAIN]).replace('pos="0 0 0.5"', f'pos="0 {y} 0.5"')
         for side, y in (("a", 0.6), ("b", -0.6))
     )
     body, servos = (two.split(f"<{t}>")[1].split(f"</{t}>")[0] for t in ("worldbody", "actuator"))

@@ -58,10 +58,10 @@ def find_hands(model: mujoco.MjModel) -> list[Hand]:
     hands = [
         _hand(model, palm, [b for sub in branches(palm) for b in sub], driven) for palm in palms
     ]
-    taken = {b for palm in palms for b in below[palm]}
+    gripping = {b for palm in palms for b in below[palm]}
     leaves = [b for b in jointed if not any(b != j and j in below[b] for j in jointed)]
     for leaf in leaves:  # a jaw against the body that carries it
-        if leaf not in taken and model.body_jntnum[leaf] == 1:
+        if leaf not in gripping and model.body_jntnum[leaf] == 1:
             palm = int(model.body_parentid[leaf])
             hands.append(_hand(model, palm, below[leaf], driven, one_finger=True))
     hands = [hand for hand in hands if len(hand.arm) > 1 and hand.gripper]
@@ -104,7 +104,7 @@ def _driven(model: mujoco.MjModel) -> set[int]:
             driven |= {int(model.wrap_objid[w]) for w in wraps if model.wrap_type[w] == 1}
     joint = int(mujoco.mjtEq.mjEQ_JOINT)
     ties = zip(model.eq_type, model.eq_obj1id, model.eq_obj2id, strict=True)
-    followers = {int(one) for kind, one, two in ties if kind == joint and two >= 0}
+    followers = {int(follower) for kind, follower, leader in ties if kind == joint and leader >= 0}
     trees = [model.body_rootid[body] for body in model.jnt_bodyid]
     with_servos = {trees[j] for j in driven}
     bare = {j for j, tree in enumerate(trees) if tree not in with_servos}
@@ -136,9 +136,9 @@ def find_root(model: mujoco.MjModel, hand: Hand) -> int:
     the whole file, if there is nothing else in it than what a scene leaves out by itself, and the
     arm's base.
     """
-    mine = {*hand.arm} | _joints(model, list(hand.bodies))
+    arm_joints = {*hand.arm} | _joints(model, list(hand.bodies))
     path = [*reversed([*ancestors(model, hand.palm)])]
-    root = next(b for b in path if _joints(model, _below(model, b)) <= mine)
+    root = next(b for b in path if _joints(model, _below(model, b)) <= arm_joints)
     tops = np.flatnonzero(model.body_parentid == 0)[1:]
     free = {t for t in tops if _FREE in model.jnt_type[_body_joints(model, t)]}
     plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE

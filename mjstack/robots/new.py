@@ -10,6 +10,7 @@ from typing import Any
 
 import yaml  # type: ignore[import-untyped]
 
+from mjstack.config.load import load_config
 from mjstack.config.session import CONFIG_FOLDER, list_choices
 from mjstack.errors import MjstackError
 from mjstack.files import check_regular
@@ -52,15 +53,15 @@ def write_new(args: Sequence[str], arm: str = "") -> tuple[list[Path], list[Gues
         except (OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or error
             raise MjstackError(f"{file}: expected an MJCF file: {reason}.") from error
-        profile = guess_profile(file, arm)
+        profile = guess_profile(file, load_config([]).scene, arm)
         path = f"conf/robot/{name}.yaml"
         source = os.path.relpath(file, folder / "conf" / "robot")
         lines = [("file", source, "relative to this YAML"), *profile]
         contents[path] += "".join(_line(*line) for line in lines)
     paths = [folder / path for path in contents]
-    for path, content in zip(paths, contents.values(), strict=True):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(content, encoding="utf-8")
+    for target, content in zip(paths, contents.values(), strict=True):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(content, encoding="utf-8")
     return paths, profile
 
 

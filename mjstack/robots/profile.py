@@ -3,6 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,7 +11,7 @@ import mujoco
 import numpy as np
 from numpy import ndarray
 
-from mjstack.config.schema import ModelCfg, RobotCfg, ServoCfg
+from mjstack.config.schema import ModelCfg, RobotCfg, SceneCfg, ServoCfg
 from mjstack.config.schema.robot import BasePoseCfg
 from mjstack.errors import MjstackError
 from mjstack.robots.guest import compile_scene
@@ -24,6 +25,9 @@ from mjstack.robots.workspace import Workspace, find_workspace
 _WIDTH = 0.044  # m: of the cube that a closed gripper holds
 _FORCE = 20.0  # N on a cube, as far as the jaws can close farther
 _LEAST = 5.0  # N
+_SQUEEZE = 0.003  # m nearer than the cube's width, at least
+_LEANS = 0.1  # rad off the vertical
+_SHALLOW = 0.010  # m
 _POSTURES = 30  # random ones
 _RUBS = 0.001  # m that links overlap
 _TURN = 6.283  # rad either way, for a hinge without a range
@@ -41,11 +45,12 @@ class Guess(NamedTuple):
     reason: str
 
 
-def guess_profile(file: Path, arm: str = "") -> list[Guess]:
+def guess_profile(file: Path, scene: SceneCfg, arm: str = "") -> list[Guess]:
     """Guess a robot's profile: joints, gripper, grasp, home and a table from a file's bodies.
 
     Args:
         file: An MJCF file or a URDF.
+        scene: The scene whose objects get their places on the table.
         arm: Part of the names of the arm that counts, where the file has several.
 
     Raises:
@@ -86,15 +91,19 @@ def guess_profile(file: Path, arm: str = "") -> list[Guess]:
             f"{file}: the hand of {names[0]} cannot point down over a table within the arm's reach,"
             " which the drivers' grasps from above need."
         )
-    other = [name for name, pair in zip(names, hands, strict=True) if pair is not chosen[0]]
+    if space.tilt > _LEANS:
+        with suppress(ValueError):  # a tip of a hand that leans reaches lower
+            ranges = _ranges(model, hand.gripper)
+            grip = Fingers(spec, hand, ranges).measure(_WIDTH, _SHALLOW)
+    rest = [name for name, pair in zip(names, hands, strict=True) if pair is not chosen[0]]
     guesses = [
-        *_guess_joints(model, hand, other),
+        *_guess_joints(model, hand, rest),
         *_guess_grip(model, hand, grip),
         *_guess_home(model, hand, grip, space),
         *_guess_servos(spec, model, hand, grip, space),
-        *_guess_table(space),
+        *_guess_table(space, scene),
     ]
-    return [*guesses, *_guess_scene(file, guesses, np.abs(grip.shut - grip.touching))]
+    return [*guesses, *_guess_scene(file, guesses, grip)]
 
 
 def _label(model: mujoco.MjModel, hand: Hand) -> str:
@@ -121,14 +130,14 @@ def _numbers(values: Any, digits: int = 4) -> list[float]:
     return [round(float(value), digits) + 0.0 for value in values]
 
 
-def _guess_joints(model: mujoco.MjModel, hand: Hand, other: list[str]) -> Iterator[Guess]:
+def _guess_joints(model: mujoco.MjModel, hand: Hand, rest: list[str]) -> Iterator[Guess]:
     if root := find_root(model, hand):
         yield Guess("root", model.body(root).name, "the rest of the file is no part of this arm")
     why = f"all that carry {model.body(hand.palm).name}, the last body that branches"
     if hand.one_finger:
         why = f"all that carry {model.body(hand.palm).name}, against which one jaw closes"
-    if other:
-        why += f"; --arm takes {' or '.join(other)}"
+    if rest:
+        why += f"; --arm takes {' or '.join(rest)}"
     yield Guess("arm_joints", [model.joint(j).name for j in hand.arm], why)
     servos = "beyond it, moved by a servo or a tendon; others follow"
     if not model.nu:
@@ -143,12 +152,16 @@ def _guess_joints(model: mujoco.MjModel, hand: Hand, other: list[str]) -> Iterat
 def _guess_grip(model: mujoco.MjModel, hand: Hand, grip: Grip) -> Iterator[Guess]:
     jaws = [model.body(jaw).name for jaw in grip.jaws]
     yield Guess("jaw_bodies", jaws, "their surfaces face each other at the tips")
-    taken = {model.site(k).name for k in range(model.nsite)}
-    sites = [name + "_" * (name in taken) for name in ("grasp_first", "grasp_second")]
+    sites_there = {model.site(k).name for k in range(model.nsite)}
+    sites = [name + "_" * (name in sites_there) for name in ("grasp_first", "grasp_second")]
     yield Guess("grasp_sites", sites, "made: where these surfaces touch a cube of 44 mm")
     yield Guess("grasp_parts", {s: [jaw] for s, jaw in zip(sites, jaws, strict=True)}, "")
     places = {s: _numbers(at) for s, at in zip(sites, grip.sites, strict=True)}
-    yield Guess("grasp_pos", places, "16 mm from the tips' ends, in the jaws' frames, m")
+    yield Guess(
+        "grasp_pos",
+        places,
+        f"{1e3 * grip.beyond:.0f} mm from the tips' ends, in the jaws' frames, m",
+    )
     yield Guess("approach_body", model.body(hand.palm).name, "it carries both jaws")
     axis = grip.approach / np.linalg.norm(grip.approach)
     yield Guess("approach_axis", _numbers(axis, 5), "from the wrist to the tips, across their way")
@@ -207,9 +220,9 @@ def _guess_servos(
         yield Guess("servos", servos, why)
 
 
-def _guess_scene(file: Path, guesses: list[Guess], travel: ndarray) -> Iterator[Guess]:
-    """What only the compiled robot tells: stiffer servos where its own let a cube slip, and links
-    that touch each other in nearly every posture.
+def _guess_scene(file: Path, guesses: list[Guess], grip: Grip) -> Iterator[Guess]:
+    """Keys that depend on the compiled robot: how far the jaws close, with stiffer servos where
+    its own let a cube slip, and links that touch each other in nearly every posture.
     """
     values = {guess.key: guess.value for guess in guesses if guess.key != "placements"}
     servos = {name: ServoCfg(**servo) for name, servo in values.pop("servos", {}).items()}
@@ -218,7 +231,8 @@ def _guess_scene(file: Path, guesses: list[Guess], travel: ndarray) -> Iterator[
     model = compile_scene(robot_spec(robot, ModelCfg(source="builtin")))
     gripper = [model.actuator(name).id for name in robot.gripper_joints]
     gains, damping = model.actuator_gainprm[gripper, 0], -model.actuator_biasprm[gripper, 2]
-    force = float(gains @ travel**2) / _WIDTH
+    travel = grip.shut - grip.touching
+    force = float(gains @ travel**2) / _WIDTH  # N where they close all the way
     if force < _LEAST:
         more = [
             {
@@ -229,13 +243,17 @@ def _guess_scene(file: Path, guesses: list[Guess], travel: ndarray) -> Iterator[
         ]
         stiffer = values.get("servos", {}) | dict(zip(robot.gripper_joints, more, strict=True))
         yield Guess("servos", stiffer, f"the file's own press with {force:.1f} N, and a cube slips")
+    share = 1.0 if force < _FORCE else max(_FORCE / force, _SQUEEZE / _WIDTH)
+    closed = _numbers(grip.touching + share * travel, 5)
+    yield Guess("gripper_closed", closed, f"around 44 mm, to press with {_FORCE:g} N or more")
     data = mujoco.MjData(model)
-    whole = posture(model, robot.joints)
+    opened = values["gripper_open"]
+    whole = posture(model, tuple(robot.joints))
     joints = [model.joint(name).id for name in robot.arm_joints]
     low, high = np.clip(model.jnt_range[joints], -np.pi, np.pi).T
     count: Counter[tuple[str, ...]] = Counter()
     for q in np.random.default_rng(0).uniform(low, high, (_POSTURES, len(low))):
-        data.qpos[:] = whole.qpos(np.concatenate((q, robot.gripper_open)))
+        data.qpos[:] = whole.qpos(np.concatenate((q, opened)))
         mujoco.mj_fwdPosition(model, data)
         bodies = [model.geom_bodyid[c.geom] for c in data.contact if c.dist < -_RUBS]
         count.update({tuple(sorted(model.body(b).name for b in pair)) for pair in bodies})
@@ -256,7 +274,7 @@ def _effort(model: mujoco.MjModel, joint: int) -> float:
     return float(np.abs(model.jnt_actfrcrange[joint]).max()) if limited else 0.0
 
 
-def _guess_table(space: Workspace) -> Iterator[Guess]:
+def _guess_table(space: Workspace, scene: SceneCfg) -> Iterator[Guess]:
     """Where the arm stands, the table before it, and what stands on it."""
     distance = float(np.linalg.norm((space.center - space.shoulder)[:2]))
     cos, sin = math.cos(space.azimuth), math.sin(space.azimuth)
@@ -274,10 +292,13 @@ def _guess_table(space: Workspace) -> Iterator[Guess]:
     x, y = _numbers(turn @ space.center[:2] + shift[:2], 3)
     top = float(space.center[2] + shift[2])
     half = [round(min(0.14, max(0.09, distance - 0.1)) if distance > 0.15 else 0.14, 3)]
-    stack = {
+    sides = np.linspace(-space.apart, space.apart, len(scene.objects))
+    places = {
         "table_center": [x, y, round(top - _THICK, 3)],
         "table_half": [*half, round(space.apart + 0.12, 3), _THICK],
-        "objects": {"red": [x, round(y - space.apart, 3)], "blue": [x, round(y + space.apart, 3)]},
+        "objects": {
+            name: [x, round(y + s, 3)] for name, s in zip(scene.objects, sides, strict=True)
+        },
         "random_xy": [0.03, 0.03],
     }
-    yield Guess("placements", {"stack": stack}, "m; the hand reaches all of it, pointing down")
+    yield Guess("placements", {scene.name: places}, "m; the hand reaches all of it, pointing down")

@@ -1,5 +1,6 @@
 """The fingers of a hand: how they close, which surfaces face each other, and where it grasps."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -93,9 +94,9 @@ class Fingers:
             clouds.append(self._to_palm(local + data.geom_xpos[geom]))
         return np.concatenate(clouds)
 
-    def measure(self, width: float) -> Grip:
-        """Find the grasp around an object of some width [m]; a ValueError if the fingers do not
-        close around one.
+    def measure(self, width: float, deepest: float = math.inf) -> Grip:
+        """Find the grasp around an object of some width [m], where the tips reach beyond it by
+        ``deepest`` [m] at most; a ValueError if the fingers do not close around one.
         """
         hand = self._hand
         middle = self._ranges.mean(axis=1)
@@ -143,7 +144,8 @@ class Fingers:
         closing = _unit(away - (away @ approach) * approach)
         frame = np.stack((np.cross(approach, closing), approach, closing), axis=1)
         grips = []
-        for depth, self.model.geom_size[self._plate, 1] in _DEPTHS:
+        depths = [pair for pair in _DEPTHS if pair[0] <= deepest]
+        for depth, self.model.geom_size[self._plate, 1] in depths:
             grip = self._grasp(width, (opened, shut), frame, (first, second), depth)
             grips.append(grip)
             if grip.gap[0] >= width + _ROOM and grip.beyond <= _REACH:
@@ -196,7 +198,8 @@ class Fingers:
             if gaps.min() > width - 0.01:
                 raise ValueError("its fingers do not close on each other")
             share = _last(gaps, width)
-        most = _WIDE - 0.015 * self._hand.one_finger  # it swings up as it opens
+        thick = self.model.geom_size[self._plate, 1] < 2.0 * _TIP  # above it, the fingers are
+        most = _FAR if thick else _WIDE - 0.015 * self._hand.one_finger  # it swings up
         wide = opened + _last(gaps, min(most, float(gaps.max()))) * (shut - opened)
         touching = opened + share * (shut - opened)
         _, point, geoms = self._gap(touching, start, frame, sides)
@@ -209,12 +212,12 @@ class Fingers:
         reaches = []
         for state in (touching, wide):
             self.settle(state)
-            ends = [
+            touches = [
                 self._to_palm(self._data.xpos[jaw] + self._data.xmat[jaw].reshape(3, 3) @ site)
                 for jaw, site in zip(jaws, sites, strict=True)
             ]
             top = max((self.points(side) @ frame)[:, 1].max() for side in sides)
-            reaches.append(float(top - np.mean(ends, axis=0) @ frame[:, 1]))
+            reaches.append(float(top - np.mean(touches, axis=0) @ frame[:, 1]))
         gap = (float(gaps.max()), float(gaps.min()))
         point, (_, approach, closing) = frame @ point, frame.T
         return Grip(wide, touching, shut, gap, max(reaches), point, closing, approach, jaws, sites)
@@ -228,9 +231,11 @@ class Fingers:
         self.settle(gripper)
         point = start.copy()
         for _ in range(4):
-            (left, one), (right, two) = (self._touch(frame @ point, frame, side) for side in sides)
+            (left, first), (right, second) = (
+                self._touch(frame @ point, frame, side) for side in sides
+            )
             point[2] += 0.5 * (right - left)
-        return left + right + 2.0 * _PLATE[2], point, [one, two]
+        return left + right + 2.0 * _PLATE[2], point, [first, second]
 
     def _touch(self, point: ndarray, frame: ndarray, bodies: Sequence[int]) -> tuple[float, int]:
         """How far the nearest solid geom of some bodies is from the plate, and which it is."""

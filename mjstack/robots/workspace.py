@@ -20,7 +20,7 @@ _REACHED = 5e-4  # m
 _UPRIGHT = 0.5  # rad: the hand points down where its approach axis is so near
 _CUBE = 0.022  # m: half of its height
 _TOP = 0.024  # m: height of a table's top on the floor
-_GOOD = 1.5  # of 2: a table with such a score is taken
+_ENOUGH = 1.5  # of 2: a table with such a score is taken
 
 
 @dataclass(frozen=True)
@@ -165,18 +165,18 @@ def find_workspace(
     for count, azimuth in product(_SEEDS, (0.0, -0.5 * np.pi, 0.5 * np.pi, np.pi)):
         ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
         for cost, top, share in sorted(tables):
-            if best[0] >= _GOOD - cost:
+            if best[0] >= _ENOUGH - cost:
                 break
             center = np.array([*shoulder[:2], top]) + share * reach * ahead
             away = np.linalg.norm(cloud - center - [0.0, 0.0, _CUBE + 0.1], axis=1)
             near = np.argsort(away + 9.0 * ~down)[:count]
             if away[near[0]] + 9.0 * ~down[near[0]] > 0.5 * reach + 0.1:
                 continue
-            found = _try_table(
+            tried = _try_table(
                 arm, [*plain, *starts[near]], center, azimuth, shoulder, reach, upright
             )
-            if found is not None:
-                best = max(best, (found[0] - cost, found[1]), key=lambda pair: pair[0])
+            if tried is not None:
+                best = max(best, (tried[0] - cost, tried[1]), key=lambda pair: pair[0])
         if best[1] is not None:
             break  # the nearer to the file's own direction, the better
     return best[1]
@@ -223,7 +223,7 @@ def _try_table(
         if best is None or score > best[0]:
             arguments = (azimuth, center, apart, height, q, locked, roll, upright)
             best = score, Workspace(*arguments, tilts, shoulder, lowest)
-        if best[0] >= _GOOD:
+        if best[0] >= _ENOUGH:
             break
     return best
 
