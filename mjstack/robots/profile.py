@@ -130,6 +130,14 @@ def _numbers(values: Any, digits: int = 4) -> list[float]:
     return [round(float(value), digits) + 0.0 for value in values]
 
 
+def _within(values: ndarray, ranges: ndarray) -> list[float]:
+    """Joint positions, rounded so that they stay within ranges."""
+    low, high = ranges.T
+    return _numbers(
+        np.clip(np.round(values, 4), np.ceil(1e4 * low) / 1e4, np.floor(1e4 * high) / 1e4)
+    )
+
+
 def _guess_joints(model: mujoco.MjModel, hand: Hand, rest: list[str]) -> Iterator[Guess]:
     if root := find_root(model, hand):
         yield Guess("root", model.body(root).name, "the rest of the file is no part of this arm")
@@ -166,18 +174,23 @@ def _guess_grip(model: mujoco.MjModel, hand: Hand, grip: Grip) -> Iterator[Guess
     axis = grip.approach / np.linalg.norm(grip.approach)
     yield Guess("approach_axis", _numbers(axis, 5), "from the wrist to the tips, across their way")
     wide, narrow = (f"{1e3 * max(gap, 0.0):.0f}" for gap in grip.gap)
-    yield Guess("gripper_open", _numbers(grip.opened, 5), f"of {narrow} to {wide} mm, 85 at most")
+    yield Guess(
+        "gripper_open",
+        _within(grip.opened, _ranges(model, hand.gripper)),
+        f"of {narrow} to {wide} mm, 85 at most",
+    )
 
 
 def _guess_home(model: mujoco.MjModel, hand: Hand, grip: Grip, space: Workspace) -> Iterator[Guess]:
-    home = [*_numbers(space.home), *_numbers(grip.opened)]
+    arm = _within(space.home, _ranges(model, hand.arm))
+    home = [*arm, *_within(grip.opened, _ranges(model, hand.gripper))]
     why = f"hand down {100 * space.height:.0f} cm above the table's middle, by inverse kinematics"
     yield Guess(
         "home", home, f"{why}; off the vertical by {math.degrees(space.tilt):.0f} deg at most"
     )
     names = [model.joint(j).name for j in hand.arm]
     if space.locked:
-        locked = {names[k]: round(float(space.home[k]), 4) for k in space.locked}
+        locked = {names[k]: arm[k] for k in space.locked}
         yield Guess("locked", locked, "the others reach the table with the hand down")
     roll = None if space.roll is None else names[space.roll]
     if roll:
@@ -244,7 +257,8 @@ def _guess_scene(file: Path, guesses: list[Guess], grip: Grip) -> Iterator[Guess
         stiffer = values.get("servos", {}) | dict(zip(robot.gripper_joints, more, strict=True))
         yield Guess("servos", stiffer, f"the file's own press with {force:.1f} N, and a cube slips")
     share = 1.0 if force < _FORCE else max(_FORCE / force, _SQUEEZE / _WIDTH)
-    closed = _numbers(grip.touching + share * travel, 5)
+    limits = model.jnt_range[[model.joint(name).id for name in robot.gripper_joints]]
+    closed = _within(grip.touching + share * travel, limits)
     yield Guess("gripper_closed", closed, f"around 44 mm, to press with {_FORCE:g} N or more")
     data = mujoco.MjData(model)
     opened = values["gripper_open"]
