@@ -73,11 +73,12 @@ def test_vector_spaces(make: Make) -> None:
 
 
 @pytest.mark.full
-def test_vector_env_in_absolute_joint_commands_has_the_actuators_bounds(make: Make) -> None:
+def test_vector_env_in_absolute_joint_commands_has_the_joints_bounds(make: Make) -> None:
     inner = make("action=joint_absolute")
     space = GymnasiumVectorEnv(inner).single_action_space
     assert isinstance(space, Box)
-    limits = inner.sim.model.actuator_ctrlrange.astype(np.float32)
+    limits = inner.index.ctrl_range.astype(np.float32)
+    assert space.high[4] == np.float32(inner.sim.model.joint("wrist_roll").range[1])
     np.testing.assert_array_equal(np.stack((space.low, space.high), 1), limits)
 
 

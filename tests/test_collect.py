@@ -165,7 +165,7 @@ def test_lerobot_units_are_those_of_the_real_arm(demos: SimpleNamespace) -> None
     assert set(info["features"]) == {"observation.state", "action", *INDICES}
     assert info["features"]["action"]["names"] == names
     assert info["mjstack"]["units"]["action"] == ["deg"] * 5 + ["%"]
-    low, high = np.array(Stage(demos.cfg).index.ctrl_range).T
+    low, high = np.array(Stage(demos.cfg).index.servo_range).T
     units = LerobotUnits(5, np.stack([low, high], 1))
     for number in range(4):
         si, degrees = steps_of(demos.dataset, number), steps_of(dataset, number)
@@ -178,7 +178,7 @@ def test_lerobot_units_are_those_of_the_real_arm(demos: SimpleNamespace) -> None
 
 def test_ends_and_middles_of_lerobots_units() -> None:
     cfg = load_config([])
-    ranges = np.array(Stage(cfg).index.ctrl_range)
+    ranges = np.array(Stage(cfg).index.servo_range)
     units = LerobotUnits(len(cfg.robot.arm_joints), ranges)
     half = np.rad2deg(0.5 * (ranges[:5, 1] - ranges[:5, 0]))
     for values, arm, gripper in (

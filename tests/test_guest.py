@@ -1,27 +1,26 @@
 """A robot's file is a guest in the scene, and each of its servos keeps its meaning."""
 
+import contextlib
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
+from arm_file import MJCF, SERVOS, changed, scara
 from compositions import refusal
 
-from mjstack import load_config
-from mjstack.config.schema import Config
+from mjstack.config.schema import Backend, Config
 from mjstack.config.schema.robot import BasePoseCfg, ServoCfg
+from mjstack.envs import build_env
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.robots import read_robot, robot_spec
-from mjstack.robots.guest import left_behind
+from mjstack.robots.guest import compile_scene, left_behind
 from mjstack.scene import build_model
 from mjstack.scene.build import scene_names
 
-SCARA = Path(__file__).parents[1] / "examples" / "scara"
-MJCF = (SCARA / "scara.xml").read_text()
 ROOT = "<worldbody>"
-ELBOW = '<position name="elbow" joint="elbow" kp="500" kv="20" forcerange="-40 40"/>'
+ELBOW = SERVOS["elbow"]
 FURNITURE = """
     <geom name="floor" type="plane" size="1 1 .1"/>
     <light pos="0 0 3"/>
@@ -29,22 +28,6 @@ FURNITURE = """
       <geom name="table" type="box" size=".1 .1 .1" contype="1"/>
     </body>
     <body name="toy" pos="1 1 1"><freejoint/><geom name="toy" size=".02"/></body>"""
-
-
-@cache
-def scara() -> Config:
-    return load_config([f"hydra.searchpath=[file://{SCARA}/conf]", "robot=scara"])
-
-
-def changed(tmp_path: Path, *pairs: tuple[str, str], **fields: object) -> Config:
-    """The SCARA with parts of its file replaced, and other fields of its profile."""
-    text = MJCF
-    for old, new in pairs:
-        assert old in text
-        text = text.replace(old, new)
-    file = tmp_path / "arm.xml"
-    file.write_text(text)
-    return replace(scara(), robot=replace(scara().robot, file=str(file), **fields))  # type: ignore[arg-type]
 
 
 def notes(cfg: Config, model: mujoco.MjModel) -> str:
@@ -95,6 +78,36 @@ def test_its_furniture_stays_behind(tmp_path: Path) -> None:
     assert "left out: body toy, geom floor, light" in text
     assert "renamed to robot_NAME: table" in text
     assert notes(scara(), plain) == ""
+
+
+def test_a_camera_of_what_stays_behind_stays_behind_too(tmp_path: Path) -> None:
+    cameras = """<camera name="eye" mode="targetbody" target="toy"/>
+    <camera name="other" mode="targetbody" target="hand"/>"""
+    model = build_model(changed(tmp_path, (ROOT, ROOT + FURNITURE + cameras)))
+    assert [model.camera(k).name for k in range(model.ncam)] == ["other"]
+
+
+@pytest.mark.parametrize(
+    "pairs",
+    [
+        [('diaginertia="0.005 0.025 0.027"', 'fullinertia="0.005 0.025 0.027 0.001 0.002 0"')],
+        [
+            ('contype="0" conaffinity="0" mass="0"', 'contype="0" conaffinity="0" mass="0.3"'),
+            (ROOT, f'<compiler inertiafromgeom="true"/>{ROOT}'),
+        ],
+    ],
+    ids=["fullinertia", "inertiafromgeom"],
+)
+def test_a_total_mass_scales_the_robot_alone(pairs: list, tmp_path: Path) -> None:
+    cfg = changed(tmp_path, *pairs, ("<option", '<compiler settotalmass="50"/><option'))
+    model, alone = build_model(cfg), mujoco.MjModel.from_xml_path(str(cfg.robot.file))
+    assert alone.body_mass.sum() == pytest.approx(50.0)
+    for body in range(1, alone.nbody):
+        there = model.body(alone.body(body).name)
+        for name in ("mass", "inertia", "ipos"):
+            right = getattr(alone.body(body), name)
+            np.testing.assert_allclose(getattr(there, name), right, rtol=1e-9, atol=1e-12)
+    assert float(model.body("red").mass[0]) == cfg.scene.objects["red"].mass
 
 
 def test_where_it_stands_and_which_subtree_it_is(tmp_path: Path) -> None:
@@ -219,3 +232,245 @@ def test_a_made_servo_has_nothing_of_the_files_defaults(tmp_path: Path) -> None:
     model = robot_spec(cfg.robot, cfg.model).compile()
     assert force_of(model, "elbow", 0.5, 0.0, 0.7) == pytest.approx(2.0)
     assert force_of(model, "elbow", 0.2, 0.0, 2.0) == pytest.approx(4.0)  # its effort
+
+
+COUPLING = '<joint name="fingers" joint1="left" joint2="right" polycoef="0 1 0 0 0"/>'
+CHAIN = """<joint joint1="middle" joint2="left" polycoef="0.002 -2 0 0 0"/>
+    <joint joint1="right" joint2="middle" polycoef="0.001 -0.25 0 0 0"/>"""
+PALM = '<geom name="palm"'
+MIDDLE = """<body name="middle" gravcomp="1">
+      <joint name="middle" type="slide" axis="1 0 0" ref="0.01" armature="0.1"/>
+      <inertial mass="0.01" pos="0 0 0" diaginertia="1e-5 1e-5 1e-5"/></body>"""
+GRIP = '<position name="grip" tendon="split" kp="9000" kv="90" ctrlrange="0 0.05"/>'
+GENERAL = """<general name="grip" tendon="split" ctrlrange="0 255" biastype="affine" gainprm="2"
+    biasprm="3 -8000 -70" forcerange="-50 60"/>"""
+ROTOR = GRIP.replace("/>", ' gear="3" armature="0.02" damping="4"/>')
+ALIKE = {"left": (0.0, 1.0), "right": (0.0, 1.0)}
+ONE = {"gripper_joints": ["left"], "home": [-0.8, 1.6, 0.2, 0.0, 0.045]}
+ONE |= {"gripper_open": [0.045], "gripper_closed": [0.018]}
+
+
+def hung(left: float, right: float, actuator: str, equality: str = COUPLING) -> list:
+    """The fingers on a tendon, with one actuator."""
+    tendon = "".join(
+        f'<joint joint="{name}" coef="{coef}"/>'
+        for name, coef in (("left", left), ("right", right))
+        if coef
+    )
+    tendon = f'<tendon><fixed name="split" range="0 0.06">{tendon}</fixed></tendon>'
+    return [
+        (SERVOS["left"], ""),
+        (SERVOS["right"], ""),
+        ("</actuator>", f"{actuator}</actuator>{tendon}"),
+        (COUPLING, equality),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("pairs", "lines", "profile"),
+    [
+        (hung(1, 0.25, GRIP), ALIKE, {}),
+        (hung(-1, -0.5, GENERAL), ALIKE, {}),
+        (hung(0.5, 0.5, ROTOR), ALIKE, {}),
+        (hung(0.5, 0.5, GRIP.replace('kv="90"', 'dampratio="1"')), ALIKE, {}),
+        (hung(1, 1, '<position tendon="split" kp="900" dampratio="0.7"/>'), ALIKE, {}),
+        (
+            hung(0.5, 0.5, GRIP.replace('ctrlrange="0 0.05"', 'inheritrange="0.8" gear="-2"')),
+            ALIKE,
+            {},
+        ),
+        (
+            hung(2, 1, GRIP, COUPLING.replace("0 1 0", "0.004 0.5 0")),
+            {"left": (0.0, 1.0), "right": (-0.008, 2.0)},
+            {},
+        ),
+        (
+            [*hung(1, 1, GENERAL, CHAIN), (PALM, MIDDLE + PALM)],
+            # middle - 0.01 = 0.002 - 2 left, right = 0.001 - 0.25 (middle - 0.01)
+            {"left": (0.0, 1.0), "right": (0.0005, 0.5)},
+            {},
+        ),
+        (hung(1, 0.25, GRIP), ALIKE, ONE),
+        (hung(1, 0, GRIP), {"left": (0.0, 1.0)}, ONE),
+    ],
+    ids=[
+        *("coefs", "affine", "rotor", "dampratio", "unnamed"),
+        *("inherit", "offset", "chain", "one", "alone"),
+    ],
+)  # fmt: skip
+def test_a_tendon_pulls_as_in_its_file(
+    pairs: list, lines: dict, profile: dict, tmp_path: Path
+) -> None:
+    cfg = changed(tmp_path, *pairs, **profile)
+    alone = mujoco.MjModel.from_xml_path(str(cfg.robot.file))
+    model = compile_scene(robot_spec(cfg.robot, cfg.model))
+    share = {n: c for n, c in (("left", 0), ("right", 0)) if n in lines}
+    data = mujoco.MjData(alone)
+    for name in share:
+        data.qpos[:] = 0.0
+        data.joint(name).qpos = 1.0
+        mujoco.mj_forward(alone, data)
+        share[name] = data.ten_length[0]
+    data.qpos[:] = 0.0
+    mujoco.mj_forward(alone, data)
+    share = {name: float(length - data.ten_length[0]) for name, length in share.items()}
+    start, slope = np.sum([np.multiply(share[n], line) for n, line in lines.items()], axis=0)
+    (number,) = np.flatnonzero(alone.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON)
+    grip = alone.actuator(number)
+    gear, gain, (offset, bias) = grip.gear[0], grip.gainprm[0], grip.biasprm[:2]
+    listed = cfg.robot.gripper_joints
+    for name in listed:  # bounds
+        lengths = -(gain * grip.ctrlrange + offset) / (bias * gear)
+        origin, ratio = lines[name]
+        np.testing.assert_allclose(
+            model.actuator(name).ctrlrange, np.sort(origin + ratio * (lengths - start) / slope)
+        )
+
+    def forces(of: mujoco.MjModel, s: float, v: float, target: float) -> dict[str, float]:
+        data = mujoco.MjData(of)
+        for name, (origin, ratio) in lines.items():
+            data.joint(name).qpos = origin + ratio * s
+            data.joint(name).qvel = ratio * v
+            if of is model and name in listed:
+                data.actuator(name).ctrl = origin + ratio * target
+        if of is alone:
+            data.ctrl[number] = -(offset + bias * gear * (start + slope * target)) / gain
+        mujoco.mj_forward(of, data)
+        spring = {name: float(data.joint(name).qfrc_passive[0]) for name in lines}
+        return {name: float(data.joint(name).qfrc_actuator[0]) + spring[name] for name in lines}
+
+    for s, v, target in ((0.02, 0.0, 0.021), (0.03, -0.01, 0.028), (0.01, 0.02, 0.04)):
+        found, right = forces(model, s, v, target), forces(alone, s, v, target)
+        if set(listed) >= set(lines):
+            assert found == pytest.approx(right, rel=1e-9)
+        work = [sum(f[n] * lines[n][1] for n in lines) for f in (found, right)]
+        assert work[0] == pytest.approx(work[1], rel=1e-9)
+        assert abs(work[0]) > 1.0
+    dofs = [[int(m.joint(name).dofadr[0]) for name in lines] for m in (model, alone)]
+    np.testing.assert_allclose(model.dof_armature[dofs[0]], alone.dof_armature[dofs[1]])
+    for number, m in enumerate((model, alone)):
+        data = mujoco.MjData(m)
+        mujoco.mj_forward(m, data)
+        full = np.zeros((m.nv, m.nv))
+        mujoco.mj_fullM(m, data, full)
+        share[str(number)] = full[np.ix_(dofs[number], dofs[number])]  # rotors
+    np.testing.assert_allclose(share["0"], share["1"], rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("pairs", "line"),
+    [
+        (hung(1, -1, GRIP), "tendon split={'left': 1.0, 'right': -1.0}: expected coefficients"),
+        (
+            hung(1, 1, GRIP, COUPLING.replace("0 1 0", "0 1 2")),
+            "joint of a tendon=right: expected one that moves as left",
+        ),
+        (
+            hung(1, 1, GRIP, COUPLING.replace("0 1 0", "0.01 0 0")),
+            "joint of a tendon=right: expected one that moves as left",
+        ),
+        (
+            [*hung(1, 1, GRIP, CHAIN.replace("-2 0 0", "-2 1 0")), (PALM, MIDDLE + PALM)],
+            "joint of a tendon=right: expected one that moves as left",
+        ),
+        (hung(1, 1, '<motor name="grip" tendon="split"/>'), "a position servo (grip has biastype"),
+        (hung(1, 1, GRIP.replace("split", "spli")), "actuators of joint left=none"),
+    ],
+    ids=["cancel", "bent", "still", "bent chain", "motor", "name"],
+)
+def test_what_a_tendon_cannot_do_is_one_line(pairs: list, line: str, tmp_path: Path) -> None:
+    refusal(lambda: build_model(changed(tmp_path, *pairs)), line)
+
+
+def test_a_finger_that_follows_freely_is_no_follower(tmp_path: Path) -> None:
+    cfg = changed(tmp_path, *hung(1, 1, GRIP, ""), **ONE)
+    refusal(lambda: build_model(cfg), "joint of a tendon=right: expected one that moves as left")
+
+
+def test_servos_in_place_of_a_motor_on_a_tendon(tmp_path: Path) -> None:
+    made = ServoCfg(stiffness=900.0, damping=9.0, effort=30.0)
+    pairs = hung(1, 1, '<motor name="grip" tendon="split"/>')
+    model = build_model(changed(tmp_path, *pairs, servos={"left": made, "right": made}))
+    assert [model.actuator(k).name for k in range(model.nu)][-2:] == ["left", "right"]
+    assert model.actuator("left").gainprm[0] == 900.0
+
+
+def test_a_tendon_of_one_arm_joint_is_that_joints_servo(tmp_path: Path) -> None:
+    """Beside one that wraps around sites and a pulley, which moves on its own."""
+    cable = """<spatial name="cable"><site site="left_grasp"/><site site="right_grasp"/>
+      <pulley divisor="2"/><site site="left_grasp"/><site site="right_grasp"/></spatial>"""
+    pairs = [
+        (ELBOW, '<position name="e" tendon="belt" kp="125" kv="5" ctrlrange="0.2 5.2"/>'
+         '<motor name="cable" tendon="cable"/>'),
+        ("</actuator>", '</actuator><tendon><fixed name="belt"><joint joint="elbow" coef="2"/>'
+         f"</fixed>{cable}</tendon>"),
+    ]  # fmt: skip
+    model = build_model(changed(tmp_path, *pairs))
+    elbow = model.actuator("elbow")
+    assert (elbow.gainprm[0], elbow.biasprm[2]) == (500.0, -20.0)
+    np.testing.assert_allclose(elbow.ctrlrange, [0.1, 2.6])
+    assert model.actuator("cable").trntype[0] == mujoco.mjtTrn.mjTRN_TENDON
+
+
+def test_another_actuator_of_a_joints_name(tmp_path: Path) -> None:
+    """It keeps its joint, with a prefix; sensors go on to measure their actuators."""
+    fan = """<body name="fan"><joint name="fan" axis="0 0 1"/>
+      <inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/></body>"""
+    servo = ELBOW.replace('name="elbow"', 'name="joint2"')
+    sensors = "".join(
+        f'<actuatorfrc name="of {name}" actuator="{name}"/>' for name in ("elbow", "joint2", "lift")
+    )
+    pairs = [
+        (PALM, fan + PALM),
+        (ELBOW, f'{servo}<motor name="elbow" joint="fan"/>'),
+        ("</actuator>", f"</actuator><sensor>{sensors}</sensor>"),
+    ]
+    model = build_model(changed(tmp_path, *pairs))
+    for actuator, joint in (("elbow", "elbow"), ("robot_elbow", "fan"), ("lift", "lift")):
+        assert model.actuator(actuator).trnid[0] == model.joint(joint).id
+    for sensor, actuator in (("elbow", "robot_elbow"), ("joint2", "elbow"), ("lift", "lift")):
+        assert model.sensor(f"of {sensor}").objid[0] == model.actuator(actuator).id
+    pairs[0] = (PALM, fan.replace('"fan"', '"robot_elbow"') + PALM)
+    pairs[1] = (ELBOW, f'{servo}<motor name="elbow" joint="robot_elbow"/>'
+                '<motor name="robot_elbow" joint="robot_elbow"/>')  # fmt: skip
+    refusal(lambda: build_model(changed(tmp_path, *pairs)), "repeated name 'robot_elbow'")
+
+
+def test_an_arm_that_a_mocap_body_drives(tmp_path: Path) -> None:
+    """It takes no commands; servos can be made, and the mocap body stays behind."""
+    mocap = '<body name="puppet" mocap="true"><geom name="puppet" size="0.01"/></body>'
+    weld = '<equality><weld body1="puppet" body2="hand"/></equality>'
+    pairs = [(ROOT, ROOT + mocap), ("</worldbody>", f"</worldbody>{weld}")]
+    pairs += [(servo, "") for servo in SERVOS.values()]
+    line = "actuators of joint shoulder=none: expected one <position>"
+    lines = (line, "(mocap body puppet takes no commands)", "robot.servos.shoulder")
+    refusal(lambda: build_model(changed(tmp_path, *pairs)), *lines)
+    made = ServoCfg(stiffness=900.0, damping=9.0, effort=30.0)
+    cfg = changed(tmp_path, *pairs, servos=dict.fromkeys(SERVOS, made))
+    model = build_model(cfg)
+    assert model.nmocap == 0
+    assert model.neq == 1  # the fingers'
+    assert "left out: body puppet" in notes(cfg, model)
+
+
+def test_a_wrap_that_the_scene_names_too(tmp_path: Path) -> None:
+    """MuJoCo would leave the tendon and its actuator behind."""
+    tendon = """<tendon><spatial name="cable"><site site="left_grasp"/><geom geom="table"/>
+      <site site="right_grasp"/></spatial></tendon>"""
+    drum = '<geom name="table" type="cylinder" size="0.01 0.01"/>'
+    pairs = [(PALM, drum + PALM), ("</actuator>", f"</actuator>{tendon}")]
+    refusal(lambda: build_model(changed(tmp_path, *pairs)), "the scene has table too")
+    pairs = [(old, new.replace('"table"', '"drum"')) for old, new in pairs]
+    assert build_model(changed(tmp_path, *pairs)).ntendon == 1
+
+
+def test_frictions_are_what_contacts_have(tmp_path: Path) -> None:
+    """MuJoCo's least counts in a contact of the native physics too, and MJWarp takes it."""
+    friction = ('friction="1 0.005 0.0005"', 'friction="0 0 0"')
+    pair = '<contact><pair geom1="left_pad" geom2="right_pad" friction="0 0 0 0 0"/></contact>'
+    cfg = changed(tmp_path, friction, ("</actuator>", f"</actuator>{pair}"))
+    model = build_model(cfg)
+    assert model.geom("left_pad").friction.tolist() == [mujoco.mjMINMU] * 3
+    assert model.pair_friction.tolist() == [[mujoco.mjMINMU] * 5]
+    with contextlib.closing(build_env(cfg, nworld=1, model=model, backend=Backend.mjwarp)) as env:
+        assert env.nworld == 1

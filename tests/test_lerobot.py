@@ -319,7 +319,7 @@ def test_a_follower_has_the_real_ones_words(tmp_path: Path) -> None:
     # A bus with this calibration gives these numbers, to a tick of its encoders
     index = follower._world.inner.index
     angles = follower._world.inner.sim.qpos[0, index.robot_qpos].numpy()
-    middles = index.ctrl_range.mean(1)
+    middles = index.servo_range.mean(1)
     turns = (angles - middles) / (2 * np.pi)
     values = [seen[name] for name in joints]
     for part, turn, value in zip(follower.calibration.values(), turns, values, strict=True):

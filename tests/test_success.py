@@ -405,7 +405,7 @@ def test_worst_regions_of_made_up_episodes() -> None:
     succeeded = ~(corner & (rng.random(n) < 0.9)) & ~(turned & (rng.random(n) < 0.5))
     cfg = load_config(["gate.success.worst_regions=2"]).gate.success
     assert (cfg.cell, cfg.yaw_cell_deg, cfg.cell_episodes) == (0.02, 15.0, 20)
-    regions = find_regions(cfg, places, succeeded, ("red", "blue"))
+    regions = find_regions(cfg, places, succeeded, ("red", "blue"), (0.0, 0.0))
     assert [region["rate"] for region in regions] == sorted(region["rate"] for region in regions)
     assert all(region["episodes"] >= 20 for region in regions)
     assert not any(region["object"] == "red" and region.get("x_min_m") == 0.4 for region in regions)

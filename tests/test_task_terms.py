@@ -160,6 +160,13 @@ def test_training_is_judged_from_the_starts_of_the_task(turned: Path, tmp_path: 
     )
     chosen = composed(turned, "job=train", "reset=jitter", "gate.success.reset=randomized")
     assert list(chosen.gate.success.reset) == [*SHIPPED, "turn", "slide"]
+    # An experiment's choice counts as one of the command line
+    (turned / "experiment").mkdir()
+    text = "# @package _global_\ndefaults:\n  - override /reset@gate.success.reset: jitter\n"
+    (turned / "experiment" / "near.yaml").write_text(text)
+    near = composed(turned, "job=train", "reset=randomized", "experiment=near")
+    assert list(near.reset) == [*SHIPPED, "turn", "slide"]
+    assert list(near.gate.success.reset) == ["home", "cubes", "turn", "slide"]
 
 
 @pytest.mark.parametrize(
@@ -254,6 +261,18 @@ def test_a_policy_sees_what_a_task_writes(turned: Path) -> None:
     chosen = load_config([*more, "job.observation=task"])
     assert chosen.job.observation == chosen.observation
     assert not chosen.unused_terms
+
+
+def test_terms_that_are_null(turned: Path) -> None:
+    """A task's own one, or one that the policy is not to see."""
+    cfg = composed(turned, "job=train", "observation.policy.terms.shoulder=null")
+    assert cfg.job.observation == cfg.observation
+    assert "shoulder" not in cfg.job.observation["policy"].terms
+    assert not [line for line in cfg.unused_terms if "does not see" in line]
+    cfg = composed(turned, "job=train", "job.observation.policy.terms.shoulder=null")
+    assert "shoulder" not in cfg.job.observation["policy"].terms
+    (line,) = [line for line in cfg.unused_terms if "does not see" in line]
+    assert "the task's own shoulder it does not see" in line
 
 
 def test_terms_without_noise_get_some_in_a_training(turned: Path) -> None:

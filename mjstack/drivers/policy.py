@@ -164,7 +164,7 @@ class LerobotWords:
         self._seen = seen
         self._images = images
         self._joints = env.index.on(env.device, env.sim.qpos.dtype).qpos
-        self.units = LerobotUnits(env.index.n_arm, env.index.ctrl_range, units)
+        self.units = LerobotUnits(env.index.n_arm, env.index.servo_range, units)
 
     def observe(self) -> dict[str, np.ndarray]:
         """The observations, by LeRobot's names. A number that is not finite becomes 0: the check

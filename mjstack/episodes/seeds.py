@@ -181,7 +181,8 @@ def _worlds(tally: EpisodeTally, run: Run) -> Worlds:
             x, _ = objects[name]
             ways = [(world.label, world.failed, world.qpos[:, x : x + 2]) for world in moving]
         xy = places[plotted, :2]
-        worlds.maps.append(Map(title=name, xy=xy, table=table, ways=ways, marks=marks))
+        base = run.stage.index.base
+        worlds.maps.append(Map(title=name, xy=xy, table=table, ways=ways, marks=marks, base=base))
     return worlds
 
 

@@ -78,7 +78,7 @@ def run_success(run: Run) -> list[GateResult]:
     succeeded = tally.array("failed") == 0
     retried = int((retries > 0).sum())
     retried_succeeded = int(((retries > 0) & succeeded).sum())
-    regions = find_regions(t, starts, succeeded, list(places))
+    regions = find_regions(t, starts, succeeded, list(places), run.stage.index.base)
     distinct = len(np.unique(np.round(np.nan_to_num(starts), 6).reshape(len(starts), -1), axis=0))
     lost = sum(goal.lost for goal in goals)
     doubts = find_doubts(distinct, tally.episodes, tally.successes, lost, t.rate)
@@ -186,18 +186,22 @@ def _describe_start(cfg: Config) -> str:
 
 
 def radial_yaw_deg(places: np.ndarray) -> np.ndarray:
-    """Angle of an object relative to the direction in which the base, at the origin, sees it [deg],
-    from 0 to 90.
+    """Angle of an object relative to the direction in which the arm's base sees it [deg], from 0 to
+    90.
 
     Args:
-        places: x and y [m] and rotation about z [rad], shape ``(..., 3)``.
+        places: x and y from the base [m] and rotation about z [rad], shape ``(..., 3)``.
     """
     relative = np.degrees(places[..., 2] - np.arctan2(places[..., 1], places[..., 0]))
     return np.mod(relative, 90.0) % 90.0  # twice: just below 0 rounds to 90
 
 
 def find_regions(
-    cfg: SuccessGateCfg, places: np.ndarray, succeeded: np.ndarray, objects: Sequence[str]
+    cfg: SuccessGateCfg,
+    places: np.ndarray,
+    succeeded: np.ndarray,
+    objects: Sequence[str],
+    base: Sequence[float],
 ) -> list[Region]:
     """Cells of each object's position, of its direction, and of both, that have enough episodes;
     the lowest rate first. In x and y they begin at multiples of their width; the last one in
@@ -209,12 +213,13 @@ def find_regions(
             shape ``(n, objects, 3)``.
         succeeded: Whether each episode was, shape ``(n,)``, bool.
         objects: Names of the objects.
+        base: x and y of the arm's base [m].
     """
     out: list[Region] = []
     widths = np.array([cfg.cell, cfg.cell, cfg.yaw_cell_deg])
     ends = np.array([math.inf, math.inf, 90.0])
     for number, name in enumerate(objects):
-        yaw = radial_yaw_deg(places[:, number])
+        yaw = radial_yaw_deg(places[:, number] - [*base, 0.0])
         keys = np.floor(np.column_stack((places[:, number, :2], yaw)) / widths + _EDGE)
         keys[keys[:, 2] * cfg.yaw_cell_deg >= 90.0, 2] = 0.0  # on the edge of 90, which is 0
         for axes in ([0, 1],) if np.isnan(yaw).any() else ([0, 1], [2], [0, 1, 2]):

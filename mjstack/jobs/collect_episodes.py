@@ -70,7 +70,7 @@ class EpisodeSource:
         self.drawing = 0.0
         self._units: LerobotUnits | None = None
         if stage.cfg.job.units == LEROBOT:
-            self._units = LerobotUnits(stage.index.n_arm, stage.index.ctrl_range)
+            self._units = LerobotUnits(stage.index.n_arm, stage.index.servo_range)
         self._most_rendered = 0  # states at once
         self._renderer: StateRenderer | None = None
         self._cameras = with_outputs(stage.cfg.scene.cameras, ["rgb"])

@@ -218,7 +218,7 @@ def make_spec(env: Env, cfg: Config, provenance: Mapping[str, Any]) -> DatasetSp
     config = episode_config(cfg)
     job: CollectJobCfg = cfg.job
     units = joint_units(env)
-    lerobot = LerobotUnits(env.index.n_arm, env.index.ctrl_range).units
+    lerobot = LerobotUnits(env.index.n_arm, env.index.servo_range).units
     positions = Feature(
         dtype="float32",
         names=tuple(f"{name}.pos" for name in cfg.robot.joints),

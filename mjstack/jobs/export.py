@@ -49,7 +49,7 @@ def export_policy(stage: Stage, folder: Path) -> list[GateResult]:
     lerobot = stage.cfg.job.format == "lerobot"
     files: Mapping[str, str | bytes]
     if lerobot:
-        files = lerobot_files(policy, stage.index.ctrl_range)
+        files = lerobot_files(policy, stage.index.servo_range)
     else:
         onnx = to_onnx(policy.network, export_facts(stage))
         files = {MODEL: model_bytes(stage.model), POLICY: onnx}

@@ -11,7 +11,7 @@ from numpy import ndarray
 from mjstack.config.schema import ModelCfg, RobotCfg
 from mjstack.errors import ConfigError
 from mjstack.robots import robot_spec
-from mjstack.robots.guest import compile_scene
+from mjstack.robots.guest import compile_scene, mujoco_errors
 from mjstack.robots.posture import Posture, posture
 from mjstack.scene.index import locked_home
 
@@ -77,9 +77,10 @@ class GraspIk:
         """Compile the robot without a scene, from its description ``model``; ``tolerance`` is the
         distance that counts as reached [m].
         """
-        spec = robot_spec(robot, model)
-        spec.compiler.discardvisual = True
-        self.model = compile_scene(spec)
+        with mujoco_errors(robot.name):
+            spec = robot_spec(robot, model)
+            spec.compiler.discardvisual = True
+            self.model = compile_scene(spec)
         self.tolerance = tolerance
         joints = [self.model.joint(name).id for name in robot.joints]
         self._qpos = self.model.jnt_qposadr[joints]

@@ -175,6 +175,7 @@ class EndEffectorDelta(_Commands):
         if tilt and not upright:
             raise ParameterError("tilt", tilt, "0, because upright is 0")
         self._tilt = tilt
+        self._base = torch.tensor(env.index.base, device=env.device)
         self._all = robot(env).ctrl
         self._scale = scale
         profile = env.cfg.robot
@@ -215,7 +216,8 @@ class EndEffectorDelta(_Commands):
         plane through the base and the grasp point.
         """
         goal = 0.5 * (action + 1.0) * self._tilt
-        away = point[:, :2] / norm(point[:, :2])[:, None]
+        away = point[:, :2] - self._base
+        away /= norm(away)[:, None]
         now = atan2((approach[:, :2] * away).sum(1), -approach[:, 2])
         angle = now + (goal - now).clamp(-_TILT_STEP, _TILT_STEP)
         return torch.cat((torch.sin(angle)[:, None] * away, -torch.cos(angle)[:, None]), dim=1)

@@ -31,9 +31,9 @@ def require_lerobot(what: str) -> None:
         raise MjstackError(problem, f"Run pip install 'lerobot=={SERIES}1'")
 
 
-def lerobot_files(policy: Policy, ctrl_range: np.ndarray) -> dict[str, str]:
-    """Files by name that make a policy's folder one of LeRobot's, of type ``mjstack``. Limits of
-    the joint targets [rad, m] are of shape ``(joints, 2)``.
+def lerobot_files(policy: Policy, servo_range: np.ndarray) -> dict[str, str]:
+    """Files by name that make a policy's folder one of LeRobot's, of type ``mjstack``.
+    ``servo_range`` is as of `SceneIndex`.
 
     A policy that sees its joint positions and images alone takes what a real arm measures; another
     one takes the environment ``mjstack``'s ``environment_state``. One whose actions are no joint
@@ -57,7 +57,7 @@ def lerobot_files(policy: Policy, ctrl_range: np.ndarray) -> dict[str, str]:
         "output_features": {"action": {"type": "ACTION", "shape": [policy.network.width]}},
         "push_to_hub": False,
         "device": "cpu",
-        "joint_range": ctrl_range.tolist(),
+        "joint_range": servo_range.tolist(),
     }
     here = Path(__file__)
     files = {name: here.with_name(name).read_text(encoding="utf-8") for name in _PROCESSORS}

@@ -19,6 +19,7 @@ class Map:
         ways: Its ways in some episodes: a label, whether that failed, and positions [m], shape
             ``(frames, 2)``.
         marks: Positions [m] of what is the same in every episode, by name.
+        base: Position of the arm's base [m].
     """
 
     title: str
@@ -26,6 +27,7 @@ class Map:
     table: tuple[Sequence[float], Sequence[float]]
     ways: Sequence[tuple[str, bool, np.ndarray]] = ()
     marks: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    base: Sequence[float] = (0.0, 0.0)
 
 
 @dataclass(kw_only=True, slots=True)

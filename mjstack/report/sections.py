@@ -296,7 +296,7 @@ def table_map(
 ) -> str:
     """A figure of the table from above: x up, y to the left, as seen from behind the arm."""
     (x0, y0), (hx, hy) = plan.table[0][:2], plan.table[1][:2]
-    scale = _TALL / (x0 + hx - (min(0.0, x0 - hx) - 0.02))
+    scale = _TALL / (x0 + hx - (min(plan.base[0], x0 - hx) - 0.02))
 
     def place(points: np.ndarray) -> list[list[float]]:
         """Where positions are in the figure; those that are not finite are left out."""
@@ -304,7 +304,7 @@ def table_map(
         return (scale * (np.array([y0 + hy, x0 + hx]) - xy[:, ::-1])).tolist()
 
     wide = 2.0 * scale * hy
-    ((x, y),) = place(np.zeros((1, 2)))
+    ((x, y),) = place(np.array([plan.base]))
     marks = [
         f"<rect fill=none class=axis x=0 y=0 width={wide:.1f} height={2.0 * scale * hx:.1f} />",
         f"<path class=axis fill='var(--fg)' d='M{x:.1f} {y - 8:.1f}l6 10h-12z' />",

@@ -19,7 +19,8 @@ _SOLVER = ("iterations", "ls_iterations", "impratio", "tolerance")
 _CONFIGURED = (*_SOLVER, "timestep", "integrator", "cone")  # by groups timing and solver
 _FREE = mujoco.mjtJoint.mjJNT_FREE
 SAG = 0.002  # m: how far off its target a hand is of which gravity, or a report, takes no notice
-_PREFIX = "robot_"
+_WRAPS = (mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER)
+PREFIX = "robot_"
 _NAMED = ("geoms", "bodies", "cameras")  # elements that a scene has too
 _NAMING = {  # elements with the names of others
     "pairs": ("geomname1", "geomname2"),
@@ -35,7 +36,7 @@ _FLAGS = {"disableflags": mujoco.mjtDisableBit, "enableflags": mujoco.mjtEnableB
 
 def as_guest(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) -> mujoco.MjSpec:
     """A fresh scene with the robot in it. Its compiler settings act on its bodies alone, and its
-    options, sizes, keyframes, lights, floors and free bodies stay behind.
+    options, sizes, keyframes, lights, floors, free and mocap bodies stay behind.
 
     Args:
         spec: The robot; it is changed in place, and goes on to live in the scene.
@@ -118,6 +119,19 @@ def grasp_jacobian(data: mujoco.MjData, robot: RobotCfg) -> np.ndarray:
 
 
 @contextmanager
+def mujoco_errors(robot: str) -> Iterator[None]:
+    """Raise MuJoCo's errors as those of a robot, alone or in a scene."""
+    try:
+        yield
+    except ValueError as error:
+        problem = ", ".join(str(error).removeprefix("Error: ").splitlines())
+        raise MjstackError(
+            f"robot {robot}: {problem}. Correct the robot's file or the scene, whose names (floor,"
+            " table and the objects) the robot cannot have."
+        ) from error
+
+
+@contextmanager
 def _without_prefix() -> Iterator[None]:
     """Silence MuJoCo's warning that names without a prefix may spoil a file that is written: none
     is written.
@@ -170,12 +184,12 @@ def left_behind(
         yield f"left out: {', '.join(sorted(set(strangers)))}"
     names = set(_clashes(spec, reserved)) - {e.name for e in _strangers(spec, robot)}
     if names:
-        yield f"renamed to {_PREFIX}NAME: {', '.join(sorted(names))}"
+        yield f"renamed to {PREFIX}NAME: {', '.join(sorted(names))}"
 
 
 def _strangers(spec: mujoco.MjSpec, robot: RobotCfg) -> list[Any]:
     """Elements of the file that are not the robot: all outside of ``robot.root`` if that is given,
-    else floors, lights, and bodies that are free; and keyframes, which fit no scene.
+    else floors, lights, and bodies that are free or mocap; and keyframes, which fit no scene.
     """
     world = spec.worldbody
     planes = [geom for geom in world.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]
@@ -184,7 +198,8 @@ def _strangers(spec: mujoco.MjSpec, robot: RobotCfg) -> list[Any]:
     free = [
         body
         for body in world.bodies
-        if body.name not in trees and any(j.type == _FREE for b in _below(body) for j in b.joints)
+        if body.name not in trees
+        and any(b.mocap or any(j.type == _FREE for j in b.joints) for b in _below(body))
     ]
     out = [*spec.keys, *world.lights, *planes, *free]
     if robot.root:
@@ -236,7 +251,9 @@ def _clashes(spec: mujoco.MjSpec, reserved: Collection[str]) -> list[str]:
 def _rename(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) -> None:
     """Put a prefix in front of names that the scene needs, and wherever they are named."""
     clashes = _clashes(spec, reserved)
-    profile = {*robot.joints, *robot.jaw_bodies, *robot.grasp_sites, robot.approach_body}
+    paths = [wrap for tendon in spec.tendons for wrap in tendon.path]
+    wraps = [wrap.target.name for wrap in paths if wrap.type in _WRAPS]  # they keep their names
+    profile = {*robot.joints, *robot.jaw_bodies, *robot.grasp_sites, robot.approach_body, *wraps}
     if names := profile & set(clashes):
         raise MjstackError(
             f"robot {robot.name}: the scene has {', '.join(sorted(names))} too, expected other"
@@ -246,7 +263,7 @@ def _rename(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) -> 
         for element in getattr(spec, kind):
             for field in ("name", *_NAMING.get(kind, ())):
                 if getattr(element, field) in clashes:
-                    setattr(element, field, _PREFIX + getattr(element, field))
+                    setattr(element, field, PREFIX + getattr(element, field))
 
 
 def _fields(option: object) -> list[str]:

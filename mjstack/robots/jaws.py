@@ -20,14 +20,20 @@ _BESIDE = 0.005  # [m] that a pad may be farther from the grasp point than anoth
 
 
 def jaw_members(parents: Mapping[str, str], jaws: Sequence[str]) -> dict[str, list[str]]:
-    """Bodies of each jaw: the named one and all below it, without those of a jaw further down.
-    ``parents`` has each body's parent, in the order of the tree.
+    """Bodies of each jaw: the named one and all below it; of one that carries another jaw, such as
+    a wrist with a fixed jaw, that alone. ``parents`` has each body's parent, in the tree's order.
     """
     roots = {name: name for name in jaws}
     for name, parent in parents.items():
         if name not in roots and parent in roots:
             roots[name] = roots[parent]
-    return {jaw: [name for name, root in roots.items() if root == jaw] for jaw in jaws}
+    carriers = set()
+    for parent in map(parents.get, jaws):
+        while parent is not None:
+            carriers.add(parent)
+            parent = parents.get(parent)
+    members = {jaw: [name for name, root in roots.items() if root == jaw] for jaw in jaws}
+    return {jaw: [jaw] if jaw in carriers else bodies for jaw, bodies in members.items()}
 
 
 def jaw_bodies(model: mujoco.MjModel, jaws: Sequence[str]) -> list[list[int]]:

@@ -28,6 +28,7 @@ KNOTS = 129
 _STEPS = 50  # of a projection, at most
 _MAX_STEP = 0.3  # [rad, m] per step
 _EXACT = 1e-10  # [rad, m] a smaller step ends it
+_ERROR = 1e-6  # [rad, m] of an equality that does not hold
 _MOTION = 1e-9  # [rad, m] less is rounding
 
 
@@ -83,9 +84,9 @@ class Posture:
         # Tables
         tables: dict[int, tuple[int, float, float, ndarray]] = {}
         for k, address in enumerate(self.commanded):
-            if address in tables or not self._linked[self._addresses == address][0]:
+            if address in tables or not self._linked[self._addresses == address].any():
                 continue
-            positions = self._walk(int(address), self.commanded[: k + 1])
+            positions = self._walk(int(address), k + 1)
             low, high = positions[[0, -1], address]
             moved = np.ptp(positions, axis=0) > _MOTION
             moved[address] = False
@@ -164,8 +165,10 @@ class Posture:
         slope = first + (t - 0.5) * second + (t * (t / 2.0 - 1.0) + 1.0 / 3.0) * third
         return position, slope / step
 
-    def _walk(self, address: int, still: ndarray) -> ndarray:
-        """Positions while a joint goes over its range and others stand, shape ``(KNOTS, nq)``."""
+    def _walk(self, address: int, count: int) -> ndarray:
+        """Positions while a joint goes over its range, shape ``(KNOTS, nq)``. Other commanded ones
+        stand, unless the equalities need those after the first few, of this count, to move.
+        """
         ends = (self._low, self._high)
         low, high = (float(end[self._addresses == address][0]) for end in ends)
         if not np.isfinite(low):
@@ -177,7 +180,10 @@ class Posture:
             qpos = self.rest.copy()
             for knot in way:
                 qpos[address] = knots[knot]
-                positions[knot] = qpos = self._settle(qpos, still)
+                qpos = self._settle(qpos, self.commanded)
+                if np.abs(self._rows(qpos)[1]).max(initial=0.0) > _ERROR:
+                    qpos = self._settle(qpos, self.commanded[:count])
+                positions[knot] = qpos
         return positions
 
     def _rows(self, qpos: ndarray) -> tuple[ndarray, ndarray]:

@@ -117,20 +117,25 @@ def _replace_collision(spec: mujoco.MjSpec, robot: RobotCfg) -> None:
 
 
 def _add_grasp_sites(spec: mujoco.MjSpec, robot: RobotCfg) -> None:
-    """Add the grasp sites that the file lacks, each at the mean of its geoms or bodies."""
-    for site in robot.grasp_sites:
-        if spec.site(site) is not None:
-            continue
+    """Add the grasp sites that the file lacks, each at its place on a body, or at the mean of its
+    geoms.
+    """
+    for site in [name for name in robot.grasp_sites if spec.site(name) is None]:
         if site not in robot.grasp_parts:
             _require("grasp site", [site], spec.sites)
         parts = robot.grasp_parts[site]
-        if spec.body(parts[0]) is not None:
-            pos = robot.grasp_pos.get(site, [0.0, 0.0, 0.0])
-            spec.body(parts[0]).add_site(name=site, pos=pos, group=4)
-            continue
-        _require("geom", parts, spec.geoms)
-        geoms = [spec.geom(name) for name in parts]
-        geoms[0].parent.add_site(name=site, pos=np.mean([g.pos for g in geoms], axis=0), group=4)
+        _require("geom or body", parts, [*spec.geoms, *spec.bodies])
+        bodies = [spec.body(name) or spec.geom(name).parent for name in parts]
+        if len({body.name for body in bodies}) > 1:
+            expected = "geoms of one body, or one body"
+            raise ConfigError(f"robot.grasp_parts.{site}", parts, expected)
+        pos = robot.grasp_pos.get(site, [0.0, 0.0, 0.0])
+        if site not in robot.grasp_pos and bodies[0].name not in parts:
+            alone = spec.copy()  # the file's positions may be in frames, or of ends
+            alone.compiler.fusestatic = alone.compiler.discardvisual = False
+            model = alone.compile()
+            pos = np.mean([model.geom(name).pos for name in parts], axis=0)
+        bodies[0].add_site(name=site, pos=pos, group=4)
 
 
 def _require(kind: str, names: Iterable[str | None], available: Iterable) -> None:

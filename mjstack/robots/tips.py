@@ -198,8 +198,7 @@ class Fingers:
             if gaps.min() > width - 0.01:
                 raise ValueError("its fingers do not close on each other")
             share = _last(gaps, width)
-        thick = self.model.geom_size[self._plate, 1] < 2.0 * _TIP  # above it, the fingers are
-        most = _FAR if thick else _WIDE - 0.015 * self._hand.one_finger  # it swings up
+        most = _WIDE - 0.015 * self._hand.one_finger  # it swings up as it opens
         wide = opened + _last(gaps, min(most, float(gaps.max()))) * (shut - opened)
         touching = opened + share * (shut - opened)
         _, point, geoms = self._gap(touching, start, frame, sides)

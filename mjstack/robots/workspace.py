@@ -193,7 +193,8 @@ def _try_table(
 ) -> tuple[float, Workspace] | None:
     """How well an arm works over a table, and the best home there; None if it does not."""
     side = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-    apart = round(min(0.14, 0.25 * reach), 2)
+    # Of an arm that does not turn about the vertical no gain keeps the tilt between objects
+    apart = round(min(0.14 if upright else 0.08, 0.25 * reach), 2)
     height = 0.1 if reach > 0.4 else 0.07
     everything = np.ones(len(arm.low))
     best: tuple[float, Workspace] | None = None

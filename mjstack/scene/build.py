@@ -4,7 +4,6 @@ set before compilation.
 
 import itertools
 import math
-from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -12,9 +11,9 @@ import mujoco
 import numpy as np
 
 from mjstack.config.schema import BoxCfg, CameraCfg, Config, ObjectCfg, SceneCfg
-from mjstack.errors import ConfigError, MjstackError, UnknownName
+from mjstack.errors import ConfigError, UnknownName
 from mjstack.robots import read_mjcf, robot_spec
-from mjstack.robots.guest import WORLD, compile_scene
+from mjstack.robots.guest import WORLD, compile_scene, mujoco_errors
 from mjstack.robots.jaws import jaw_members
 
 TABLE = "table"
@@ -35,15 +34,12 @@ def build_model(cfg: Config, *, visuals: bool = False) -> mujoco.MjModel:
     Raises:
         MjstackError: The robot's file does not fit the scene, such as one with a geom named table.
     """
-    spec = robot_spec(cfg.robot, cfg.model, scene_names(cfg.scene))
-    try:
-        return build_scene(spec, cfg, visuals=visuals)
-    except ValueError as error:
-        problem = ", ".join(str(error).removeprefix("Error: ").splitlines())
-        raise MjstackError(
-            f"robot {cfg.robot.name} in scene {cfg.scene.name}: {problem}. Correct the robot's file"
-            " or the scene, whose names (floor, table and the objects) the robot cannot have."
-        ) from error
+    with mujoco_errors(f"{cfg.robot.name} in scene {cfg.scene.name}"):
+        spec = robot_spec(cfg.robot, cfg.model, scene_names(cfg.scene))
+        model = build_scene(spec, cfg, visuals=visuals)
+    for friction in (model.geom_friction, model.pair_friction):  # as contacts have it
+        friction[:] = friction.clip(min=mujoco.mjMINMU)  # MJWarp warns of less
+    return model
 
 
 def scene_names(scene: SceneCfg) -> set[str]:
@@ -109,15 +105,16 @@ def add_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> Non
         pairs += [(WORLD, name) for name in scene.objects]
         pairs += itertools.combinations(scene.objects, 2)
     body = mujoco.mjtObj.mjOBJ_BODY
-    alone = {jaw: jaw_members(parents, [jaw])[jaw] == members[jaw] for jaw in jaw_bodies}
-    touching = {jaw: _touching(spec, jaw, members[jaw], alone[jaw]) for jaw in jaw_bodies}
+    subtree = mujoco.mjtObj.mjOBJ_XBODY
+    several = {
+        jaw for jaw, bodies in members.items() if any(spec.body(b).geoms for b in bodies[1:])
+    }
     for first, second in pairs:  # the net contact force [N]: 3 numbers, world frame
-        kind, name = touching.get(first, (body, first))
         spec.add_sensor(
             name=force_sensor(first, second),
             type=mujoco.mjtSensor.mjSENS_CONTACT,
-            objtype=kind,
-            objname=name,
+            objtype=subtree if first in several else body,
+            objname=first,
             reftype=body,
             refname=second,
             intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), _NETFORCE, 1],
@@ -146,24 +143,6 @@ def add_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> Non
         spec.visual.quality.shadowsize = 1024  # without a GPU, MuJoCo's 4096 doubles the time
     else:
         spec.compiler.discardvisual = True
-
-
-def _touching(
-    spec: mujoco.MjSpec, jaw: str, members: Sequence[str], alone: bool
-) -> tuple[mujoco.mjtObj, str]:
-    """Kind and name of what touches objects for a jaw: a body; or all below it, if it carries no
-    other jaw.
-    """
-    geoms = {name: spec.body(name).geoms for name in members}
-    names = [name for name in members if any(g.contype or g.conaffinity for g in geoms[name])]
-    if jaw in names[:1] * (not alone or len(names) == 1) or not names:
-        return mujoco.mjtObj.mjOBJ_BODY, jaw
-    if alone:
-        return mujoco.mjtObj.mjOBJ_XBODY, jaw
-    if len(names) > 1:
-        expected = f"one of {', '.join(names)}, which collide, as it carries another jaw too"
-        raise ConfigError("robot.jaw_bodies", jaw, expected)
-    return mujoco.mjtObj.mjOBJ_BODY, names[0]
 
 
 def force_sensor(first: str, second: str) -> str:

@@ -61,8 +61,11 @@ class SceneIndex:
         robot_range: Joint limits in the same order [rad, m], shape ``(n, 2)``.
         posture: Where all joints are, from the robot's.
         ctrl: Actuator indices in the same order.
-        ctrl_range: Limits of the joint targets in the same order, shape ``(n, 2)``.
+        ctrl_range: Limits of the joint targets in the same order, of `joint_limits`, shape
+            ``(n, 2)``.
+        servo_range: What the file's servos take, which LeRobot's units count in, shape ``(n, 2)``.
         n_arm: How many of them are the arm's.
+        base: x and y of the body that carries the arm, or, on the world, of its first one [m].
         grasp_sites: The two site indices whose midpoint is the grasp point.
         object_qpos: First qpos address of every object that moves, in the scene's order.
         object_qvel: First qvel address of each of them.
@@ -91,8 +94,18 @@ class SceneIndex:
         self.robot_range = model.jnt_range[joints]
         self.ctrl = np.array([model.actuator(name).id for name in robot.joints])
         self._idle = _idle_servos(model, self.ctrl, self.posture.rest)
-        self.ctrl_range = model.actuator_ctrlrange[self.ctrl]
+        self.servo_range = model.actuator_ctrlrange[self.ctrl]
+        self.ctrl_range = np.stack(joint_limits(model, robot.joints), axis=1)
+        for name, (low, high) in zip(robot.joints, self.ctrl_range, strict=True):
+            if not low < high:
+                expected = f"one that meets its range {model.joint(name).range.tolist()}"
+                span = model.actuator(name).ctrlrange.tolist()
+                raise ConfigError(f"ctrlrange of joint {name}", span, expected)
         self.n_arm = len(robot.arm_joints)
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        first = model.jnt_bodyid[joints[0]]
+        self.base = data.xpos[model.body_parentid[first] or first, :2].tolist()
         self.grasp_sites = [model.site(name).id for name in robot.grasp_sites]
         self.objects = {
             name: (int(model.joint(name).qposadr[0]), int(model.joint(name).dofadr[0]))

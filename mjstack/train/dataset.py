@@ -38,7 +38,7 @@ def check_dataset(stage: Stage, widths: Mapping[str, int]) -> range:
     cfg = stage.cfg
     stored, places = _open(cfg, widths)
     action = _numbers(stored, places[_ACTION])  # degrees, say, are far out of the ranges
-    low, high = stage.index.ctrl_range.T
+    low, high = stage.index.servo_range.T
     worst = np.maximum(low - action, action - high).max(0)
     joint = int(worst.argmax())
     if worst[joint] > _BEYOND:

@@ -71,7 +71,7 @@ class MjstackFollower(Robot):
         self._world = LerobotVectorEnv(self._cfg, 1, [*self.cameras])
         self._world.reset(seed=[self._seed])
         self.is_connected = True
-        half = 0.5 * _TICKS * np.diff(self._world.inner.index.ctrl_range)[:, 0]
+        half = 0.5 * _TICKS * np.diff(self._world.inner.index.servo_range)[:, 0]
         self.calibration = {
             name: MotorCalibration(k, 0, 0, round(2047.5 - ticks), round(2047.5 + ticks))
             for k, (name, ticks) in enumerate(zip(self._cfg.robot.joints, half, strict=True), 1)

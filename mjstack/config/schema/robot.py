@@ -93,7 +93,7 @@ class RobotCfg:
     folder. null: mjstack's own file of the robot."""
     root: str = ""
     """Body of the file that is the robot, with all below it; the rest is left out. Empty: the whole
-    file, without floors, lights and free bodies."""
+    file, without floors, lights, free and mocap bodies."""
     base: BasePoseCfg = field(default_factory=BasePoseCfg)
     """Where the file's origin stands in the world, such as on a pedestal."""
     gravcomp: Any = spec("auto", choices=("auto", True, False))
@@ -118,9 +118,9 @@ class RobotCfg:
     grasp_sites: list[str] = spec(length=2)
     """Two sites, on fingers, pads or palm, one at each jaw. Their midpoint is the grasp point."""
     grasp_parts: dict[str, list[str]] = spec({})
-    """Where a grasp site goes that the file lacks: the mean of these geoms or bodies of one jaw."""
+    """Where a grasp site goes that the file lacks: the mean of these geoms of a jaw, or a body."""
     grasp_pos: dict[str, Any] = spec({}, vectors=True, unit="m", length=3)
-    """Where such a site lies in the frame of the body that ``grasp_parts`` names; its origin."""
+    """Where such a site lies in the frame of that body; its origin, or the geoms' mean."""
     home: list[float] = spec(unit="rad, m")
     """Joint values at which a driven episode begins."""
     start: list[float] = spec([], unit="rad, m")

@@ -242,8 +242,8 @@ class SceneCfg:
     table_half: list[float] = spec(unit="m", length=3, gt=0.0)
     """Half sizes of the table."""
     frame: str = spec("world", choices=("world", "table"))
-    """Where positions of objects and places count from: the arm's base, or the middle of the
-    table's top. Loading turns them into the world's."""
+    """Where positions of objects and places count from: the world's origin, at which an arm stands
+    by default, or the middle of the table's top. Loading turns them into the world's."""
     table_friction: list[float] = spec([1.0, 0.005, 0.0005], length=3, gt=0.0)
     """Sliding, torsional and rolling coefficient of the table."""
     random_xy: list[float] = spec([0.03, 0.03], unit="m", length=2, ge=0.0)

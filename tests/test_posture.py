@@ -1,0 +1,303 @@
+"""Joints that follow, idle joints, and jaws: where they are at home, at starts and in inverse
+kinematics, against the equalities of native MuJoCo.
+"""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from compositions import refusal
+from ik_arm import Arm
+from test_guest import MJCF, SCARA, changed, scara
+
+from mjstack import load_config, make_env
+from mjstack.config.schema import Config
+from mjstack.episodes.stage import Stage
+from mjstack.errors import ConfigError
+from mjstack.kinematics.mink_ik import GraspIk
+from mjstack.kinematics.reach import PointReach
+from mjstack.robots.jaws import Jaws
+from mjstack.robots.posture import Posture
+from mjstack.scene import build_model
+from mjstack.scene.index import SceneIndex, gripper_targets
+
+SERVO = '<position name="right" class="finger" joint="right"/>'
+FINGERS = '<joint name="fingers" joint1="left" joint2="right" polycoef="0 1 0 0 0"/>'
+RIGHT = '<joint name="right" class="finger" axis="0 -1 0"/>'
+QUILL = '<body name="quill" pos="0 0 0" gravcomp="1">'
+WRIST = (
+    '<body name="wrist" pos="0.28 0 -0.315"><joint name="wrist" range="-3 3"/>'
+    '<inertial mass="0.1" pos="0 0 0" diaginertia="1e-3 1e-3 1e-3"/>' + QUILL
+)
+LEFT = {
+    "gripper_joints": ["left"],
+    "home": [-0.8, 1.6, 0.2, 0.0, 0.042],
+    "start": [-0.8, 1.6, 0.2, 0.0, 0.042],
+    "gripper_open": [0.042],
+    "gripper_closed": [0.0175],
+}
+
+
+def equality(first: str, second: str, coefs: str) -> str:
+    return f'<joint joint1="{first}" joint2="{second}" polycoef="{coefs}"/>'
+
+
+FOLLOWERS = {
+    "plain": ((FINGERS, equality("right", "left", "0 1 0 0 0")),),
+    "wrong sign": (
+        (FINGERS, equality("right", "left", "0 -1 0 0 0")),
+        (RIGHT, '<joint name="right" class="finger" axis="0 1 0" range="-0.05 0"/>'),
+    ),
+    "leader second": ((FINGERS, equality("left", "right", "0 1 0 0 0")),),
+    "tendons": (
+        (FINGERS, '<tendon tendon1="a" tendon2="b" polycoef="0 1 0 0 0"/>'),
+        (
+            "<equality>",
+            '<tendon><fixed name="a"><joint joint="left" coef="2"/></fixed><fixed name="b">'
+            '<joint joint="right" coef="2"/></fixed></tendon><equality>',
+        ),
+    ),
+    "connect": (
+        (FINGERS, '<connect body1="right_finger" body2="mirror" anchor="0 0 0"/>'),
+        (
+            '<body name="right_finger"',
+            '<body name="mirror"><joint name="mirror" class="finger" axis="0 -1 0"/>'
+            '<inertial mass="0.03" pos="0 0 0" diaginertia="2e-5 2e-5 4e-6"/></body>'
+            '<body name="right_finger"',
+        ),
+        ("</equality>", equality("mirror", "left", "0 1 0 0 0") + "</equality>"),
+    ),
+}
+
+
+def follower(tmp_path: Path, kind: str) -> Config:
+    """The SCARA with one servo at its gripper."""
+    return changed(tmp_path, (SERVO, ""), *FOLLOWERS[kind], **LEFT)
+
+
+def equality_error(model: mujoco.MjModel, qpos: np.ndarray) -> float:
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_forward(model, data)
+    rows = data.efc_type == int(mujoco.mjtConstraint.mjCNSTR_EQUALITY)
+    return float(np.abs(data.efc_pos[rows]).max(initial=0.0))
+
+
+@pytest.mark.parametrize("kind", FOLLOWERS)
+def test_a_finger_that_follows_has_its_place(kind: str, tmp_path: Path) -> None:
+    """As with two servos: the start, the grasp point, and how far the jaws close."""
+    cfg = follower(tmp_path, kind)
+    model = build_model(cfg)
+    qpos = SceneIndex(model, cfg.robot, cfg.scene).posture.qpos(np.array(cfg.robot.home))
+    assert equality_error(model, qpos) < 1e-9
+    right = float(qpos[model.joint("right").qposadr[0]])
+    assert right == pytest.approx(-0.042 if kind == "wrong sign" else 0.042, abs=1e-9)
+    ik = GraspIk(cfg.robot, cfg.model, tolerance=1e-4)
+    two = GraspIk(scara().robot, cfg.model, tolerance=1e-4)
+    expected = two.grasp_point(np.array([*cfg.robot.home, 0.042]))
+    np.testing.assert_allclose(ik.grasp_point(ik.home), expected, atol=1e-9)
+    targets = gripper_targets(model, cfg.robot, [0.030, 0.044, 0.060])
+    np.testing.assert_allclose(targets[:, 0], [0.0105, 0.0175, 0.0255], atol=1e-6)
+
+
+@pytest.mark.parametrize("sim", ["native", pytest.param("mjwarp", marks=pytest.mark.full)])
+def test_a_follower_starts_in_its_place(sim: str, tmp_path: Path) -> None:
+    cfg = follower(tmp_path, "wrong sign")
+    overrides = [f"sim={sim}", "nworld=4", "reset=randomized", "+reset.joints.params.gripper=0.003"]
+    options = [f"robot.{key}={value}" for key, value in LEFT.items()]
+    search = f"hydra.searchpath=[file://{SCARA}/conf]"
+    options = [o.replace(" ", "").replace("'", "") for o in options]
+    env = make_env([search, "robot=scara", f"robot.file={cfg.robot.file}", *options, *overrides])
+    env.reset(seed=3)
+    left, right = (env.sim.qpos[:, env.sim.model.joint(n).qposadr[0]] for n in ("left", "right"))
+    assert len(set(left.tolist())) == 4
+    torch.testing.assert_close(right, -left, atol=1e-7, rtol=0.0)
+
+
+IDLE = '<body name="mast"><joint name="mast" axis="0 1 0" range="0.5 2"/><inertial mass="0.1" '
+IDLE += 'pos="0 0 0" diaginertia="1e-3 1e-3 1e-3"/></body><body name="base">'
+
+
+COUPLINGS = {
+    "cubic": [equality("wrist", "elbow", "0.1 -0.5 0.1 0.02 0")],
+    "chain": [
+        equality("wrist", "mast", "0.05 -0.5 0 0 0"),
+        equality("mast", "shoulder", "0 0 1 0 0"),
+    ],
+}
+
+
+def coupled_arm(tmp_path: Path, kind: str) -> Config:
+    """The SCARA with a wrist that follows its arm."""
+    mast = '<body name="mast"><joint name="mast" axis="1 0 0" range="-9 9"/><inertial mass="0.1" '
+    mast += 'pos="0 0 0" diaginertia="1e-3 1e-3 1e-3"/></body><body name="base">'
+    tail = "            </body>\n          </body>\n        </body>"
+    return changed(
+        tmp_path,
+        ('<body name="quill" pos="0.28 0 -0.315" gravcomp="1">', WRIST),
+        (tail, "</body>" + tail),
+        ('<body name="base">', mast),
+        ("</equality>", "".join(COUPLINGS[kind]) + "</equality>"),
+    )
+
+
+@pytest.mark.parametrize("kind", COUPLINGS)
+def test_inverse_kinematics_takes_what_follows_along(kind: str, tmp_path: Path) -> None:
+    """mink, the batched solver and the reach agree with MuJoCo's grasp point, and reach it."""
+    cfg = coupled_arm(tmp_path, kind)
+    ik = GraspIk(cfg.robot, cfg.model, tolerance=1e-4)
+    places = Posture(ik.model, cfg.robot.joints)
+    arm = Arm(ik.model, cfg.robot)
+    goals = np.tile(ik.home, (8, 1))
+    goals[:, :3] += np.random.default_rng(1).uniform(-0.15, 0.15, (8, 3)) * [1.0, 1.0, 0.2]
+    assert max(equality_error(ik.model, places.qpos(goal)) for goal in goals) < 1e-7
+    points = np.array([ik.grasp_point(goal) for goal in goals])
+    solver = arm.solver(8, iterations=40)
+    np.testing.assert_allclose(solver.forward(torch.from_numpy(goals))[0], points, atol=1e-6)
+    start = torch.from_numpy(np.tile(ik.home, (8, 1)))
+    command, distance = solver.solve(start, torch.from_numpy(points))
+    assert distance.max() < 1e-5
+    for k, point in enumerate(points):
+        assert np.linalg.norm(ik.grasp_point(command[k].double().numpy()) - point) < 1e-5
+        assert ik.solve(point, ik.home)[1] < 1e-4
+    reach = PointReach(ik.model, cfg.robot, cfg.robot.home[4:])
+    q, left = reach.solve(points)
+    assert left.max() < 1e-5
+    np.testing.assert_allclose(reach.forward(q)[1], points, atol=1e-5)
+
+
+def test_a_joint_that_follows_two_is_refused(tmp_path: Path) -> None:
+    joints = "".join(
+        f'<joint joint="{name}" coef="{coef}"/>'
+        for name, coef in (("mast", 1), ("shoulder", 0.5), ("elbow", 0.5))
+    )
+    tendon = f'<tendon><fixed name="t">{joints}</fixed></tendon><equality>'
+    pairs = (
+        ('<body name="base">', IDLE.replace("0.5 2", "-9 9")),
+        (FINGERS, '<tendon tendon1="t" polycoef="0 0 0 0 0"/>'),
+        ("<equality>", tendon),
+    )
+    cfg = changed(tmp_path, *pairs)
+    line = "joint mast follows shoulder and elbow"
+    refusal(lambda: GraspIk(cfg.robot, cfg.model, tolerance=1e-4), line)
+
+
+def test_a_value_that_the_equalities_do_not_allow_is_refused(tmp_path: Path) -> None:
+    cfg = replace(scara(), robot=replace(scara().robot, home=[-0.8, 1.6, 0.2, 0.0, 0.045, 0.02]))
+    line = "robot.home of right=0.02: expected 0.045, as the file's equalities have it"
+    refusal(lambda: GraspIk(cfg.robot, cfg.model, tolerance=1e-4), line, kind=ConfigError)
+
+
+MAST = '<actuator><position name="mast" joint="mast" kp="5" kv="1" inheritrange="1"/>'
+KEY = '<keyframe><key name="home" qpos="1.2 0 1 0 0 0 0"/></keyframe></mujoco>'
+
+
+@pytest.mark.parametrize(("key", "angle"), [("</mujoco>", 0.5), (KEY, 1.2)])
+def test_an_idle_joint_keeps_the_files_home_within_its_range(
+    key: str, angle: float, tmp_path: Path
+) -> None:
+    """Whatever its range, inverse kinematics is not held by it."""
+    cfg = changed(tmp_path, ('<body name="base">', IDLE), ("<actuator>", MAST), ("</mujoco>", key))
+    ik = GraspIk(cfg.robot, cfg.model, tolerance=1e-4)
+    off = np.array([0.02, 0.03, -0.05])
+    _, distance = ik.solve(ik.grasp_point(ik.home) + off, ik.home)
+    assert distance < 1e-4
+    search = f"hydra.searchpath=[file://{SCARA}/conf]"
+    overrides = ["robot=scara", f"robot.file={cfg.robot.file}", "sim=native", "nworld=2"]
+    env = make_env([search, *overrides])
+    env.reset(seed=0)
+    mast = int(env.sim.model.joint("mast").qposadr[0])
+    assert env.sim.qpos[:, mast].tolist() == pytest.approx([angle] * 2)
+    env.sim.step(100)
+    assert env.sim.qpos[:, mast].tolist() == pytest.approx([angle] * 2, abs=0.02)
+
+
+def test_a_target_out_of_reach_is_a_finite_distance_away(tmp_path: Path) -> None:
+    ik = GraspIk(scara().robot, scara().model, tolerance=1e-4)
+    start = ik.home.copy()
+    start[1] = 9.0  # beyond its range
+    assert np.isfinite(ik.solve(np.array([0.4, 0.0, 0.2]), start)[1])
+    robot = replace(scara().robot, locked={"roll": 9.0})
+    line = "robot.locked of roll=9.0: expected a value within"
+    refusal(lambda: GraspIk(robot, scara().model, tolerance=1e-4), line, kind=ConfigError)
+
+
+# --- Grip
+
+
+@pytest.mark.parametrize("sites", ["fingers", "palm"])
+def test_widths_of_the_grip_need_no_sites_on_the_fingers(sites: str, tmp_path: Path) -> None:
+    """With sites on the palm the pads' distance counts, as with those on the pads."""
+    pairs = []
+    if sites == "palm":
+        for y, side in ((0.022, "left"), (-0.022, "right")):
+            pairs.append((f'<site name="{side}_grasp" pos="0 0 -0.13"/>', ""))
+            site = f'<site name="{side}_grasp" pos="0 {y} -0.13"/><body name="left_finger"'
+            pairs.append(('<body name="left_finger"', site))
+    cfg = changed(tmp_path, *pairs)
+    targets = gripper_targets(build_model(cfg), cfg.robot, [0.030, 0.044, 0.060])
+    np.testing.assert_allclose(targets[:, 0], [0.011, 0.018, 0.026], atol=1e-6)
+
+
+def test_joint_targets_follow_from_the_jaws_where_none_are_given(tmp_path: Path) -> None:
+    """The jaws press with 20 N on each object, and open as far as they can."""
+    robot = replace(scara().robot, gripper_open=None, gripper_closed=None)
+    model = build_model(scara())
+    widths = (None, 0.030, 0.050)
+    opened, *closed = gripper_targets(model, robot, widths)
+    assert opened.tolist() == model.joint("left").range[1:].tolist() * 2
+    stiffness = model.actuator("left").gainprm[0]
+    for target, width in zip(closed, widths[1:], strict=True):
+        assert stiffness * (0.5 * width - target[0]) == pytest.approx(20.0, rel=1e-3)
+
+
+def test_a_joint_target_of_a_task_is_for_any_object(tmp_path: Path) -> None:
+    """A robot's own is for 44 mm; one that a task or the command line sets means just that."""
+    task = tmp_path / "conf" / "task" / "peg.yaml"
+    task.parent.mkdir(parents=True)
+    task.write_text("# @package _global_\ndefaults: [stack]\nrobot: {gripper_closed: [0.22]}\n")
+    folder = tmp_path / "conf"
+    model = build_model(load_config())
+
+    def targets(*overrides: str) -> list[float]:
+        robot = load_config(overrides, config_dir=folder).robot
+        return gripper_targets(model, robot, [0.032, 0.044])[:, 0].tolist()
+
+    assert targets("task=peg") == [0.22, 0.22]
+    assert targets("robot.gripper_closed=[0.3]") == [0.3, 0.3]
+    narrow, cube = targets()
+    assert narrow < 0.25
+    assert cube == 0.3
+    with_width = targets("task=peg", "robot.closed_width=0.032")
+    assert with_width[0] == 0.22
+    assert with_width[1] > 0.25
+    line = "controller.phases.lift_red.width=0.03: expected null, because robot.gripper_closed"
+    refusal(lambda: targets("task=peg", "controller.phases.lift_red.width=0.03"), line)
+
+
+def test_a_jaw_is_all_that_hangs_below_its_body(tmp_path: Path) -> None:
+    """Pads are children of the bodies that the profile names, as those of a linkage are."""
+    text = MJCF
+    for side in ("left", "right"):
+        pad = re.search(rf' *<geom name="{side}_pad".*/>\n', text)
+        assert pad is not None
+        body = f'<body name="{side}_tip" gravcomp="1">{pad[0]}</body>\n'
+        text = text.replace(pad[0], body)
+    file = tmp_path / "arm.xml"
+    file.write_text(text)
+    search = f"hydra.searchpath=[file://{SCARA}/conf]"
+    cfg = load_config([search, "robot=scara", f"robot.file={file}", "sim=native", "nworld=1"])
+    stage = Stage(cfg)
+    outcome = stage.play(stage.batch_simulation(1), cfg.reset)
+    assert not bool(outcome.result.failed.any())
+    jaws = Jaws(
+        stage.model,
+        *(tuple(n) for n in (cfg.robot.joints, cfg.robot.gripper_joints)),
+        cfg.robot.jaw_bodies,
+        cfg.robot.grasp_sites,
+    )
+    np.testing.assert_allclose(jaws.gap([np.array([0.01, 0.01])]), [0.02], atol=1e-9)
