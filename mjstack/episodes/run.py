@@ -123,17 +123,13 @@ class Run:
         viewers = () if "parity" in self.cfg.gates else self.viewers
         episode = stage.play(sim, reset, [*viewers, world, snapshots, sent])
         states = snapshots.states
-        absolute = all(term.params.get("mode") == "absolute" for term in stage.action.values())
-        return NominalRun(
-            sim=sim,
-            episode=episode,
-            world=world,
-            states=states,
-            targets={
-                step: actions[step] if absolute else state.ctrl[0][stage.index.ctrl]
-                for step, state in states.items()
-            },
-        )
+        modes = [(t.params.get("joints"), t.params.get("mode")) for t in stage.action.values()]
+        absolute = modes == [("arm", "absolute"), ("gripper", "absolute")]
+        targets = {
+            step: actions[step] if absolute else state.ctrl[0][stage.index.ctrl]
+            for step, state in states.items()
+        }
+        return NominalRun(sim=sim, episode=episode, world=world, states=states, targets=targets)
 
     @property
     def parity_steps(self) -> dict[str, int]:

@@ -63,7 +63,7 @@ def find_cause(stage: Stage, state: State, target: np.ndarray) -> str:
     unit, newton = ("rad", "N m") if turns else ("m", "N")
     text = f"{name} is {abs(off[worst]):.3g} {unit} off"
     if not np.isclose(bounded := data.ctrl[servo], target[worst], atol=1e-5):
-        return f"{text}; its servo's range bounds its target {target[worst]:.3g} to {bounded:.3g}"
+        return f"{text}; its range bounds its target {target[worst]:.3g} to {bounded:.3g}"
     most = np.inf
     if model.actuator_forcelimited[servo]:
         most = model.actuator_forcerange[servo].max()

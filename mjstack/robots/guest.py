@@ -50,10 +50,11 @@ def as_guest(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) ->
         spec.delete(element)
     bodies = [body.name for body in spec.bodies]
     for pair in robot.exclude:
-        require_names("robot.exclude: body", pair, bodies)
-        if len({*pair}) != 2 or len(pair) != 2:
-            raise ConfigError("robot.exclude", pair, "two bodies for each pair")
-        spec.add_exclude(bodyname1=pair[0], bodyname2=pair[1])
+        if not isinstance(pair, list) or len(pair) != 2 or len({*map(str, pair)}) != 2:
+            expected = "pairs of bodies, such as [[world, link1]]"
+            raise ConfigError("robot.exclude", robot.exclude, expected)
+        require_names("robot.exclude: body", map(str, pair), bodies)
+        spec.add_exclude(bodyname1=str(pair[0]), bodyname2=str(pair[1]))
     for camera in [c for c in spec.cameras if c.targetbody and c.targetbody not in bodies]:
         spec.delete(camera)
     geoms = {geom.name for geom in spec.geoms}

@@ -99,7 +99,7 @@ class RobotCfg:
     gravcomp: Any = spec("auto", choices=("auto", True, False))
     """Whether gravity of the robot's bodies is compensated. auto: as in its file, and where that
     compensates none, if the hand would sag more than 2 mm at home."""
-    exclude: list[list[str]] = spec([])
+    exclude: list[Any] = spec([])
     """Pairs of the robot's bodies that do not collide, such as ``[world, link1]``."""
     menagerie_name: str = ""
     """The robot's folder in MuJoCo Menagerie, for ``model=menagerie``."""
