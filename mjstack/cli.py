@@ -97,9 +97,7 @@ def _dispatch(flags: Namespace, overrides: list[str]) -> int:
         if overrides[:1] == ["list"]:
             print(list_text(overrides[1:]), flush=True)
         elif overrides[:1] == ["new"]:
-            from mjstack.robots.new import write_new  # it loads MuJoCo
-
-            print("\n".join(map(str, write_new(overrides[1:]))))
+            return _write_new(overrides[1:], flags.arm)
         elif overrides[:1] == ["doctor"]:
             from mjstack.jobs.doctor import findings  # it loads Warp
 
@@ -122,6 +120,23 @@ def _dispatch(flags: Namespace, overrides: list[str]) -> int:
                 show_demo(_results[-1].folder, arm)
             return status
     return 0
+
+
+def _write_new(args: list[str], arm: str) -> int:
+    """Write the files of `mjstack new`; for a robot, show guesses and picture, run *baseline*."""
+    from mjstack.robots.new import write_new  # it loads MuJoCo
+
+    paths, guesses = write_new(args, arm)
+    print("\n".join(map(str, paths)))
+    if not guesses:
+        return 0
+    from mjstack.jobs.new_robot import show_guesses  # it loads torch
+
+    name, folder = args[1], paths[0].parent.parent
+    with search_path([folder]), hydra_session() as hydra:
+        overrides = [f"robot={name}", "sim=native", "nworld=1", "gates=[baseline]"]
+        show_guesses(guesses, to_config(compose(overrides)), folder.parent / "home.png")
+        return _run_one(hydra, overrides)
 
 
 def _show(hydra: Any, flags: Namespace, overrides: list[str]) -> None:
@@ -307,6 +322,7 @@ def _parse(args: list[str]) -> Namespace:
     parser.error = refuse  # type: ignore[method-assign]
     parser._optionals.conflict_handler = "resolve"
     parser.add_argument("--config-dir", "-cd", action="append", default=[])  # several add up
+    parser.add_argument("--arm", default="")  # of `new robot`
     known = set(parser._option_string_actions) - _NOT_OFFERED
     for arg in args:
         if arg.startswith("-") and arg.partition("=")[0] not in known:

@@ -4,8 +4,10 @@ import os
 import runpy
 from collections.abc import Sequence
 from pathlib import Path
-from xml.sax.saxutils import quoteattr
+from typing import Any
+from xml.sax.saxutils import escape
 
+import numpy as np
 import pytest
 import torch
 from doc_blocks import ROOT
@@ -13,6 +15,9 @@ from environments import Capture, Patch, Refused
 
 import mjstack
 from mjstack.cli import run
+from mjstack.errors import MjstackError
+from mjstack.robots.new import write_new
+from mjstack.robots.profile import guess_profile
 
 GATES = "gates=[baseline,parity,capacity,batch]"
 
@@ -44,21 +49,29 @@ def test_it_passes_the_gates_with_both_robots(arm: str, here: Path) -> None:
         runpy.run_path(str(folder / f"test_fresh_{arm}.py"))["test_the_gates_pass"]()
 
 
-def test_a_robot_is_read_from_its_file(here: Path) -> None:
-    """What the example's own YAML says, as far as the XML tells."""
-    assert run(["new", "robot", "fresh_scara", str(ROOT / "examples/scara/scara.xml")]) == 0
-    folder = here / "fresh_scara" / "conf"
-    robot = mjstack.load_config(["robot=fresh_scara"], config_dir=folder).robot
-    example = mjstack.load_config(["robot=scara"], config_dir=ROOT / "examples/scara/conf").robot
-    for key in ("file", "arm_joints", "gripper_joints", "jaw_bodies", "grasp_sites"):
-        assert getattr(robot, key) == getattr(example, key), key
-    assert robot.gripper_open == [0.05, 0.05]
-    assert robot.home == [0.0, 0.1, 0.0, 0.0, 0.0, 0.0]  # within the elbow's range
-    assert run(["new", "robot", "fresh_arm", str(ROOT / "mjstack/robots/so101.xml")]) == 0
-    arm = mjstack.load_config(["robot=fresh_arm"], config_dir=here / "fresh_arm" / "conf").robot
-    builtin = mjstack.load_config().robot
-    for key in ("arm_joints", "gripper_joints", "jaw_bodies", "grasp_sites"):
-        assert getattr(arm, key) == getattr(builtin, key), key
+@pytest.mark.parametrize(
+    ("name", "file", "config"),
+    [
+        ("scara", "examples/scara/scara.xml", ["robot=scara"]),
+        ("so101", "mjstack/robots/so101.xml", []),
+    ],
+)
+def test_a_robot_is_read_from_its_file(
+    name: str, file: str, config: list[str], here: Path, capsys: Capture
+) -> None:
+    """What the project's own YAML says of it, and gate *baseline* passes as it is written."""
+    assert run(["new", "robot", f"fresh_{name}", str(ROOT / file)]) == 0
+    printed = capsys.readouterr().out
+    assert "pass baseline" in printed
+    assert "branches" in printed or "one jaw" in printed
+    folder = here / f"fresh_{name}"
+    assert (folder / "home.png").stat().st_size > 10_000 or "offscreen" in printed
+    robot = mjstack.load_config([f"robot=fresh_{name}"], config_dir=folder / "conf").robot
+    own = mjstack.load_config(config, config_dir=ROOT / "examples/scara/conf").robot
+    for key in ("arm_joints", "gripper_joints", "jaw_bodies", "roll_joint", "approach_axis"):
+        assert getattr(robot, key) == getattr(own, key), key
+    assert Path(str(robot.file)).samefile(ROOT / file)
+    assert [joint for joint in robot.arm_joints if joint in robot.locked] == [*own.locked]
 
 
 NAMES = [
@@ -68,15 +81,139 @@ NAMES = [
 ]  # fmt: skip
 
 
-def arm(names: Sequence[str]) -> str:
-    """An MJCF file with a body, a joint and a site for each name, one on the other."""
-    bodies = [
-        f"<body name={quoteattr(f'{name} body')}><joint name={quoteattr(name)}/>"
-        f"<geom size='0.1'/><site name={quoteattr(f'{name} site')}/>"
-        for name in names
-    ]
-    text = f"<mujoco><worldbody>{''.join(bodies)}{'</body>' * len(bodies)}</worldbody></mujoco>"
-    return text.replace("\n", "&#10;")
+PLAIN = ["x", "y", "z", "roll", "left", "right", "bridge", "hand", "left jaw", "right jaw"]
+
+
+def gantry(
+    names: Sequence[str] = PLAIN,
+    *,
+    actuators: str = "<position joint='{0}' kp='500' kv='50'/>",
+    roll: str = "range='-3 3'",
+    right: str = "<position joint='{0}' kp='500' kv='50'/>",
+    more: str = "",
+    base: str = "",
+    world: str = "",
+    root: str = "",
+) -> str:
+    """An MJCF file of three slides, a roll and two fingers; ``names`` are those of its joints and
+    of some of its bodies.
+    """
+    x, y, z, turn, left, rightmost, bridge, hand, one, two = (
+        escape(n, {'"': "&quot;"}) for n in names
+    )
+    servos = "".join(actuators.format(name) for name in (x, y, z, turn, left))
+    text = f"""<mujoco><compiler angle="radian"/>
+    <default><geom mass="0.1"/><joint damping="1" armature="0.01"/></default>
+    <worldbody>{world}<body pos="0 0 0.5" {base}>{root}
+      <body name="{bridge}">
+        <joint name="{x}" type="slide" axis="1 0 0" range="-0.4 0.4"/>
+        <joint name="{y}" type="slide" axis="0 1 0" range="-0.4 0.4"/><geom size="0.02"/>
+        <body><joint name="{z}" type="slide" axis="0 0 1" range="-0.45 0"/><geom size="0.02"/>
+          <body name="{hand}"><joint name="{turn}" axis="0 0 1" {roll}/>
+            <geom type="box" size="0.02 0.06 0.01" pos="0 0 -0.03"/>
+            <body name="{one}"><joint name="{left}" type="slide" axis="0 1 0" range="0 0.04"/>
+              <geom type="box" size="0.01 0.005 0.03" pos="0 0.005 -0.07" friction="1.5"/></body>
+            <body name="{two}"><joint name="{rightmost}" type="slide" axis="0 -1 0" range="0 0.04"/>
+              <geom type="box" size="0.01 0.005 0.03" pos="0 -0.005 -0.07" friction="1.5"/></body>
+          </body></body></body></body></worldbody>
+    <actuator>{servos}{right.format(rightmost)}</actuator>{more}</mujoco>"""
+    return text.replace("\n", "&#10;") if "\n" in "".join(names) else text
+
+
+MIMIC = "<equality><joint joint1='right' joint2='left' polycoef='0 1 0 0 0'/></equality>"
+TENDON = (
+    "<tendon><fixed name='t'><joint joint='left' coef='0.5'/><joint joint='right' coef='0.5'/>"
+    "</fixed></tendon><actuator><general tendon='t' gainprm='4' biasprm='0 -1000 -30' biastype="
+    "'affine' ctrlrange='0 10'/></actuator>"
+)
+KINDS: dict[str, tuple[dict[str, str], dict[str, object]]] = {
+    "two servos": ({}, {"gripper_joints": ["left", "right"], "gripper_open": [0.04, 0.04]}),
+    "a finger that follows": (
+        {"right": "", "more": MIMIC},
+        {"gripper_joints": ["left"], "jaw_bodies": ["left jaw", "right jaw"]},
+    ),
+    "no range": ({"roll": ""}, {"ranges": {"roll": [-6.283, 6.283]}, "roll_joint": "roll"}),
+    "a whole scene": (
+        {
+            "world": "<geom type='plane' size='1 1 1'/><geom name='table' type='box' size='1 1 .1'"
+            " pos='0 0 -.1'/><body name='cube'><freejoint/><geom name='cube' size='.02'/></body>"
+        },
+        {"root": "unnamed_2"},
+    ),
+    "a base that floats": ({"root": "<freejoint/><geom size='.05'/>"}, {"root": "bridge"}),
+    "a base that drives": (
+        {"root": "<joint name='d' type='slide' axis='1 0 0'/><geom size='.05'/>"},
+        {"root": "bridge", "arm_joints": ["x", "y", "z", "roll"]},
+    ),
+}
+
+
+SCENE = mjstack.load_config().scene
+
+
+def guess(text: str, arm: str = "") -> dict[str, Any]:
+    Path("arm.xml").write_text(text)
+    return {guess.key: guess.value for guess in guess_profile(Path("arm.xml"), SCENE, arm)}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_files_of_many_kinds_are_read(kind: str, here: Path) -> None:
+    options, expected = KINDS[kind]
+    robot = guess(gantry(**options))
+    assert {key: robot.get(key) for key in expected} == expected
+    assert robot["approach_axis"] == [0.0, 0.0, -1.0]
+    assert robot["arm_joints"] == ["x", "y", "z", "roll"]
+    assert "servos" not in robot
+    point = np.mean([robot["grasp_pos"][site] for site in robot["grasp_sites"]], axis=0)
+    assert point == pytest.approx([0.0, 0.0, -0.084], abs=2e-4)  # 16 mm above the tips' ends
+    center = robot["placements"]["stack"]["table_center"]
+    assert center[2] == 0.012
+
+
+def test_servos_are_made_where_the_file_has_motors_or_none(here: Path) -> None:
+    motors = gantry(actuators="<motor joint='{0}' ctrlrange='-9 9' gear='2'/>", right="")
+    robot = guess(motors.replace("</actuator>", "</actuator>" + MIMIC))
+    assert list(robot["servos"]) == ["x", "y", "z", "roll", "left"]
+    assert {servo["effort"] for servo in robot["servos"].values()} == {18.0}
+    bare = guess(gantry(actuators="", right=""))
+    assert list(bare["servos"]) == ["x", "y", "z", "roll", "left", "right"]
+    assert bare["servos"]["z"]["effort"] > 3.0 * 0.4 * 9.81  # what hangs on it
+
+
+def test_a_weak_gripper_gets_stiffer_servos(here: Path) -> None:
+    robot = guess(gantry(right="<position joint='{0}' kp='20' kv='2'/>").replace("500", "20", 1))
+    assert "servos" not in robot  # the arm's are the file's own
+    weak = gantry().replace("joint='left' kp='500'", "joint='left' kp='20'")
+    robot = guess(weak.replace("joint='right' kp='500'", "joint='right' kp='20'"))
+    first, second = robot["servos"].values()
+    assert first == second
+    assert first["stiffness"] * 0.022**2 * 2 / 0.044 == pytest.approx(20.0, rel=0.02)  # N
+
+
+def test_one_of_two_arms_is_chosen(here: Path) -> None:
+    one, two = (
+        gantry([f"{side} {name}" for name in PLAIN]).replace('pos="0 0 0.5"', f'pos="0 {y} 0.5"')
+        for side, y in (("a", 0.6), ("b", -0.6))
+    )
+    body, servos = (two.split(f"<{t}>")[1].split(f"</{t}>")[0] for t in ("worldbody", "actuator"))
+    both = one.replace("</worldbody>", body + "</worldbody>")
+    both = both.replace("</actuator>", servos + "</actuator>")
+    robot = guess(both)
+    assert (robot["arm_joints"][0], robot["base"]["pos"][1]) == ("a x", -0.6)
+    robot = guess(both, "B X")
+    assert (robot["arm_joints"][0], robot["base"]["pos"][1]) == ("b x", 0.6)
+    with pytest.raises(MjstackError, match="--arm c x: expected a part of a name of a hand or b"):
+        guess(both, "c x")
+
+
+def test_a_high_arm_gets_a_table_in_its_reach(here: Path) -> None:
+    """On a pedestal the table is higher; below the floor the base is."""
+    for height, base, table in ((1.2, None, 0.7), (0.0, 0.5, 0.012)):
+        robot = guess(gantry().replace('pos="0 0 0.5"', f'pos="0 0 {height}"'))
+        raised = robot.get("base", {"pos": [0, 0, 0]})["pos"][2]
+        assert raised == pytest.approx(base or 0.0, abs=0.2)
+        found = robot["placements"]["stack"]["table_center"][2]
+        assert found == pytest.approx(table, abs=0.2)
 
 
 def test_names_come_back_as_they_are(here: Path) -> None:
@@ -84,38 +221,44 @@ def test_names_come_back_as_they_are(here: Path) -> None:
     folder = here / "it's a: #1\nname: x"
     folder.mkdir()
     file = folder / "arm.xml"
-    file.write_text(arm([*NAMES, "left finger", "right finger"]))
-    assert run(["new", "robot", "odd", str(file)]) == 0
-    robot = mjstack.load_config(["robot=odd"], config_dir=here / "odd" / "conf").robot
-    assert robot.name == "odd"
-    assert robot.arm_joints == NAMES
-    assert robot.gripper_joints == ["left finger", "right finger"]
-    assert robot.jaw_bodies == ["left finger body", "right finger body"]
-    assert robot.grasp_sites == ["left finger site", "right finger site"]
-    assert robot.file == str(file)
+    for number in range(0, len(NAMES), 10):
+        names = [*NAMES[number : number + 10], *PLAIN][:10]
+        file.write_text(gantry(names))
+        name = f"odd_{number}"
+        write_new(["robot", name, str(file)])
+        robot = mjstack.load_config([f"robot={name}"], config_dir=here / name / "conf").robot
+        assert robot.name == name
+        assert robot.joints == names[:6]
+        assert robot.approach_body == names[7]
+        assert sorted(robot.jaw_bodies) == sorted(names[8:])
+        assert robot.file == str(file)
 
 
+ROLL_ALONE = gantry().split('<body name="left jaw">')[0] + 4 * "</body>" + "</worldbody></mujoco>"
 REFUSED = {
-    "interpolation": (arm(["x${oc.env:HOME}", "jaw"]), "'x${oc.env:HOME}' in it means something"),
-    "missing value": (arm(["???", "jaw"]), "'???' in it means something else"),
-    "no joints": ("<mujoco><worldbody/></mujoco>", "it has 0 hinges and slides, fewer than"),
+    "interpolation": (gantry(["x${oc.env:HOME}", *PLAIN[1:]]), "'x${oc.env:HOME}' in it means"),
+    "missing value": (gantry(["???", *PLAIN[1:]]), "'???' in it means something else"),
+    "no joints": ("<mujoco><worldbody/></mujoco>", "expected an arm of two joints or more"),
     "free": (
         "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>",
-        "it has 0 hinges and slides",
+        "no body has fingers, or one jaw, at the end of joints",
     ),
-    "no name": (arm(["", "jaw"]).replace('joint name=""', "joint"), "the name '' in it"),
-    "text": ("<mujoco", "expected an MJCF file: XML parse error"),
+    "no gripper": (ROLL_ALONE, "its fingers open by 0 mm only"),
+    "no name": (gantry().replace('name="z"', ""), "the joint of body unnamed_3 has no name"),
+    "sideways": (
+        gantry().replace('pos="0 0 0.5"', 'pos="0 0 0.5" quat="1 1 0 0"'),
+        "the hand of hand cannot point down over a table within the arm's reach",
+    ),
+    "thick fingers": (gantry().replace("0 0.04", "0 0.01"), "its fingers open by 20 mm only"),
+    "text": ("<mujoco", "arm.xml cannot be read: XML parse error"),
 }
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_a_robot_that_no_profile_can_name_is_refused(
-    name: str, here: Path, refused: Refused
-) -> None:
+def test_a_file_that_no_profile_fits_is_refused(name: str, here: Path, refused: Refused) -> None:
     content, message = REFUSED[name]
     (here / "arm.xml").write_text(content)
     line = refused("new", "robot", "odd", "arm.xml")
-    assert line.startswith("mjstack: arm.xml: expected an MJCF file: ")
     assert message in line
     assert not (here / "odd").exists()
 

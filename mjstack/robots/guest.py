@@ -210,7 +210,8 @@ def _strangers(spec: mujoco.MjSpec, robot: RobotCfg) -> list[Any]:
             missing,
             [j.name for b in _below(root) for j in b.joints],
         )
-        out = [*spec.keys, *world.lights, *world.geoms, *outside]
+        carried = [joint for body in _above(root) for joint in body.joints]  # its base stands
+        out = [*spec.keys, *world.lights, *world.geoms, *outside, *carried]
     return out
 
 

@@ -6,27 +6,32 @@ import re
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
-import mujoco
 import yaml  # type: ignore[import-untyped]
 
+from mjstack.config.load import load_config
 from mjstack.config.session import CONFIG_FOLDER, list_choices
-from mjstack.errors import MjstackError, first_line
+from mjstack.errors import MjstackError
 from mjstack.files import check_regular
+from mjstack.robots.profile import Guess, guess_profile
 
-_MISSING = "fill_in"
-_SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)  # hinges follow; others are not the robot's own
 _GROUPS = {"task": "task", "robot": "robot", "driver": "controller", "action": "action"}
-_GRIPPER = re.compile("grip|finger|jaw|thumb|left|right", re.IGNORECASE)
+_PLAIN = re.compile("[A-Za-z][A-Za-z0-9_]+")  # needs no quotation marks, unless it is a value
 
 
-def write_new(args: Sequence[str]) -> list[Path]:
+def write_new(args: Sequence[str], arm: str = "") -> tuple[list[Path], list[Guess]]:
     """Write the files of ``task``, ``driver`` or ``action NAME``, or of ``robot NAME FILE.xml``,
-    into a new folder NAME; a MjstackError if the arguments are others, NAME exists, or MuJoCo
-    cannot compile the file.
+    into a new folder NAME; a MjstackError if the arguments are others, NAME exists, or the file has
+    no arm that can be used. Returns the paths, and what was guessed of a robot; ``arm`` is a part
+    of the names of the arm that counts.
     """
     kind, name = (*args, "", "")[:2]
-    if len(args) != (3 if kind == "robot" else 2) or kind not in _GROUPS:
+    if (
+        len(args) != (3 if kind == "robot" else 2)
+        or kind not in _GROUPS
+        or (arm and kind != "robot")
+    ):
         expected = "task, driver or action NAME, or robot NAME FILE.xml, such as new task lift"
         raise MjstackError(f"new {' '.join(args)}: expected {expected}.")
     folder = Path(name)
@@ -37,66 +42,54 @@ def write_new(args: Sequence[str]) -> list[Path]:
             f"new {kind} {name}: expected small letters, digits and _, and no folder, {kind} or"
             " Python module of that name. Choose another name."
         )
-    words = {"NAME": name} | (_read_robot(Path(args[2]), folder) if kind == "robot" else {})
     text = (CONFIG_FOLDER / "new" / f"{kind}.txt").read_text(encoding="utf-8")
-    _, *parts = re.split(r"(?m)^=== (.+)\n", re.sub("@([A-Z]+)@", lambda m: words[m[1]], text))
-    paths = [folder / path for path in parts[::2]]
-    for path, content in zip(paths, parts[1::2], strict=True):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(content, encoding="utf-8")
-    return paths
+    _, *parts = re.split(r"(?m)^=== (.+)\n", text.replace("@NAME@", name))
+    contents = dict(zip(parts[::2], parts[1::2], strict=True))
+    profile: list[Guess] = []
+    if kind == "robot":
+        file = Path(args[2])
+        try:
+            check_regular(file)
+        except (OSError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise MjstackError(f"{file}: expected an MJCF file: {reason}.") from error
+        profile = guess_profile(file, load_config([]).scene, arm)
+        path = f"conf/robot/{name}.yaml"
+        source = os.path.relpath(file, folder / "conf" / "robot")
+        lines = [("file", source, "relative to this YAML"), *profile]
+        contents[path] += "".join(_line(*line) for line in lines)
+    paths = [folder / path for path in contents]
+    for target, content in zip(paths, contents.values(), strict=True):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(content, encoding="utf-8")
+    return paths, profile
 
 
-def _read_robot(file: Path, folder: Path) -> dict[str, str]:
-    """Joints, jaws and sites of an MJCF file, as YAML has them; a MjstackError if it cannot be
-    read, has too few joints, or a name that YAML cannot have.
+def _line(key: str, value: Any, comment: str) -> str:
+    """A key with its value in one line of YAML that reads as the same, whatever the names in it.
+
+    Raises:
+        MjstackError: The configuration takes a name for another value.
     """
-    try:
-        check_regular(file)
-        model = mujoco.MjModel.from_xml_path(str(file))
-        joints = [model.joint(k) for k in range(model.njnt) if model.jnt_type[k] >= _SLIDE]
-        gripper = [joint for joint in joints if _GRIPPER.search(joint.name)]
-        if len(gripper) in (0, len(joints)):
-            gripper = joints[-1:]
-        joints = [joint for joint in joints if joint not in gripper] + gripper
-        if len(joints) < 2:
-            raise ValueError(f"it has {len(joints)} hinges and slides, fewer than arm and gripper")
-        jaws = [int(joint.bodyid[0]) for joint in gripper]
-        if len(jaws) == 1:
-            jaws.insert(0, int(model.body_parentid[jaws[0]]))
-        names = {jaw: [_MISSING] for jaw in jaws}
-        for site in map(model.site, range(model.nsite)):
-            names.get(int(site.bodyid[0]), []).append(site.name or _MISSING)
-        sites = [
-            max(on_jaw[1:] or on_jaw, key=lambda name: "grasp" in name) for on_jaw in names.values()
-        ]
-        qpos = model.key_qpos[0] if model.nkey else model.qpos0
-        home = [min(max(float(qpos[j.qposadr[0]]), j.range[0]), j.range[1]) for j in joints]
-        values = {
-            "FILE": os.path.relpath(file, folder / "conf" / "robot"),
-            "ARM": [joint.name for joint in joints[: -len(gripper)]],
-            "GRIPPER": [joint.name for joint in gripper],
-            "JAWS": [model.body(body).name or _MISSING for body in jaws],
-            "SITES": sites[:2],
-            "HOME": [round(float(value), 4) for value in home],
-            "OPEN": [round(float(joint.range[1]), 4) for joint in gripper],
-            "CLOSED": [round(float(joint.range.mean()), 4) for joint in gripper],
-        }
-        return {key: _to_yaml(value) for key, value in values.items()}
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or first_line(error)
-        raise MjstackError(f"{file}: expected an MJCF file: {reason}.") from error
+    return f"{key}: {_to_yaml(value)}{comment and f' # {comment}'}\n"
 
 
-def _to_yaml(value: object) -> str:
-    """A name, a number or a list of them in one line of YAML that reads as the same; a `ValueError`
-    for a name that the configuration takes for another value.
-    """
+def _to_yaml(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{_to_yaml(k)}: {_to_yaml(v)}" for k, v in value.items()) + "}"
     if isinstance(value, list):
         return f"[{', '.join(map(_to_yaml, value))}]"
     if not isinstance(value, str):
         return str(value)
     if value in ("", "???") or "${" in value:
-        raise ValueError(f"the name {value!r} in it means something else in YAML, or nothing")
-    value.encode()
+        problem = f"the name {value!r} in it means something else in the configuration, or nothing"
+        raise MjstackError(f"{problem}, expected another one. Rename it in the file.")
+    try:
+        value.encode()
+    except UnicodeError as error:
+        raise MjstackError(
+            f"the name {value!r} in it is no text. Rename it in the file."
+        ) from error
+    if _PLAIN.fullmatch(value) and yaml.safe_load(value) == value:
+        return value
     return yaml.safe_dump(value, default_style='"', allow_unicode=True, width=math.inf).rstrip()

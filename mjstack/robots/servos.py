@@ -64,16 +64,16 @@ def _find_servo(spec: mujoco.MjSpec, name: str, made: ServoCfg | None) -> mujoco
     if not low < high:
         expected = f"a range, in the file or as robot.ranges.{name}=[LOW,HIGH]"
         raise ConfigError(f"range of joint {name}", [float(low), float(high)], expected)
-    servos = [a for a in spec.actuators if a.trntype in _JOINT and a.target == name]
-    mocap = [f"mocap body {body.name} takes no commands" for body in spec.bodies if body.mocap]
-    reason = _refusal(servos[0]) if len(servos) == 1 else "".join(mocap[: not servos])
-    if len(servos) == 1 and not reason:
+    servos = _servos(spec, name)
+    reason = servo_problem(spec, name)
+    if not reason:
         servos[0].trntype = mujoco.mjtTrn.mjTRN_JOINT  # the same for hinges and slides
         _convert(spec, servos[0])
         return servos[0]
     if made is None or not _complete(made):
         names = ", ".join(a.name or "unnamed" for a in servos) or "none"
-        expected = f"one <position> in the robot's file{reason and f' ({reason})'}, or"
+        because = "" if reason.startswith("it has") else f" ({reason})"
+        expected = f"one <position> in the robot's file{because}, or"
         expected += f" stiffness, damping and effort in robot.servos.{name}"
         raise ConfigError(f"actuators of joint {name}", names, expected)
     for servo in servos:
@@ -114,6 +114,19 @@ def _add_servo(spec: mujoco.MjSpec, joint: str, made: ServoCfg) -> mujoco.MjsAct
     servo.set_to_position(kp=made.stiffness, kv=made.damping)
     servo.inheritrange = 0.0
     return servo
+
+
+def _servos(spec: mujoco.MjSpec, name: str) -> list[mujoco.MjsActuator]:
+    return [a for a in spec.actuators if a.trntype in _JOINT and a.target == name]
+
+
+def servo_problem(spec: mujoco.MjSpec, name: str) -> str:
+    """Why a joint's actuators are no servo of its position; empty if one is."""
+    servos = _servos(spec, name)
+    if len(servos) == 1:
+        return _refusal(servos[0])
+    mocap = [f"mocap body {body.name} takes no commands" for body in spec.bodies if body.mocap]
+    return mocap[0] if mocap and not servos else f"it has {len(servos)} actuators"
 
 
 def _refusal(servo: mujoco.MjsActuator) -> str:

@@ -1,0 +1,281 @@
+"""The fingers of a hand: how they close, which surfaces face each other, and where it grasps."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy import ndarray
+
+from mjstack.robots.hand import Hand
+from mjstack.robots.posture import Posture
+
+# m that the tips reach beyond the grasp point, clear of a table under a small cube, and half of the
+# height of what they grasp: less where the fingers are thick
+_DEPTHS = ((0.016, 0.013), (0.010, 0.013), (0.005, 0.013), (0.005, 0.004))
+_REACH = 0.018  # m that they may at most, which a jaw on a hinge changes as it opens
+_ROOM = 0.016  # m beside an object that is enough
+_EDGE = 0.002  # m from a tip's end at least
+_PLATE = [0.004, 0.013, 0.0005]  # m: half sizes of the patch of a surface that counts
+_TIP = 0.004  # m of it that is beyond the grasp point; the rest is as high as an object there
+_FAR = 0.3  # m
+_WIDE = 0.085  # m: as far as jaws open, with room beside a cube
+_SHARES = np.linspace(0.0, 1.0, 33)  # of the way from open to shut
+
+
+@dataclass(frozen=True)
+class Grip:
+    """A hand around an object. Vectors are in the palm's frame.
+
+    Attributes:
+        opened: Positions of the gripper's joints where it is open [rad, m].
+        touching: The same, where it touches the object.
+        shut: The same, at the other end of their ranges.
+        gap: Distance of the surfaces at both ends [m].
+        beyond: How far a tip reaches beyond the middle of the sites, open or around it [m].
+        point: Middle between the surfaces [m].
+        closing: Unit vector from the first jaw to the second.
+        approach: Unit vector from the wrist towards the tips.
+        jaws: Bodies with these surfaces.
+        sites: Where they touch [m], in the frames of these bodies.
+    """
+
+    opened: ndarray
+    touching: ndarray
+    shut: ndarray
+    gap: tuple[float, float]
+    beyond: float
+    point: ndarray
+    closing: ndarray
+    approach: ndarray
+    jaws: list[int]
+    sites: list[ndarray]
+
+
+class Fingers:
+    """Moves a hand's fingers while the arm rests, and measures between them."""
+
+    def __init__(self, spec: mujoco.MjSpec, hand: Hand, ranges: ndarray) -> None:
+        """Compile a description, in which joints have the same numbers, with a plate to measure by;
+        ``ranges`` are those of the gripper's joints [rad, m], shape ``(n, 2)``.
+        """
+        spec = spec.copy()
+        plate = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=_PLATE)
+        plate.contype = plate.conaffinity = 0
+        plate.name = "plate/of/mjstack"
+        self.model = model = spec.compile()
+        self._data = mujoco.MjData(model)
+        self._plate = model.geom(plate.name).id
+        self._hand = hand
+        self._ranges = ranges
+        self._posture = Posture(model, [model.joint(j).name for j in (*hand.arm, *hand.gripper)])
+        self._arm = self._posture.rest[self._posture.commanded[: len(hand.arm)]]
+        self._solid = np.flatnonzero((model.geom_contype | model.geom_conaffinity) != 0)
+        palm = model.body_weldid[hand.palm]
+        self._fixed = np.flatnonzero(model.body_weldid == palm) if palm else np.array([hand.palm])
+
+    def settle(self, gripper: ndarray) -> None:
+        """Bring the gripper's joints to positions, and what follows them along."""
+        self._data.qpos[:] = self._posture.qpos(np.concatenate((self._arm, gripper)))
+        mujoco.mj_kinematics(self.model, self._data)
+
+    def _agree(self, gripper: ndarray) -> ndarray:
+        """The positions that coupled joints can have at once [rad, m]."""
+        whole = self._posture.agree(np.concatenate((self._arm, gripper)))
+        return whole[len(self._arm) :]
+
+    def points(self, bodies: Sequence[int]) -> ndarray:
+        """Points of the solid geoms of bodies in the palm's frame [m], shape ``(n, 3)``."""
+        model, data = self.model, self._data
+        clouds = [np.zeros((0, 3))]
+        for geom in self._solid[np.isin(model.geom_bodyid[self._solid], bodies)]:
+            local = _corners(model, geom) @ data.geom_xmat[geom].reshape(3, 3).T
+            clouds.append(self._to_palm(local + data.geom_xpos[geom]))
+        return np.concatenate(clouds)
+
+    def measure(self, width: float, deepest: float = math.inf) -> Grip:
+        """Find the grasp around an object of some width [m], where the tips reach beyond it by
+        ``deepest`` [m] at most; a ValueError if the fingers do not close around one.
+        """
+        hand = self._hand
+        middle = self._ranges.mean(axis=1)
+        self.settle(middle)
+        clouds = {body: self.points([body]) for body in hand.bodies}
+        bodies = [body for body, cloud in clouds.items() if len(cloud)]
+        if not bodies:
+            raise ValueError("the fingers have no geoms that collide")
+        centres = np.array([clouds[body].mean(axis=0) for body in bodies])
+        ways = np.zeros((len(middle), len(bodies), 3))  # from a joint's lower end to its upper
+        for number, ends in enumerate(self._ranges):
+            for end, sign in zip(ends, (-1.0, 1.0), strict=True):
+                target = middle.copy()
+                target[number] = end
+                self.settle(target)
+                means = [self.points([body]).mean(axis=0) for body in bodies]
+                ways[number] += sign * np.array(means)
+        closing = np.linalg.svd(ways.reshape(-1, 3))[2][0]
+        along = centres @ closing
+        right = along > 0.5 * (along.min() + along.max())
+        if right[0]:  # the first jaw is the one that the file has first
+            closing, right = -closing, ~right
+        first = [body for body, far in zip(bodies, right, strict=True) if not far]
+        second = [body for body, far in zip(bodies, right, strict=True) if far]
+        if hand.one_finger:
+            first, second, right = [*self._fixed], bodies, np.ones(len(bodies), dtype=bool)
+            if not len(cloud := self.points(first)):
+                raise ValueError("the body that carries the jaw has no geoms that collide")
+            if along.mean() < (cloud @ closing).mean():
+                closing = -closing
+        moves = ways @ closing
+        opens = moves[:, right].mean(axis=1)
+        if not right.all():
+            opens = opens - moves[:, ~right].mean(axis=1)
+        low, high = self._ranges.T
+        opened = self._agree(np.where(opens > 0.0, high, low))
+        shut = self._agree(np.where(opens > 0.0, low, high))
+        nearly = []  # shut: there a jaw on a hinge lies along the approach axis
+        for share in (0.15, 0.0):
+            self.settle(shut + share * (opened - shut))
+            nearly.append(np.array([self.points([body]).mean(axis=0) for body in bodies]))
+        away = nearly[0] - nearly[1]
+        away = away[right].mean(axis=0) - (0.0 if right.all() else away[~right].mean(axis=0))
+        approach = self._approach(nearly[1].mean(axis=0), _unit(away))
+        closing = _unit(away - (away @ approach) * approach)
+        frame = np.stack((np.cross(approach, closing), approach, closing), axis=1)
+        grips = []
+        depths = [pair for pair in _DEPTHS if pair[0] <= deepest]
+        for depth, self.model.geom_size[self._plate, 1] in depths:
+            grip = self._grasp(width, (opened, shut), frame, (first, second), depth)
+            grips.append(grip)
+            if grip.gap[0] >= width + _ROOM and grip.beyond <= _REACH:
+                break
+        else:
+            grip = max(grips, key=lambda grip: min(grip.gap[0], width + _ROOM) - grip.beyond)
+        if grip.gap[0] < width + 0.1 * _ROOM:
+            raise ValueError(f"its fingers open by {1e3 * max(grip.gap[0], 0.0):.0f} mm only")
+        return grip
+
+    def _approach(self, middle: ndarray, closing: ndarray) -> ndarray:
+        """Unit vector from the wrist to the fingers' middle, across the closing axis: along the
+        last joint's axis, or one of the palm's, where that is near.
+        """
+        model, data, palm = self.model, self._data, self._hand.palm
+        last = self._hand.arm[-1]
+        turn = data.xmat[palm].reshape(3, 3)
+        hinge = model.jnt_type[last] == mujoco.mjtJoint.mjJNT_HINGE
+        body = self.points([*self._fixed])
+        origin = body.mean(axis=0) if len(body) and not hinge else self._to_palm(data.xanchor[last])
+        away = middle - origin
+        away = _unit(away - (away @ closing) * closing)
+        axes = [*([turn.T @ data.xaxis[last]] if hinge else []), *np.eye(3)]
+        for axis, near in zip(axes, [0.8] * hinge + [0.95] * 3, strict=True):
+            if abs(axis @ away) > near and abs(axis @ closing) < 0.6:
+                return np.copysign(1.0, axis @ away) * axis
+        return away
+
+    def _grasp(
+        self,
+        width: float,
+        ends: tuple[ndarray, ndarray],
+        frame: ndarray,
+        sides: tuple[Sequence[int], Sequence[int]],
+        depth: float,
+    ) -> Grip:
+        """Close the jaws around an object: where they touch it, near their tips."""
+        opened, shut = ends
+        share = 1.0
+        for _ in range(3):  # tips may move along the approach axis as they close
+            self.settle(opened + share * (shut - opened))
+            clouds = [self.points(side) @ frame for side in sides]
+            tops = [cloud[:, 1].max() for cloud in clouds]
+            level = min(min(tops) - _EDGE, max(tops) - depth)
+            tips = [cloud[cloud[:, 1] > level - _EDGE] for cloud in clouds]
+            start = np.array([tips[1][:, 0].mean(), level, np.mean([t[:, 2].mean() for t in tips])])
+            gaps = np.array(
+                [self._gap(opened + s * (shut - opened), start, frame, sides)[0] for s in _SHARES]
+            )
+            if gaps.min() > width - 0.01:
+                raise ValueError("its fingers do not close on each other")
+            share = _last(gaps, width)
+        most = _WIDE - 0.015 * self._hand.one_finger  # it swings up as it opens
+        wide = opened + _last(gaps, min(most, float(gaps.max()))) * (shut - opened)
+        touching = opened + share * (shut - opened)
+        _, point, geoms = self._gap(touching, start, frame, sides)
+        jaws = [int(self.model.geom_bodyid[geom]) for geom in geoms]
+        sites = []
+        for jaw, sign in zip(jaws, (-0.5, 0.5), strict=True):
+            world = self._from_palm(frame @ (point + np.array([0.0, 0.0, sign * width])))
+            turn = self._data.xmat[jaw].reshape(3, 3)
+            sites.append(turn.T @ (world - self._data.xpos[jaw]))
+        reaches = []
+        for state in (touching, wide):
+            self.settle(state)
+            touches = [
+                self._to_palm(self._data.xpos[jaw] + self._data.xmat[jaw].reshape(3, 3) @ site)
+                for jaw, site in zip(jaws, sites, strict=True)
+            ]
+            top = max((self.points(side) @ frame)[:, 1].max() for side in sides)
+            reaches.append(float(top - np.mean(touches, axis=0) @ frame[:, 1]))
+        gap = (float(gaps.max()), float(gaps.min()))
+        point, (_, approach, closing) = frame @ point, frame.T
+        return Grip(wide, touching, shut, gap, max(reaches), point, closing, approach, jaws, sites)
+
+    def _gap(
+        self, gripper: ndarray, start: ndarray, frame: ndarray, sides: Sequence[Sequence[int]]
+    ) -> tuple[float, ndarray, list[int]]:
+        """Distance of the sides [m] along the closing axis, the point between them, in ``frame``,
+        and the geoms there.
+        """
+        self.settle(gripper)
+        point = start.copy()
+        for _ in range(4):
+            (left, first), (right, second) = (
+                self._touch(frame @ point, frame, side) for side in sides
+            )
+            point[2] += 0.5 * (right - left)
+        return left + right + 2.0 * _PLATE[2], point, [first, second]
+
+    def _touch(self, point: ndarray, frame: ndarray, bodies: Sequence[int]) -> tuple[float, int]:
+        """How far the nearest solid geom of some bodies is from the plate, and which it is."""
+        model, data = self.model, self._data
+        back = model.geom_size[self._plate, 1] - _TIP
+        data.geom_xpos[self._plate] = self._from_palm(point - back * frame[:, 1])
+        turn = data.xmat[self._hand.palm].reshape(3, 3)
+        data.geom_xmat[self._plate] = (turn @ frame).ravel()
+        nearest = (_FAR, -1)
+        for geom in self._solid[np.isin(model.geom_bodyid[self._solid], bodies)]:
+            left = mujoco.mj_geomDistance(model, data, self._plate, geom, _FAR, None)
+            nearest = min(nearest, (left, int(geom)))
+        return nearest
+
+    def _to_palm(self, points: ndarray) -> ndarray:
+        palm = self._hand.palm
+        return (points - self._data.xpos[palm]) @ self._data.xmat[palm].reshape(3, 3)
+
+    def _from_palm(self, point: ndarray) -> ndarray:
+        palm = self._hand.palm
+        return self._data.xpos[palm] + self._data.xmat[palm].reshape(3, 3) @ point
+
+
+def _corners(model: mujoco.MjModel, geom: int) -> ndarray:
+    """Vertices of a mesh, or corners of the box around another geom, in its frame [m]."""
+    mesh = model.geom_dataid[geom]
+    if mesh >= 0 and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
+        first = model.mesh_vertadr[mesh]
+        return model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
+    middle, half = model.geom_aabb[geom].reshape(2, 3)
+    return middle + half * np.stack(np.meshgrid(*[[-1, 1]] * 3), axis=-1).reshape(-1, 3)
+
+
+def _last(gaps: ndarray, gap: float) -> float:
+    """The largest share of the way to shut at which the jaws are still so far apart."""
+    number = int(np.flatnonzero(gaps >= min(gap, gaps.max()))[-1])
+    if number == len(gaps) - 1 or gaps[number] < gap:
+        return float(_SHARES[number])
+    rise = (gaps[number] - gap) / (gaps[number] - gaps[number + 1])
+    return float(_SHARES[number] + rise * (_SHARES[1] - _SHARES[0]))
+
+
+def _unit(vector: ndarray) -> ndarray:
+    return vector / np.linalg.norm(vector)
