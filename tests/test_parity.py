@@ -343,7 +343,7 @@ def test_ends_of_all_joints_but_the_robots_are_compared(
     stage = SimpleNamespace(model=model, play=lambda sim, reset: None)  # all end where they start
     run = SimpleNamespace(cfg=cfg, stage=stage, nominal=nominal)
     result = GateResult(name="parity", status=Status.passed)
-    found, lines = _compare_ends(run, ends[0], result, again=True)  # type: ignore[arg-type]
+    found, lines = _compare_ends(run, ends[0], result, rounded=True)  # type: ignore[arg-type]
     assert found == [f"{text} from native's" for text in problems]
     assert farthest is None or lines == [f"{text} from native's" for text in farthest]
     assert not any("arm" in name for name in result.metrics)
@@ -363,12 +363,12 @@ def test_an_end_that_native_mujoco_reaches_by_rounding_passes() -> None:
     nominal = SimpleNamespace(world=SimpleNamespace(qpos=model.qpos0[None]))
     stage = SimpleNamespace(model=model, play=play)
     run = SimpleNamespace(cfg=cfg, stage=stage, nominal=nominal)
-    for again, problems in ((True, []), (False, ["drawer ends 5.00 mm from native's"])):
+    for rounded, problems in ((True, []), (False, ["drawer ends 5.00 mm from native's"])):
         result = GateResult(name="parity", status=Status.passed)
-        found, _ = _compare_ends(run, end, result, again=again)  # type: ignore[arg-type]
+        found, _ = _compare_ends(run, end, result, rounded=rounded)  # type: ignore[arg-type]
         assert found == problems
         text = "drawer ends 0.5 of the limit from one of 8 native worlds that round"
-        assert result.details == [text] * again
+        assert result.details == [text] * rounded
 
 
 @pytest.mark.full

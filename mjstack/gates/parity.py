@@ -78,7 +78,7 @@ def _compare(run: Run, mjwarp: Simulation) -> GateResult:
         "peak_constraint_rows": int(mjwarp.peak_constraints[0]),
         "episode_s": episode.timing.seconds,
     }
-    apart, ends = _compare_ends(run, world.qpos[-1], result, again=not problems)
+    apart, ends = _compare_ends(run, world.qpos[-1], result, rounded=not problems)
     problems += apart
     if cfg.scene.cameras:
         problems += compare_images(run, result)
@@ -155,14 +155,16 @@ def compare_models(
 ) -> list[str]:
     """A problem for each array of the model that the simulation holds otherwise than in float32."""
     problems = []
-    for name, held in sim.model_values().items():
-        expected = getattr(model, name).astype(held.dtype)
-        different = np.argwhere((held != expected) & ~(np.isnan(held) & np.isnan(expected)))
+    for name, uploaded in sim.model_values().items():
+        expected = getattr(model, name).astype(uploaded.dtype)
+        different = np.argwhere((uploaded != expected) & ~(np.isnan(uploaded) & np.isnan(expected)))
         if name in leave_out or not len(different):
             continue
         at = tuple(different[0])
         owner = _element(model, name, int(at[0]))
-        problems.append(f"model: {name} of {owner} is {held[at]:.6g}, natively {expected[at]:.6g}")
+        problems.append(
+            f"model: {name} of {owner} is {uploaded[at]:.6g}, natively {expected[at]:.6g}"
+        )
     return problems
 
 
@@ -196,12 +198,12 @@ def _moved(model: mujoco.MjModel, state: State, name: str) -> State:
     beyond = state.qpos[0, model.jnt_qposadr] > model.jnt_range.mean(1)
     qvel[0, model.jnt_dofadr[beyond & (model.jnt_limited == 1)]] *= -1.0
     bodies = model.geom_bodyid[data.contact.geom]
-    held = (model.body_weldid[bodies] > 0).all(1)
+    movable = (model.body_weldid[bodies] > 0).all(1)
     for joint in np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)):
         body = model.jnt_bodyid[joint]
         axis = np.array([0.0, 0.0, 1.0])
         if name == TWISTED:
-            normals = data.contact.frame[held & (bodies == body).any(1), :3]
+            normals = data.contact.frame[movable & (bodies == body).any(1), :3]
             normal = np.linalg.eigh(normals.T @ normals)[1][:, -1]
             axis = len(normals[:1]) * data.xmat[body].reshape(3, 3).T @ normal
         dof = model.jnt_dofadr[joint]
@@ -250,44 +252,44 @@ def _owner(model: mujoco.MjModel, field: str, index: int) -> str:
 
 
 def _compare_ends(
-    run: Run, end: np.ndarray, result: GateResult, *, again: bool
+    run: Run, end: np.ndarray, result: GateResult, *, rounded: bool
 ) -> tuple[list[str], list[str]]:
     """Where objects, and joints that the robot does not command, are at the end of the task;
     returns the problems, and lines on the farthest object and the farthest of the other joints.
 
-    With ``again``, native MuJoCo plays the task in rounded worlds if one is off by more than the
+    With ``rounded``, native MuJoCo plays the task in rounded worlds if one is off by more than the
     limits: they may be off from where it is in the nearest of these instead.
     """
     limits = run.cfg.gate.parity
     allowed = {"position_m": limits.object_position, "rotation_deg": limits.object_rotation_deg}
     result.thresholds |= {f"final.{key}": limit for key, limit in allowed.items()}
 
-    def shares(other: np.ndarray) -> dict[str, float]:
+    def shares(target: np.ndarray) -> dict[str, float]:
         return {
-            name: float(np.max([v / max(allowed[key], 1e-30) for key, v in found.items()]))
-            for name, found in _ends_apart(run, end, other).items()
+            name: float(np.max([v / max(allowed[key], 1e-30) for key, v in gaps.items()]))
+            for name, gaps in _ends_apart(run, end, target).items()
         }
 
     native = run.nominal.world.qpos[-1]
     share = shares(native)
     beyond = [name for name, value in share.items() if not value <= 1.0]
-    if beyond and again:
+    if beyond and rounded:
         with closing(RoundedSimulation(run.stage.model, _ROUNDED_EPISODES)) as sim:
             run.stage.play(sim, run.cfg.gate.baseline.reset)
-            every = [share, *map(shares, sim.qpos.numpy())]
-        share = {name: min(one[name] for one in every) for name in share}
+            candidates = [share, *map(shares, sim.qpos.numpy())]
+        share = {name: min(candidate[name] for candidate in candidates) for name in share}
         worlds = f"one of {_ROUNDED_EPISODES} native worlds that round"
         result.details += [f"{n} ends {share[n]:.2g} of the limit from {worlds}" for n in beyond]
     problems = []
     farthest: dict[bool, tuple[float, str]] = {}  # object, and other joint
-    for name, found in _ends_apart(run, end, native).items():
-        result.metrics |= {f"final.{name}.{key}": value for key, value in found.items()}
-        values = [(v, "deg") if "deg" in key else (1e3 * v, "mm") for key, v in found.items()]
+    for name, gaps in _ends_apart(run, end, native).items():
+        result.metrics |= {f"final.{name}.{key}": value for key, value in gaps.items()}
+        values = [(v, "deg") if "deg" in key else (1e3 * v, "mm") for key, v in gaps.items()]
         text = f"{name} ends {' and '.join(f'{v:.2f} {unit}' for v, unit in values)} from native's"
         problems += [] if share[name] <= 1.0 else [text]
-        other = name not in run.cfg.scene.objects
-        if share[name] > farthest.get(other, (-1.0, ""))[0]:
-            farthest[other] = (share[name], text)
+        joint = name not in run.cfg.scene.objects
+        if share[name] > farthest.get(joint, (-1.0, ""))[0]:
+            farthest[joint] = (share[name], text)
     return problems, [text for _, text in farthest.values()]
 
 

@@ -197,9 +197,9 @@ class MjwarpSimulation(Simulation):
     def model_values(self) -> dict[str, np.ndarray]:
         values = {}
         for name in dir(self.model):
-            held, array = getattr(self._m, name, None), getattr(self.model, name)
-            if isinstance(held, wp.array) and isinstance(array, np.ndarray) and array.size:
-                values[name] = held.numpy().ravel()[: array.size].reshape(array.shape)
+            uploaded, array = getattr(self._m, name, None), getattr(self.model, name)
+            if isinstance(uploaded, wp.array) and isinstance(array, np.ndarray) and array.size:
+                values[name] = uploaded.numpy().ravel()[: array.size].reshape(array.shape)
         return values
 
     @override
