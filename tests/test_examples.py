@@ -182,7 +182,7 @@ def test_the_cabinet_stands_where_the_handle_is_drawn_and_its_cube_stays_in_it()
     cfg = configure("drawer", "so101", "nworld=4", "reset=randomized")
     stage = Stage(cfg)
     env = stage.start(stage.batch_simulation(4), cfg.reset)
-    handle = env.sim.xpos[:, env.sim.model.body("handle").id, :2]
+    handle = env.sim.xpos[:, env.sim.model.body("cabinet_handle").id, :2]
     assert torch.allclose(handle, place_xy(env, "handle").to(handle), atol=1e-6)
     assert len(handle.unique(dim=0)) == 4
     cube = env.index.objects["cube"][0]

@@ -171,7 +171,8 @@ def test_a_world_that_is_reset_forgets_its_velocities(device: str) -> None:
         sim.qvel[:] = 1.0
         sim.step(1)
         ends.append(sim.qvel.clone())
-    assert torch.equal(ends[0][::2], ends[1][::2])
+    # CUDA adds up in an order that is chance
+    torch.testing.assert_close(ends[0][::2], ends[1][::2], rtol=0.0, atol=1e-4 * (device != "cpu"))
     assert not torch.equal(ends[0], ends[1])
 
 
