@@ -32,10 +32,7 @@ _CONVERGED = 1e-12  # tolerance of the solver in float64
 _CONVERGED_FLOAT32 = 1e-8  # of what float32 can still tell
 _ROUNDED = {1: 32, 50: 16}  # worlds, by steps
 _ROUNDED_EPISODES = 8
-_LEAST_SIZES = {
-    "qvel": 300.0,
-    "qfrc_actuator": 100.0,
-}  # whose rounding is allowed; else 2
+_LEAST_SIZES = {"qvel": 300.0, "qfrc_actuator": 100.0}  # whose rounding is allowed; else 2
 _SLIDES = {int(mujoco.mjtJoint.mjJNT_FREE): 3, int(mujoco.mjtJoint.mjJNT_SLIDE): 1}  # else turns
 _WIDTHS = {"xpos": 3, "xquat": 4, "site_xpos": 3}
 _CAPTURED = 10  # steps of a graph: one of fifty takes longer to capture than to run
