@@ -81,6 +81,32 @@ def test_its_furniture_stays_behind(tmp_path: Path) -> None:
     assert notes(scara(), plain) == ""
 
 
+def test_joints_keep_names_that_the_scene_has(tmp_path: Path) -> None:
+    """With their servos, equalities and sensors; what names the renamed bodies has the new name."""
+    bodies = "".join(
+        f"""<body name="{name}"><joint name="{name}" axis="0 0 1" range="-1 1"/>
+        <inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/></body>"""
+        for name in ("table", "floor")
+    )
+    extra = """<adhesion body="table" ctrlrange="0 1"/><position joint="table" kp="9"/></actuator>
+    <equality><joint joint1="table" joint2="floor"/><weld body1="table" body2="floor"/></equality>
+    <sensor><jointpos joint="table"/><framepos objtype="xbody" objname="table"/></sensor>"""
+    model = build_model(changed(tmp_path, (PALM, bodies + PALM), ("</actuator>", extra)))
+    plain = build_model(scara())
+    counts = [[getattr(m, n) for n in ("nu", "neq", "nsensor")] for m in (model, plain)]
+    assert np.subtract(*counts).tolist() == [2, 2, 2]
+    joint, body = model.joint("table").id, model.body("robot_table").id
+    assert model.actuator_trnid[-2:, 0].tolist() == [body, joint]
+    assert model.eq_obj1id[-2:].tolist() == [joint, body]
+    assert sorted(model.sensor_objid[:2]) == sorted([joint, body])
+    names = {"arm_joints": ["table", *scara().robot.arm_joints[1:]]}
+    swap = [(f'{k}="shoulder"', f'{k}="table"') for k in ("name", "joint")]
+    swap += [('<body name="base">', '<body name="table">')]
+    robot = changed(tmp_path, *swap, **names).robot
+    named = compile_scene(robot_spec(robot, scara().model, ["table"]))
+    assert named.actuator("table").trnid[0] == named.joint("table").id
+
+
 def test_a_camera_of_what_stays_behind_stays_behind_too(tmp_path: Path) -> None:
     cameras = """<camera name="eye" mode="targetbody" target="toy"/>
     <camera name="other" mode="targetbody" target="hand"/>"""

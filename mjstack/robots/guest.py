@@ -30,14 +30,18 @@ SAG = 0.002  # m: how far off its target a hand is of which gravity, or a report
 _WRAPS = (mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER)
 PREFIX = "robot_"
 _NAMED = ("geoms", "bodies", "cameras")  # elements that a scene has too
-_NAMING = {  # elements with the names of others
-    "pairs": ("geomname1", "geomname2"),
-    "excludes": ("bodyname1", "bodyname2"),
-    "equalities": ("name1", "name2"),
-    "sensors": ("objname", "refname"),
-    "actuators": ("target",),
-    "cameras": ("targetbody",),
-    "lights": ("targetbody",),
+_NAMING = {  # elements with the names of others, whose kind another field has, or is always renamed
+    "pairs": {"geomname1": "", "geomname2": ""},
+    "excludes": {"bodyname1": "", "bodyname2": ""},
+    "equalities": {"name1": "objtype", "name2": "objtype"},
+    "sensors": {"objname": "objtype", "refname": "reftype"},
+    "actuators": {"target": "trntype"},
+    "cameras": {"targetbody": ""},
+    "lights": {"targetbody": ""},
+}
+_RENAMED = {
+    *(mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_XBODY),
+    *(mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_CAMERA, mujoco.mjtTrn.mjTRN_BODY),
 }
 _FLAGS = {"disableflags": mujoco.mjtDisableBit, "enableflags": mujoco.mjtEnableBit}
 
@@ -250,7 +254,7 @@ def _rename(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) -> 
     clashes = _clashes(spec, reserved)
     paths = [wrap for tendon in spec.tendons for wrap in tendon.path]
     wraps = [wrap.target.name for wrap in paths if wrap.type in _WRAPS]  # they keep their names
-    profile = {*robot.joints, *robot.jaw_bodies, *robot.grasp_sites, robot.approach_body, *wraps}
+    profile = {*robot.jaw_bodies, robot.approach_body, *wraps}
     if names := profile & set(clashes):
         raise MjstackError(
             f"robot {robot.name}: the scene has {', '.join(sorted(names))} too, expected other"
@@ -258,8 +262,10 @@ def _rename(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) -> 
         )
     for kind in (*_NAMED, *_NAMING):
         for element in getattr(spec, kind):
-            for field in ("name", *_NAMING.get(kind, ())):
-                if getattr(element, field) in clashes:
+            fields = {"name": ""} if kind in _NAMED else {}
+            for field, of in (fields | _NAMING.get(kind, {})).items():
+                typed = not of or getattr(element, of) in _RENAMED
+                if typed and getattr(element, field) in clashes:
                     setattr(element, field, PREFIX + getattr(element, field))
 
 
