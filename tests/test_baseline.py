@@ -262,6 +262,17 @@ def test_the_end_of_a_range_is_a_load() -> None:
     assert "; it is at the end of its range (" in cause
 
 
+def test_another_actuator_that_pulls_is_a_load(tmp_path: Path) -> None:
+    """Here a tendon with a constant force, which no command reaches."""
+    cable = """<general name="cable" tendon="belt" biastype="affine" biasprm="-30 0 0"/></actuator>
+      <tendon><fixed name="belt"><joint joint="shoulder" coef="1"/><joint joint="elbow" coef="1"/>
+      </fixed></tendon>"""
+    result = baseline(arm=arm_file(tmp_path, ("</actuator>", cable)))
+    line = r"(elbow|shoulder) is .* rad off; actuator cable of the robot's file pulls at it \(30 N m\)"
+    assert result.status == "fail"
+    assert re.search(line, result.reason)
+
+
 POST = '<geom name="post" type="box" pos="POS" size="0.02 0.02 0.1" contype="1" conaffinity="1"/>'
 BOOM = '<geom name="boom" pos="0.15 0 0" size="0.15 0.02 0.02" contype="1" conaffinity="1"/>'
 

@@ -20,6 +20,8 @@ from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError
 from mjstack.kinematics.mink_ik import GraspIk
 from mjstack.kinematics.reach import PointReach
+from mjstack.robots import read_robot
+from mjstack.robots.guest import left_behind
 from mjstack.robots.jaws import Jaws
 from mjstack.robots.posture import Posture
 from mjstack.scene import build_model
@@ -214,6 +216,65 @@ def test_an_idle_joint_keeps_the_files_home_within_its_range(
     assert env.sim.qpos[:, mast].tolist() == pytest.approx([angle] * 2)
     env.sim.step(100)
     assert env.sim.qpos[:, mast].tolist() == pytest.approx([angle] * 2, abs=0.02)
+
+
+SPARE = """<body name="other" pos="-0.5 0 0.5" gravcomp="1">
+  <joint name="spare" axis="0 1 0" range="-2 2"/>
+  <inertial mass="0.3" pos="0.1 0 0" diaginertia="1e-3 1e-3 1e-3"/></body></worldbody>"""
+VALUES = 'kp="50" kv="5" ctrlrange="-2 2"'
+
+
+@pytest.mark.parametrize(
+    "actuator",
+    [
+        f'<position joint="spare" {VALUES}/>',
+        f'<position joint="spare" {VALUES} timeconst="0.2"/>',
+        f'<position jointinparent="spare" {VALUES} gear="-2"/>',
+        f'<position tendon="t" {VALUES} timeconst="0.5"/>',
+        '<intvelocity joint="spare" kp="50" kv="5" actrange="-2 2" ctrlrange="-1 1"/>',
+        '<general joint="spare" dyntype="filter" dynprm="0.3" gainprm="7" biastype="affine"'
+        ' biasprm="3 -40 -5"/>',
+    ],
+    ids=["position", "timeconst", "in parent", "tendon", "intvelocity", "general"],
+)
+def test_a_servo_without_a_command_holds_its_joint(actuator: str, tmp_path: Path) -> None:
+    """For seconds, whatever it is; a dynamics that is left out is said."""
+    tendon = '<tendon><fixed name="t"><joint joint="spare" coef="1"/></fixed></tendon>'
+    key = "<keyframe><key name='home' qpos='0 0 0 0 0 0 1.0'/></keyframe>"
+    cfg = changed(
+        tmp_path,
+        ("</worldbody>", SPARE),
+        ("</actuator>", f"{actuator}</actuator>{tendon}{key}"),
+    )
+    search = f"hydra.searchpath=[file://{SCARA}/conf]"
+    overrides = ["robot=scara", f"robot.file={cfg.robot.file}", "sim=native", "nworld=1"]
+    env = make_env([search, *overrides, "reset=nominal"])
+    env.reset(seed=0)
+    spare = int(env.sim.model.joint("spare").qposadr[0])
+    for _ in range(4):
+        env.sim.step(100)
+        assert env.sim.qpos[0, spare] == pytest.approx(1.0, abs=1e-3)
+    said = "without activation, which an idle joint does not need: actuator" in "".join(
+        left_behind(read_robot(cfg.robot, cfg.model), cfg.robot, env.sim.model, [])
+    )
+    assert said == ("position" not in actuator or "timeconst" in actuator)
+
+
+def test_a_servo_that_no_command_reaches_does_not_fight_others(tmp_path: Path) -> None:
+    """A follower's, or one of a tendon over arm joints."""
+    line = "actuator without a command={}: expected none that pulls at joint {}"
+    cfg = changed(tmp_path, FOLLOWERS["plain"][0], **LEFT)
+    cases = [(cfg, "right", "right")]
+    for name, dynamics in (("belt", 'kv="9"'), ("slow", 'timeconst="0.1"')):
+        extra = f"""<position name="{name}" tendon="t" kp="90" inheritrange="0" {dynamics}/>
+        </actuator><tendon><fixed name="t"><joint joint="shoulder" coef="1"/><joint joint="elbow" coef="1"/></fixed>
+        </tendon>"""
+        folder = tmp_path / name
+        folder.mkdir()
+        cases.append((changed(folder, ("</actuator>", extra)), name, "shoulder"))
+    for cfg, *names in cases:
+        model = build_model(cfg)
+        refusal(lambda m=model, c=cfg: SceneIndex(m, c.robot, c.scene), line.format(*names))
 
 
 def test_a_target_out_of_reach_is_a_finite_distance_away(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from mjstack.episodes.rollout import State
 from mjstack.episodes.stage import Stage
 from mjstack.robots.guest import WORLD, grasp_jacobian
 from mjstack.scene.build import scene_names
+from mjstack.scene.index import actuator_moment
 
 _DEEP = 1e-4  # m: contacts at rest are less deep
 _KINDS = mujoco.mjtConstraint
@@ -78,6 +79,10 @@ def find_cause(stage: Stage, state: State, target: np.ndarray) -> str:
         f"gravity: {gravcomp}a stiffer servo": data.qfrc_passive[dof] - data.qfrc_bias[dof],
         "it still moves: more seconds": model.actuator_biasprm[servo][2] * data.qvel[dof],
     }
+    moment = actuator_moment(data)
+    for number in np.setdiff1d(np.arange(model.nu), index.ctrl):
+        pull = f"actuator {model.actuator(number).name or number} of the robot's file pulls at it"
+        loads[pull] = moment[number, dof] * data.actuator_force[number]
     torque = np.zeros(model.nv)
     for row, kind in enumerate(data.efc_type.tolist()):
         cause = _CAUSES.get(kind) or _touch(stage, data.contact[data.efc_id[row]])

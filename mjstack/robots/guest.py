@@ -43,6 +43,8 @@ _RENAMED = {
     *(mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_XBODY),
     *(mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_CAMERA, mujoco.mjtTrn.mjTRN_BODY),
 }
+_DYN = mujoco.mjtDyn
+_LAGS = (_DYN.mjDYN_INTEGRATOR, _DYN.mjDYN_FILTER, _DYN.mjDYN_FILTEREXACT)  # no force at rest
 _FLAGS = {"disableflags": mujoco.mjtDisableBit, "enableflags": mujoco.mjtEnableBit}
 
 
@@ -67,6 +69,11 @@ def as_guest(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) ->
             raise ConfigError("robot.exclude", robot.exclude, expected)
         require_names("robot.exclude: body", map(str, pair), bodies)
         spec.add_exclude(bodyname1=str(pair[0]), bodyname2=str(pair[1]))
+    for servo in _idle_servos(spec, robot, *_LAGS):
+        if servo.dyntype == _DYN.mjDYN_INTEGRATOR:
+            servo.ctrlrange = servo.actrange  # its position, no longer a speed
+        servo.dyntype = _DYN.mjDYN_NONE
+        servo.actlimited = mujoco.mjtLimited.mjLIMITED_FALSE
     for camera in [c for c in spec.cameras if c.targetbody and c.targetbody not in bodies]:
         spec.delete(camera)
     geoms = {geom.name for geom in spec.geoms}
@@ -157,6 +164,10 @@ def left_behind(
         yield f"gravity compensation {state} ({value}; auto: from {1e3 * SAG:g} mm on); {sag}"
     if strangers:
         yield f"left out: {describe(strangers)}"
+    if lags := _idle_servos(spec, robot, *_LAGS):
+        yield f"without activation, which an idle joint does not need: {describe(lags)}"
+    if others := _idle_servos(spec, robot, _DYN.mjDYN_PID):
+        yield f"not held at rest, as its command stays 0: {describe(others)}"
     names = set(_clashes(spec, reserved)) - {e.name for e in strangers}
     if names:
         yield f"renamed to {PREFIX}NAME: {', '.join(sorted(names))}"
@@ -217,6 +228,20 @@ def _strangers(spec: mujoco.MjSpec, robot: RobotCfg) -> list[Any]:
         carried = [joint for body in _above(root) for joint in body.joints]  # its base stands
         out = [*spec.keys, *world.lights, *world.geoms, *outside, *carried]
     return out
+
+
+def _idle_servos(
+    spec: mujoco.MjSpec, robot: RobotCfg, *dynamics: mujoco.mjtDyn
+) -> list[mujoco.MjsActuator]:
+    """Servos with some dynamics that move joints of the profile neither alone nor by a tendon."""
+    paths = {tendon.name: {wrap.target.name for wrap in tendon.path} for tendon in spec.tendons}
+    return [
+        a
+        for a in spec.actuators
+        if a.dyntype in dynamics
+        and a.biasprm[1] < 0.0
+        and {a.target, *paths.get(a.target, ())}.isdisjoint(robot.joints)
+    ]
 
 
 def _home_key(spec: mujoco.MjSpec, robot: RobotCfg) -> dict[str, np.ndarray]:

@@ -15,7 +15,7 @@ from mjstack.config.schema import RobotCfg, SceneCfg
 from mjstack.errors import ConfigError, require_names
 from mjstack.math import lowest_point, quat_mul, quat_to_matrix
 from mjstack.robots.jaws import Jaws
-from mjstack.robots.posture import posture
+from mjstack.robots.posture import Posture, posture
 from mjstack.scene.build import CAPSULE_TURN, WORLD, force_sensor
 from mjstack.sim.simulation import Columns
 
@@ -94,7 +94,7 @@ class SceneIndex:
         self.robot_qvel = model.jnt_dofadr[joints]
         self.robot_range = model.jnt_range[joints]
         self.ctrl = np.array([model.actuator(name).id for name in robot.joints])
-        self._idle = _idle_servos(model, self.ctrl, self.posture.rest)
+        self._idle = _idle_servos(model, self.ctrl, self.posture)
         self.servo_range = model.actuator_ctrlrange[self.ctrl]
         self.ctrl_range = np.stack(joint_limits(model, robot.joints), axis=1)
         for name, (low, high) in zip(robot.joints, self.ctrl_range, strict=True):
@@ -191,18 +191,40 @@ class SceneIndex:
 
 
 def _idle_servos(
-    model: mujoco.MjModel, commanded: np.ndarray, rest: np.ndarray
+    model: mujoco.MjModel, commanded: np.ndarray, posture: Posture
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Position servos of joints without a command, and commands that hold these at rest."""
-    servos = np.setdiff1d(np.arange(model.nu), commanded)
-    joint = model.actuator_trntype[servos] == int(mujoco.mjtTrn.mjTRN_JOINT)
-    bias = model.actuator_biasprm[servos]
-    servos = servos[joint & (bias[:, 1] < 0.0) & (model.actuator_gainprm[servos, 0] != 0.0)]
-    bias = model.actuator_biasprm[servos]
-    length = (
-        model.actuator_gear[servos, 0] * rest[model.jnt_qposadr[model.actuator_trnid[servos, 0]]]
-    )
-    return servos, -(bias[:, 0] + bias[:, 1] * length) / model.actuator_gainprm[servos, 0]
+    """Position servos without a command, and commands that hold what they move at rest.
+
+    Raises:
+        ConfigError: One pulls at a joint whose place commands determine.
+    """
+    data = mujoco.MjData(model)
+    data.qpos = posture.rest
+    mujoco.mj_fwdPosition(model, data)
+    moment = actuator_moment(data)
+    gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm
+    fixed = model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_FIXED)
+    servos = np.flatnonzero(fixed & (gain != 0.0) & (bias[:, 1] < 0.0))
+    servos = np.setdiff1d(servos, commanded)
+    followers = posture.columns[np.ptp(posture.value, axis=1)[: len(posture.columns)] > 0.0]
+    moved = np.isin(model.jnt_qposadr[model.dof_jntid], (*posture.commanded, *followers))
+    for servo, dof in np.argwhere(moved & (moment != 0.0)):
+        if servo in servos:
+            name = model.actuator(servo).name or "unnamed"
+            joint = model.joint(model.dof_jntid[dof]).name
+            expected = f"none that pulls at joint {joint}, which other servos move"
+            fix = "List a follower in gripper_joints, or take the actuator out of the robot's file"
+            raise ConfigError("actuator without a command", name, expected, fix)
+    servos = servos[model.actuator_dyntype[servos] == int(mujoco.mjtDyn.mjDYN_NONE)]
+    return servos, -(bias[:, 0] + bias[:, 1] * data.actuator_length)[servos] / gain[servos]
+
+
+def actuator_moment(data: mujoco.MjData) -> np.ndarray:
+    """Force on each dof by a unit of each actuator's, shape ``(nu, nv)``."""
+    moment = np.zeros((data.model.nu, data.model.nv))
+    sparse = (data.moment_rownnz, data.moment_rowadr, data.moment_colind)
+    mujoco.mju_sparse2dense(moment, data.actuator_moment, *sparse)
+    return moment
 
 
 def joint_limits(model: mujoco.MjModel, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
