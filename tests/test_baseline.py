@@ -268,7 +268,9 @@ def test_another_actuator_that_pulls_is_a_load(tmp_path: Path) -> None:
       <tendon><fixed name="belt"><joint joint="shoulder" coef="1"/><joint joint="elbow" coef="1"/>
       </fixed></tendon>"""
     result = baseline(arm=arm_file(tmp_path, ("</actuator>", cable)))
-    line = r"(elbow|shoulder) is .* rad off; actuator cable of the robot's file pulls at it \(30 N m\)"
+    line = (
+        r"(elbow|shoulder) is .* rad off; actuator cable of the robot's file pulls at it \(30 N m\)"
+    )
     assert result.status == "fail"
     assert re.search(line, result.reason)
 

@@ -62,7 +62,8 @@ def test_its_settings_do_not_reach_the_scene(setting: str, note: str, tmp_path: 
     for name in ("gravity", "density", "viscosity", "disableflags", "enableflags", "wind"):
         np.testing.assert_array_equal(getattr(model.opt, name), getattr(plain.opt, name))
     assert model.opt.disableactuator == model.opt.noslip_iterations == 0
-    assert note in notes(cfg, model)
+    assert note in (text := notes(cfg, model))
+    assert bool(note) == bool(text)
     alone = mujoco.MjModel.from_xml_path(str(cfg.robot.file))  # they act on its own bodies
     robot = [b for b in range(1, alone.nbody) if alone.body(b).name]
     mass = [float(model.body(alone.body(b).name).mass[0]) for b in robot]
@@ -239,6 +240,30 @@ def test_another_actuator_is_refused_or_replaced(servo: str, words: str, tmp_pat
         assert elbow.biasprm[1:3].tolist() == [-300.0, -9.0]
         assert elbow.forcerange.tolist() == [-30.0, 30.0]
         np.testing.assert_allclose(elbow.ctrlrange, model.joint("elbow").range)
+
+
+@pytest.mark.parametrize(
+    "pairs",
+    [
+        [(ELBOW, ELBOW.replace("/>", ' ctrllimited="false" inheritrange="0" ctrlrange="1 2"/>'))],
+        [
+            (ELBOW, '<position tendon="t" kp="90" kv="9" gear="3" inheritrange="0"'
+             ' ctrllimited="false" ctrlrange="1 2"/>'),
+            ("</actuator>", '</actuator><tendon><fixed name="t"><joint joint="elbow" coef="2"/>'
+             "</fixed></tendon>"),
+        ],
+    ],
+    ids=["joint", "tendon"],
+)  # fmt: skip
+def test_a_range_that_the_file_does_not_use_is_no_limit(pairs: list, tmp_path: Path) -> None:
+    model = build_model(changed(tmp_path, *pairs))
+    np.testing.assert_allclose(model.actuator("elbow").ctrlrange, model.joint("elbow").range)
+
+
+def test_a_base_and_a_grasp_site_have_a_place(tmp_path: Path) -> None:
+    refusal(lambda: scara("robot.base.quat=[0,0,0,0]"), "robot.base.quat=[0.0, 0.0, 0.0, 0.0]")
+    cfg = changed(tmp_path, grasp_sites=["x", "right_grasp"], grasp_parts={"x": []})
+    refusal(lambda: build_model(cfg), "robot.grasp_parts.x=[]: expected geoms of one body")
 
 
 def test_a_joint_gets_a_range(tmp_path: Path) -> None:

@@ -260,6 +260,18 @@ def test_a_servo_without_a_command_holds_its_joint(actuator: str, tmp_path: Path
     assert said == ("position" not in actuator or "timeconst" in actuator)
 
 
+def test_an_idle_joint_without_a_name_keeps_the_files_home(tmp_path: Path) -> None:
+    key = "</actuator><keyframe><key name='home' qpos='0 0 0 0 0 0 1.0'/></keyframe>"
+    body = SPARE.replace('name="spare" ', "").replace(
+        "range=", 'stiffness="9" springref="1" range='
+    )
+    cfg = changed(tmp_path, ("</worldbody>", body), ("</actuator>", key))
+    model = build_model(cfg)
+    (number,) = model.body("other").jntadr
+    rest = Posture(model, cfg.robot.joints).rest
+    assert rest[model.jnt_qposadr[number]] == 1.0
+
+
 def test_a_servo_that_no_command_reaches_does_not_fight_others(tmp_path: Path) -> None:
     """A follower's, or one of a tendon over arm joints."""
     line = "actuator without a command={}: expected none that pulls at joint {}"
@@ -267,8 +279,8 @@ def test_a_servo_that_no_command_reaches_does_not_fight_others(tmp_path: Path) -
     cases = [(cfg, "right", "right")]
     for name, dynamics in (("belt", 'kv="9"'), ("slow", 'timeconst="0.1"')):
         extra = f"""<position name="{name}" tendon="t" kp="90" inheritrange="0" {dynamics}/>
-        </actuator><tendon><fixed name="t"><joint joint="shoulder" coef="1"/><joint joint="elbow" coef="1"/></fixed>
-        </tendon>"""
+        </actuator><tendon><fixed name="t"><joint joint="shoulder" coef="1"/>
+        <joint joint="elbow" coef="1"/></fixed></tendon>"""
         folder = tmp_path / name
         folder.mkdir()
         cases.append((changed(folder, ("</actuator>", extra)), name, "shoulder"))
@@ -304,13 +316,18 @@ def test_widths_of_the_grip_need_no_sites_on_the_fingers(sites: str, tmp_path: P
     np.testing.assert_allclose(targets[:, 0], [0.011, 0.018, 0.026], atol=1e-6)
 
 
-def test_joint_targets_follow_from_the_jaws_where_none_are_given(tmp_path: Path) -> None:
-    """The jaws press with 20 N on each object, and open as far as they can."""
+@pytest.mark.parametrize("ends", [(0.0, 0.05), (0.0, 0.03), (0.004, 0.06)])
+def test_joint_targets_follow_from_the_jaws_where_none_are_given(
+    ends: tuple[float, float],
+) -> None:
+    """The jaws press with 20 N on each object, and open as far as joints and servos can."""
     robot = replace(scara().robot, gripper_open=None, gripper_closed=None)
     model = build_model(scara())
+    for name in robot.gripper_joints:
+        model.actuator(name).ctrlrange = ends
     widths = (None, 0.030, 0.050)
     opened, *closed = gripper_targets(model, robot, widths)
-    assert opened.tolist() == model.joint("left").range[1:].tolist() * 2
+    assert opened.tolist() == [min(ends[1], 0.05)] * 2
     stiffness = model.actuator("left").gainprm[0]
     for target, width in zip(closed, widths[1:], strict=True):
         assert stiffness * (0.5 * width - target[0]) == pytest.approx(20.0, rel=1e-3)

@@ -113,6 +113,7 @@ def _robot(cfg: Config) -> Checks:
         path = Path(getattr(robot, key))
         wrong = path.is_absolute() or ".." in path.parts
         yield f"robot.{key}", wrong, "a name that does not lead out of a folder"
+    yield "robot.base.quat", not any(robot.base.quat), "a rotation (w, x, y, z)"
     wrong = robot.file is not None and cfg.model.source == "menagerie"
     yield "robot.file", wrong, "null, because model=menagerie has its own. Add model=builtin"
     names = (*robot.ik_joints, *robot.locked)

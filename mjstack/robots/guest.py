@@ -234,7 +234,7 @@ def _idle_servos(
     spec: mujoco.MjSpec, robot: RobotCfg, *dynamics: mujoco.mjtDyn
 ) -> list[mujoco.MjsActuator]:
     """Servos with some dynamics that move joints of the profile neither alone nor by a tendon."""
-    paths = {tendon.name: {wrap.target.name for wrap in tendon.path} for tendon in spec.tendons}
+    paths = {t.name: {wrap.target.name for wrap in t.path if wrap.target} for t in spec.tendons}
     return [
         a
         for a in spec.actuators

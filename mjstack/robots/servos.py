@@ -42,6 +42,8 @@ def prepare_servos(spec: mujoco.MjSpec, robot: RobotCfg) -> None:
             moved.armature += actuator.armature * gear**2
             moved.damping += actuator.damping * gear ** np.arange(2.0, 5.0)
             actuator.armature, actuator.damping = 0.0, np.zeros(3)
+        if actuator.ctrllimited == mujoco.mjtLimited.mjLIMITED_FALSE:  # the file uses no range
+            actuator.ctrlrange, actuator.inheritrange = [0.0, 0.0], 0.0
     _split_tendons(spec, robot)
     servos = {name: _find_servo(spec, name, robot.servos.get(name)) for name in robot.joints}
     _name_servos(spec, servos)

@@ -52,8 +52,9 @@ def read_robot(robot: RobotCfg, model: ModelCfg) -> mujoco.MjSpec:
     menagerie = model.source == "menagerie"
     path = _menagerie_path(robot) if menagerie else _file_path(robot)
     spec = read_mjcf(path, _MENAGERIE_FIX if menagerie else "Correct the file (robot.file).")
-    for number, body in enumerate(spec.bodies):
-        body.name = body.name or f"unnamed_{number}"  # bodies are told apart by their names
+    for elements in (spec.bodies, spec.joints):  # they are told apart by their names
+        for number, element in enumerate(elements):
+            element.name = element.name or f"unnamed_{number}"
     return spec
 
 
@@ -111,7 +112,7 @@ def _add_grasp_sites(spec: mujoco.MjSpec, robot: RobotCfg) -> None:
         parts = robot.grasp_parts[site]
         _require("geom or body", parts, [*spec.geoms, *spec.bodies])
         bodies = [spec.body(name) or spec.geom(name).parent for name in parts]
-        if len({body.name for body in bodies}) > 1:
+        if len({body.name for body in bodies}) != 1:
             expected = "geoms of one body, or one body"
             raise ConfigError(f"robot.grasp_parts.{site}", parts, expected)
         pos = robot.grasp_pos.get(site, [0.0, 0.0, 0.0])

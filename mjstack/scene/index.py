@@ -250,16 +250,16 @@ def gripper_targets(
     ``widths`` are those of the objects across the jaws [m]; None is for the open gripper.
     """
     jaws = jaws_of(model, robot)
-    opened = (
-        jaws.opened if robot.gripper_open is None else np.array(robot.gripper_open, dtype=float)
+    low, high = joint_limits(model, robot.gripper_joints)
+    opened, closed = (
+        np.clip(end, low, high) if given is None else np.array(given, dtype=float)
+        for end, given in ((jaws.opened, robot.gripper_open), (jaws.shut, robot.gripper_closed))
     )
     probed = robot.gripper_closed is None
-    closed = np.array(jaws.shut if probed else robot.gripper_closed, dtype=float)
     wide = np.array(widths, dtype=float)  # None is NaN
     if not probed and robot.closed_width is None:
         return np.where(np.isnan(wide)[:, None], opened, closed)
     shares = np.linspace(-2.0, 1.0, 301)[:, None]  # of the way from closed (the 200th) to open
-    low, high = joint_limits(model, robot.gripper_joints)
     targets = np.clip(closed + shares * (opened - closed), low, high)
     if jaws.carry_sites and not probed:
         apart = jaws.spread(targets)

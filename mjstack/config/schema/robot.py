@@ -116,7 +116,7 @@ class RobotCfg:
     """Bodies that touch a grasped object, each with all below it. A sensor measures the force of
     each on each object."""
     grasp_sites: list[str] = spec(length=2)
-    """Two sites, on fingers, pads or palm, one at each jaw. Their midpoint is the grasp point."""
+    """Two sites, one on each jaw, or both on the palm. Their midpoint is the grasp point."""
     grasp_parts: dict[str, list[str]] = spec({})
     """Where a grasp site goes that the file lacks: the mean of these geoms of a jaw, or a body."""
     grasp_pos: dict[str, Any] = spec({}, vectors=True, unit="m", length=3)
@@ -126,7 +126,7 @@ class RobotCfg:
     start: list[float] = spec([], unit="rad, m")
     """Joint values at which environments begin, clear of the table. Empty: ``home``."""
     gripper_open: list[float] | None = spec(None, unit="rad, m")
-    """Joint targets of the open gripper. null: as far as the joints' ranges allow."""
+    """Joint targets of the open gripper. null: as far as joints and servos allow."""
     gripper_closed: list[float] | None = spec(None, unit="rad, m")
     """Joint targets of the gripper around an object as wide as ``closed_width``; around any object
     where a task or the command line sets it alone. null: the jaws press with 20 N."""
