@@ -23,6 +23,7 @@ from mjstack.report.record import GateResult
 from mjstack.robots.guest import gravity_sag
 from mjstack.scene import build_model
 from mjstack.scene.build import add_scene
+from mjstack.scene.index import SceneIndex
 
 SCARA = Path(__file__).parents[1] / "examples" / "scara"
 MJCF = (SCARA / "scara.xml").read_text()
@@ -293,6 +294,31 @@ def test_a_contact_that_holds_the_arm_is_named_and_excluded(tmp_path: Path) -> N
     assert free.metrics["waypoint_error_m"] < 2e-3
 
 
+def test_an_excluded_world_is_the_files_alone(tmp_path: Path) -> None:
+    """The table still touches the pads, and the arm stands where it stood."""
+    post = POST.replace("POS", "0.20 -0.07 0.41")
+    file = arm_file(tmp_path, ("<worldbody>", f"<worldbody>{post}"))
+    deep = ["scene.table_center=[0.41,0,0.03]", f"robot.file={file}"]
+    plain = scara(*deep)
+    cfg = scara("robot.exclude=[[world,left_finger],[inner_arm,world]]", *deep)
+    bases, touching = [], []
+    for c in (plain, cfg):
+        model = build_model(c)
+        bases.append(SceneIndex(model, c.robot, c.scene).base)
+        data = mujoco.MjData(model)
+        for name, value in zip(c.robot.joints, [-0.8, 1.6, 0.0, 0.0, 0.045, 0.045], strict=True):
+            data.joint(name).qpos = value
+        mujoco.mj_forward(model, data)
+        touching.append({tuple(model.geom(g).name for g in pair.geom) for pair in data.contact})
+    assert touching[0] == touching[1]
+    assert ("table", "left_pad") in touching[1]
+    assert bases[0] == bases[1]
+    own = model.body("robot_world").id
+    assert model.geom("post").bodyid[0] == own
+    pairs = {tuple(divmod(int(s), 1 << 16)) for s in model.exclude_signature}
+    assert pairs == {(own, model.body(name).id) for name in ("left_finger", "inner_arm")}
+
+
 def test_a_start_inside_of_the_table_is_named() -> None:
     result = baseline(
         "robot.home=[-0.8,1.6,0.0,0.0,0.045,0.045]", "scene.table_center=[0.41,0,0.03]"
@@ -305,7 +331,7 @@ def test_a_start_inside_of_the_table_is_named() -> None:
 def test_exclude_and_gravcomp_take_names_and_words(tmp_path: Path) -> None:
     model = build_model(scara("robot.exclude=[[left_finger,right_finger],[world,hand]]"))
     pairs = [{model.body(n).name for n in divmod(int(s), 1 << 16)} for s in model.exclude_signature]
-    assert pairs == [{"world", "hand"}, {"left_finger", "right_finger"}]
+    assert pairs == [{"robot_world", "hand"}, {"left_finger", "right_finger"}]
     near = "robot.exclude: body 'left_fingr' does not exist. Did you mean 'left_finger'?"
     refusal(lambda: build_model(scara("robot.exclude=[[left_fingr,hand]]")), near)
     refusal(lambda: build_model(scara("robot.exclude=[[red,hand]]")), "robot.exclude: body 'red'")

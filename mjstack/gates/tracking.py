@@ -7,7 +7,7 @@ import numpy as np
 
 from mjstack.episodes.rollout import State
 from mjstack.episodes.stage import Stage
-from mjstack.robots.guest import WORLD, grasp_jacobian
+from mjstack.robots.guest import OWN_WORLD, WORLD, grasp_jacobian
 from mjstack.scene.build import scene_names
 from mjstack.scene.index import actuator_moment
 
@@ -120,6 +120,7 @@ def _touch(
     for number in contact.geom:
         geom, body = model.geom(number), model.geom_bodyid[number]
         name, root = (model.body(n).name for n in (body, model.body_rootid[body]))
+        name = WORLD if name == OWN_WORLD else name
         label, in_scene = name, root in stage.cfg.scene.objects
         if name == WORLD:
             in_scene = geom.name in scene_names(stage.cfg.scene)

@@ -29,6 +29,7 @@ _CONFIGURED = (*_SOLVER, "timestep", "integrator", "cone")  # by groups timing a
 SAG = 0.002  # m: how far off its target a hand is of which gravity, or a report, takes no notice
 _WRAPS = (mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER)
 PREFIX = "robot_"
+OWN_WORLD = PREFIX + WORLD  # body for the file's worldbody, where robot.exclude names that
 _NAMED = ("geoms", "bodies", "cameras")  # elements that a scene has too
 _NAMING = {  # elements with the names of others, whose kind another field has, or is always renamed
     "pairs": {"geomname1": "", "geomname2": ""},
@@ -68,7 +69,8 @@ def as_guest(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) ->
             expected = "pairs of bodies, such as [[world, link1]]"
             raise ConfigError("robot.exclude", robot.exclude, expected)
         require_names("robot.exclude: body", map(str, pair), bodies)
-        spec.add_exclude(bodyname1=str(pair[0]), bodyname2=str(pair[1]))
+        first, second = (OWN_WORLD if name == WORLD else str(name) for name in pair)
+        spec.add_exclude(bodyname1=first, bodyname2=second)
     for servo in _idle_servos(spec, robot, *_LAGS):
         if servo.dyntype == _DYN.mjDYN_INTEGRATOR:
             servo.ctrlrange = servo.actrange  # its position, no longer a speed
@@ -85,7 +87,10 @@ def as_guest(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) ->
         fix_masses(spec)
     for name in _SOLVER:
         setattr(fresh.option, name, getattr(spec.option, name))
-    base = fresh.worldbody.add_frame(pos=robot.base.pos, quat=robot.base.quat)
+    world = fresh.worldbody
+    if any(WORLD in pair for pair in robot.exclude):  # table and floor are not excluded
+        world = world.add_body(name=OWN_WORLD)
+    base = world.add_frame(pos=robot.base.pos, quat=robot.base.quat)
     attach_guest(fresh, spec, base, "")
     for joint in fresh.joints:
         if joint.name in rest:
@@ -257,12 +262,12 @@ def _home_key(spec: mujoco.MjSpec, robot: RobotCfg) -> dict[str, np.ndarray]:
 
 def _tree(body: mujoco.MjsBody) -> mujoco.MjsBody:
     """The child of the world that a body hangs below."""
-    return [body, *_above(body)][-2] if body.name != WORLD else body
+    return [body, *_above(body)][-2] if body.name not in (WORLD, OWN_WORLD) else body
 
 
 def _above(body: mujoco.MjsBody) -> list[mujoco.MjsBody]:
     """A body's ancestors, up to the world."""
-    return [] if body.name == WORLD else [body.parent, *_above(body.parent)]
+    return [] if body.name in (WORLD, OWN_WORLD) else [body.parent, *_above(body.parent)]
 
 
 def _below(body: mujoco.MjsBody) -> list[mujoco.MjsBody]:

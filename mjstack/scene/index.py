@@ -14,6 +14,7 @@ from torch import Tensor
 from mjstack.config.schema import RobotCfg, SceneCfg
 from mjstack.errors import ConfigError, require_names
 from mjstack.math import lowest_point, quat_mul, quat_to_matrix
+from mjstack.robots.guest import OWN_WORLD
 from mjstack.robots.jaws import Jaws
 from mjstack.robots.posture import Posture, posture
 from mjstack.scene.build import CAPSULE_TURN, WORLD, force_sensor
@@ -106,7 +107,10 @@ class SceneIndex:
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         first = model.jnt_bodyid[joints[0]]
-        self.base = data.xpos[model.body_parentid[first] or first, :2].tolist()
+        carrier = model.body_parentid[first]
+        if model.body(carrier).name in (WORLD, OWN_WORLD):
+            carrier = first
+        self.base = data.xpos[carrier, :2].tolist()
         self.grasp_sites = [model.site(name).id for name in robot.grasp_sites]
         self.objects = {
             name: (int(model.joint(name).qposadr[0]), int(model.joint(name).dofadr[0]))

@@ -100,7 +100,8 @@ class RobotCfg:
     """Whether gravity of the robot's bodies is compensated. auto: as in its file, and where that
     compensates none, if the hand would sag more than 2 mm at home."""
     exclude: list[Any] = spec([])
-    """Pairs of the robot's bodies that do not collide, such as ``[world, link1]``."""
+    """Pairs of the robot's bodies that do not collide, such as ``[world, link1]``. world:
+    what its file has in the worldbody."""
     menagerie_name: str = ""
     """The robot's folder in MuJoCo Menagerie, for ``model=menagerie``."""
     menagerie_file: str = ""
