@@ -171,8 +171,8 @@ def left_behind(
         yield f"left out: {describe(strangers)}"
     if lags := _idle_servos(spec, robot, *_LAGS):
         yield f"without activation, which an idle joint does not need: {describe(lags)}"
-    if others := _idle_servos(spec, robot, _DYN.mjDYN_PID):
-        yield f"not held at rest, as its command stays 0: {describe(others)}"
+    if pids := _idle_servos(spec, robot, _DYN.mjDYN_PID):
+        yield f"not held at rest, as its command stays 0: {describe(pids)}"
     names = set(_clashes(spec, reserved)) - {e.name for e in strangers}
     if names:
         yield f"renamed to {PREFIX}NAME: {', '.join(sorted(names))}"

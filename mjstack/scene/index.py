@@ -256,8 +256,8 @@ def gripper_targets(
     jaws = jaws_of(model, robot)
     low, high = joint_limits(model, robot.gripper_joints)
     opened, closed = (
-        np.clip(end, low, high) if given is None else np.array(given, dtype=float)
-        for end, given in ((jaws.opened, robot.gripper_open), (jaws.shut, robot.gripper_closed))
+        np.clip(end, low, high) if target is None else np.array(target, dtype=float)
+        for end, target in ((jaws.opened, robot.gripper_open), (jaws.shut, robot.gripper_closed))
     )
     probed = robot.gripper_closed is None
     wide = np.array(widths, dtype=float)  # None is NaN
