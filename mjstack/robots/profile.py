@@ -77,7 +77,7 @@ def guess_profile(file: Path, scene: SceneCfg, arm: str = "") -> list[Guess]:
         except (ValueError, MjstackError) as error:
             problems.append(f"{_label(model, hand)}: {error}")
     names = [model.body(hand.palm).name for hand, *_ in hands]
-    chosen = [found for found in hands if arm.lower() in _label(model, found[0]).lower()]
+    chosen = [entry for entry in hands if arm.lower() in _label(model, entry[0]).lower()]
     if not hands:
         raise MjstackError(
             f"{file}: expected an arm of two joints or more with a gripper; "
@@ -95,7 +95,7 @@ def guess_profile(file: Path, scene: SceneCfg, arm: str = "") -> list[Guess]:
     if space.tilt > _LEANS:
         with suppress(ValueError):  # a tip of a hand that leans reaches lower
             grip = Fingers(spec, hand, limits[len(hand.arm) :]).measure(_WIDTH, _SHALLOW)
-    rest = [name for name, found in zip(names, hands, strict=True) if found is not chosen[0]]
+    rest = [name for name, entry in zip(names, hands, strict=True) if entry is not chosen[0]]
     guesses = [
         *_guess_joints(model, hand, rest),
         *_guess_grip(model, hand, grip, limits[len(hand.arm) :]),
@@ -124,8 +124,8 @@ def _fit(spec: mujoco.MjSpec, model: mujoco.MjModel, hand: Hand) -> tuple[list[s
     arm, gripper = names[: len(hand.arm)], names[len(hand.arm) :]
     tendons = {w.target.name for t in spec.tendons for w in t.path if w.target is not None}
     bare = [name for name in names if servo_problem(spec, name)]
-    kept = [name for name in bare if name in gripper and name in tendons]
-    for missing in ([name for name in bare if name not in kept], bare):
+    pulled = [name for name in bare if name in gripper and name in tendons]
+    for missing in ([name for name in bare if name not in pulled], bare):
         servos = {name: ServoCfg(stiffness=1.0, damping=1.0, effort=1.0) for name in missing}
         robot = RobotCfg(name="guess", arm_joints=arm, gripper_joints=gripper, servos=servos)
         robot.ranges = _unlimited(model, hand)
