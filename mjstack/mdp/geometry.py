@@ -41,8 +41,7 @@ def zeros(env: EnvView) -> Tensor | None:
     """How far joint zeros are off the file's [rad, m], shape ``(nworld, n)``, where any may be."""
     if "qpos0" not in env.sim.fields:
         return None
-    now = robot(env).qpos.read(env.sim.fields["qpos0"])
-    return env.index.constant(env.sim.model.qpos0[env.index.robot_qpos].tolist(), now) - now
+    return robot(env).zero - robot(env).qpos.read(env.sim.fields["qpos0"])
 
 
 def gripper_opening(env: EnvView) -> Tensor:

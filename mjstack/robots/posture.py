@@ -194,17 +194,17 @@ class Posture:
         knots = np.linspace(ends[0], ends[1], KNOTS)
         first = int(np.abs(knots - self.rest[address]).argmin())
         positions = np.empty((KNOTS, len(self.rest)))
-        held = np.zeros(KNOTS, dtype=bool)
+        exact = np.zeros(KNOTS, dtype=bool)
         for way in (range(first, KNOTS), range(first, -1, -1)):
             qpos = self.rest
             for knot in way:
-                qpos, held[knot] = self._place(qpos, address, knots[knot], count)
+                qpos, exact[knot] = self._place(qpos, address, knots[knot], count)
                 positions[knot] = qpos
-                if held.any() and not held[knot]:
+                if exact.any() and not exact[knot]:
                     break
-        if held.all() or not held.any():
+        if exact.all() or not exact.any():
             return positions
-        inside = np.flatnonzero(held)[[0, -1]]
+        inside = np.flatnonzero(exact)[[0, -1]]
         near, far = knots[inside], knots[np.clip(inside + np.array([-1, 1]), 0, KNOTS - 1)]
         for _ in range(_HALVINGS):
             for side, middle in enumerate((near + far) / 2.0):

@@ -51,6 +51,7 @@ class RobotTensors:
     gripper_closed: Tensor  # around the narrowest of the scene's objects and that of closed_width
     gripper_travel: Tensor  # the open less the closed one
     idle_ctrl: Tensor  # commands that hold those joints
+    zero: Tensor  # qpos0 of the joints
 
 
 class SceneIndex:
@@ -95,6 +96,7 @@ class SceneIndex:
         self.robot_qpos = model.jnt_qposadr[joints]
         self.robot_qvel = model.jnt_dofadr[joints]
         self.robot_range = model.jnt_range[joints]
+        self._zero = model.qpos0[self.robot_qpos]
         self.ctrl = np.array([model.actuator(name).id for name in robot.joints])
         self._idle = _idle_servos(model, self.ctrl, self.posture.rest)
         self.servo_range = model.actuator_ctrlrange[self.ctrl]
@@ -170,7 +172,7 @@ class SceneIndex:
             ranges = (self.robot_range, self.ctrl_range)
             numbers = [torch.tensor(n, dtype=dtype, device=device) for n in (*ranges, *poses)]
             numbers.append(numbers[-2] - numbers[-1])
-            numbers.append(torch.from_numpy(idle_ctrl).to(device, dtype))
+            numbers += [torch.from_numpy(n).to(device, dtype) for n in (idle_ctrl, self._zero)]
             self.posture.follow(numbers[2])  # which moves its tables there
             self._tensors[key] = RobotTensors(*columns, *numbers)  # type: ignore[arg-type]
         return self._tensors[key]
@@ -243,9 +245,9 @@ def joint_limits(
     servos = [model.actuator(name).id for name in robot.joints]
     limited = model.actuator_ctrllimited[servos, None]
     span = np.where(limited, model.actuator_ctrlrange[servos], [-np.inf, np.inf])
-    both = np.stack((posture(model, tuple(robot.joints)).limits, span))
-    both = both if numbers is None else both[:, list(numbers)]
-    return both[..., 0].max(axis=0), both[..., 1].min(axis=0)
+    spans = np.stack((posture(model, tuple(robot.joints)).limits, span))
+    spans = spans if numbers is None else spans[:, list(numbers)]
+    return spans[..., 0].max(axis=0), spans[..., 1].min(axis=0)
 
 
 def gripper_targets(
