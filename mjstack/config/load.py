@@ -64,8 +64,6 @@ _REPLAYED = {
 # Overrides by the key where a choice of a group goes, such as gate.success.reset=jitter
 _CHOICE = re.compile(r"^(?:gate\.\w+\.|job\.)(reset|observation)=(?!null$)[\w,]+$")
 
-_WHOLE = re.compile(r"\$\{([\w.]+)\}")  # an interpolation of a key, alone
-
 # Interpolations: ${NAME:ARGUMENT,...} is the value of a function of these and of the configuration.
 _RESOLVERS: dict[str, Callable] = {
     "steps": _control_steps,
@@ -204,18 +202,21 @@ def _locate_files(cfg: DictConfig, files: Sequence[tuple[Path, Mapping[str, obje
     where an override does, to the working folder. ``files`` are the folder, keys and values of
     each, in the order of composition.
     """
+    named = [(owner, owner._get_node("file")._dereference_node()) for _, owner in _with_file(cfg)]
+    # All before the first changes, as one may take another's value
+    sources = [(owner, node._get_full_key(None), node._value()) for owner, node in named]
+    for owner, source, value in sources:
+        folders = [folder for folder, values in files if source in values]
+        owner.file = os.path.abspath(Path(*folders[-1:], value))
+
+
+def _with_file(cfg: DictConfig) -> Iterator[tuple[str, Any]]:
+    """The robot and the objects that have an MJCF file, by their keys."""
     objects = OmegaConf.select(cfg, "scene.objects", default={})
-    for key in ("robot.file", *(f"scene.objects.{name}.file" for name in objects)):
-        value = OmegaConf.select(cfg, key, throw_on_missing=False)
-        if not isinstance(value, str):
-            continue
-        source = key
-        named = [(folder, values[source]) for folder, values in files if source in values]
-        while named and (match := _WHOLE.fullmatch(str(named[-1][1]))):  # takes another key's value
-            source = match[1]
-            named = [(folder, values[source]) for folder, values in files if source in values]
-        folder = named[-1][0] if named else Path()
-        OmegaConf.update(cfg, key, os.path.abspath(folder / value))
+    for key in ("robot", *(f"scene.objects.{name}" for name in objects)):
+        owner = OmegaConf.select(cfg, key)
+        if isinstance(OmegaConf.select(cfg, f"{key}.file"), str):
+            yield key, owner
 
 
 def _drop_inherited(cfg: DictConfig, files: Sequence[Mapping[str, object]]) -> None:
