@@ -276,19 +276,36 @@ def load_saved(path: Path) -> Config:
             for place, kind in _REPLAYED.items():
                 if key.startswith(place) and key.endswith(".func"):
                     session.check_term(key.removesuffix(".func"), str(name), kind, path)
+        _locate_saved(merged, path)
         try:
             cfg = to_config(merged)
         except ConfigError as error:
             if not error.key.endswith(".file"):
                 raise
             raise MjstackError(f"{error} {session.add_folder(path)}") from error
-        folders = [folder.parent for folder in session.config_folders()]
-        for key, file in cfg.files.items():
-            if not any(map(Path(file).is_relative_to, folders)):
-                advice = session.folder_advice([Path(file).parent])
-                problem = f"{key}={file}: expected a file beside a folder of the search path"
-                raise MjstackError(problem, f"If you trust it, add {advice}")
     return cfg
+
+
+def _locate_saved(cfg: DictConfig, path: Path) -> None:
+    """Let the MJCF files of a run, which may be a stranger's, be beside the folders of the search
+    path, wherever these are by now; a MjstackError if one is not.
+    """
+    folders = session.config_folders()
+    used = session.used_folders(path)
+    moved = zip(
+        [folder for folder in used if folder not in folders],
+        [folder for folder in folders if folder not in used],
+        strict=False,
+    )
+    pairs = [(folder.parent, folder.parent) for folder in folders]
+    pairs += [(old.parent, new.parent) for old, new in moved]
+    for key, owner in _with_file(cfg):
+        file = Path(os.path.abspath(owner.file))
+        places = [new / file.relative_to(old) for old, new in pairs if file.is_relative_to(old)]
+        if not places:
+            problem = f"{key}.file={file}: expected a file beside a folder of the search path"
+            raise MjstackError(f"{problem}. {session.add_folder(path, file.parent)}")
+        owner.file = str(places[0])
 
 
 def to_config(cfg: DictConfig) -> Config:
