@@ -92,12 +92,12 @@ def search_path_args(folders: Sequence[Path] | None = None) -> list[str]:
     return [arg for folder in folders for arg in ("--config-dir", str(folder))]
 
 
-def add_folder(saved: Path, *others: Path) -> str:
+def add_folder(saved: Path, *more: Path) -> str:
     """The advice where the search path lacks a folder that the run of a config.yaml had used, or
-    others, where it lacks none of these.
+    ``more``, where it lacks none of these.
     """
     folders = [folder for folder in used_folders(saved) if folder not in config_folders()]
-    return f"If you trust the folder that it had used, add {folder_advice(folders or others)}."
+    return f"If you trust the folder that it had used, add {folder_advice(folders or more)}."
 
 
 def used_folders(saved: Path) -> list[Path]:
