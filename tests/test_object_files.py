@@ -17,6 +17,7 @@ from mjstack.mdp.geometry import above_table, pose_w
 from mjstack.mdp.observation import fixture_pos, fixture_vel
 from mjstack.mdp.starts.starts_file import write_starts
 from mjstack.robots.guest import object_left_behind
+from mjstack.scene import build_model
 from mjstack.tasks.view import TaskView
 
 NATIVE = ("sim=native", "reset=nominal")
@@ -134,6 +135,27 @@ def test_a_mug_is_one_body_without_its_surroundings(tmp_path: Path) -> None:
     other.close()
 
 
+NAMED = {  # requests that would keep a body apart from the object's
+    "gravcomp": ("", ""),
+    "camera k": ("<camera name='k' mode='trackcom'/>", ""),
+    "camera t": ("<camera name='t' mode='targetbody' target='b'/>", ""),
+    "light l": ("<light name='l' mode='targetbody' target='b'/>", ""),
+    "equality": ("", "<equality><weld body1='b'/></equality>"),
+}
+
+
+@pytest.mark.parametrize("left", NAMED)
+def test_a_body_that_its_file_names_is_one_with_the_object(tmp_path: Path, left: str) -> None:
+    content, end = NAMED[left]
+    body = f"<body name='b' gravcomp='{int(left == 'gravcomp')}'><freejoint/>{content}"
+    body += "<geom size='0.02' mass='0.05'/></body>"
+    path = written(tmp_path, f"<mujoco><worldbody>{body}</worldbody>{end}</mujoco>")
+    model = build_model(load_config([f"+scene.objects.w={{file: {path}, xy: [0.38, 0.13]}}"]))
+    assert model.body("w").mass[0] == pytest.approx(0.05)
+    assert model.body_gravcomp[model.body("w").id] == 0.0
+    assert left in "\n".join(object_left_behind(str(path), model, fixed=False))
+
+
 def test_heights_of_a_turned_mesh_are_those_of_its_points(tmp_path: Path) -> None:
     """Against all vertices: a box around the mesh would reach lower by 10 mm."""
     points = np.random.default_rng(0).normal(size=(60, 3))
@@ -169,6 +191,25 @@ WRONG = {
     "twice": ("<geom size='0.02'/>", "mass: 1, density: 1", "thing.density=1.0: expected null"),
     "fixed mass": ("<geom size='0.02'/>", "fixed: true, mass: 1", "masses of a fixture are its"),
     "free": ("<geom size='0.02'/>", "joints: {lid: {damping: 1}}", "it is no fixture from a file"),
+    "mocap": ("<body name='b' mocap='true'><geom size='.1'/></body>", "", "rigid body; body b"),
+    "adhesion": (
+        "<body name='b'><freejoint/><geom size='.02'/></body></worldbody><actuator>"
+        "<adhesion body='b' ctrlrange='0 1'/></actuator><worldbody>",
+        "",
+        "body b cannot be fused",
+    ),
+    "fixed mocap": (
+        "<body name='b' mocap='true'><geom size='.02'/></body>",
+        "fixed: true",
+        "scene.objects.thing: mocap body 'thing_b' is not",
+    ),
+    "range": (LID, "fixed: true, joints: {lid: {range: [0.5, 0.1]}}", "lid.range=[0.5, 0.1]: expe"),
+    "empty range": (LID, "fixed: true, joints: {lid: {range: [0, 0]}}", "lid.range=[0.0, 0.0]: ex"),
+    "ball": (
+        "<body><joint name='b' type='ball'/><geom size='.02'/></body>",
+        "fixed: true, joints: {b: {range: [0.1, 0.5]}}",
+        "scene.objects.thing: range[0] should be 0 in ball joint",
+    ),
     "unknown": (LID, "fixed: true, joints: {lit: {damping: 1}}", "Did you mean 'lid'"),
 }
 
@@ -223,12 +264,30 @@ def test_starts_of_a_fixture_are_drawn_and_come_back_from_a_file(tmp_path: Path)
     file = f"starts={tmp_path}/starts.npz"
     again = build(path, "reset=starts_file", file, keys=", fixed: true", nworld=8)
     assert torch.equal(again.sim.qpos, env.sim.qpos)
-    for wrong in ("[0.6, 0.2]", "[0.0, 1.6]", "[0.1]"):
+    for wrong in ("[0.6, 0.2]", "[0.0, 1.6]", "[0.1]", "3", "[a, b]", "ab", "{a: 1, b: 2}"):
         bad = term.replace("[0.2, 0.6]", wrong)
         message = "expected two numbers in 0 to 1.5708"
         refusal(partial(build, path, f"+reset.door={bad}", keys=", fixed: true"), message)
     env.close()
     again.close()
+
+
+@pytest.mark.parametrize("joints", ["{}", "null", "[1]", "3"])
+def test_starts_of_fixtures_are_a_mapping(tmp_path: Path, joints: str) -> None:
+    term = f"{{func: mjstack.mdp.reset.FixtureJoints, params: {{joints: {joints}}}}}"
+    path = written(tmp_path, DOOR)
+    message = f"reset.door.params.joints={joints}: expected a mapping"
+    refusal(partial(build, path, f"+reset.door={term}", keys=", fixed: true"), message)
+
+
+@pytest.mark.parametrize(("ends", "start"), [([0.5, 0.9], 0.5), ([-0.9, -0.5], -0.5)])
+def test_a_fixture_starts_at_the_end_nearest_to_zero(
+    tmp_path: Path, ends: list[float], start: float
+) -> None:
+    keys = f", fixed: true, joints: {{hinge: {{range: {ends}}}}}"
+    env = build(written(tmp_path, DOOR), keys=keys)
+    assert fixture_pos(env, joint="thing_hinge").tolist() == [start]
+    env.close()
 
 
 def test_a_fixture_with_pos_may_be_beside_the_table(tmp_path: Path) -> None:

@@ -5,19 +5,22 @@ kinematics of an arm with a slide against MuJoCo's.
 import re
 import shutil
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 from compositions import refusal
-from environments import Patch
+from environments import Patch, one_second_episode
 from ik_arm import Arm
 
 from mjstack import load_config
+from mjstack.cli import run
 from mjstack.config.fingerprint import config_content
+from mjstack.config.load import load_saved
 from mjstack.config.schema import Config
+from mjstack.config.session import search_path
 from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.errors import ConfigError, MjstackError, UnknownName
 from mjstack.kinematics.reach import PointReach
@@ -91,6 +94,50 @@ def test_each_file_is_beside_the_yaml_that_names_it(
         "robot.file": str(alpha / "scara.xml"),
         "scene.objects.wall.file": str(alpha / "mug.xml"),
     }
+
+
+TAKEN = {
+    "object": "v: ${scene.objects.w}",
+    "relative": "v: {fixed: true, xy: [0.3, 0.1], file: '${..w.file}'}",
+    "chain": "v: {fixed: true, xy: [0.3, 0.1], file: '${..u.file}'}\n    u: ${scene.objects.w}",
+}
+
+
+@pytest.mark.parametrize("case", TAKEN)
+def test_a_file_taken_from_a_later_object_is_beside_its_yaml(tmp_path: Path, case: str) -> None:
+    conf = tmp_path / "conf/experiment"
+    conf.mkdir(parents=True)
+    shutil.copy(SCARA / "scara.xml", tmp_path / "mug.xml")
+    (conf / "taken.yaml").write_text(
+        "# @package _global_\nscene:\n  objects:\n    " + TAKEN[case] + "\n"
+        "    w: {fixed: true, xy: [0.3, 0.1], file: ../../mug.xml}\n"
+    )
+    files = load_config(["experiment=taken"], config_dir=tmp_path / "conf").files
+    assert set(files) >= {"scene.objects.v.file", "scene.objects.w.file"}
+    assert set(files.values()) == {str(tmp_path / "mug.xml")}
+
+
+def test_a_run_finds_its_files_where_the_project_has_moved(
+    tmp_path: Path, monkeypatch: Patch
+) -> None:
+    """Though the other project, which stayed, has a file of that name."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("old", "other"):
+        shutil.copytree(SCARA, tmp_path / name)
+    (tmp_path / "other/conf/robot/scara.yaml").unlink()
+    search = f"hydra.searchpath=[file://{tmp_path}/other/conf,file://{tmp_path}/old/conf]"
+    robot = [search, "robot=scara", "sim=native", "nworld=2", "gates=[batch]"]
+    args = [*robot, "web.episode=false", *one_second_episode()]
+    assert run([*args, "hydra.run.dir=old/out"]) in (0, 1)
+    saved = Path("new/out/.hydra/config.yaml")
+    Path("old").rename("new")
+    with search_path([tmp_path / "new/conf", tmp_path / "other/conf"]):
+        cfg = load_saved(saved)
+        assert cfg.robot.file == str(tmp_path / "new/scara.xml")
+        text = saved.read_text().replace(str(tmp_path / "old"), str(tmp_path / "old/../elsewhere"))
+        saved.write_text(text)
+        refusal(partial(load_saved, saved), "expected a file beside a folder of the search path")
+    refusal(partial(load_saved, saved), "/old/conf'")  # where it was, as the folder says
 
 
 @pytest.mark.full

@@ -292,6 +292,19 @@ def test_nothing_outside_is_read(name: str, stranger: Path) -> None:
             replay(stranger)
 
 
+@pytest.mark.parametrize("fixed", [False, True])
+def test_no_file_outside_is_compiled(fixed: bool, stranger: Path, monkeypatch: Patch) -> None:
+    def compiled(*args: Any, **options: Any) -> None:
+        pytest.fail("compiled")
+
+    monkeypatch.setattr("mjstack.config.mjcf.read_mjcf", compiled)
+    Path(stranger / "thing.xml").write_text("<mujoco/>")
+    edit(stranger, "scene.objects.red.fixed", fixed)
+    for file in (f"{stranger}/thing.xml", "stranger/thing.xml", "/none.xml"):
+        edit(stranger, "scene.objects.red.file", file)
+        assert "expected a file beside a " in refused(lambda: replay(stranger))
+
+
 @pytest.mark.full
 def test_aliases_are_refused_at_once(stranger: Path) -> None:
     path = stranger / ".hydra" / "config.yaml"

@@ -143,6 +143,10 @@ def _scene(cfg: Config) -> Checks:
         yield f"{key}.fixed", wrong, "true, because it has parts"
         wrong = bool(thing.joints) and not (thing.file and thing.fixed)
         yield f"{key}.joints", wrong, "{}, because it is no fixture from a file"
+        for joint, values in thing.joints.items():
+            if values.range is not None and not values.range[0] < values.range[1]:
+                expected = "two numbers, the smaller one first"
+                raise ConfigError(f"{key}.joints.{joint}.range", values.range, expected)
         shapes = [(key, thing)] * (not made)
         for where, shape in shapes + [(f"{key}.parts.{n}", p) for n, p in thing.parts.items()]:
             count, words = SHAPES[shape.shape]

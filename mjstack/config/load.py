@@ -64,8 +64,6 @@ _REPLAYED = {
 # Overrides by the key where a choice of a group goes, such as gate.success.reset=jitter
 _CHOICE = re.compile(r"^(?:gate\.\w+\.|job\.)(reset|observation)=(?!null$)[\w,]+$")
 
-_WHOLE = re.compile(r"\$\{([\w.]+)\}")  # an interpolation of a key, alone
-
 # Interpolations: ${NAME:ARGUMENT,...} is the value of a function of these and of the configuration.
 _RESOLVERS: dict[str, Callable] = {
     "steps": _control_steps,
@@ -204,18 +202,21 @@ def _locate_files(cfg: DictConfig, files: Sequence[tuple[Path, Mapping[str, obje
     where an override does, to the working folder. ``files`` are the folder, keys and values of
     each, in the order of composition.
     """
+    named = [(owner, owner._get_node("file")._dereference_node()) for _, owner in _with_file(cfg)]
+    # All before the first changes, as one may take another's value
+    sources = [(owner, node._get_full_key(None), node._value()) for owner, node in named]
+    for owner, source, value in sources:
+        folders = [folder for folder, values in files if source in values]
+        owner.file = os.path.abspath(Path(*folders[-1:], value))
+
+
+def _with_file(cfg: DictConfig) -> Iterator[tuple[str, Any]]:
+    """The robot and the objects that have an MJCF file, by their keys."""
     objects = OmegaConf.select(cfg, "scene.objects", default={})
-    for key in ("robot.file", *(f"scene.objects.{name}.file" for name in objects)):
-        value = OmegaConf.select(cfg, key, throw_on_missing=False)
-        if not isinstance(value, str):
-            continue
-        source = key
-        named = [(folder, values[source]) for folder, values in files if source in values]
-        while named and (match := _WHOLE.fullmatch(str(named[-1][1]))):  # takes another key's value
-            source = match[1]
-            named = [(folder, values[source]) for folder, values in files if source in values]
-        folder = named[-1][0] if named else Path()
-        OmegaConf.update(cfg, key, os.path.abspath(folder / value))
+    for key in ("robot", *(f"scene.objects.{name}" for name in objects)):
+        owner = OmegaConf.select(cfg, key)
+        if isinstance(OmegaConf.select(cfg, f"{key}.file"), str):
+            yield key, owner
 
 
 def _drop_inherited(cfg: DictConfig, files: Sequence[Mapping[str, object]]) -> None:
@@ -275,19 +276,36 @@ def load_saved(path: Path) -> Config:
             for place, kind in _REPLAYED.items():
                 if key.startswith(place) and key.endswith(".func"):
                     session.check_term(key.removesuffix(".func"), str(name), kind, path)
+        _locate_saved(merged, path)
         try:
             cfg = to_config(merged)
         except ConfigError as error:
             if not error.key.endswith(".file"):
                 raise
             raise MjstackError(f"{error} {session.add_folder(path)}") from error
-        folders = [folder.parent for folder in session.config_folders()]
-        for key, file in cfg.files.items():
-            if not any(map(Path(file).is_relative_to, folders)):
-                advice = session.folder_advice([Path(file).parent])
-                problem = f"{key}={file}: expected a file beside a folder of the search path"
-                raise MjstackError(problem, f"If you trust it, add {advice}")
     return cfg
+
+
+def _locate_saved(cfg: DictConfig, path: Path) -> None:
+    """Let the MJCF files of a run, which may be a stranger's, be beside the folders of the search
+    path, wherever these are by now; a MjstackError if one is not.
+    """
+    folders = session.config_folders()
+    used = session.used_folders(path)
+    moved = zip(
+        [folder for folder in used if folder not in folders],
+        [folder for folder in folders if folder not in used],
+        strict=False,
+    )
+    pairs = [(folder.parent, folder.parent) for folder in folders]
+    pairs += [(old.parent, new.parent) for old, new in moved]
+    for key, owner in _with_file(cfg):
+        file = Path(os.path.abspath(owner.file))
+        places = [new / file.relative_to(old) for old, new in pairs if file.is_relative_to(old)]
+        if not places:
+            problem = f"{key}.file={file}: expected a file beside a folder of the search path"
+            raise MjstackError(f"{problem}. {session.add_folder(path, file.parent)}")
+        owner.file = str(places[0])
 
 
 def to_config(cfg: DictConfig) -> Config:

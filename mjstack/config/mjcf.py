@@ -87,6 +87,9 @@ def read_object(file: str, *, fixed: bool) -> tuple[mujoco.MjSpec, str]:
     elif free and not fixed:
         content = (*world.bodies, *world.geoms, *world.sites, *world.cameras)
         extra += [element for element in content if element not in (*free, *extra)]
+    if not fixed:  # bodies that others name, or that float, would stay apart
+        aimed = [light for light in spec.lights if light.targetbody and light not in extra]
+        extra += [*spec.cameras, *aimed, *spec.equalities, *spec.excludes, *spec.sensors]
     left = describe(extra)
     joints = [joint for body in free if body not in extra for joint in body.joints]
     for element in (*extra, *(joint for joint in joints if joint.type == FREE)):
@@ -94,8 +97,10 @@ def read_object(file: str, *, fixed: bool) -> tuple[mujoco.MjSpec, str]:
     for number, joint in enumerate(spec.joints):
         joint.name = joint.name or f"joint{number}"
     if not fixed:
-        for element in (*spec.excludes, *spec.sensors):  # bodies that they name would stay apart
-            spec.delete(element)
+        if any(body.gravcomp for body in spec.bodies):
+            left += ", gravcomp" if left else "gravcomp"
+        for body in spec.bodies:
+            body.gravcomp = 0.0
         if len(free) > 1 or spec.joints:
             cause = f"{len(free)} free ones" if len(free) > 1 else f"joint {spec.joints[0].name}"
             problem = f"{file}: expected one rigid body, as the object moves; it has {cause}"
@@ -125,6 +130,9 @@ def free_body(
     body.add_freejoint(name=name)
     attach_guest(scene, spec, body.add_frame(pos=origin), f"{name}_")
     scene.fuse_static()
+    if apart := [low.name.removeprefix(f"{name}_") for low in body.bodies]:
+        problem = f"{file}: expected one rigid body; body {', '.join(apart)} cannot be fused"
+        raise MjstackError(problem, "Correct it, or set fixed=true for a fixture")
     return scene
 
 
@@ -166,8 +174,7 @@ def measure(file: str, *, fixed: bool) -> Solid:
         probe = spec.worldbody.add_geom(size=[1e-6] * 3, contype=0, conaffinity=0)
         model = compile_scene(spec)
     except ValueError as error:
-        problem = ", ".join(str(error).removeprefix("Error: ").splitlines())
-        raise MjstackError(f"{file}: {problem}. Correct the object's file") from error
+        raise MjstackError(f"{file}: {mujoco_lines(error)}. Correct the object's file") from error
     collides = (model.geom_contype | model.geom_conaffinity) != 0
     if not collides.any() and (not fixed or model.ngeom == 1):
         raise MjstackError(f"{file}: expected a geom that collides, there is none.")
@@ -227,3 +234,8 @@ def _without_prefix() -> Iterator[None]:
             yield
     finally:
         mujoco.set_mju_user_warning(hook)
+
+
+def mujoco_lines(error: ValueError) -> str:
+    """An error of MuJoCo's compiler in one line."""
+    return ", ".join(str(error).removeprefix("Error: ").splitlines())

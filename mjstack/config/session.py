@@ -92,14 +92,23 @@ def search_path_args(folders: Sequence[Path] | None = None) -> list[str]:
     return [arg for folder in folders for arg in ("--config-dir", str(folder))]
 
 
-def add_folder(saved: Path) -> str:
-    """The advice where the search path lacks a folder that the run of a config.yaml had used."""
+def add_folder(saved: Path, *more: Path) -> str:
+    """The advice where the search path lacks a folder that the run of a config.yaml had used, or
+    ``more``, where it lacks none of these.
+    """
+    folders = [folder for folder in used_folders(saved) if folder not in config_folders()]
+    return f"If you trust the folder that it had used, add {folder_advice(folders or more)}."
+
+
+def used_folders(saved: Path) -> list[Path]:
+    """Folders of the search path of the run of a config.yaml beside mjstack's; none if it does not
+    say.
+    """
     try:
         sources = read_yaml(saved.with_name("hydra.yaml"))["hydra"]["runtime"]["config_sources"]
-        folders = lacking_folders(sources)
+        return [Path(source["path"]) for source in sources if source["provider"] == PROVIDER]
     except Exception:  # the file may be missing, or hold anything
-        folders = []
-    return f"If you trust the folder that it had used, add {folder_advice(folders)}."
+        return []
 
 
 def lacking_folders(sources: Iterable[Any]) -> list[Path]:

@@ -186,14 +186,17 @@ class FixtureJoints:
 
     def __init__(self, env: EnvView, *, joints: Mapping[str, Sequence[float]]) -> None:
         """Take the smallest and largest position of each joint [rad, m], by its name."""
-        require_names("joints: joint of a fixture", joints, env.index.joints)
+        if not isinstance(joints, Mapping) or not joints:
+            raise ParameterError("joints", joints, "a mapping of a fixture's joints to two numbers")
+        require_names("joints: joint of a fixture", map(str, joints), env.index.joints)
         model = env.sim.model
         for name, ends in joints.items():
             joint = model.joint(name).id
             span = model.jnt_range[joint] if model.jnt_limited[joint] else (-math.inf, math.inf)
-            if len(ends) != 2 or not span[0] <= ends[0] <= ends[1] <= span[1]:
+            numbers = isinstance(ends, Sequence) and all(isinstance(e, int | float) for e in ends)
+            if not numbers or len(ends) != 2 or not span[0] <= ends[0] <= ends[1] <= span[1]:
                 expected = f"two numbers in {span[0]:g} to {span[1]:g}, the smaller one first"
-                raise ParameterError(f"joints.{name}", list(ends), expected)
+                raise ParameterError(f"joints.{name}", ends, expected)
         places = [env.index.joints[name] for name in joints]
         self._qpos, self._qvel = (Columns(at, env.device) for at in zip(*places, strict=True))
         low, high = env.sim.qpos.new_tensor(list(joints.values())).unbind(1)

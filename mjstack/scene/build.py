@@ -13,14 +13,16 @@ import numpy as np
 
 from mjstack.config.mjcf import (
     attach_guest,
+    compile_scene,
     fix_masses,
     free_body,
     measure,
+    mujoco_lines,
     read_object,
     set_range,
 )
 from mjstack.config.schema import BoxCfg, CameraCfg, Config, ObjectCfg, SceneCfg
-from mjstack.errors import ConfigError, UnknownName, require_names
+from mjstack.errors import ConfigError, MjstackError, UnknownName, require_names
 from mjstack.robots import robot_spec
 from mjstack.robots.guest import WORLD, compile_robot_scene, mujoco_errors
 from mjstack.robots.jaws import jaw_members
@@ -45,7 +47,11 @@ def build_model(cfg: Config, *, visuals: bool = False) -> mujoco.MjModel:
     """
     with mujoco_errors(f"{cfg.robot.name} in scene {cfg.scene.name}"):
         spec = robot_spec(cfg.robot, cfg.model, scene_names(cfg.scene))
-        model = build_scene(spec, cfg, visuals=visuals)
+        try:
+            model = build_scene(spec, cfg, visuals=visuals)
+        except ValueError:
+            _require_objects(cfg.scene)
+            raise
     for friction in (model.geom_friction, model.pair_friction):  # as contacts have it
         friction[:] = friction.clip(min=mujoco.mjMINMU)  # MJWarp warns of less
     return model
@@ -227,6 +233,18 @@ def _attach_file(spec: mujoco.MjSpec, name: str, thing: ObjectCfg, pose: Mapping
         attach_guest(spec, child, body.add_frame(), f"{name}_")
     else:
         attach_guest(spec, child, spec.worldbody.add_frame(**pose), "")
+
+
+def _require_objects(scene: SceneCfg) -> None:
+    """Raise a `MjstackError` for the first object from a file that does not compile alone."""
+    for name, thing in scene.objects.items():
+        alone = mujoco.MjSpec()
+        try:
+            _add_object(alone, name, thing, scene.table_top)
+            compile_scene(alone)
+        except ValueError as error:
+            problem = f"scene.objects.{name}: {mujoco_lines(error)}"
+            raise MjstackError(problem, f"Correct it, or its file {thing.file}") from error
 
 
 def _require_clear(model: mujoco.MjModel, scene: SceneCfg) -> None:

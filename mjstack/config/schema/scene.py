@@ -150,7 +150,9 @@ class ObjectCfg(ShapeCfg):
     parts: dict[str, PartCfg] = spec({})
     """Shapes of a fixed object that has several, by name, in place of ``shape`` and ``size``."""
     file: str | None = None
-    """Its MJCF file, or a mesh, in place of them: relative to the YAML or the working folder."""
+    """Its MJCF file, or a mesh, in place of them: relative to the YAML that names it, or on the
+    command line to the working folder.
+    """
     joints: dict[str, JointCfg] = spec({})
     """Joints of a fixed object's file, by their names there."""
 
