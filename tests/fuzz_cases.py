@@ -536,7 +536,7 @@ def _long_name(draw: random.Random, cwd: Path) -> list[str]:
 
 
 def _odd_robot(draw: random.Random, cwd: Path) -> list[str]:
-    """A robot's file with odd names, which its profile has to give back, or one that is none."""
+    """A robot's file with odd names, or one that is none; `test_new.py` holds what comes back."""
     path = cwd / draw.choice(("arm.xml", "arm\nx: 1 #.xml", "${oc.env:HOME}.xml", "a'b.xml"))
     kind = draw.choice(("names", "names", "names", "pipe", "joints", "gone"))
     odd = ("".join(draw.choices("01:, #[]{}&*!|>'\"%@`$\\\n\t-?~é回🤖=<x", k=7)) for _ in range(3))
@@ -557,14 +557,6 @@ def _odd_robot(draw: random.Random, cwd: Path) -> list[str]:
         body = "".join(parts).replace("\n", "&#10;").replace("\t", "&#9;") + "</body>" * len(parts)
         path.write_text(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
     command = ["new", "robot", "arm", str(path.relative_to(cwd))]
-    if kind == "names" and not any(
-        "${" in text or text in ("", "???") for text in [*names, str(path)]
-    ):
-        with chdir(cwd):
-            assert run(command) == 0, names
-            robot = load_config(["robot=arm"], config_dir="arm/conf").robot
-        assert [*robot.arm_joints, *robot.gripper_joints] == names
-        command[2] = "arm2"
     return command
 
 
