@@ -183,6 +183,21 @@ def test_a_scene_as_configured_passes(overrides: list[str]) -> None:
     assert list(scene_faults(cfg, build_model(cfg))) == []
 
 
+def test_friction_less_than_mujoco_keeps_is_as_configured(tmp_path: Path) -> None:
+    """Of files, fixed and free, and of keys: contacts have at least mjMINMU of each direction."""
+    geom = '<geom type="box" size="0.02 0.02 0.02" mass="0.05" friction="1 0 0"/>'
+    files = {name: tmp_path / f"{name}.xml" for name in ("stop", "cup")}
+    for (name, path), free in zip(files.items(), ("", "<freejoint/>"), strict=True):
+        body = f'<body name="{name}">{free}{geom}</body>'
+        path.write_text(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
+    cfg = scara(
+        f"+scene.objects.stop={{file: {files['stop']}, fixed: true, xy: [0.4, 0.12]}}",
+        f"+scene.objects.cup={{file: {files['cup']}, xy: [0.4, -0.12]}}",
+        "scene.objects.red.friction=[1e-7, 1e-7, 1e-7]",
+    )
+    assert list(scene_faults(cfg, build_model(cfg))) == []
+
+
 # Where the arm goes
 
 

@@ -36,7 +36,8 @@ def scene_faults(cfg: Config, model: mujoco.MjModel) -> Iterator[str]:
             expected.body(name).mass = thing.mass
     for name, (size, friction) in shapes.items():  # not as `add_scene` has understood them
         expected.geom(name).size[: len(size)] = size
-        expected.geom(name).friction = np.clip(friction, mujoco.mjMINMU, None)
+        expected.geom(name).friction = friction
+    expected.geom_friction[:] = expected.geom_friction.clip(min=mujoco.mjMINMU)  # as in contacts
     yield from _field_faults(cfg, model, expected)
     for name in bare.free:
         yield from _fall_faults(cfg, model, expected, name)
