@@ -191,8 +191,8 @@ def test_friction_less_than_mujoco_keeps_is_as_configured(tmp_path: Path) -> Non
         body = f'<body name="{name}">{free}{geom}</body>'
         path.write_text(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
     cfg = scara(
-        f"+scene.objects.stop={{file: {files['stop']}, fixed: true, xy: [0.4, 0.12]}}",
-        f"+scene.objects.cup={{file: {files['cup']}, xy: [0.4, -0.12]}}",
+        f"+scene.objects.stop={{file: {files['stop']}, fixed: true, xy: [0.41, 0.0]}}",
+        f"+scene.objects.cup={{file: {files['cup']}, xy: [0.33, 0.0]}}",
         "scene.objects.red.friction=[1e-7, 1e-7, 1e-7]",
     )
     assert list(scene_faults(cfg, build_model(cfg))) == []
