@@ -352,7 +352,7 @@ def test_ends_of_all_joints_but_the_robots_are_compared(
     ends = [model.qpos0.copy() for _ in range(2)]
     mujoco.mj_integratePos(model, ends[0], change, 1.0)
     nominal = SimpleNamespace(world=SimpleNamespace(qpos=ends[1][None]))
-    stage = SimpleNamespace(model=model, play=lambda sim, reset: None)  # all end where they start
+    stage = SimpleNamespace(model=model, play=lambda sim, reset, worlds: None)  # all end where they start
     run = SimpleNamespace(cfg=cfg, stage=stage, nominal=nominal)
     result = GateResult(name="parity", status=Status.passed)
     found, lines = _compare_ends(run, ends[0], result, rounded=True)  # type: ignore[arg-type]
@@ -369,7 +369,8 @@ def test_an_end_that_native_mujoco_reaches_by_rounding_passes() -> None:
     end, near = model.qpos0.copy(), model.qpos0.copy()
     end[drawer], near[drawer] = 0.005, 0.004
 
-    def play(sim: Simulation, reset: object) -> None:
+    def play(sim: Simulation, reset: object, worlds: list[int]) -> None:
+        assert worlds == [0] * sim.nworld  # all from the start of world 0
         sim.qpos[3] = torch.from_numpy(near)
 
     nominal = SimpleNamespace(world=SimpleNamespace(qpos=model.qpos0[None]))
