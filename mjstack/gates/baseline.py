@@ -48,10 +48,9 @@ def run_baseline(run: Run) -> list[GateResult]:
             causes = [f"{miss}: {cause}", *contacts]
         if not errors[worst] <= thresholds["waypoint_error_m"]:
             status = Status.failed
-            reason = reason or "failed"
             beyond.append("waypoint_error_m")
     if status is Status.failed:
-        reason = "; ".join((reason, *causes))
+        reason = "; ".join(filter(None, (reason, *causes)))
     world = run.nominal.world
     label = "baseline, native"
     run.show_world("baseline", label, world.qpos, status, world.env, "baseline world")
