@@ -352,7 +352,7 @@ def test_ends_of_all_joints_but_the_robots_are_compared(
     ends = [model.qpos0.copy() for _ in range(2)]
     mujoco.mj_integratePos(model, ends[0], change, 1.0)
     nominal = SimpleNamespace(world=SimpleNamespace(qpos=ends[1][None]))
-    stage = SimpleNamespace(model=model, play=lambda sim, reset, worlds: None)  # all end where they start
+    stage = SimpleNamespace(model=model, play=lambda sim, reset, worlds: None)
     run = SimpleNamespace(cfg=cfg, stage=stage, nominal=nominal)
     result = GateResult(name="parity", status=Status.passed)
     found, lines = _compare_ends(run, ends[0], result, rounded=True)  # type: ignore[arg-type]
