@@ -31,9 +31,9 @@ test: $(READY_DEV)
 
 # The tests that `make test` leaves out.
 test-rest: $(READY_DEV)
-	$(PYTEST) -m full
+	$(PYTEST) -m "full and not long"
 
-# Trainings that take minutes, and the notebook.
+# Trainings and several ranks that take long, and the notebook.
 test-long: $(READY_DEV)
 	$(PIP) --editable '.[notebook]'
 	$(PYTEST) -m long

@@ -118,6 +118,7 @@ def test_rules_are_counted_over_batches_and_ranks() -> None:
 
 
 @pytest.mark.full
+@pytest.mark.long
 def test_two_ranks_give_one_policy_and_go_on_bit_for_bit(tmp_path: Path) -> None:
     """The second one is killed when the first one has written its part of a round."""
     sizes = ["nworld=5", "job.episodes=5", "job.batches=60", "job.save_every=10"]

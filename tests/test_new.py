@@ -12,12 +12,16 @@ import pytest
 import torch
 from doc_blocks import ROOT
 from environments import Capture, Patch, Refused
+from omegaconf import OmegaConf
 
 import mjstack
 from mjstack.cli import run
+from mjstack.config.schema import Config
 from mjstack.errors import MjstackError
+from mjstack.jobs.new_robot import show_guesses
+from mjstack.report import picture
 from mjstack.robots.new import write_new
-from mjstack.robots.profile import guess_profile
+from mjstack.scene.build import build_model
 
 GATES = "gates=[baseline,parity,capacity,batch]"
 
@@ -84,25 +88,29 @@ NAMES = [
 PLAIN = ["x", "y", "z", "roll", "left", "right", "bridge", "hand", "left jaw", "right jaw"]
 
 
+SERVO = "<position joint='{0}' kp='500' kv='50'/>"
+
+
 def gantry(
     names: Sequence[str] = PLAIN,
     *,
-    actuators: str = "<position joint='{0}' kp='500' kv='50'/>",
+    actuators: str = SERVO,
     roll: str = "range='-3 3'",
-    right: str = "<position joint='{0}' kp='500' kv='50'/>",
+    right: str = SERVO,
     more: str = "",
     base: str = "",
     world: str = "",
     root: str = "",
+    ball: str = "",
 ) -> str:
     """An MJCF file of three slides, a roll and two fingers; ``names`` are those of its joints and
     of some of its bodies.
     """
     x, y, z, turn, left, rightmost, bridge, hand, one, two = (
-        escape(n, {'"': "&quot;"}) for n in names
+        escape(n, {'"': "&quot;", "\n": "&#10;", "\r": "&#13;"}) for n in names
     )
     servos = "".join(actuators.format(name) for name in (x, y, z, turn, left))
-    text = f"""<mujoco><compiler angle="radian"/>
+    return f"""<mujoco><compiler angle="radian"/>
     <default><geom mass="0.1"/><joint damping="1" armature="0.01"/></default>
     <worldbody>{world}<body pos="0 0 0.5" {base}>{root}
       <body name="{bridge}">
@@ -112,12 +120,12 @@ def gantry(
           <body name="{hand}"><joint name="{turn}" axis="0 0 1" {roll}/>
             <geom type="box" size="0.02 0.06 0.01" pos="0 0 -0.03"/>
             <body name="{one}"><joint name="{left}" type="slide" axis="0 1 0" range="0 0.04"/>
-              <geom type="box" size="0.01 0.005 0.03" pos="0 0.005 -0.07" friction="1.5"/></body>
+              <geom type="box" size="0.01 0.005 0.03" pos="0 0.005 -0.07" friction="1.5"/>
+              {ball}</body>
             <body name="{two}"><joint name="{rightmost}" type="slide" axis="0 -1 0" range="0 0.04"/>
               <geom type="box" size="0.01 0.005 0.03" pos="0 -0.005 -0.07" friction="1.5"/></body>
           </body></body></body></body></worldbody>
     <actuator>{servos}{right.format(rightmost)}</actuator>{more}</mujoco>"""
-    return text.replace("\n", "&#10;") if "\n" in "".join(names) else text
 
 
 MIMIC = "<equality><joint joint1='right' joint2='left' polycoef='0 1 0 0 0'/></equality>"
@@ -148,12 +156,12 @@ KINDS: dict[str, tuple[dict[str, str], dict[str, object]]] = {
 }
 
 
-SCENE = mjstack.load_config().scene
-
-
 def guess(text: str, arm: str = "") -> dict[str, Any]:
+    """The YAML as it is written: its reader refuses a key that is there twice."""
     Path("arm.xml").write_text(text)
-    return {guess.key: guess.value for guess in guess_profile(Path("arm.xml"), SCENE, arm)}
+    paths, _ = write_new(["robot", f"guess_{len(list(Path().iterdir()))}", "arm.xml"], arm)
+    written: dict[str, Any] = OmegaConf.to_container(OmegaConf.load(paths[0]))  # type: ignore
+    return written
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -175,9 +183,81 @@ def test_servos_are_made_where_the_file_has_motors_or_none(here: Path) -> None:
     robot = guess(motors.replace("</actuator>", "</actuator>" + MIMIC))
     assert list(robot["servos"]) == ["x", "y", "z", "roll", "left"]
     assert {servo["effort"] for servo in robot["servos"].values()} == {18.0}
-    bare = guess(gantry(actuators="", right=""))
+    ball = "<body pos='0 0 -0.06'><joint name='b' type='ball'/><inertial mass='0.01' pos='0 0 0'"
+    ball += " diaginertia='1e-6 1e-6 1e-6'/></body>"  # not a joint of the gripper
+    bare = guess(gantry(actuators="", right="", ball=ball))
     assert list(bare["servos"]) == ["x", "y", "z", "roll", "left", "right"]
     assert bare["servos"]["z"]["effort"] > 3.0 * 0.4 * 9.81  # what hangs on it
+
+
+TENDON_ONLY = gantry(right="", more=TENDON).replace(SERVO.format("left"), "")
+MOTOR = "<motor joint='{0}' ctrlrange='-90 90'/>"
+WEAK = {"joint='left' kp='500'": "joint='left' kp='20'", "right' kp='500'": "right' kp='20'"}
+GEARED = "<position joint='x' kp='125' kv='12' gear='2' ctrlrange='{}'/>"
+FINGER = SERVO.replace("/>", " forcerange='-0.5 0.5'/>")
+
+
+def altered(text: str, pairs: dict[str, str]) -> str:
+    for old, new in pairs.items():
+        assert old in text
+        text = text.replace(old, new)
+    return text
+
+
+@pytest.mark.parametrize(
+    ("text", "joints", "efforts"),
+    [
+        (altered(gantry(), {SERVO.format("x"): MOTOR.format("x"), **WEAK}), "x left right", {90.0}),
+        (altered(gantry(), {f: FINGER.format(n) for n in ("left", "right")
+         if (f := SERVO.format(n))}), "left right", {40.0}),
+        (TENDON_ONLY, "", set()),
+        (TENDON_ONLY.replace("gainprm='4' biasprm='0 -1000 -30' biastype='affine'", "gainprm='4'"),
+         "left right", {20.0}),
+        (TENDON_ONLY.replace("gainprm", "dyntype='filter' dynprm='0.05' gainprm"), "left right",
+         set()),
+    ],
+    ids=["motor and weak fingers", "force", "tendon", "tendon motor", "tendon filter"],
+)  # fmt: skip
+def test_servos_are_made_where_others_do_not_do(
+    text: str, joints: str, efforts: set[float], here: Path
+) -> None:
+    robot = guess(text)
+    servos = robot.get("servos", {})
+    assert list(servos) == joints.split()
+    assert efforts <= {servo.get("effort") for servo in servos.values()}
+    assert build_model(read("guess_1")).nu == 6
+
+
+def read(name: str) -> Config:
+    return mjstack.load_config([f"robot={name}"], config_dir=Path(name) / "conf")
+
+
+def test_home_is_within_the_range_of_a_geared_servo(here: Path) -> None:
+    for ends, low, high in (("0.2 0.6", 0.1, 0.3), ("-0.6 -0.2", -0.3, -0.1)):
+        robot = guess(gantry().replace(SERVO.format("x"), GEARED.format(ends)))
+        assert low <= robot["home"][0] <= high
+
+
+def test_the_reason_tells_the_force_of_the_jaws(here: Path) -> None:
+    """Less than 20 N, where the file's own servos have no more; it is enough for a cube."""
+    for limit in (8.0, 20.0, 200.0):
+        fingers = {SERVO.format(n): SERVO.format(n).replace("/>", f" forcerange='-{limit} {limit}'"
+                   "/>").replace("500", "5000") for n in ("left", "right")}  # fmt: skip
+        robot = guess(altered(gantry(), fingers))
+        text = next(Path().glob(f"guess_*/conf/robot/{robot['name']}.yaml")).read_text()
+        assert f"to press with {min(limit, 20.0):.0f} N\n" in text
+        assert "servos" not in robot
+
+
+def test_the_picture_has_followers_in_their_places(here: Path, monkeypatch: Patch) -> None:
+    guess(gantry(right="", more=MIMIC))
+    drawn: list[Any] = []
+    monkeypatch.setattr(picture, "save_scene", lambda _, *scene: drawn.append(scene))
+    show_guesses([], read("guess_1"), Path("home.png"))
+    model, qpos = drawn[0]
+    left, right = (qpos[model.joint(name).qposadr[0]] for name in ("left", "right"))
+    assert right == pytest.approx(left, abs=1e-6)
+    assert left == pytest.approx(0.04)
 
 
 def test_a_weak_gripper_gets_stiffer_servos(here: Path) -> None:
@@ -221,13 +301,15 @@ def test_names_come_back_as_they_are(here: Path) -> None:
     folder = here / "it's a: #1\nname: x"
     folder.mkdir()
     file = folder / "arm.xml"
-    for number in range(0, len(NAMES), 10):
-        names = [*NAMES[number : number + 10], *PLAIN][:10]
+    files = [[*NAMES[k : k + 10], *PLAIN][:10] for k in range(0, len(NAMES), 10)]
+    files += [[f"{k}{b}gravcomp: false{b}#" for k in range(10)] for b in "\n\r\x85\u2028\u2029"]
+    for number, names in enumerate(files):
         file.write_text(gantry(names))
         name = f"odd_{number}"
         write_new(["robot", name, str(file)])
         robot = mjstack.load_config([f"robot={name}"], config_dir=here / name / "conf").robot
         assert robot.name == name
+        assert robot.gravcomp == "auto"
         assert robot.joints == names[:6]
         assert robot.approach_body == names[7]
         assert sorted(robot.jaw_bodies) == sorted(names[8:])
@@ -250,6 +332,18 @@ REFUSED = {
         "the hand of hand cannot point down over a table within the arm's reach",
     ),
     "thick fingers": (gantry().replace("0 0.04", "0 0.01"), "its fingers open by 20 mm only"),
+    "balls": (
+        gantry(actuators="", right="")
+        .replace('type="slide" axis="0 1 0" range="0 0.04"', 'type="ball"')
+        .replace('type="slide" axis="0 -1 0" range="0 0.04"', 'type="ball"'),
+        "expected an arm of two joints or more with a gripper; no body has fingers",
+    ),
+    "along z": (
+        gantry()
+        .replace('axis="0 1 0" range="0 0.04"', 'axis="0 0 1" range="0 0.04"')
+        .replace('axis="0 -1 0" range="0 0.04"', 'axis="0 0 1" range="0 0.04"'),
+        "its fingers do not close on each other",
+    ),
     "text": ("<mujoco", "arm.xml cannot be read: XML parse error"),
 }
 
@@ -280,7 +374,7 @@ def test_a_robot_from_a_pipe_is_refused(here: Path, refused: Refused) -> None:
         ("new task antigravity.x", "expected small letters, digits and _"),
         ("new task __main__", "expected small letters, digits and _"),
         (f"new task {'x' * 300}", "expected small letters, digits and _"),
-        ("new robot arm nope.xml", "nope.xml: expected an MJCF file: "),
+        ("new robot arm nope.xml", "nope.xml: expected an MJCF file or a URDF: "),
     ],
 )
 def test_a_name_that_is_taken_is_refused(

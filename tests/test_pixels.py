@@ -317,6 +317,7 @@ def test_augmentation_shifts_and_tints() -> None:
 
 
 @pytest.mark.full
+@pytest.mark.long
 def test_a_training_goes_on_where_it_was_interrupted(trained: Path, tmp_path: Path) -> None:
     """In the first round, when it is over, and in the second one, from other images each."""
     command = [*TINY, f"job.folder={tmp_path}"]

@@ -10,7 +10,8 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from arm_file import MJCF, SCARA, changed, scara
+from arm_file import MJCF, SCARA, changed, scara, write_arm
+from arms import model_of
 from compositions import refusal
 from ik_arm import Arm
 
@@ -187,9 +188,18 @@ def test_a_joint_that_follows_two_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_value_that_the_equalities_do_not_allow_is_refused(tmp_path: Path) -> None:
-    cfg = replace(scara(), robot=replace(scara().robot, home=[-0.8, 1.6, 0.2, 0.0, 0.045, 0.02]))
-    line = "robot.home of right=0.02: expected 0.045, as the file's equalities have it"
-    refusal(lambda: GraspIk(cfg.robot, cfg.model, tolerance=1e-4), line, kind=ConfigError)
+    """By every environment, with a planner or without."""
+    home, scene = [-0.8, 1.6, 0.2, 0.0, 0.045, 0.045], scara().scene
+    equalities = "as the file's equalities have it"
+    for changes, line in (
+        ({"home": [*home[:5], 0.02]}, f"robot.home of right=0.02: expected 0.045, {equalities}"),
+        ({"start": [*home[:5], 0.01]}, f"robot.start of right=0.01: expected 0.045, {equalities}"),
+        ({"home": [*home[:2], 0.9, *home[3:]]}, "robot.home of lift=0.9: expected a value within"),
+        ({"locked": {"roll": 9.0}}, "robot.locked of roll=9.0: expected a value within"),
+        ({"gripper_open": [0.045, 0.03]}, "robot.gripper_open of right=0.03: expected 0.045"),
+    ):
+        robot = replace(scara().robot, **changes)  # type: ignore[arg-type]
+        refusal(lambda r=robot: SceneIndex(build_model(scara()), r, scene), line, kind=ConfigError)
 
 
 MAST = '<actuator><position name="mast" joint="mast" kp="5" kv="1" inheritrange="1"/>'
@@ -221,9 +231,78 @@ def test_a_target_out_of_reach_is_a_finite_distance_away(tmp_path: Path) -> None
     start = ik.home.copy()
     start[1] = 9.0  # beyond its range
     assert np.isfinite(ik.solve(np.array([0.4, 0.0, 0.2]), start)[1])
-    robot = replace(scara().robot, locked={"roll": 9.0})
-    line = "robot.locked of roll=9.0: expected a value within"
-    refusal(lambda: GraspIk(robot, scara().model, tolerance=1e-4), line, kind=ConfigError)
+
+
+def test_a_range_ends_where_what_follows_can_go_no_farther(tmp_path: Path) -> None:
+    """A linkage that locks, and a follower with a shorter range."""
+    model = model_of("linkage")
+    places = Posture(model, ("lift", "turn", "right_driver"))
+    low, high = places.limits[2]
+    assert -0.2 < low < -0.01
+    assert high == 0.8
+    for driver in np.linspace(low, high, 50):
+        assert equality_error(model, places.qpos([0.0, 0.0, driver])) < 1e-5
+    short = (RIGHT, RIGHT.replace("/>", ' range="0 0.04"/>'))
+    cfg = changed(tmp_path, (SERVO, ""), short, **{**LEFT, "home": [*LEFT["home"][:4], 0.04]})  # type: ignore[dict-item, index]
+    model = build_model(cfg)
+    line = "robot.start of left=0.042: expected a value within [0, 0.04]"
+    refusal(lambda: SceneIndex(model, cfg.robot, cfg.scene), line, kind=ConfigError)
+    robot = replace(cfg.robot, start=cfg.robot.home, gripper_open=None, gripper_closed=None)
+    index = SceneIndex(model, robot, cfg.scene)
+    assert index.ctrl_range[4, 1] == pytest.approx(0.04, abs=1e-5)
+    assert gripper_targets(model, robot, [None])[0, 0] == pytest.approx(0.04, abs=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["follower", "coupled"])
+def test_what_follows_moves_with_its_leaders_zero(kind: str, tmp_path: Path) -> None:
+    """Fingers of a linkage stay together where a servo's zero is elsewhere."""
+    options = [f"robot.file={write_arm(tmp_path)}"]
+    if kind == "follower":
+        options = [f"robot.{key}={value}" for key, value in LEFT.items()]
+        options = [o.replace(" ", "").replace("'", "") for o in options]
+        options.append(f"robot.file={follower(tmp_path, 'plain').robot.file}")
+    for term in ("Zeros", "Noise"):  # the second starts from what the first has written
+        params = "params: {arm: 0.0, gripper: 0.004}"
+        options.append(f"+reset.{term}={{func: mjstack.mdp.reset.Joint{term}, {params}}}")
+    search = f"hydra.searchpath=[file://{SCARA}/conf]"
+    env = make_env([search, "robot=scara", "sim=native", "nworld=4", "reset=nominal", *options])
+    env.reset(seed=1)
+    zero = env.sim.fields["qpos0"]
+    assert len(set(zero[:, env.sim.model.joint("left").qposadr[0]].tolist())) == 4
+    left, right = (
+        (env.sim.qpos - zero)[:, env.sim.model.joint(n).qposadr[0]] for n in ("left", "right")
+    )
+    torch.testing.assert_close(right, left, atol=1e-7, rtol=0.0)
+
+
+@pytest.mark.parametrize("where", ["base", "finger"])
+def test_an_idle_joint_follows_none(where: str, tmp_path: Path) -> None:
+    """Inverse kinematics need not ask MuJoCo about it, wherever it is in the arm."""
+    idle = '<joint name="spare" axis="0 0 1" range="0.1 2"/>'
+    pairs = [('<body name="base">', IDLE)]
+    if where == "finger":
+        pairs = [(RIGHT, f"{RIGHT}{idle}")]
+    cfg = changed(tmp_path, *pairs)
+    ik = GraspIk(cfg.robot, cfg.model, tolerance=1e-4)
+    assert Posture(ik.model, cfg.robot.joints).leader.max(initial=-1) <= 4  # the fingers' alone
+    assert not ik._frozen.along
+    reach = PointReach(ik.model, cfg.robot, cfg.robot.home[4:])
+    assert reach._native is None
+    goals = np.tile(ik.home, (4, 1))
+    goals[:, :3] += np.random.default_rng(1).uniform(-0.15, 0.15, (4, 3)) * [1.0, 1.0, 0.2]
+    points = np.array([ik.grasp_point(goal) for goal in goals])
+    np.testing.assert_allclose(reach.forward(goals[:, :3])[1], points, atol=1e-9)
+    solver = Arm(ik.model, cfg.robot).solver(4, iterations=40)
+    np.testing.assert_allclose(solver.forward(torch.from_numpy(goals))[0], points, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["rest/foo", "rest/mast"])
+def test_numbers_of_a_file_say_nothing_about_rest(name: str, tmp_path: Path) -> None:
+    custom = f'<custom><numeric name="{name}" data="1.5"/></custom><equality>'
+    cfg = changed(tmp_path, ('<body name="base">', IDLE), ("<equality>", custom))
+    model = build_model(cfg)
+    index = SceneIndex(model, cfg.robot, cfg.scene)
+    assert index.posture.rest[model.joint("mast").qposadr[0]] == 0.5
 
 
 # --- Grip

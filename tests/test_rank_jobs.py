@@ -94,6 +94,7 @@ def test_a_mistyped_override_ends_a_comparison(what: str, tmp_path: Path) -> Non
     assert not [*tmp_path.iterdir()]
 
 
+@pytest.mark.long
 def test_ranks_collect_images(tmp_path: Path) -> None:
     """Videos of both ranks: each frame is that of the world as one rank draws it."""
     args = ["job=collect", *CAMERA, "nworld=3", "job.keep_failures=true", "job.episodes=3"]
@@ -112,6 +113,7 @@ def test_ranks_collect_images(tmp_path: Path) -> None:
         assert second.std() > 10.0
 
 
+@pytest.mark.long
 def test_ranks_learn_from_pixels(tmp_path: Path) -> None:
     """Each draws images of its own episodes; both have one policy, which the first one writes."""
     vision = ["channels=[4,8]", "features=8", "pool=40", "shift=1", "cameras=[front]"]

@@ -125,6 +125,7 @@ def assert_same_episodes(one: Path, other: Path) -> None:
 
 
 @pytest.mark.full
+@pytest.mark.long
 def test_ranks_play_what_one_plays(tmp_path: Path) -> None:
     """Five worlds, so that shares differ, with the feedback of the closed loop. Batch and success,
     whose starts are drawn; every gate has one result, and says where its worlds were.

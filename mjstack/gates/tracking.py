@@ -55,7 +55,7 @@ def find_cause(stage: Stage, state: State, target: np.ndarray) -> str:
     # The joint
     dofs = index.robot_qvel[: index.n_arm]
     off = (target - data.qpos[index.robot_qpos])[: index.n_arm]
-    shares = grasp_jacobian(data, stage.cfg.robot)[:, dofs] * off
+    shares = grasp_jacobian(data, stage.cfg.robot.grasp_sites)[:, dofs] * off
     worst = int(np.argmax(np.linalg.norm(shares, axis=0)))
     dof, servo, name = dofs[worst], index.ctrl[worst], stage.cfg.robot.arm_joints[worst]
     joint = model.dof_jntid[dof]

@@ -3,12 +3,11 @@
 from collections.abc import Iterable
 from pathlib import Path
 
-import mujoco
-
 from mjstack.config.schema import Config
 from mjstack.report import picture
 from mjstack.report.table import Console, Table
 from mjstack.report.write import safely_write
+from mjstack.robots.posture import posture
 from mjstack.robots.profile import Guess
 from mjstack.scene.build import build_model
 
@@ -19,7 +18,5 @@ def show_guesses(guesses: Iterable[Guess], cfg: Config, path: Path) -> None:
     table = Table(header=["guessed", "value", "because"], rows=rows)
     Console().print(table.to_console())
     model = build_model(cfg, visuals=True)
-    data = mujoco.MjData(model)
-    for name, value in zip(cfg.robot.joints, cfg.robot.home, strict=True):
-        data.joint(name).qpos = value
-    print(safely_write(path, picture.save_scene, model, data.qpos) or f"picture: {path}")
+    qpos = posture(model, tuple(cfg.robot.joints)).qpos(cfg.robot.home)
+    print(safely_write(path, picture.save_scene, model, qpos) or f"picture: {path}")

@@ -16,7 +16,6 @@ from mjstack.errors import ArgumentError, ConfigError, MjstackError
 from mjstack.kinematics.ik_kernels import HINGE, SLIDE, Chain, Shape, forward_kernel, solve_kernel
 from mjstack.robots.posture import posture
 from mjstack.scene.index import approach_body, joint_limits, locked_home
-from mjstack.sim.simulation import Columns
 from mjstack.sim.warp_setup import torch_stream_scope
 
 # m: with a gain, an iterate this close to the target replaces a closer one that came before
@@ -46,7 +45,7 @@ def build_chain(model: mujoco.MjModel, robot: RobotCfg) -> tuple[Chain, Shape]:
             columns[joint] = (int(leader), row)
     moved = [column for column in moved if column not in coupling.coupled]
     limits = np.tile(np.array([[-np.inf], [np.inf]], dtype=np.float32), len(robot.joints))
-    ranges = joint_limits(model, [robot.joints[column] for column in moved])
+    ranges = joint_limits(model, robot, moved)
     for side, values in enumerate(ranges):
         limits[side, moved] = _round_inwards(values, 1.0 - 2.0 * side)
 
@@ -97,7 +96,7 @@ def build_chain(model: mujoco.MjModel, robot: RobotCfg) -> tuple[Chain, Shape]:
     chain.frame = wp.array(poses, dtype=wp.transform)
     chain.axis = wp.array(axes, dtype=wp.vec3)
     chain.kind = wp.array(kinds, dtype=int)
-    chain.column = wp.array(column, dtype=int)
+    chain.column = wp.array([max(c, 0) for c in column], dtype=int)
     chain.low = wp.array(limits[0, column], dtype=float)
     chain.high = wp.array(limits[1, column], dtype=float)
     chain.row = wp.array(rows, dtype=int)
@@ -220,12 +219,8 @@ class BatchedIk:
         gains = (posture_gain, approach_gain)
         self._settings = [iterations, guided, _DAMPING, _MAX_STEP, *gains, near]
 
-        # Commanded joints that follow ik joints
-        self._coupling = coupling = posture(model, tuple(robot.joints))
-        leaders = coupling.leader[len(coupling.columns) :]
-        follows = np.isin(leaders, [robot.joints.index(name) for name in robot.ik_joints])
-        self._coupled = Columns(coupling.coupled[follows], self.device)
-        self._rows = Columns(len(coupling.columns) + np.flatnonzero(follows), self.device)
+        self._coupling = posture(model, tuple(robot.joints))
+        self._moving = [robot.joints.index(name) for name in robot.ik_joints]
 
         # The chain and all buffers, each a Warp array and a torch view of it
         with torch_stream_scope(self._device):
@@ -298,9 +293,7 @@ class BatchedIk:
             self._copy_in("approach", approach)
             names[3] = "approach"
         self._launch(self._kernel, names, self._settings, ["solution", "distance"])
-        if self._coupled.indices:
-            follow, _ = self._coupling.follow(self._view["solution"])
-            self._coupled.write(self._view["solution"], self._rows.read(follow))
+        self._coupling.project(self._view["solution"], self._moving)
         return self._view["solution"], self._view["distance"]
 
     def _launch(

@@ -4,22 +4,19 @@ import copy
 import math
 
 import mink
-import mujoco
 import numpy as np
 from numpy import ndarray
 
 from mjstack.config.mjcf import compile_scene
 from mjstack.config.schema import ModelCfg, RobotCfg
-from mjstack.errors import ConfigError
 from mjstack.robots import robot_spec
-from mjstack.robots.guest import mujoco_errors
+from mjstack.robots.guest import grasp_jacobian, mujoco_errors
 from mjstack.robots.posture import Posture, posture
 from mjstack.scene.index import locked_home
 
 _POSTURE_COST = 1e-3  # pulls the redundant joints home; moves the grasp point by micrometres
 _ITERATIONS = 60  # at most, per solve
 _CONVERGED = 0.1  # share of the tolerance: Newton's method squares the error, so that is enough
-_APART = 1e-4  # [rad, m] that a joint value may be off an equality
 _MAX_STEP = 0.3  # [rad, m] per iteration: a far target is approached on one branch of solutions
 
 
@@ -29,12 +26,11 @@ class GraspPointTask(mink.Task):
     The midpoint belongs to no single frame: on a jaw that swings it moves with the jaw's angle.
     """
 
-    def __init__(self, sites: list[int], nv: int) -> None:
+    def __init__(self, sites: list[int]) -> None:
         """Store the two site indices; the target is set before each solve."""
         super().__init__(cost=np.ones(3))
         self.target = np.zeros(3)
         self._sites = sites
-        self._jac = np.empty((2, 3, nv))
 
     def compute_error(self, configuration: mink.Configuration) -> ndarray:
         """Grasp point minus target [m], shape ``(3,)``."""
@@ -42,9 +38,7 @@ class GraspPointTask(mink.Task):
 
     def compute_jacobian(self, configuration: mink.Configuration) -> ndarray:
         """Mean of the two sites' translational Jacobians, shape ``(3, nv)``."""
-        for jac, site in zip(self._jac, self._sites, strict=True):
-            mujoco.mj_jacSite(configuration.model, configuration.data, jac, None, site)
-        return self._jac.mean(axis=0)
+        return grasp_jacobian(configuration.data, self._sites)
 
 
 class _Frozen(mink.DofFreezingTask):
@@ -87,17 +81,15 @@ class GraspIk:
         self._qpos = self.model.jnt_qposadr[joints]
         self._coupling = posture(self.model, tuple(robot.joints))
         self.home = locked_home(robot)
-        self._check(robot)
         self._configuration = mink.Configuration(self.model)
         moving = np.array([robot.joints.index(name) for name in robot.ik_joints])
         moving = np.setdiff1d(moving, self._coupling.coupled)
         self._frozen = _Frozen(self._configuration, self._coupling, moving)
-        self._task = GraspPointTask(
-            [self.model.site(name).id for name in robot.grasp_sites], self.model.nv
-        )
+        self._task = GraspPointTask([self.model.site(name).id for name in robot.grasp_sites])
         self._posture = mink.PostureTask(self.model, cost=_POSTURE_COST)
         limited = copy.copy(self.model)
         limited.jnt_limited[np.setdiff1d(np.arange(self.model.njnt), joints)] = False
+        limited.jnt_range[joints] = self._coupling.limits
         self._limits = [mink.ConfigurationLimit(limited, gain=1.0)]
         self._posture.set_target(self._to_qpos(self.home))
 
@@ -147,28 +139,3 @@ class GraspIk:
 
     def _to_qpos(self, q: ndarray) -> ndarray:
         return self._coupling.qpos(q)
-
-    def _check(self, robot: RobotCfg) -> None:
-        """Raise a ConfigError for a joint value that the robot's file does not allow."""
-        poses = {
-            "home": (robot.joints, robot.home),
-            "start": (robot.joints, robot.start),
-            "locked": (list(robot.locked), list(robot.locked.values())),
-            "gripper_open": (robot.gripper_joints, robot.gripper_open),
-            "gripper_closed": (robot.gripper_joints, robot.gripper_closed),
-        }
-        for key, (names, values) in poses.items():
-            command = self.home.copy()
-            columns = [robot.joints.index(name) for name in names]
-            if values is not None:
-                command[columns] = values
-            allowed = self._coupling.agree(command)
-            for k, name in zip(columns, names, strict=True):
-                low, high = self.model.joint(name).range
-                if not low <= command[k] <= high:
-                    expected = f"a value within [{low:.4g}, {high:.4g}]"
-                elif abs(command[k] - allowed[k]) > _APART:
-                    expected = f"{allowed[k]:.4g}, as the file's equalities have it"
-                else:
-                    continue
-                raise ConfigError(f"robot.{key} of {name}", float(command[k]), expected)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy import ndarray
 
 from mjstack.config.schema import RobotCfg
+from mjstack.robots.guest import grasp_jacobian
 from mjstack.robots.posture import posture
 from mjstack.scene.index import joint_limits, locked_home
 
@@ -54,7 +55,7 @@ class PointReach:
         sites = [model.site(name).id for name in robot.grasp_sites]
         self._sites = sites
         self.tip = data.site_xpos[sites].mean(axis=0)  # the grasp point at home [m], ``(3,)``
-        self._low, self._high = joint_limits(model, [model.joint(j).name for j in joints])
+        self._low, self._high = joint_limits(model, robot, self._columns)
 
     def solve(self, points: ndarray) -> tuple[ndarray, ndarray]:
         """Bring the grasp point as near to each point [m], shape ``(n, 3)``, as possible, from a
@@ -145,14 +146,12 @@ class PointReach:
         data, home = self._native
         command = home.copy()
         jacobians, tips = np.empty((len(q), 3, q.shape[1])), np.empty((len(q), 3))
-        jac = np.empty((2, 3, data.model.nv))
         for k, command[self._columns] in enumerate(q):
             data.qpos[:] = self._coupling.qpos(command)
             mujoco.mj_kinematics(data.model, data)
             mujoco.mj_comPos(data.model, data)
-            for site, rows in zip(self._sites, jac, strict=True):
-                mujoco.mj_jacSite(data.model, data, rows, None, site)
-            jacobians[k] = jac.mean(axis=0) @ self._coupling.shares(command)[:, self._columns]
+            jacobian = grasp_jacobian(data, self._sites)
+            jacobians[k] = jacobian @ self._coupling.shares(command)[:, self._columns]
             tips[k] = data.site_xpos[self._sites].mean(axis=0)
         return jacobians, tips
 

@@ -28,12 +28,20 @@ def write_robot(env: EnvView, mask: Tensor, command: Tensor) -> None:
     """
     tensors = robot(env)
     if passive := len(tensors.passive.indices):
-        follow, _ = env.index.posture.follow(command.to(env.sim.qpos.dtype))
+        true = command if (off := zeros(env)) is None else command + off
+        follow, _ = env.index.posture.follow(true.to(env.sim.qpos.dtype))
         tensors.passive.write_masked(env.sim.qpos, mask, follow[..., :passive])
     tensors.qpos.write_masked(env.sim.qpos, mask, command)
     tensors.ctrl.write_masked(env.sim.ctrl, mask, command)
     if tensors.idle.indices:
         tensors.idle.write_masked(env.sim.ctrl, mask, tensors.idle_ctrl)
+
+
+def zeros(env: EnvView) -> Tensor | None:
+    """How far joint zeros are off the file's [rad, m], shape ``(nworld, n)``, where any may be."""
+    if "qpos0" not in env.sim.fields:
+        return None
+    return robot(env).zero - robot(env).qpos.read(env.sim.fields["qpos0"])
 
 
 def gripper_opening(env: EnvView) -> Tensor:

@@ -13,7 +13,7 @@ from mjstack.config.functions import offered
 from mjstack.errors import ParameterError, require_names
 from mjstack.managers.view import EnvView, offers, random_uniform, uses_fields, zero_rows
 from mjstack.math import quat_from_yaw, quat_mul
-from mjstack.mdp.geometry import Pose, robot, write_robot
+from mjstack.mdp.geometry import Pose, robot, write_robot, zeros
 from mjstack.mdp.starts.placement import GAP, Placement, may_meet, require_reach
 from mjstack.mdp.starts.randomization import Elements, Randomized, bounds
 from mjstack.robots.jaws import jaw_bodies
@@ -47,13 +47,8 @@ class JointNoise:
         """
         self._width = torch.full_like(robot(env).home, gripper)
         self._width[: env.index.n_arm] = arm
-        posture = env.index.posture
-        first = len(posture.columns)
-        moved = self._width.cpu().numpy() > 0.0
-        moved = moved[posture.coupled] | moved[posture.leader[first:]]
-        self._coupled = Columns(posture.coupled[moved], env.device)
-        self._rows = Columns(first + np.flatnonzero(moved), env.device)
-        limits = joint_limits(env.sim.model, env.cfg.robot.joints)
+        self._moving = self._width.cpu().numpy().nonzero()[0]
+        limits = joint_limits(env.sim.model, env.cfg.robot)
         self._low, self._high = (torch.from_numpy(limit).to(self._width) for limit in limits)
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
@@ -61,8 +56,7 @@ class JointNoise:
         noise = random_uniform(env, self.label, self._width.shape[0])
         command = robot(env).ctrl.read(env.sim.ctrl) + self._width * noise
         command = torch.clamp(command, self._low, self._high)
-        if self._rows.indices:
-            self._coupled.write(command, self._rows.read(env.index.posture.follow(command)[0]))
+        env.index.posture.project(command, self._moving, zeros(env))
         write_robot(env, mask, command)
 
 
@@ -70,7 +64,7 @@ class JointNoise:
 class JointZeros:
     """Moves the zero of every joint by a random amount that no sensor shows, as the calibrations of
     real arms differ: positions and commands count from the zero that the servo believes in, and the
-    arm is elsewhere. Objects are placed clear of where it would be without.
+    arm is elsewhere, with what follows it. Objects are placed clear of where it would be without.
     """
 
     label = "reset.zeros"
@@ -79,12 +73,17 @@ class JointZeros:
         """Take the half-widths: of the arm's joints and of the gripper's [rad or m]."""
         self._width = torch.full_like(robot(env).home, gripper, dtype=torch.float64)
         self._width[: env.index.n_arm] = arm
+        self._moving = self._width.cpu().numpy().nonzero()[0]
         self._nominal = torch.from_numpy(env.sim.model.qpos0[env.index.robot_qpos]).to(env.device)
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
-        """Write qpos0, from which MuJoCo counts."""
+        """Write qpos0, from which MuJoCo counts, and qpos and ctrl of what follows."""
         moved = self._width * random_uniform(env, self.label, len(self._width))
         robot(env).qpos.write_masked(env.sim.fields["qpos0"], mask, self._nominal - moved)
+        if env.index.posture.leader.size:
+            command = robot(env).ctrl.read(env.sim.ctrl)
+            env.index.posture.project(command, self._moving, zeros(env))
+            write_robot(env, mask, command)
 
 
 @offers("reset term")

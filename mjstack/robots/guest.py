@@ -1,6 +1,6 @@
 """A robot as a guest in a scene: what of its file comes along, and what stays behind."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -109,13 +109,13 @@ def gravity_sag(model: mujoco.MjModel, robot: RobotCfg) -> float:
     dofs = [int(model.joint(name).dofadr[0]) for name in robot.arm_joints]
     stiffness = [-model.actuator(name).biasprm[1] for name in robot.arm_joints]
     lowered = (data.qfrc_spring - data.qfrc_bias)[dofs] / stiffness
-    return float(np.linalg.norm(grasp_jacobian(data, robot)[:, dofs] @ lowered))
+    return float(np.linalg.norm(grasp_jacobian(data, robot.grasp_sites)[:, dofs] @ lowered))
 
 
-def grasp_jacobian(data: mujoco.MjData, robot: RobotCfg) -> np.ndarray:
-    """The grasp point's translational Jacobian, shape ``(3, nv)``."""
+def grasp_jacobian(data: mujoco.MjData, sites: Sequence[str | int]) -> np.ndarray:
+    """Translational Jacobian of the grasp point, the midpoint of two sites, shape ``(3, nv)``."""
     jac = np.zeros((2, 3, data.model.nv))
-    for part, site in zip(jac, robot.grasp_sites, strict=True):
+    for part, site in zip(jac, sites, strict=True):
         mujoco.mj_jacSite(data.model, data, part, None, data.site(site).id)
     return jac.mean(axis=0)
 

@@ -82,7 +82,7 @@ def _hand(
     unbounded = (model.jnt_type < _SLIDE) | (model.jnt_type == _SLIDE) & (model.jnt_limited == 0)
     bases = [int(model.jnt_bodyid[j]) for j in path if unbounded[j]]
     last = max((path.index(j) for j in path if model.jnt_bodyid[j] in bases), default=-1)
-    joints = sorted(_joints(model, bodies))
+    joints = sorted(j for j in _joints(model, bodies) if model.jnt_type[j] >= _SLIDE)
     fingers = [j for j in joints if j in driven] or joints
     return Hand(
         palm, tuple(path[last + 1 :]), tuple(fingers), tuple(bodies), one_finger,
@@ -108,7 +108,7 @@ def _driven(model: mujoco.MjModel) -> set[int]:
     trees = [model.body_rootid[body] for body in model.jnt_bodyid]
     with_servos = {trees[j] for j in driven}
     bare = {j for j, tree in enumerate(trees) if tree not in with_servos}
-    return driven | (bare - followers)
+    return {j for j in driven | (bare - followers) if model.jnt_type[j] >= _SLIDE}
 
 
 def ancestors(model: mujoco.MjModel, body: int) -> Iterator[int]:

@@ -83,6 +83,7 @@ class Jaws:
         # The ends of the way
         command = self._posture.rest[self._posture.commanded]
         ranges = np.array([model.joint(name).range for name in gripper]).reshape(-1, 2)
+        ranges = np.clip(ranges.T, *self._posture.limits[self._columns].T).T
         self.shut, self.opened = ranges.T.copy()
         for k, ends in enumerate(ranges):
             tries = np.tile(ranges.mean(axis=1), (2, 1))

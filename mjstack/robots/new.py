@@ -52,11 +52,13 @@ def write_new(args: Sequence[str], arm: str = "") -> tuple[list[Path], list[Gues
             check_regular(file)
         except (OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or error
-            raise MjstackError(f"{file}: expected an MJCF file: {reason}.") from error
+            raise MjstackError(f"{file}: expected an MJCF file or a URDF: {reason}.") from error
         profile = guess_profile(file, load_config([]).scene, arm)
         path = f"conf/robot/{name}.yaml"
         source = os.path.relpath(file, folder / "conf" / "robot")
         lines = [("file", source, "relative to this YAML"), *profile]
+        if len({key for key, *_ in lines}) < len(lines):
+            raise MjstackError(f"{file}: a key of its profile was guessed twice.")
         contents[path] += "".join(_line(*line) for line in lines)
     paths = [folder / path for path in contents]
     for target, content in zip(paths, contents.values(), strict=True):
@@ -71,7 +73,8 @@ def _line(key: str, value: Any, comment: str) -> str:
     Raises:
         MjstackError: The configuration takes a name for another value.
     """
-    return f"{key}: {_to_yaml(value)}{comment and f' # {comment}'}\n"
+    plain = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in comment)  # on this line
+    return f"{key}: {_to_yaml(value)}{plain and f' # {plain}'}\n"
 
 
 def _to_yaml(value: Any) -> str:

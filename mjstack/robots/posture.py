@@ -9,7 +9,7 @@ MuJoCo, and keeps a table of each over its leader's range:
 """
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from functools import lru_cache
 
 import mujoco
@@ -21,7 +21,7 @@ from torch import Tensor
 
 from mjstack.errors import MjstackError
 
-REST = "rest/"
+REST = "rest/of/mjstack/"
 """Prefix of a model's numeric field with the position of a joint that has no command."""
 KNOTS = 129
 """Positions in a table, over the leader's range."""
@@ -29,6 +29,7 @@ _STEPS = 50  # of a projection, at most
 _MAX_STEP = 0.3  # [rad, m] per step
 _EXACT = 1e-10  # [rad, m] a smaller step ends it
 _ERROR = 1e-6  # [rad, m] of an equality that does not hold
+_HALVINGS = 16  # of the distance of two knots, where a range ends between them
 _MOTION = 1e-9  # [rad, m] less is rounding
 
 
@@ -41,10 +42,12 @@ class Posture:
     Attributes:
         rest: Positions at which joints without a leader stay, shape ``(nq,)``.
         commanded: Addresses in qpos of the commanded joints, shape ``(n,)``.
+        limits: Their ranges, as far as what follows them can [rad, m], shape ``(n, 2)``; infinite
+            where there is none.
         columns: Addresses that a command determines besides: of what follows, and of what is off
             qpos0, shape ``(m,)``.
         coupled: Numbers of the commanded joints that follow earlier ones; below, m includes them.
-        leader: Number of the commanded joint that each follows, shape ``(m,)``.
+        leader: Number of the commanded joint that each follows, or -1, shape ``(m,)``.
         low: Where the leader's range begins [rad, m], shape ``(m,)``.
         step: Distance of two knots [rad, m], shape ``(m,)``.
         value: Position at each knot [rad, m], shape ``(m, KNOTS)``.
@@ -67,9 +70,9 @@ class Posture:
 
         # Rest
         self.rest = m.qpos0.copy()
-        for name in (m.numeric(k).name for k in range(m.nnumeric)):
-            if name.startswith(REST):
-                first = m.joint(name.removeprefix(REST)).qposadr[0]
+        for joint in range(m.njnt):
+            name, first = REST + m.joint(joint).name, m.jnt_qposadr[joint]
+            if mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_NUMERIC, name) >= 0:
                 self.rest[first : first + len(m.numeric(name).data)] = m.numeric(name).data
         idle = ~np.isin(self._addresses, self.commanded)
         at = self._addresses[idle]
@@ -83,11 +86,15 @@ class Posture:
 
         # Tables
         tables: dict[int, tuple[int, float, float, ndarray]] = {}
+        limited = m.jnt_limited[numbers, None]
+        self.limits = np.where(limited, m.jnt_range[numbers], [-np.inf, np.inf])
         for k, address in enumerate(self.commanded):
             if address in tables or not self._linked[self._addresses == address].any():
                 continue
-            positions = self._walk(int(address), k + 1)
+            ends = np.where(np.isinf(self.limits[k]), [-2.0 * np.pi, 2.0 * np.pi], self.limits[k])
+            positions = self._walk(int(address), k + 1, ends)
             low, high = positions[[0, -1], address]
+            self.limits[k] = np.where([low, high] == ends, self.limits[k], [low, high])
             moved = np.ptp(positions, axis=0) > _MOTION
             moved[address] = False
             for column in np.flatnonzero(moved).tolist():
@@ -100,7 +107,7 @@ class Posture:
                 tables[column] = (k, low, (high - low) / (KNOTS - 1), positions[:, column])
         for column in np.flatnonzero(np.abs(self.rest - m.qpos0) > _MOTION).tolist():
             if column not in self.commanded:
-                tables.setdefault(column, (0, 0.0, 1.0, np.full(KNOTS, self.rest[column])))
+                tables.setdefault(column, (-1, 0.0, 1.0, np.full(KNOTS, self.rest[column])))
         coupled = [k for k, address in enumerate(self.commanded) if address in tables]
         self.coupled = np.array(coupled, dtype=int)
         self.columns = np.array([c for c in tables if c not in self.commanded], dtype=int)
@@ -130,9 +137,23 @@ class Posture:
     def agree(self, command: ArrayLike) -> ndarray:
         """Commands [rad, m], shape ``(..., n)``, in which coupled joints follow earlier ones."""
         command = np.array(command, dtype=float)
-        follow, _ = self.follow(torch.from_numpy(command))
-        command[..., self.coupled] = follow[..., len(self.columns) :].numpy()
+        self.project(torch.from_numpy(command), range(len(self.commanded)))
         return command
+
+    def project(
+        self, command: Tensor, moving: Collection[int], zeros: Tensor | None = None
+    ) -> None:
+        """Write coupled joints into commands [rad, m], shape ``(..., n)``: those that are among
+        some numbers of joints, or whose leaders are. ``zeros``, of the same shape, is how far the
+        joints' zeros are off the file's.
+        """
+        leaders = self.leader[len(self.columns) :].tolist()
+        pairs = enumerate(zip(self.coupled.tolist(), leaders, strict=True), len(self.columns))
+        rows = [(row, k) for row, (k, leader) in pairs if k in moving or leader in moving]
+        if rows:
+            follow, _ = self.follow(command if zeros is None else command + zeros)
+        for row, k in rows:
+            command[..., k] = follow[..., row] - (0.0 if zeros is None else zeros[..., k])
 
     def shares(self, command: ndarray) -> ndarray:
         """How far each degree of freedom moves with each commanded joint, shape ``(nv, n)``."""
@@ -152,7 +173,7 @@ class Posture:
         key = (command.device, command.dtype)
         if key not in self._tensors:
             tables = [torch.tensor(n).to(*key) for n in (self.low, self.step, self.value)]
-            rows = (self.leader, np.arange(len(self.leader)))
+            rows = (self.leader.clip(0), np.arange(len(self.leader)))
             self._tensors[key] = tables + [torch.tensor(n, device=command.device) for n in rows]
         low, step, value, leader, row = self._tensors[key]
         at = ((command.index_select(-1, leader) - low) / step).clamp(0.0, KNOTS - 1.0)
@@ -165,26 +186,45 @@ class Posture:
         slope = first + (t - 0.5) * second + (t * (t / 2.0 - 1.0) + 1.0 / 3.0) * third
         return position, slope / step
 
-    def _walk(self, address: int, count: int) -> ndarray:
-        """Positions while a joint goes over its range, shape ``(KNOTS, nq)``. Other commanded ones
-        stand, unless the equalities need those after the first few, of this count, to move.
+    def _walk(self, address: int, count: int, ends: ndarray) -> ndarray:
+        """Positions while a joint goes from one end to the other, as far as the equalities hold,
+        shape ``(KNOTS, nq)``. Other commanded ones stand, unless the equalities need those after
+        the first few, of this count, to move.
         """
-        ends = (self._low, self._high)
-        low, high = (float(end[self._addresses == address][0]) for end in ends)
-        if not np.isfinite(low):
-            low, high = -2.0 * np.pi, 2.0 * np.pi
-        knots = np.linspace(low, high, KNOTS)
+        knots = np.linspace(ends[0], ends[1], KNOTS)
         first = int(np.abs(knots - self.rest[address]).argmin())
         positions = np.empty((KNOTS, len(self.rest)))
+        exact = np.zeros(KNOTS, dtype=bool)
         for way in (range(first, KNOTS), range(first, -1, -1)):
-            qpos = self.rest.copy()
+            qpos = self.rest
             for knot in way:
-                qpos[address] = knots[knot]
-                qpos = self._settle(qpos, self.commanded)
-                if np.abs(self._rows(qpos)[1]).max(initial=0.0) > _ERROR:
-                    qpos = self._settle(qpos, self.commanded[:count])
+                qpos, exact[knot] = self._place(qpos, address, knots[knot], count)
                 positions[knot] = qpos
-        return positions
+                if exact.any() and not exact[knot]:
+                    break
+        if exact.all() or not exact.any():
+            return positions
+        inside = np.flatnonzero(exact)[[0, -1]]
+        near, far = knots[inside], knots[np.clip(inside + np.array([-1, 1]), 0, KNOTS - 1)]
+        for _ in range(_HALVINGS):
+            for side, middle in enumerate((near + far) / 2.0):
+                holds = self._place(positions[inside[side]], address, middle, count)[1]
+                (near if holds else far)[side] = middle
+        return self._walk(address, count, near)
+
+    def _place(self, qpos: ndarray, address: int, value: float, count: int) -> tuple[ndarray, bool]:
+        """Positions with a joint elsewhere, and whether the equalities hold there."""
+        qpos = qpos.copy()
+        qpos[address] = value
+        for still in (self.commanded, self.commanded[:count]):
+            qpos = self._settle(qpos, still)
+            if self.error(qpos) <= _ERROR:
+                return qpos, True
+        return qpos, False
+
+    def error(self, qpos: ndarray) -> float:
+        """The largest error of an equality [rad, m] at positions of shape ``(nq,)``."""
+        return float(np.abs(self._rows(qpos)[1]).max(initial=0.0))
 
     def _rows(self, qpos: ndarray) -> tuple[ndarray, ndarray]:
         """Jacobian of the equalities, shape ``(rows, hinges and slides)``, and their errors."""

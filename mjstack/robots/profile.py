@@ -14,11 +14,11 @@ from numpy import ndarray
 from mjstack.config.mjcf import read_mjcf
 from mjstack.config.schema import ModelCfg, RobotCfg, SceneCfg, ServoCfg
 from mjstack.config.schema.robot import BasePoseCfg
-from mjstack.errors import MjstackError
-from mjstack.robots.guest import compile_scene
+from mjstack.errors import ConfigError, MjstackError
+from mjstack.robots.guest import compile_scene, mujoco_errors
 from mjstack.robots.hand import Hand, find_hands, find_root
 from mjstack.robots.posture import posture
-from mjstack.robots.servos import servo_problem
+from mjstack.robots.servos import prepare_servos, servo_problem
 from mjstack.robots.source import robot_spec
 from mjstack.robots.tips import Fingers, Grip
 from mjstack.robots.workspace import Workspace, find_workspace
@@ -61,10 +61,8 @@ def guess_profile(file: Path, scene: SceneCfg, arm: str = "") -> list[Guess]:
     for number, body in enumerate(spec.bodies):  # as `read_robot` names them
         body.name = body.name or f"unnamed_{number}"
     spec.compiler.fusestatic = False
-    try:
+    with mujoco_errors(str(file)):
         model = spec.copy().compile()
-    except ValueError as error:
-        raise MjstackError(f"{file} cannot be compiled: {error}") from error
     hands, problems = [], []
     for hand in find_hands(model):
         bare = [j for j in (*hand.arm, *hand.gripper) if not model.joint(j).name]
@@ -73,11 +71,13 @@ def guess_profile(file: Path, scene: SceneCfg, arm: str = "") -> list[Guess]:
             problems.append(f"the joint of body {body} has no name")
             continue
         try:
-            hands.append((hand, Fingers(spec, hand, _ranges(model, hand.gripper)).measure(_WIDTH)))
+            servos, limits = _fit(spec, model, hand)
+            grip = Fingers(spec, hand, limits[len(hand.arm) :]).measure(_WIDTH)
+            hands.append((hand, grip, servos, limits))
         except (ValueError, MjstackError) as error:
             problems.append(f"{_label(model, hand)}: {error}")
-    names = [model.body(hand.palm).name for hand, _ in hands]
-    chosen = [pair for pair in hands if arm.lower() in _label(model, pair[0]).lower()]
+    names = [model.body(hand.palm).name for hand, *_ in hands]
+    chosen = [entry for entry in hands if arm.lower() in _label(model, entry[0]).lower()]
     if not hands:
         raise MjstackError(
             f"{file}: expected an arm of two joints or more with a gripper; "
@@ -85,8 +85,8 @@ def guess_profile(file: Path, scene: SceneCfg, arm: str = "") -> list[Guess]:
         )
     if not chosen:
         raise MjstackError(f"--arm {arm}: expected a part of a name of {' or '.join(names)}.")
-    hand, grip = chosen[0]
-    space = find_workspace(model, hand, grip, _ranges(model, hand.arm))
+    hand, grip, missing, limits = chosen[0]
+    space = find_workspace(model, hand, grip, limits[: len(hand.arm)])
     if space is None:
         raise MjstackError(
             f"{file}: the hand of {names[0]} cannot point down over a table within the arm's reach,"
@@ -94,17 +94,16 @@ def guess_profile(file: Path, scene: SceneCfg, arm: str = "") -> list[Guess]:
         )
     if space.tilt > _LEANS:
         with suppress(ValueError):  # a tip of a hand that leans reaches lower
-            ranges = _ranges(model, hand.gripper)
-            grip = Fingers(spec, hand, ranges).measure(_WIDTH, _SHALLOW)
-    rest = [name for name, pair in zip(names, hands, strict=True) if pair is not chosen[0]]
+            grip = Fingers(spec, hand, limits[len(hand.arm) :]).measure(_WIDTH, _SHALLOW)
+    rest = [name for name, entry in zip(names, hands, strict=True) if entry is not chosen[0]]
     guesses = [
         *_guess_joints(model, hand, rest),
-        *_guess_grip(model, hand, grip),
-        *_guess_home(model, hand, grip, space),
-        *_guess_servos(spec, model, hand, grip, space),
+        *_guess_grip(model, hand, grip, limits[len(hand.arm) :]),
+        *_guess_home(model, hand, grip, space, limits),
         *_guess_table(space, scene),
     ]
-    return [*guesses, *_guess_scene(file, guesses, grip)]
+    made = _make_servos(model, hand, grip, space, missing)
+    return [*guesses, *_guess_scene(file, guesses, made, grip)]
 
 
 def _label(model: mujoco.MjModel, hand: Hand) -> str:
@@ -112,19 +111,37 @@ def _label(model: mujoco.MjModel, hand: Hand) -> str:
     return f"{model.body(hand.palm).name} ({', '.join(names)})"
 
 
-def _ranges(model: mujoco.MjModel, joints: tuple[int, ...]) -> ndarray:
-    """Ranges of joints [rad, m], no wider than those of their servos, shape ``(n, 2)``."""
-    ranges = model.jnt_range[list(joints)].copy()
-    ranges[model.jnt_limited[list(joints)] == 0] = [-_TURN, _TURN]
-    for row, joint in zip(ranges, joints, strict=True):
-        for k in np.flatnonzero(model.actuator_trnid[:, 0] == joint):
-            direct = model.actuator_trntype[k] == mujoco.mjtTrn.mjTRN_JOINT
-            plain = model.actuator_gainprm[k, 0] == -model.actuator_biasprm[k, 1]
-            same = model.actuator_gear[k, 0] == 1.0 and not model.actuator_biasprm[k, 0]
-            if direct and plain and same and model.actuator_ctrllimited[k]:
-                low, high = model.actuator_ctrlrange[k]
-                row[:] = max(row[0], low), min(row[1], high)
-    return ranges
+def _unlimited(model: mujoco.MjModel, hand: Hand) -> dict[str, list[float]]:
+    joints = [j for j in (*hand.arm, *hand.gripper) if not model.jnt_limited[j]]
+    return {model.joint(j).name: [-_TURN, _TURN] for j in joints}
+
+
+def _fit(spec: mujoco.MjSpec, model: mujoco.MjModel, hand: Hand) -> tuple[list[str], ndarray]:
+    """Joints for which servos have to be made, and where the servos of all joints can bring them
+    [rad, m], shape ``(n, 2)``; a MjstackError if a tendon moves one in a way that no servo can.
+    """
+    names = [model.joint(j).name for j in (*hand.arm, *hand.gripper)]
+    arm, gripper = names[: len(hand.arm)], names[len(hand.arm) :]
+    tendons = {w.target.name for t in spec.tendons for w in t.path if w.target is not None}
+    bare = [name for name in names if servo_problem(spec, name)]
+    pulled = [name for name in bare if name in gripper and name in tendons]
+    for missing in ([name for name in bare if name not in pulled], bare):
+        servos = {name: ServoCfg(stiffness=1.0, damping=1.0, effort=1.0) for name in missing}
+        robot = RobotCfg(name="guess", arm_joints=arm, gripper_joints=gripper, servos=servos)
+        robot.ranges = _unlimited(model, hand)
+        fitted = spec.copy()
+        for key in list(fitted.keys):  # they have a number of commands
+            fitted.delete(key)
+        try:
+            prepare_servos(fitted, robot)
+            break
+        except ConfigError:
+            if missing == bare:
+                raise
+    compiled = fitted.compile()
+    spans = [[compiled.joint(n).range, compiled.actuator(n).ctrlrange] for n in names]
+    low, high = np.transpose(spans, (2, 0, 1))
+    return missing, np.stack((low.max(axis=1), high.min(axis=1)), axis=1)
 
 
 def _numbers(values: Any, digits: int = 4) -> list[float]:
@@ -152,13 +169,11 @@ def _guess_joints(model: mujoco.MjModel, hand: Hand, rest: list[str]) -> Iterato
     if not model.nu:
         servos = "beyond it; no equality lets them follow others"
     yield Guess("gripper_joints", [model.joint(j).name for j in hand.gripper], servos)
-    wide = [j for j in (*hand.arm, *hand.gripper) if not model.jnt_limited[j]]
-    if wide:
-        ranges = {model.joint(j).name: [-_TURN, _TURN] for j in wide}
+    if ranges := _unlimited(model, hand):
         yield Guess("ranges", ranges, "the file has none: one turn either way")
 
 
-def _guess_grip(model: mujoco.MjModel, hand: Hand, grip: Grip) -> Iterator[Guess]:
+def _guess_grip(model: mujoco.MjModel, hand: Hand, grip: Grip, limits: ndarray) -> Iterator[Guess]:
     jaws = [model.body(jaw).name for jaw in grip.jaws]
     yield Guess("jaw_bodies", jaws, "their surfaces face each other at the tips")
     sites_there = {model.site(k).name for k in range(model.nsite)}
@@ -177,21 +192,22 @@ def _guess_grip(model: mujoco.MjModel, hand: Hand, grip: Grip) -> Iterator[Guess
     wide, narrow = (f"{1e3 * max(gap, 0.0):.0f}" for gap in grip.gap)
     yield Guess(
         "gripper_open",
-        _within(grip.opened, _ranges(model, hand.gripper)),
+        _within(grip.opened, limits),
         f"of {narrow} to {wide} mm, 85 at most",
     )
 
 
-def _guess_home(model: mujoco.MjModel, hand: Hand, grip: Grip, space: Workspace) -> Iterator[Guess]:
-    arm = _within(space.home, _ranges(model, hand.arm))
-    home = [*arm, *_within(grip.opened, _ranges(model, hand.gripper))]
+def _guess_home(
+    model: mujoco.MjModel, hand: Hand, grip: Grip, space: Workspace, limits: ndarray
+) -> Iterator[Guess]:
+    home = _within(np.concatenate((space.home, grip.opened)), limits)
     why = f"hand down {100 * space.height:.0f} cm above the table's middle, by inverse kinematics"
     yield Guess(
         "home", home, f"{why}; off the vertical by {math.degrees(space.tilt):.0f} deg at most"
     )
     names = [model.joint(j).name for j in hand.arm]
     if space.locked:
-        locked = {names[k]: arm[k] for k in space.locked}
+        locked = {names[k]: home[k] for k in space.locked}
         yield Guess("locked", locked, "the others reach the table with the hand down")
     roll = None if space.roll is None else names[space.roll]
     if roll:
@@ -203,64 +219,73 @@ def _guess_home(model: mujoco.MjModel, hand: Hand, grip: Grip, space: Workspace)
     yield Guess("finger_room", 0.03, "m beside an object")
 
 
-def _guess_servos(
-    spec: mujoco.MjSpec, model: mujoco.MjModel, hand: Hand, grip: Grip, space: Workspace
-) -> Iterator[Guess]:
-    """Servos that are missing, and the positions to which the gripper's close."""
+def _make_servos(
+    model: mujoco.MjModel, hand: Hand, grip: Grip, space: Workspace, missing: list[str]
+) -> dict[str, dict[str, float]]:
+    """Servos of joints that have none."""
     data = mujoco.MjData(model)
     data.qpos[model.jnt_qposadr[list(hand.arm)]] = space.home
     data.qpos[model.jnt_qposadr[list(hand.gripper)]] = grip.opened
     mujoco.mj_forward(model, data)
     inertia = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, inertia)
-    tendons = {w.target.name for t in spec.tendons for w in t.path if w.target is not None}
     travel = np.abs(grip.shut - grip.touching)
     servos = {}
-    for joint in (*hand.arm, *hand.gripper):
-        name, dof = model.joint(joint).name, model.jnt_dofadr[joint]
-        if not servo_problem(spec, name) or (joint in hand.gripper and name in tendons):
-            continue
+    for joint in (model.joint(name).id for name in missing):
+        dof = model.jnt_dofadr[joint]
         mass, damping = inertia[dof, dof], model.dof_damping[dof]
         hinge = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
         stiffness = max(mass * _BANDWIDTH**2, 20.0 * damping, 40.0 if hinge else 2000.0)
         if joint in hand.gripper:  # the way that is left has to make the force
             stiffness = max(20.0 * damping, _FORCE * _WIDTH / float((travel**2).sum()))
-        effort = _effort(model, joint) or max(3.0 * abs(data.qfrc_bias[dof]), 0.3 * stiffness, 1.0)
-        made = (stiffness, 2.0 * math.sqrt(stiffness * mass), effort)
-        keys = ("stiffness", "damping", "effort")
-        servos[name] = {key: float(f"{v:.3g}") for key, v in zip(keys, made, strict=True)}
-    why = f"made where the file has no position servo: from the inertia, {_BANDWIDTH:g} rad/s"
-    if servos:
-        yield Guess("servos", servos, why)
+        effort = _effort(data, joint) or max(3.0 * abs(data.qfrc_bias[dof]), 0.3 * stiffness, 1.0)
+        made = _servo(stiffness, 2.0 * math.sqrt(stiffness * mass), effort)
+        servos[model.joint(joint).name] = made
+    return servos
 
 
-def _guess_scene(file: Path, guesses: list[Guess], grip: Grip) -> Iterator[Guess]:
-    """Keys that depend on the compiled robot: how far the jaws close, with stiffer servos where
-    its own let a cube slip, and links that touch each other in nearly every posture.
+def _servo(*values: float) -> dict[str, float]:
+    pairs = zip(("stiffness", "damping", "effort"), values, strict=True)
+    return {key: float(f"{value:.3g}") for key, value in pairs if value < np.inf}
+
+
+def _guess_scene(
+    file: Path, guesses: list[Guess], servos: dict[str, dict[str, float]], grip: Grip
+) -> Iterator[Guess]:
+    """Keys that depend on the compiled robot: servos, stiffer ones where the file's own let a cube
+    slip, how far the jaws close, and links that touch each other in nearly every posture.
     """
     values = {guess.key: guess.value for guess in guesses if guess.key != "placements"}
-    servos = {name: ServoCfg(**servo) for name, servo in values.pop("servos", {}).items()}
     base = BasePoseCfg(**values.pop("base", {}))
-    robot = RobotCfg(name="guess", file=str(file), servos=servos, base=base, **values)
-    model = compile_scene(robot_spec(robot, ModelCfg(source="builtin")))
+    made = {name: ServoCfg(**servo) for name, servo in servos.items()}
+    robot = RobotCfg(name="guess", file=str(file), servos=made, base=base, **values)
+    with mujoco_errors(str(file)):
+        model = compile_scene(robot_spec(robot, ModelCfg(source="builtin")))
     gripper = [model.actuator(name).id for name in robot.gripper_joints]
     gains, damping = model.actuator_gainprm[gripper, 0], -model.actuator_biasprm[gripper, 2]
+    limited = model.actuator_forcelimited[gripper]
+    efforts = np.where(limited, model.actuator_forcerange[gripper, 1], np.inf)
     travel = grip.shut - grip.touching
-    force = float(gains @ travel**2) / _WIDTH  # N where they close all the way
+    press = gains * travel**2 / _WIDTH  # N where they close all the way, without limits
+    force = np.minimum(press, efforts * np.abs(travel) / _WIDTH).sum()
+    reasons = []
+    if servos:
+        why = "made where the file has no position servo: from the inertia,"
+        reasons.append(f"{why} {_BANDWIDTH:g} rad/s")
     if force < _LEAST:
-        more = [
-            {
-                "stiffness": float(f"{_FORCE / force * k:.3g}"),
-                "damping": float(f"{_FORCE / force * d:.3g}"),
-            }
-            for k, d in zip(gains, damping, strict=True)
-        ]
-        stiffer = values.get("servos", {}) | dict(zip(robot.gripper_joints, more, strict=True))
-        yield Guess("servos", stiffer, f"the file's own press with {force:.1f} N, and a cube slips")
-    share = 1.0 if force < _FORCE else max(_FORCE / force, _SQUEEZE / _WIDTH)
+        reasons.append(f"the file's own press with {force:.1f} N, and a cube slips")
+        more = max(1.0, _FORCE / press.sum())
+        efforts = np.maximum(efforts, 2.0 * _FORCE * gains * np.abs(travel) / press.sum())
+        press *= more
+        stiffer = zip(more * gains, more * damping, efforts, strict=True)
+        servos |= zip(robot.gripper_joints, (_servo(*values) for values in stiffer), strict=True)
+    if servos:
+        yield Guess("servos", servos, "; ".join(reasons))
+    share = min(1.0, max(_FORCE / press.sum(), _SQUEEZE / _WIDTH))
+    force = np.minimum(share * press, efforts * np.abs(travel) / _WIDTH).sum()
     limits = model.jnt_range[[model.joint(name).id for name in robot.gripper_joints]]
     closed = _within(grip.touching + share * travel, limits)
-    yield Guess("gripper_closed", closed, f"around 44 mm, to press with {_FORCE:g} N or more")
+    yield Guess("gripper_closed", closed, f"around 44 mm, to press with {force:.0f} N")
     data = mujoco.MjData(model)
     opened = values["gripper_open"]
     whole = posture(model, tuple(robot.joints))
@@ -277,14 +302,18 @@ def _guess_scene(file: Path, guesses: list[Guess], grip: Grip) -> Iterator[Guess
         yield Guess("exclude", always, "they touch in nearly every posture")
 
 
-def _effort(model: mujoco.MjModel, joint: int) -> float:
+def _effort(data: mujoco.MjData, joint: int) -> float:
     """The largest force that the file gives a joint's motor [N m, N]; 0 if it says none."""
-    for k in np.flatnonzero(model.actuator_trnid[:, 0] == joint):
-        gear, limits = model.actuator_gear[k, 0], model.actuator_ctrlrange[k]
+    model = data.model
+    moments = np.zeros((model.nu, model.nv))
+    layout = (data.moment_rownnz, data.moment_rowadr, data.moment_colind)
+    mujoco.mju_sparse2dense(moments, data.actuator_moment, *layout)
+    for k in np.flatnonzero(gears := moments[:, model.jnt_dofadr[joint]]):
         if model.actuator_forcelimited[k]:
-            return float(np.abs(gear * model.actuator_forcerange[k]).max())
+            return float(np.abs(gears[k] * model.actuator_forcerange[k]).max())
         if model.actuator_ctrllimited[k] and model.actuator_biastype[k] == 0:
-            return float(np.abs(gear * model.actuator_gainprm[k, 0] * limits).max())
+            gain = gears[k] * model.actuator_gainprm[k, 0]
+            return float(np.abs(gain * model.actuator_ctrlrange[k]).max())
     limited = model.jnt_actfrclimited[joint]
     return float(np.abs(model.jnt_actfrcrange[joint]).max()) if limited else 0.0
 

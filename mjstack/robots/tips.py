@@ -127,6 +127,8 @@ class Fingers:
                 raise ValueError("the body that carries the jaw has no geoms that collide")
             if along.mean() < (cloud @ closing).mean():
                 closing = -closing
+        elif not second:  # all move in step
+            raise ValueError("its fingers do not close on each other")
         moves = ways @ closing
         opens = moves[:, right].mean(axis=1)
         if not right.all():
@@ -142,11 +144,12 @@ class Fingers:
         away = away[right].mean(axis=0) - (0.0 if right.all() else away[~right].mean(axis=0))
         approach = self._approach(nearly[1].mean(axis=0), _unit(away))
         closing = _unit(away - (away @ approach) * approach)
-        frame = np.stack((np.cross(approach, closing), approach, closing), axis=1)
+        self._frame = np.stack((np.cross(approach, closing), approach, closing), axis=1)
+        self._sides = first, second
         grips = []
         depths = [pair for pair in _DEPTHS if pair[0] <= deepest]
         for depth, self.model.geom_size[self._plate, 1] in depths:
-            grip = self._grasp(width, (opened, shut), frame, (first, second), depth)
+            grip = self._grasp(width, (opened, shut), depth)
             grips.append(grip)
             if grip.gap[0] >= width + _ROOM and grip.beyond <= _REACH:
                 break
@@ -174,34 +177,26 @@ class Fingers:
                 return np.copysign(1.0, axis @ away) * axis
         return away
 
-    def _grasp(
-        self,
-        width: float,
-        ends: tuple[ndarray, ndarray],
-        frame: ndarray,
-        sides: tuple[Sequence[int], Sequence[int]],
-        depth: float,
-    ) -> Grip:
+    def _grasp(self, width: float, ends: tuple[ndarray, ndarray], depth: float) -> Grip:
         """Close the jaws around an object: where they touch it, near their tips."""
         opened, shut = ends
+        frame = self._frame
         share = 1.0
         for _ in range(3):  # tips may move along the approach axis as they close
             self.settle(opened + share * (shut - opened))
-            clouds = [self.points(side) @ frame for side in sides]
+            clouds = [self.points(side) @ frame for side in self._sides]
             tops = [cloud[:, 1].max() for cloud in clouds]
             level = min(min(tops) - _EDGE, max(tops) - depth)
             tips = [cloud[cloud[:, 1] > level - _EDGE] for cloud in clouds]
             start = np.array([tips[1][:, 0].mean(), level, np.mean([t[:, 2].mean() for t in tips])])
-            gaps = np.array(
-                [self._gap(opened + s * (shut - opened), start, frame, sides)[0] for s in _SHARES]
-            )
+            gaps = np.array([self._gap(opened + s * (shut - opened), start)[0] for s in _SHARES])
             if gaps.min() > width - 0.01:
                 raise ValueError("its fingers do not close on each other")
             share = _last(gaps, width)
         most = _WIDE - 0.015 * self._hand.one_finger  # it swings up as it opens
         wide = opened + _last(gaps, min(most, float(gaps.max()))) * (shut - opened)
         touching = opened + share * (shut - opened)
-        _, point, geoms = self._gap(touching, start, frame, sides)
+        _, point, geoms = self._gap(touching, start)
         jaws = [int(self.model.geom_bodyid[geom]) for geom in geoms]
         sites = []
         for jaw, sign in zip(jaws, (-0.5, 0.5), strict=True):
@@ -215,34 +210,30 @@ class Fingers:
                 self._to_palm(self._data.xpos[jaw] + self._data.xmat[jaw].reshape(3, 3) @ site)
                 for jaw, site in zip(jaws, sites, strict=True)
             ]
-            top = max((self.points(side) @ frame)[:, 1].max() for side in sides)
+            top = max((self.points(side) @ frame)[:, 1].max() for side in self._sides)
             reaches.append(float(top - np.mean(touches, axis=0) @ frame[:, 1]))
         gap = (float(gaps.max()), float(gaps.min()))
         point, (_, approach, closing) = frame @ point, frame.T
         return Grip(wide, touching, shut, gap, max(reaches), point, closing, approach, jaws, sites)
 
-    def _gap(
-        self, gripper: ndarray, start: ndarray, frame: ndarray, sides: Sequence[Sequence[int]]
-    ) -> tuple[float, ndarray, list[int]]:
-        """Distance of the sides [m] along the closing axis, the point between them, in ``frame``,
-        and the geoms there.
+    def _gap(self, gripper: ndarray, start: ndarray) -> tuple[float, ndarray, list[int]]:
+        """Distance of the sides [m] along the closing axis, the point between them, in the grasp's
+        frame, and the geoms there.
         """
         self.settle(gripper)
         point = start.copy()
         for _ in range(4):
-            (left, first), (right, second) = (
-                self._touch(frame @ point, frame, side) for side in sides
-            )
+            (left, first), (right, second) = (self._touch(point, side) for side in self._sides)
             point[2] += 0.5 * (right - left)
         return left + right + 2.0 * _PLATE[2], point, [first, second]
 
-    def _touch(self, point: ndarray, frame: ndarray, bodies: Sequence[int]) -> tuple[float, int]:
+    def _touch(self, point: ndarray, bodies: Sequence[int]) -> tuple[float, int]:
         """How far the nearest solid geom of some bodies is from the plate, and which it is."""
         model, data = self.model, self._data
         back = model.geom_size[self._plate, 1] - _TIP
-        data.geom_xpos[self._plate] = self._from_palm(point - back * frame[:, 1])
+        data.geom_xpos[self._plate] = self._from_palm(self._frame @ (point - [0.0, back, 0.0]))
         turn = data.xmat[self._hand.palm].reshape(3, 3)
-        data.geom_xmat[self._plate] = (turn @ frame).ravel()
+        data.geom_xmat[self._plate] = (turn @ self._frame).ravel()
         nearest = (_FAR, -1)
         for geom in self._solid[np.isin(model.geom_bodyid[self._solid], bodies)]:
             left = mujoco.mj_geomDistance(model, data, self._plate, geom, _FAR, None)

@@ -134,6 +134,102 @@ class _Arm:
                 idle = sorted({*lying, *idle})
         return idle, roll
 
+    def try_table(
+        self,
+        seeds: list[ndarray],
+        center: ndarray,
+        azimuth: float,
+        shoulder: ndarray,
+        reach: float,
+        upright: bool,
+    ) -> tuple[float, Workspace] | None:
+        """How well an arm works over a table, and the best home there; None if it does not."""
+        side = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+        # Of an arm that does not turn about the vertical no gain keeps the tilt between objects
+        apart = round(min(0.14 if upright else 0.08, 0.25 * reach), 2)
+        height = 0.1 if reach > 0.4 else 0.07
+        everything = np.ones(len(self.low))
+        best: tuple[float, Workspace] | None = None
+        middle = center + np.array([0.0, 0.0, _CUBE + height])
+        homes: list[ndarray] = []
+        for seed in seeds:
+            q, left, tilt = self.solve(seed, middle, everything, side)
+            if left > _REACHED or tilt > 0.3 or any(np.abs(q - h).max() < 0.05 for h in homes):
+                continue
+            homes.append(q)
+            lowest = self.lowest(q, center, apart)
+            if lowest is None:
+                continue
+            locked, roll = self.choose_locked(q, upright)
+            free = np.array([k not in locked for k in range(len(q))], dtype=float)
+            worst = list(self.walk(q, free, center, side, apart, height))
+            if max(left for left, _, _ in worst) > _REACHED:
+                continue
+            tilts = max(tilt for _, tilt, _ in worst)
+            if tilts > _UPRIGHT:
+                continue
+            room = min(min(margin for _, _, margin in worst), 0.15)
+            linear, _ = self.jacobian(self.pose(q)[0])
+            bend = float(np.linalg.svd(linear[:, free > 0.0])[1][-1])
+            score = room / 0.15 + min(bend, 0.15) / 0.15 - 1.5 * (tilt + tilts)
+            score -= 0.6 * float(
+                np.mean(np.abs(q - 0.5 * (self.low + self.high)) / (self.high - self.low))
+            )
+            if best is None or score > best[0]:
+                arguments = (azimuth, center, apart, height, q, locked, roll, upright)
+                best = score, Workspace(*arguments, tilts, shoulder, lowest)
+            if best[0] >= _ENOUGH:
+                break
+        return best
+
+    def walk(
+        self,
+        home: ndarray,
+        free: ndarray,
+        center: ndarray,
+        side: ndarray,
+        apart: float,
+        height: float,
+    ) -> Iterator[tuple[float, float, float]]:
+        """Distance that is left, tilt, and share of a joint's range beside it, at objects."""
+        ahead = np.cross(side, [0.0, 0.0, 1.0])
+        span = np.maximum(self.high - self.low, 1e-9)
+        for along, across in product((-0.03, 0.03), (-apart - 0.03, apart + 0.03)):
+            q = home
+            for up in (_CUBE + height + 0.07, _CUBE):
+                target = center + along * ahead + across * side + [0.0, 0.0, up]
+                q, _, _ = self.solve(q, target, free, None, 0.1)
+                q, left, tilt = self.solve(
+                    q, target, free, None, 0.0
+                )  # as the point alone needs it
+                margin = float((np.minimum(q - self.low, self.high - q) / span)[free > 0.0].min())
+                yield left, tilt, margin
+
+    def lowest(self, q: ndarray, center: ndarray, apart: float) -> float | None:
+        """Height of the lowest point at home [m]; None if the arm is in its own way, or if a link
+        but the hand's reaches into the table.
+        """
+        self.pose(q)
+        model, data = self.model, self.data
+        hand = {self.hand.palm, *self.hand.bodies}
+        links = {*ancestors(model, self.hand.palm), *hand}
+        lowest = np.inf
+        for geom in np.flatnonzero(model.geom_contype | model.geom_conaffinity):
+            body = int(model.geom_bodyid[geom])
+            if model.body_weldid[body] == 0 or body not in links:
+                continue
+            middle, half = model.geom_aabb[geom].reshape(2, 3)
+            turn = data.geom_xmat[geom].reshape(3, 3)
+            at = data.geom_xpos[geom] + turn @ middle
+            bottom = float(at[2] - np.abs(turn[2]) @ half)
+            lowest = min(lowest, bottom)
+            if bottom < center[2] and np.linalg.norm((at - center)[:2]) < apart + 0.1:
+                return None
+        mujoco.mj_collision(model, data)
+        pairs = [model.geom_bodyid[c.geom].tolist() for c in data.contact if c.dist < -0.005]
+        blocked = any({*pair} <= links and not {*pair} <= hand for pair in pairs)
+        return None if blocked else lowest
+
 
 def find_workspace(
     model: mujoco.MjModel, hand: Hand, grip: Grip, limits: ndarray
@@ -172,106 +268,10 @@ def find_workspace(
             near = np.argsort(away + 9.0 * ~down)[:count]
             if away[near[0]] + 9.0 * ~down[near[0]] > 0.5 * reach + 0.1:
                 continue
-            tried = _try_table(
-                arm, [*plain, *starts[near]], center, azimuth, shoulder, reach, upright
-            )
+            seeds = [*plain, *starts[near]]
+            tried = arm.try_table(seeds, center, azimuth, shoulder, reach, upright)
             if tried is not None:
                 best = max(best, (tried[0] - cost, tried[1]), key=lambda pair: pair[0])
         if best[1] is not None:
             break  # the nearer to the file's own direction, the better
     return best[1]
-
-
-def _try_table(
-    arm: _Arm,
-    seeds: list[ndarray],
-    center: ndarray,
-    azimuth: float,
-    shoulder: ndarray,
-    reach: float,
-    upright: bool,
-) -> tuple[float, Workspace] | None:
-    """How well an arm works over a table, and the best home there; None if it does not."""
-    side = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-    # Of an arm that does not turn about the vertical no gain keeps the tilt between objects
-    apart = round(min(0.14 if upright else 0.08, 0.25 * reach), 2)
-    height = 0.1 if reach > 0.4 else 0.07
-    everything = np.ones(len(arm.low))
-    best: tuple[float, Workspace] | None = None
-    middle = center + np.array([0.0, 0.0, _CUBE + height])
-    homes: list[ndarray] = []
-    for seed in seeds:
-        q, left, tilt = arm.solve(seed, middle, everything, side)
-        if left > _REACHED or tilt > 0.3 or any(np.abs(q - h).max() < 0.05 for h in homes):
-            continue
-        homes.append(q)
-        lowest = _lowest(arm, q, center, apart)
-        if lowest is None:
-            continue
-        locked, roll = arm.choose_locked(q, upright)
-        free = np.array([k not in locked for k in range(len(q))], dtype=float)
-        worst = list(_walk(arm, q, free, center, side, apart, height))
-        if max(left for left, _, _ in worst) > _REACHED:
-            continue
-        tilts = max(tilt for _, tilt, _ in worst)
-        if tilts > _UPRIGHT:
-            continue
-        room = min(min(margin for _, _, margin in worst), 0.15)
-        linear, _ = arm.jacobian(arm.pose(q)[0])
-        bend = float(np.linalg.svd(linear[:, free > 0.0])[1][-1])
-        score = room / 0.15 + min(bend, 0.15) / 0.15 - 1.5 * (tilt + tilts)
-        score -= 0.6 * float(np.mean(np.abs(q - 0.5 * (arm.low + arm.high)) / (arm.high - arm.low)))
-        if best is None or score > best[0]:
-            arguments = (azimuth, center, apart, height, q, locked, roll, upright)
-            best = score, Workspace(*arguments, tilts, shoulder, lowest)
-        if best[0] >= _ENOUGH:
-            break
-    return best
-
-
-def _walk(
-    arm: _Arm,
-    home: ndarray,
-    free: ndarray,
-    center: ndarray,
-    side: ndarray,
-    apart: float,
-    height: float,
-) -> Iterator[tuple[float, float, float]]:
-    """Distance that is left, tilt, and share of a joint's range beside it, where objects may be."""
-    ahead = np.cross(side, [0.0, 0.0, 1.0])
-    span = np.maximum(arm.high - arm.low, 1e-9)
-    for along, across in product((-0.03, 0.03), (-apart - 0.03, apart + 0.03)):
-        q = home
-        for up in (_CUBE + height + 0.07, _CUBE):
-            target = center + along * ahead + across * side + [0.0, 0.0, up]
-            q, _, _ = arm.solve(q, target, free, None, 0.1)
-            q, left, tilt = arm.solve(q, target, free, None, 0.0)  # as the point alone needs it
-            margin = float((np.minimum(q - arm.low, arm.high - q) / span)[free > 0.0].min())
-            yield left, tilt, margin
-
-
-def _lowest(arm: _Arm, q: ndarray, center: ndarray, apart: float) -> float | None:
-    """Height of an arm's lowest point at home [m]; None if it is in its own way, or if a link but
-    the hand's reaches into the table.
-    """
-    arm.pose(q)
-    model, data = arm.model, arm.data
-    hand = {arm.hand.palm, *arm.hand.bodies}
-    links = {*ancestors(model, arm.hand.palm), *hand}
-    lowest = np.inf
-    for geom in np.flatnonzero(model.geom_contype | model.geom_conaffinity):
-        body = int(model.geom_bodyid[geom])
-        if model.body_weldid[body] == 0 or body not in links:
-            continue
-        middle, half = model.geom_aabb[geom].reshape(2, 3)
-        turn = data.geom_xmat[geom].reshape(3, 3)
-        at = data.geom_xpos[geom] + turn @ middle
-        bottom = float(at[2] - np.abs(turn[2]) @ half)
-        lowest = min(lowest, bottom)
-        if bottom < center[2] and np.linalg.norm((at - center)[:2]) < apart + 0.1:
-            return None
-    mujoco.mj_collision(model, data)
-    pairs = [model.geom_bodyid[c.geom].tolist() for c in data.contact if c.dist < -0.005]
-    blocked = any({*pair} <= links and not {*pair} <= hand for pair in pairs)
-    return None if blocked else lowest

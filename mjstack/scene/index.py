@@ -15,11 +15,12 @@ from mjstack.config.schema import RobotCfg, SceneCfg
 from mjstack.errors import ConfigError, require_names
 from mjstack.math import lowest_point, quat_mul, quat_to_matrix
 from mjstack.robots.jaws import Jaws
-from mjstack.robots.posture import posture
+from mjstack.robots.posture import Posture, posture
 from mjstack.scene.build import CAPSULE_TURN, WORLD, force_sensor
 from mjstack.sim.simulation import Columns
 
 _jaws = lru_cache(maxsize=8)(Jaws)
+_APART = 1e-4  # [rad, m] that a joint value may be off an equality
 _GRIP = 20.0  # [N] of each jaw on an object, where the configuration has no joint target
 _WIDTH = 0.044  # [m] of an object, where there is none
 _SHAPES = {
@@ -50,6 +51,7 @@ class RobotTensors:
     gripper_closed: Tensor  # around the narrowest of the scene's objects and that of closed_width
     gripper_travel: Tensor  # the open less the closed one
     idle_ctrl: Tensor  # commands that hold those joints
+    zero: Tensor  # qpos0 of the joints
 
 
 class SceneIndex:
@@ -87,16 +89,18 @@ class SceneIndex:
         self._robot = robot
         self._tensors: dict[tuple[torch.device, torch.dtype], RobotTensors] = {}
         self.posture = posture(model, tuple(robot.joints))
+        _check_poses(self.posture, robot)
         wide = robot.closed_width or _WIDTH
         narrowest = min([wide, *(thing.grip_width for thing in scene.free.values())])
         self._grips = gripper_targets(model, robot, [None, narrowest])
         self.robot_qpos = model.jnt_qposadr[joints]
         self.robot_qvel = model.jnt_dofadr[joints]
         self.robot_range = model.jnt_range[joints]
+        self._zero = model.qpos0[self.robot_qpos]
         self.ctrl = np.array([model.actuator(name).id for name in robot.joints])
         self._idle = _idle_servos(model, self.ctrl, self.posture.rest)
         self.servo_range = model.actuator_ctrlrange[self.ctrl]
-        self.ctrl_range = np.stack(joint_limits(model, robot.joints), axis=1)
+        self.ctrl_range = np.stack(joint_limits(model, robot), axis=1)
         for name, (low, high) in zip(robot.joints, self.ctrl_range, strict=True):
             if not low < high:
                 expected = f"one that meets its range {model.joint(name).range.tolist()}"
@@ -168,7 +172,7 @@ class SceneIndex:
             ranges = (self.robot_range, self.ctrl_range)
             numbers = [torch.tensor(n, dtype=dtype, device=device) for n in (*ranges, *poses)]
             numbers.append(numbers[-2] - numbers[-1])
-            numbers.append(torch.from_numpy(idle_ctrl).to(device, dtype))
+            numbers += [torch.from_numpy(n).to(device, dtype) for n in (idle_ctrl, self._zero)]
             self.posture.follow(numbers[2])  # which moves its tables there
             self._tensors[key] = RobotTensors(*columns, *numbers)  # type: ignore[arg-type]
         return self._tensors[key]
@@ -205,16 +209,45 @@ def _idle_servos(
     return servos, -(bias[:, 0] + bias[:, 1] * length) / model.actuator_gainprm[servos, 0]
 
 
-def joint_limits(model: mujoco.MjModel, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Narrower of each joint's range and its servo's: low and high limits [rad, m], each of shape
-    ``(n,)``; infinite where there is none.
+def _check_poses(places: Posture, robot: RobotCfg) -> None:
+    """Raise a ConfigError for a joint value that the robot's file does not allow."""
+    poses = {
+        "home": (robot.joints, robot.home),
+        "start": (robot.joints, robot.start),
+        "locked": (list(robot.locked), list(robot.locked.values())),
+        "gripper_open": (robot.gripper_joints, robot.gripper_open),
+        "gripper_closed": (robot.gripper_joints, robot.gripper_closed),
+    }
+    for key, (names, values) in poses.items():
+        command = locked_home(robot)
+        columns = [robot.joints.index(name) for name in names]
+        if values is not None:
+            command[columns] = values
+        allowed = places.agree(command)
+        for k, name in zip(columns, names, strict=True):
+            low, high = places.limits[k] + [-_APART, _APART]
+            if not low <= command[k] <= high:
+                expected = f"a value within [{low + _APART:.4g}, {high - _APART:.4g}]"
+            elif abs(command[k] - allowed[k]) > _APART:
+                expected = f"{allowed[k]:.4g}, as the file's equalities have it"
+            else:
+                continue
+            raise ConfigError(f"robot.{key} of {name}", float(command[k]), expected)
+
+
+def joint_limits(
+    model: mujoco.MjModel, robot: RobotCfg, numbers: Sequence[int] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Narrower of the range of each joint, or of those of some numbers, as far as what follows it
+    can, and its servo's: low and high limits [rad, m], each of shape ``(n,)``; infinite where there
+    is none.
     """
-    joints = [model.joint(name).id for name in names]
-    servos = [model.actuator(name).id for name in names]
-    limited = (model.jnt_limited[joints], model.actuator_ctrllimited[servos])
-    spans = (model.jnt_range[joints], model.actuator_ctrlrange[servos])
-    low, high = np.where(np.stack(limited)[..., None], spans, [-np.inf, np.inf]).transpose(2, 0, 1)
-    return low.max(axis=0), high.min(axis=0)
+    servos = [model.actuator(name).id for name in robot.joints]
+    limited = model.actuator_ctrllimited[servos, None]
+    span = np.where(limited, model.actuator_ctrlrange[servos], [-np.inf, np.inf])
+    spans = np.stack((posture(model, tuple(robot.joints)).limits, span))
+    spans = spans if numbers is None else spans[:, list(numbers)]
+    return spans[..., 0].max(axis=0), spans[..., 1].min(axis=0)
 
 
 def gripper_targets(
@@ -237,7 +270,7 @@ def gripper_targets(
     if not probed and robot.closed_width is None:
         return np.where(np.isnan(wide)[:, None], opened, closed)
     shares = np.linspace(-2.0, 1.0, 301)[:, None]  # of the way from closed (the 200th) to open
-    low, high = joint_limits(model, robot.gripper_joints)
+    low, high = joint_limits(model, robot, range(len(robot.arm_joints), len(robot.joints)))
     targets = np.clip(closed + shares * (opened - closed), low, high)
     if jaws.carry_sites and not probed:
         apart = jaws.spread(targets)

@@ -153,7 +153,7 @@ class FromStartsFile:
         joints = [f"joint_{name}" for name in (*env.cfg.robot.joints, *env.index.joints)]
         open_ended = ~model.jnt_limited[fixtures, None].astype(bool)
         spans = np.where(open_ended, [-np.inf, np.inf], model.jnt_range[fixtures]).T
-        limits = np.hstack((joint_limits(model, env.cfg.robot.joints), spans))
+        limits = np.hstack((joint_limits(model, env.cfg.robot), spans))
         ranges: dict[str, tuple[ArrayLike, ArrayLike]] = {}
         ranges |= zip(joints, map(tuple, limits.T), strict=True)
         for quantity in quantities:
