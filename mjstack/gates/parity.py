@@ -157,8 +157,8 @@ def _nearest_count(sim: Simulation, state: State, steps: int, ends: dict[str, Te
     gaps = []
     for _ in range(_ROUNDED_STATES):
         errors = UNIT * generator.uniform(-1.0, 1.0, state.qpos.shape)
-        found = end_state(sim, state._replace(qpos=state.qpos * (1.0 + errors)), steps)
-        gaps.append(differences(ends, found)["contact_count"])
+        other_ends = end_state(sim, state._replace(qpos=state.qpos * (1.0 + errors)), steps)
+        gaps.append(differences(ends, other_ends)["contact_count"])
     return torch.stack(gaps).amin(0)
 
 
