@@ -17,7 +17,7 @@ from mjstack.config.schema import Config
 from mjstack.drivers import driver
 from mjstack.episodes.rollout import State
 from mjstack.episodes.stage import Stage
-from mjstack.gates.scene_physics import scene_faults
+from mjstack.gates.scene_physics import _fall_faults, scene_faults
 from mjstack.gates.tracking import find_cause
 from mjstack.report.record import GateResult
 from mjstack.robots.guest import gravity_sag
@@ -184,6 +184,40 @@ def test_a_scene_as_configured_passes(overrides: list[str]) -> None:
     assert list(scene_faults(cfg, build_model(cfg))) == []
 
 
+def test_friction_less_than_mujoco_keeps_is_as_configured(tmp_path: Path) -> None:
+    """Of files, fixed and free, and of keys: contacts have at least mjMINMU of each direction."""
+    geom = '<geom type="box" size="0.02 0.02 0.02" mass="0.05" friction="1 0 0"/>'
+    files = {name: tmp_path / f"{name}.xml" for name in ("stop", "cup")}
+    for (name, path), free in zip(files.items(), ("", "<freejoint/>"), strict=True):
+        body = f'<body name="{name}">{free}{geom}</body>'
+        path.write_text(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
+    cfg = scara(
+        f"+scene.objects.stop={{file: {files['stop']}, fixed: true, xy: [0.41, 0.0]}}",
+        f"+scene.objects.cup={{file: {files['cup']}, xy: [0.33, 0.0]}}",
+        "scene.objects.red.friction=[1e-7, 1e-7, 1e-7]",
+    )
+    assert list(scene_faults(cfg, build_model(cfg))) == []
+
+
+def test_an_arm_s_own_motion_and_a_ceiling_disturb_no_fall(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    ceiling = '<geom type="box" size="5 5 0.1" pos="0 0 10" contype="1" conaffinity="1"/>'
+    for pair in (("<worldbody>", f"<worldbody>{ceiling}"), ('kp="900" kv="50"', 'kp="9e8" kv="0"')):
+        cfg = scara(f"robot.file={arm_file(tmp_path, pair)}")
+        assert list(scene_faults(cfg, build_model(cfg))) == []
+    assert "WARNING" not in capfd.readouterr().err
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_body_without_mass_is_named_before_it_falls() -> None:
+    cfg = scara()
+    expected = build_model(cfg)
+    expected.body("red").mass = 0.0
+    faults = list(_fall_faults(cfg, build_model(cfg), expected, "red"))
+    assert faults == ["red has no mass: its file keeps it in bodies that MuJoCo cannot make one"]
+
+
 # Where the arm goes
 
 
@@ -244,10 +278,18 @@ def test_the_cause_is_named(
 ) -> None:
     result = altered_baseline(alter, monkeypatch)
     assert result.status == "fail"
-    assert re.search(
-        rf"failed.*; the arm is \d+\.\d mm off its target as \w+ ends: {message}", result.reason
-    )
+    text = r"^(failed: .*; )?the arm is \d+\.\d mm off its target as \w+ ends: "
+    assert re.search(text + message, result.reason)
     assert "waypoint_error_m" in result.beyond
+
+
+def test_a_late_command_is_no_error_of_the_arm() -> None:
+    """Neither one that lags by a constant nor one that lags by chance."""
+    for delay in ("timing.command_delay=25", "timing.random_delay=40"):
+        late = mjstack.verify([*RUN, delay]).gates["baseline"]
+        assert late.metrics["waypoint_error_m"] < 0.03, late.reason
+        assert late.status == "pass"
+        assert "at the start" not in str(late.details)  # though the jaws touch the table there
 
 
 def test_the_end_of_a_range_is_a_load() -> None:

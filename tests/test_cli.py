@@ -350,7 +350,7 @@ def test_cfg_prints_and_writes_nothing(
 def test_baseline_leaves_a_whole_report(folder: Path) -> None:
     assert run(["gates=[baseline]"]) == 0
     report = the_report(folder)
-    assert report["schema"] == 2
+    assert report["schema"] == 3
     assert report["status"] == "pass"
     assert set(report["provenance"]) >= PROVENANCE
     assert len(report["provenance"]["model_sha256"]) == 64

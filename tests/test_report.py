@@ -75,7 +75,7 @@ def test_numbers_that_are_not_finite_stay_json(tmp_path: Path) -> None:
     write_report(report)
     data = strict_json(tmp_path / "report.json")
     assert data["gates"][0]["metrics"] == {"a": "nan", "b": "inf", "c": "-inf", "d": 0.5}
-    assert data["schema"] == 2
+    assert data["schema"] == 3
     assert data["status"] == "fail"
     assert "nan" in (tmp_path / "report.md").read_text()
 

@@ -40,7 +40,8 @@ class NominalRun:
         episode: The episode.
         world: Its recording.
         states: At the ends of phases, and of steps that gate *parity* compares, by step.
-        targets: Joint targets there, as the driver gave them, before servos' ranges bound them.
+        targets: Joint targets there, as the driver gave them, before servos' ranges bound them;
+            those that ``timing.command_delay`` has let through.
     """
 
     sim: Simulation
@@ -119,14 +120,22 @@ class Run:
         ends = {phase.stop - 1 for phase in stage.phases}
         snapshots = Snapshots(ends.union(self.parity_steps.values()))
         actions: list[np.ndarray] = []
-        sent = Hook(lambda step, sim: actions.append(sent.env.action[0].double().numpy().copy()))
+        ctrl: list[np.ndarray] = []
+
+        def keep(step: int, sim: Simulation) -> None:
+            actions.append(sent.env.action[0].double().numpy().copy())
+            ctrl.append(sim.ctrl.numpy().copy())
+
+        sent = Hook(keep)
         viewers = () if "parity" in self.cfg.gates else self.viewers
         episode = stage.play(sim, reset, [*viewers, world, snapshots, sent])
-        states = snapshots.states
+        late = int(sent.env.command_delay.steps[0])  # physics has seen these commands
+        seen = {step: max(0, step - late) for step in snapshots.states}
+        states = {k: state._replace(ctrl=ctrl[seen[k]]) for k, state in snapshots.states.items()}
         modes = [(t.params.get("joints"), t.params.get("mode")) for t in stage.action.values()]
         absolute = modes == [("arm", "absolute"), ("gripper", "absolute")]
         targets = {
-            step: actions[step] if absolute else state.ctrl[0][stage.index.ctrl]
+            step: actions[seen[step]] if absolute else state.ctrl[0][stage.index.ctrl]
             for step, state in states.items()
         }
         return NominalRun(sim=sim, episode=episode, world=world, states=states, targets=targets)

@@ -32,7 +32,6 @@ def run_baseline(run: Run) -> list[GateResult]:
         "peak_constraint_rows": int(sim.peak_constraints[0]),
     }
     thresholds = run.stage.check.thresholds()
-    contacts = start_contacts(run.stage, episode.start[0])
     causes: list[str] = []
     if errors := waypoint_errors(run.stage, run.nominal.states, run.nominal.targets):
         worst = max(errors, key=errors.__getitem__)
@@ -45,13 +44,13 @@ def run_baseline(run: Run) -> list[GateResult]:
             end = run.stage.phase(worst).stop - 1
             cause = find_cause(run.stage, run.nominal.states[end], run.nominal.targets[end])
             miss = f"the arm is {1e3 * errors[worst]:.1f} mm off its target as {worst} ends"
-            causes = [f"{miss}: {cause}", *contacts]
+            causes = [f"{miss}: {cause}"]
         if not errors[worst] <= thresholds["waypoint_error_m"]:
             status = Status.failed
-            reason = reason or "failed"
             beyond.append("waypoint_error_m")
     if status is Status.failed:
-        reason = "; ".join((reason, *causes))
+        causes += start_contacts(run.stage, episode.start[0])
+        reason = "; ".join(filter(None, (reason, *causes)))
     world = run.nominal.world
     label = "baseline, native"
     run.show_world("baseline", label, world.qpos, status, world.env, "baseline world")
@@ -67,5 +66,5 @@ def run_baseline(run: Run) -> list[GateResult]:
         if thing.file is not None:
             lines = object_left_behind(thing.file, run.stage.model, fixed=thing.fixed)
             result.details += [f"file of {name}: {line}" for line in lines]
-    result.details += causes or contacts
+    result.details += causes
     return [result]

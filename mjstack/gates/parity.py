@@ -4,14 +4,13 @@ import copy
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import closing
-from dataclasses import asdict
 
 import mujoco
 import numpy as np
 import torch
 from torch import Tensor
 
-from mjstack.config.schema import Backend, Config
+from mjstack.config.schema import Backend
 from mjstack.episodes.recorder import WorldRecorder
 from mjstack.episodes.rollout import State, restore
 from mjstack.episodes.run import Run, needs_episode
@@ -32,6 +31,7 @@ _CONVERGED = 1e-12  # tolerance of the solver in float64
 _CONVERGED_FLOAT32 = 1e-8  # of what float32 can still tell
 _ROUNDED = {1: 32, 50: 16}  # worlds, by steps
 _ROUNDED_EPISODES = 8
+_ROUNDED_STATES = 16
 _LEAST_SIZES = {"qvel": 300.0, "qfrc_actuator": 100.0}  # whose rounding is allowed; else 2
 _SLIDES = {int(mujoco.mjtJoint.mjJNT_FREE): 3, int(mujoco.mjtJoint.mjJNT_SLIDE): 1}  # else turns
 _WIDTHS = {"xpos": 3, "xquat": 4, "site_xpos": 3}
@@ -57,9 +57,8 @@ def _compare(run: Run, mjwarp: Simulation) -> GateResult:
         notes={"backend": mjwarp.description},
     )
     problems = compare_states(run, mjwarp, result)
-    options = compare_options(cfg, run.nominal.sim, mjwarp)
-    for option, (requested, native, uploaded, equal) in options.items():
-        line = f"option {option}: requested {requested}, native {native}, uploaded {uploaded}"
+    for option, (native, uploaded, equal) in compare_options(run.nominal.sim, mjwarp).items():
+        line = f"option {option}: native {native}, uploaded {uploaded}"
         result.details.append(line)
         problems += [] if equal else [line]
 
@@ -97,7 +96,8 @@ def compare_states(run: Run, mjwarp: Simulation, result: GateResult) -> list[str
     The states are those of the reference episode, and some with the gate's own velocities and
     commands. Both solvers go on until they have converged: where they stop below the tolerance of
     the model is chance, and may lie some hundred times the limits from the solution. Every number
-    may be off by a multiple of what rounding makes of it in native MuJoCo.
+    be off by a multiple of what rounding makes of it in native MuJoCo; the number of contacts by
+    what it makes of it, in either backend.
     """
     model = copy.copy(run.stage.model)
     model.opt.tolerance = _CONVERGED
@@ -119,12 +119,14 @@ def compare_states(run: Run, mjwarp: Simulation, result: GateResult) -> list[str
             ends = end_state(native, state, steps)
             apart = differences(ends, end_state(mjwarp, state, steps))
             ranges = differences(ends, end_state(rounded[steps], state, steps))
+            if (apart["contact_count"] > ranges["contact_count"]).any():
+                apart["contact_count"] = _nearest_count(mjwarp, state, steps, ends)
             for field in COMPARED:
-                rounding = 0.0
+                allowed = ranges[field]
                 if field != "contact_count":
                     largest = float(ends[field].abs().max())
                     rounding = UNIT * max(largest, _LEAST_SIZES.get(field, 2.0))
-                allowed = multiples[steps] * (ranges[field] + rounding)
+                    allowed = multiples[steps] * (allowed + rounding)
                 worst = int((apart[field] / allowed.clamp(min=1e-30)).argmax())
                 error, limit = float(apart[field][worst]), float(allowed[worst])
                 key = f"{name}.step{steps}.{field}"
@@ -145,6 +147,19 @@ def compare_states(run: Run, mjwarp: Simulation, result: GateResult) -> list[str
         parts = "shape, mass, friction and contacts" if moves else "servo, damping and range"
         problems.append(f"look first at {look}: its {parts}")
     return problems
+
+
+def _nearest_count(sim: Simulation, state: State, steps: int, ends: dict[str, Tensor]) -> Tensor:
+    """Least difference from native's number of contacts after steps from states off by rounding:
+    MJWarp's search in float32 misses shapes that overlap by some tenths of a millimetre by chance.
+    """
+    generator = np.random.default_rng(0)
+    gaps = []
+    for _ in range(_ROUNDED_STATES):
+        errors = UNIT * generator.uniform(-1.0, 1.0, state.qpos.shape)
+        other_ends = end_state(sim, state._replace(qpos=state.qpos * (1.0 + errors)), steps)
+        gaps.append(differences(ends, other_ends)["contact_count"])
+    return torch.stack(gaps).amin(0)
 
 
 def compare_models(
@@ -272,11 +287,11 @@ def _compare_ends(
     beyond = [name for name, value in share.items() if not value <= 1.0]
     if beyond and rounded:
         with closing(RoundedSimulation(run.stage.model, _ROUNDED_EPISODES)) as sim:
-            run.stage.play(sim, run.cfg.gate.baseline.reset)
+            run.stage.play(sim, run.cfg.gate.baseline.reset, worlds=[0] * _ROUNDED_EPISODES)
             candidates = [share, *map(shares, sim.qpos.numpy())]
-        share = {name: min(candidate[name] for candidate in candidates) for name in share}
-        worlds = f"one of {_ROUNDED_EPISODES} native worlds that round"
-        result.details += [f"{n} ends {share[n]:.2g} of the limit from {worlds}" for n in beyond]
+        share = min(candidates, key=lambda candidate: np.max([*candidate.values()]))
+        text = f"one of {_ROUNDED_EPISODES} native worlds that round"
+        result.details += [f"{n} ends {share[n]:.2g} of the limit from {text}" for n in beyond]
     problems = []
     farthest: dict[bool, tuple[float, str]] = {}  # object, and other joint
     for name, gaps in _ends_apart(run, end, native).items():
@@ -342,29 +357,16 @@ def differences(a: dict[str, Tensor], b: dict[str, Tensor]) -> dict[str, Tensor]
     return out
 
 
-def compare_options(
-    cfg: Config, native: Simulation, mjwarp: Simulation
-) -> dict[str, tuple[str, str, str, bool]]:
-    """Requested, native's and the uploaded options side by side, and whether they agree; numbers to
-    float32.
+def compare_options(native: Simulation, mjwarp: Simulation) -> dict[str, tuple[str, str, bool]]:
+    """Native's and the uploaded options side by side, and whether they agree; numbers to float32.
 
-    The request is ``the file's`` where the configuration leaves an option to the robot's file.
+    Gate *baseline* holds native's against the configuration.
     """
-    requested = asdict(cfg.solver) | {
-        "timestep": cfg.timing.physics_dt,
-        "integrator": "mjINT_IMPLICITFAST",
-        "cone": f"mjCONE_{cfg.solver.cone.upper()}",
-        "box_box": "primitive",
-    }
     uploaded = mjwarp.option_values()
-    options = {}
-    for name, value in native.option_values().items():
-        request = requested.get(name)
-        equal = _agree(name, value, uploaded[name])
-        equal = equal and (request is None or _agree(name, request, value))
-        text = "the file's" if request is None else _short(request)
-        options[name] = (text, _short(value), _short(uploaded[name]), equal)
-    return options
+    return {
+        name: (_short(value), _short(uploaded[name]), _agree(name, value, uploaded[name]))
+        for name, value in native.option_values().items()
+    }
 
 
 def _agree(name: str, a: float | int | str, b: float | int | str) -> bool:

@@ -27,7 +27,7 @@ def waypoint_errors(
 ) -> dict[str, float]:
     """Distance of the grasp point at the end of each phase of the nominal episode from where the
     arm's joint targets would have it [m]; fingers count as they are. States and joint targets are
-    by step.
+    by step. Empty of a driver without phases, such as a policy.
     """
     index, data = stage.index, mujoco.MjData(stage.model)
 

@@ -12,7 +12,7 @@ from mjstack.report.record import GateResult, Report, Status
 
 log = logging.getLogger(__name__)
 
-SCHEMA = 2
+SCHEMA = 3
 
 
 def write_report(report: Report) -> None:
