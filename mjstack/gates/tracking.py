@@ -8,8 +8,8 @@ import numpy as np
 from mjstack.episodes.rollout import State
 from mjstack.episodes.stage import Stage
 from mjstack.robots.guest import OWN_WORLD, WORLD, grasp_jacobian
+from mjstack.robots.posture import actuator_moment
 from mjstack.scene.build import scene_names
-from mjstack.scene.index import actuator_moment
 
 _DEEP = 1e-4  # m: contacts at rest are less deep
 _KINDS = mujoco.mjtConstraint

@@ -19,7 +19,7 @@ from numpy import ndarray
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from mjstack.errors import MjstackError
+from mjstack.errors import ConfigError, MjstackError
 
 REST = "rest/of/mjstack/"
 """Prefix of a model's numeric field with the position of a joint that has no command."""
@@ -267,3 +267,40 @@ class Posture:
 
 posture = lru_cache(maxsize=8)(Posture)
 """The posture of a model's commanded joints, a tuple, probed once per model."""
+
+
+def idle_servos(
+    model: mujoco.MjModel, commanded: ndarray, posture: Posture
+) -> tuple[ndarray, ndarray]:
+    """Position servos without a command, and commands that hold what they move at rest.
+
+    Raises:
+        ConfigError: One pulls at a joint whose place commands determine.
+    """
+    data = mujoco.MjData(model)
+    data.qpos = posture.rest
+    mujoco.mj_fwdPosition(model, data)
+    moment = actuator_moment(data)
+    gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm
+    fixed = model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_FIXED)
+    servos = np.flatnonzero(fixed & (gain != 0.0) & (bias[:, 1] < 0.0))
+    servos = np.setdiff1d(servos, commanded)
+    followers = posture.columns[np.ptp(posture.value, axis=1)[: len(posture.columns)] > 0.0]
+    moved = np.isin(model.jnt_qposadr[model.dof_jntid], (*posture.commanded, *followers))
+    for servo, dof in np.argwhere(moved & (moment != 0.0)):
+        if servo in servos:
+            name = model.actuator(servo).name or "unnamed"
+            joint = model.joint(model.dof_jntid[dof]).name
+            expected = f"none that pulls at joint {joint}, which other servos move"
+            fix = "List a follower in gripper_joints, or take the actuator out of the robot's file"
+            raise ConfigError("actuator without a command", name, expected, fix)
+    servos = servos[model.actuator_dyntype[servos] == int(mujoco.mjtDyn.mjDYN_NONE)]
+    return servos, -(bias[:, 0] + bias[:, 1] * data.actuator_length)[servos] / gain[servos]
+
+
+def actuator_moment(data: mujoco.MjData) -> ndarray:
+    """Force on each dof by a unit of each actuator's, shape ``(nu, nv)``."""
+    moment = np.zeros((data.model.nu, data.model.nv))
+    sparse = (data.moment_rownnz, data.moment_rowadr, data.moment_colind)
+    mujoco.mju_sparse2dense(moment, data.actuator_moment, *sparse)
+    return moment

@@ -17,7 +17,7 @@ from mjstack.config.schema.robot import BasePoseCfg
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.robots.guest import compile_scene, mujoco_errors
 from mjstack.robots.hand import Hand, find_hands, find_root
-from mjstack.robots.posture import posture
+from mjstack.robots.posture import actuator_moment, posture
 from mjstack.robots.servos import prepare_servos, servo_problem
 from mjstack.robots.source import robot_spec
 from mjstack.robots.tips import Fingers, Grip
@@ -305,10 +305,7 @@ def _guess_scene(
 def _effort(data: mujoco.MjData, joint: int) -> float:
     """The largest force that the file gives a joint's motor [N m, N]; 0 if it says none."""
     model = data.model
-    moments = np.zeros((model.nu, model.nv))
-    layout = (data.moment_rownnz, data.moment_rowadr, data.moment_colind)
-    mujoco.mju_sparse2dense(moments, data.actuator_moment, *layout)
-    for k in np.flatnonzero(gears := moments[:, model.jnt_dofadr[joint]]):
+    for k in np.flatnonzero(gears := actuator_moment(data)[:, model.jnt_dofadr[joint]]):
         if model.actuator_forcelimited[k]:
             return float(np.abs(gears[k] * model.actuator_forcerange[k]).max())
         if model.actuator_ctrllimited[k] and model.actuator_biastype[k] == 0:

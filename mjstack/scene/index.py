@@ -16,7 +16,7 @@ from mjstack.errors import ConfigError, require_names
 from mjstack.math import lowest_point, quat_mul, quat_to_matrix
 from mjstack.robots.guest import OWN_WORLD
 from mjstack.robots.jaws import Jaws
-from mjstack.robots.posture import Posture, posture
+from mjstack.robots.posture import Posture, idle_servos, posture
 from mjstack.scene.build import CAPSULE_TURN, WORLD, force_sensor
 from mjstack.sim.simulation import Columns
 
@@ -99,7 +99,7 @@ class SceneIndex:
         self.robot_range = model.jnt_range[joints]
         self._zero = model.qpos0[self.robot_qpos]
         self.ctrl = np.array([model.actuator(name).id for name in robot.joints])
-        self._idle = _idle_servos(model, self.ctrl, self.posture)
+        self._idle = idle_servos(model, self.ctrl, self.posture)
         self.servo_range = model.actuator_ctrlrange[self.ctrl]
         self.ctrl_range = np.stack(joint_limits(model, robot), axis=1)
         for name, (low, high) in zip(robot.joints, self.ctrl_range, strict=True):
@@ -196,43 +196,6 @@ class SceneIndex:
         """
         require_names("object", [name], self._columns)
         return self._columns[name]
-
-
-def _idle_servos(
-    model: mujoco.MjModel, commanded: np.ndarray, posture: Posture
-) -> tuple[np.ndarray, np.ndarray]:
-    """Position servos without a command, and commands that hold what they move at rest.
-
-    Raises:
-        ConfigError: One pulls at a joint whose place commands determine.
-    """
-    data = mujoco.MjData(model)
-    data.qpos = posture.rest
-    mujoco.mj_fwdPosition(model, data)
-    moment = actuator_moment(data)
-    gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm
-    fixed = model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_FIXED)
-    servos = np.flatnonzero(fixed & (gain != 0.0) & (bias[:, 1] < 0.0))
-    servos = np.setdiff1d(servos, commanded)
-    followers = posture.columns[np.ptp(posture.value, axis=1)[: len(posture.columns)] > 0.0]
-    moved = np.isin(model.jnt_qposadr[model.dof_jntid], (*posture.commanded, *followers))
-    for servo, dof in np.argwhere(moved & (moment != 0.0)):
-        if servo in servos:
-            name = model.actuator(servo).name or "unnamed"
-            joint = model.joint(model.dof_jntid[dof]).name
-            expected = f"none that pulls at joint {joint}, which other servos move"
-            fix = "List a follower in gripper_joints, or take the actuator out of the robot's file"
-            raise ConfigError("actuator without a command", name, expected, fix)
-    servos = servos[model.actuator_dyntype[servos] == int(mujoco.mjtDyn.mjDYN_NONE)]
-    return servos, -(bias[:, 0] + bias[:, 1] * data.actuator_length)[servos] / gain[servos]
-
-
-def actuator_moment(data: mujoco.MjData) -> np.ndarray:
-    """Force on each dof by a unit of each actuator's, shape ``(nu, nv)``."""
-    moment = np.zeros((data.model.nu, data.model.nv))
-    sparse = (data.moment_rownnz, data.moment_rowadr, data.moment_colind)
-    mujoco.mju_sparse2dense(moment, data.actuator_moment, *sparse)
-    return moment
 
 
 def _check_poses(places: Posture, robot: RobotCfg) -> None:
