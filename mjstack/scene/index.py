@@ -21,7 +21,8 @@ from mjstack.scene.build import CAPSULE_TURN, WORLD, force_sensor
 from mjstack.sim.simulation import Columns
 
 _jaws = lru_cache(maxsize=8)(Jaws)
-_APART = 1e-4  # [rad, m] that a joint value may be off an equality
+_APART = 1e-4  # [rad, m] that a joint value may be off
+_OFF_EQUALITY = 1e-3  # of the joint's range, that it may besides: values in files are rounded
 _GRIP = 20.0  # [N] of each jaw on an object, where the configuration has no joint target
 _WIDTH = 0.044  # [m] of an object, where there is none
 _SHAPES = {
@@ -217,7 +218,7 @@ def _check_poses(places: Posture, robot: RobotCfg) -> None:
             low, high = places.limits[k] + [-_APART, _APART]
             if not low <= command[k] <= high:
                 expected = f"a value within [{low + _APART:.4g}, {high - _APART:.4g}]"
-            elif abs(command[k] - allowed[k]) > _APART:
+            elif abs(command[k] - allowed[k]) > _APART + _OFF_EQUALITY * (high - low):
                 expected = f"{allowed[k]:.4g}, as the file's equalities have it"
             else:
                 continue
