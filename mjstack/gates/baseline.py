@@ -49,8 +49,9 @@ def run_baseline(run: Run) -> list[GateResult]:
             status = Status.failed
             beyond.append("waypoint_error_m")
     if status is Status.failed:
-        causes += start_contacts(run.stage, episode.start[0])
-        reason = "; ".join(filter(None, (reason, *causes)))
+        contacts = [*start_contacts(run.stage, episode.start[0])]
+        reason = "; ".join(filter(None, (reason, *causes, *(contacts if causes else ()))))
+        causes += contacts
     world = run.nominal.world
     label = "baseline, native"
     run.show_world("baseline", label, world.qpos, status, world.env, "baseline world")

@@ -63,7 +63,7 @@ class JointNoise:
 @uses_fields("qpos0")
 class JointZeros:
     """Moves the zero of every joint by a random amount that no sensor shows, as the calibrations of
-    real arms differ: positions and commands count from the zero that the servo believes in, and the
+    real arms differ. Positions and commands count from the zero that the servo believes in, and the
     arm is elsewhere, with what follows it. Objects are placed clear of where it would be without.
     """
 
