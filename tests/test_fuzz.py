@@ -44,7 +44,7 @@ from mjstack.config.load import compose
 from mjstack.config.session import hydra_session
 
 # `make fuzz` tries 1,000, 500, 200 and 72
-COUNTS = {"commands": 40, "folders": 40, "datasets": 10, "small": 18}
+COUNTS = {"commands": 30, "folders": 30, "datasets": 10, "small": 18}
 REAL = 8  # folders that commands in a process of their own are given
 CASES = {
     "commands": command_lines,

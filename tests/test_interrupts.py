@@ -59,6 +59,7 @@ def test_a_script_that_is_interrupted() -> None:
 
 
 @pytest.mark.full
+@pytest.mark.long
 def test_a_training_that_is_killed_goes_on_where_it_saved(tmp_path: Path) -> None:
     """SIGKILL after the first save: the same command ends bit for bit as a whole one."""
     # With more batches than can follow before the kill

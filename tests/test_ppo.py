@@ -130,6 +130,7 @@ def test_a_training_goes_on_after_ctrl_c(tmp_path: Path) -> None:
 
 
 @pytest.mark.full
+@pytest.mark.long
 def test_two_processes_learn_one_policy(tmp_path: Path) -> None:
     """As torchrun starts them, with Gloo on a CPU: both average gradients, the first one writes."""
     out = tmp_path / "out"

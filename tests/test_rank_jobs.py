@@ -23,6 +23,7 @@ CAMERA = ["cameras=front", "scene.cameras.front.size=[32,32]", "sim=mjwarp", "si
 pytestmark = pytest.mark.full
 
 
+@pytest.mark.long
 def test_two_nodes(tmp_path: Path) -> None:
     """Two agents of torchrun, as on two machines with one disk: one report, and neither agent waits
     for the other after it, though the gate has failed.
@@ -59,6 +60,7 @@ def test_each_rank_sizes_its_own_worlds(tmp_path: Path) -> None:
     assert any(line.startswith("rank 1: ") for line in gate["details"])
 
 
+@pytest.mark.long
 def test_two_ranks_beside_one(tmp_path: Path) -> None:
     """scripts/bench_many.py: figures of throughput are sums over the ranks."""
     short = ["repetitions=2", "steps=2", "env_steps=2", "episodes=1"]

@@ -520,6 +520,7 @@ def test_all_failing_worlds_are_replayed(finished: Path, tmp_path: Path) -> None
 
 
 @pytest.mark.full
+@pytest.mark.long
 def test_ranks_replay_failing_worlds(finished: Path, tmp_path: Path) -> None:
     args = ["job=replay", f"run={finished}", "world=failing", "sim=mjwarp", "sim.device=cpu"]
     play(2, [*args, f"hydra.run.dir={tmp_path}/two"], tmp_path, 1)

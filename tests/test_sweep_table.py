@@ -74,6 +74,7 @@ def stamps(folder: Path) -> dict[str, int]:
 
 
 @pytest.mark.full
+@pytest.mark.long
 def test_throughput_goes_on_and_leaves_table_and_plot(
     folder: Path, capsys: Capture, monkeypatch: Patch
 ) -> None:

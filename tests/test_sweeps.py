@@ -201,6 +201,7 @@ def test_a_gpu_for_each_job(stub: Path, monkeypatch: Patch) -> None:
 
 
 @pytest.mark.full
+@pytest.mark.long
 def test_a_sweep_in_two_terminals(tmp_path: Path) -> None:
     """Each job runs once, and both commands report all of them."""
     args = [*PLAIN, "-m", "hydra/launcher=gpus", "seed=1,2,3", "nworld=2"]
