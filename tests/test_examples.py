@@ -66,7 +66,6 @@ def play_gates(example: str, robot: str, folder: Path, *overrides: str) -> dict[
         pytest.param("tower", "so101", "batch", marks=pytest.mark.full),
         pytest.param("tower", "rebot", "baseline,parity,batch", marks=pytest.mark.full),
         ("push", "so101", "baseline,batch"),
-        pytest.param("push", "so101", "parity,batch", marks=pytest.mark.full),
         pytest.param("push", "rebot", "baseline,parity,batch", marks=pytest.mark.full),
         ("scara", "scara", "baseline,batch,success"),
         pytest.param("slot", "so101", "batch", marks=pytest.mark.full),
