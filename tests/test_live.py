@@ -532,6 +532,7 @@ def test_a_browser_looks_at_a_run(tmp_path: Path, port: int) -> None:
         with browse(1200, 800) as tab:
             tab.open(f"http://127.0.0.1:{port}")
             assert "with its token" in tab.run("document.body.innerText")
+        with browse(1200, 800) as tab:  # what the other page was refused is logged late
             tab.open(address)
             tab.wait(f"!!{button.format('Pause')}")
             tab.run(f"{button.format('Pause')}.click()")
@@ -542,8 +543,7 @@ def test_a_browser_looks_at_a_run(tmp_path: Path, port: int) -> None:
             assert tab.run(text) == before
             tab.run(f"{button.format('Step')}.click()")
             tab.wait(f"{text} != {before!r}")
-            refusals = {text for text in tab.problems if "403 (Forbidden)" in text}  # at the first
-            assert set(tab.problems) == refusals
+            assert tab.problems == []
             assert {urlsplit(request).netloc for request in tab.requests} == {f"127.0.0.1:{port}"}
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=60) == 130

@@ -33,7 +33,7 @@ from mjstack.sim import resolve_backend
 
 NAME = "collect"
 DATASET = "dataset"  # within the job's folder
-BATCHES = "batches.json"  # likewise
+BATCHES = "batches.json"  # within it too
 STATE = "observation.state"
 ACTION = "action"
 REWARD = "next.reward"

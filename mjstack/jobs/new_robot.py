@@ -1,4 +1,4 @@
-"""What ``mjstack new robot`` guessed, as a table and a picture."""
+"""The guesses of ``mjstack new robot``, as a table and a picture."""
 
 from collections.abc import Iterable
 from pathlib import Path

@@ -49,7 +49,7 @@ class Jaws:
     Attributes:
         opened: Joint positions with the jaws as far apart as their ranges allow [rad, m].
         shut: Those at the ranges' other ends, of the same shape ``(n,)``.
-        carry_sites: Whether each site lies on a jaw of its own, so that they move apart as it does.
+        carry_sites: Whether the sites lie on different jaws, so that they move apart with them.
     """
 
     def __init__(
