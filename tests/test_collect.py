@@ -25,9 +25,9 @@ from mjstack.cli import run
 from mjstack.config.check import validate
 from mjstack.config.fingerprint import config_hash, differences
 from mjstack.config.schema import Backend, Config
-from mjstack.datasets import DatasetSpec, DatasetWriter, Feature
 from mjstack.datasets.part import PartWriter
-from mjstack.datasets.spec import INDICES
+from mjstack.datasets.spec import INDICES, DatasetSpec, Feature
+from mjstack.datasets.writer import DatasetWriter
 from mjstack.envs import Env, build_env, demonstration_config
 from mjstack.episodes.batches import Batch, BatchPlan
 from mjstack.episodes.recorder import Channels, Recorder, read_commands
@@ -592,16 +592,10 @@ def test_damaged_notes_are_one_line(
 ) -> None:
     play_nothing()
     assert collect("nworld=2", "job.episodes=1") == 0
-    (batch,) = json.loads((folder / BATCHES).read_text())
-    batch["kept"] = batch.pop("episodes")
-    for text, says in [
-        ("[{]", f"{BATCHES}: cannot be read (JSONDecodeError: "),
-        (json.dumps([batch]), "has a dataset of version 0.1, expected one of this version"),
-    ]:
-        (folder / BATCHES).write_text(text)
-        capsys.readouterr()
-        assert run([*COMMAND, "nworld=2", "job.episodes=2"]) == 2
-        assert says in capsys.readouterr().err
+    (folder / BATCHES).write_text("[{]")
+    capsys.readouterr()
+    assert run([*COMMAND, "nworld=2", "job.episodes=2"]) == 2
+    assert f"{BATCHES}: cannot be read (JSONDecodeError: " in capsys.readouterr().err
 
 
 @pytest.mark.full

@@ -201,11 +201,6 @@ def linked(name: str) -> Damage:
     return damage
 
 
-def put_folder(folder: Path) -> None:
-    (folder / "meta/stats.json").unlink()
-    (folder / "meta/stats.json").mkdir()
-
-
 def without_shards(folder: Path) -> None:
     path = folder / "meta/info.json"
     info = json.loads(path.read_text())
@@ -227,7 +222,6 @@ WRITTEN: dict[str, tuple[Damage, str]] = {
     "stats": (linked("meta/stats.json"), "stats.json is a link"),
     "meta": (linked("meta"), "meta is a link"),
     "chunk": (linked("data/chunk-000"), "chunk-000 is a link"),
-    "folder": (put_folder, "stats.json is no regular file"),
 }
 
 
@@ -235,7 +229,7 @@ WRITTEN: dict[str, tuple[Damage, str]] = {
 def test_collect_and_train_refuse_the_same_before_they_write(
     name: str, dataset: Path, tmp_path: Path, refused: Refused
 ) -> None:
-    """Links and folders where files are written, collect refuses alone."""
+    """Links, collect refuses alone."""
     damage, says = (READ | WRITTEN)[name]
     folder = tmp_path / "demos" / "dataset"
     shutil.copytree(dataset, folder)

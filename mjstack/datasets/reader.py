@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from mjstack.config.fingerprint import differences
-from mjstack.datasets import lerobot, parquet, tables
-from mjstack.datasets.lerobot import STATISTICS, is_foreign, numeric_columns, videos_of
+from mjstack.datasets import lerobot, tables
+from mjstack.datasets.lerobot import is_foreign, numeric_columns, videos_of
 from mjstack.datasets.spec import INDICES, DatasetSpec
 from mjstack.datasets.video import decode
 from mjstack.errors import FolderError, require_names
@@ -94,13 +94,13 @@ def read_dataset(folder: Path | str, used: Iterable[str] = ()) -> StoredDataset:
             looked at.
 
     Raises:
-        FolderError: There is none, or a file is missing, damaged or too large for what it holds.
+        FolderError: There is none, or a file is missing or damaged.
     """
     folder = Path(folder)
     info = tables.read_info(folder)
     columns = [*INDICES, *used] if is_foreign(info) else numeric_columns(info)
     require_names("feature", columns, info["features"])
-    _check_sizes(folder, info, columns)
+    _check_counts(folder, info)
     tasks = tables.read_tasks(folder, info)
     rows = (tables.read_lengths if is_foreign(info) else tables.read_rows)(folder, info)
     stored = StoredDataset(folder=folder, info=info, tasks=tasks, episodes=rows)
@@ -113,20 +113,11 @@ def read_begun(folder: Path, spec: DatasetSpec) -> StoredDataset | None:
 
     Raises:
         FolderError: It is damaged, as of `read_dataset`, or of another configuration; or there are
-            other files, or links where files are written, or a folder in place of a file.
+            other files, or links.
     """
-    names = ["data", "meta/episodes", *(f"videos/{name}" for name in spec.videos)]
-    chunks = [chunk for name in names for chunk in (folder / name).glob("chunk-*")]
-    folders = [*(folder / name for name in ("meta", "videos", *names)), *chunks]
-    files = [folder / name for name in (lerobot.INFO, lerobot.STATS, lerobot.TASKS)]
-    files += [*folder.glob("meta/.*"), *(file for chunk in chunks for file in chunk.glob("*"))]
-    refuse_links(folders + files, "Write into another folder")
-    for path in [*(path for path in folders if not path.is_dir()), *files]:
-        if path.exists() and (path in folders or not path.is_file()):
-            kind = "folder" if path in folders else "regular file"
-            raise FolderError(f"{path} is no {kind}, expected one. {_FIX}")
-    if not files[0].exists():
-        begun = f".{files[0].name}."
+    refuse_links(folder.rglob("*"), "Write into another folder")
+    if not (folder / lerobot.INFO).exists():
+        begun = f".{Path(lerobot.INFO).name}."
         for file in folder.rglob("*"):
             if file.is_file() and not file.name.startswith(begun):
                 name = file.relative_to(folder)
@@ -149,21 +140,12 @@ def _identity(info: dict[str, Any]) -> dict[str, Any]:
     return block | {key: info[key] for key in keys}
 
 
-def _check_sizes(folder: Path, info: dict[str, Any], columns: Iterable[str]) -> None:
-    """Check how many rows the files have and what they unpack to, before any is unpacked."""
-    width = sum(math.prod(info["features"][name]["shape"]) for name in columns)
+def _check_counts(folder: Path, info: dict[str, Any]) -> None:
+    """Check how many rows the files have, before any is read."""
     counts = []
-    for files, numbers in (
-        (lerobot.EPISODES, 2 if is_foreign(info) else width * len(STATISTICS)),
-        (lerobot.DATA, width),
-    ):
-        rows = disk = 0
-        for path in tables.data_files(folder, info, files):
-            with tables.readable(path):
-                rows += parquet.count_rows(path)
-                disk += path.stat().st_size
-                parquet.check_size(rows * numbers, disk)
-        counts.append(rows)
+    for files in (lerobot.EPISODES, lerobot.DATA):
+        paths = tables.data_files(folder, info, files)
+        counts.append(sum(tables.count_rows(path) for path in paths))
     total = [info["total_episodes"], info["total_frames"]]
     if counts != total:
         raise FolderError(

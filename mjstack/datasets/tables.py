@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from mjstack.datasets import lerobot, parquet
-from mjstack.datasets.lerobot import STATISTICS, is_foreign, numeric_columns, videos_of
+from mjstack.datasets import lerobot
+from mjstack.datasets.lerobot import is_foreign, videos_of
 from mjstack.datasets.spec import OWN_VALUES, VALUE_DTYPES
-from mjstack.datasets.video import check_video
 from mjstack.errors import FolderError
 from mjstack.files import reading
 
@@ -56,6 +55,38 @@ def read_info(folder: Path) -> dict[str, Any]:
     return info
 
 
+def open_file(path: Path) -> Any:
+    """A `ParquetFile`, whose footer is read; an exception if it is none."""
+    return lerobot.require_pyarrow()[1].ParquetFile(path)
+
+
+def count_rows(path: Path) -> int:
+    """Rows of a file, as its footer has them; a FolderError if it cannot be read."""
+    with readable(path):
+        return open_file(path).metadata.num_rows
+
+
+def read_numbers(path: Path, widths: Mapping[str, int]) -> dict[str, np.ndarray]:
+    """Columns of numbers, each shape ``(rows, width)``, in the file's types. Raises if it cannot be
+    read, or a row has not as many numbers as ``widths`` says.
+    """
+    table = open_file(path).read(columns=list(widths))
+    columns = {}
+    for name, width in widths.items():
+        column = table[name].combine_chunks()
+        even = True
+        while even and hasattr(column, "flatten"):
+            even = len(column.value_lengths().unique()) < 2  # a null has none
+            column = column.flatten()
+        if not even or len(column) != len(table) * width or column.null_count:
+            raise ValueError(f"rows of {name} without {width} numbers")
+        values = column.to_numpy(zero_copy_only=False)
+        if values.dtype.kind not in "biuf":
+            raise ValueError(f"{name} has other values than numbers")
+        columns[name] = values.reshape(len(table), width)
+    return columns
+
+
 def read_columns(path: Path, info: dict[str, Any], names: Iterable[str]) -> dict[str, np.ndarray]:
     """Columns of a data file, each shape ``(frames, numbers)``.
 
@@ -64,9 +95,7 @@ def read_columns(path: Path, info: dict[str, Any], names: Iterable[str]) -> dict
             type is another than info.json says.
     """
     features = info["features"]
-    if not is_foreign(info):
-        parquet.check_names(path, numeric_columns(info))
-    columns = parquet.read_numbers(path, {n: math.prod(features[n]["shape"]) for n in names})
+    columns = read_numbers(path, {n: math.prod(features[n]["shape"]) for n in names})
     for name, values in columns.items():
         if not is_foreign(info) and values.dtype != features[name]["dtype"]:
             raise ValueError(f"{name} is {values.dtype}, expected {features[name]['dtype']}")
@@ -81,9 +110,9 @@ def read_tasks(folder: Path, info: dict[str, Any]) -> list[str]:
     if not info.get("total_tasks", 1):
         return []
     with readable(path):
-        names = parquet.open_file(path).schema_arrow.names
+        table = open_file(path).read()
+        names = table.column_names
         text = "task" if "task" in names else next(n for n in names if n != "task_index")
-        table = parquet.read_table(path, {text: 1, "task_index": 1})
         count = len(table) if is_foreign(info) else info["total_tasks"]
         columns = (table[name].to_pylist() for name in ("task_index", text))
         tasks = sorted(zip(*columns, strict=True))[:count]
@@ -99,8 +128,9 @@ def read_lengths(folder: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for path in data_files(folder, info, lerobot.EPISODES):
         with readable(path):
-            names = {"length", *({"seed"} & {*parquet.open_file(path).schema_arrow.names})}
-            rows += parquet.read_table(path, dict.fromkeys(names, 1)).to_pylist()
+            file = open_file(path)
+            names = ["length", *({"seed"} & {*file.schema_arrow.names})]
+            rows += file.read(columns=names).to_pylist()
             if not all(type(value) is int for row in rows for value in row.values()):
                 raise ValueError("a length or a seed is no whole number")
     return rows
@@ -110,41 +140,20 @@ def read_rows(folder: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
     """Rows of every episode."""
     rows: list[dict[str, Any]] = []
     videos = videos_of(info)
-    pixels = {f"{lerobot.PIXELS}/{name}" for name in videos}
-    widths: dict[str, int] = {}
-    for name, feature in info["features"].items():
-        width = 3 if name in videos else math.prod(feature["shape"])
-        widths |= {f"stats/{name}/{kind}": width for kind in STATISTICS}
-        widths[f"stats/{name}/count"] = 1
     types = {**OWN_VALUES, **info["mjstack"]["values"]}
     place = partial(lerobot.episode_columns, videos, info["fps"])
-    names = {"tasks", *types, *place(0, 0, 0, 0, 0)}
+    names = ["tasks", *types, *place(0, 0, 0, 0, 0)]
     for shard, path in enumerate(data_files(folder, info, lerobot.EPISODES)):
         with readable(path):
-            columns = dict(widths)
-            if not pixels.isdisjoint(parquet.open_file(path).schema_arrow.names):
-                columns |= dict.fromkeys(pixels, 3 * 256)  # an earlier version left none
-            parquet.check_names(path, names | columns.keys())
-            numbers = parquet.read_numbers(path, columns)
-            if not all(np.isfinite(values).all() for values in numbers.values()):
-                raise ValueError("statistics that are not finite")
-            counts = {name: numbers[name] for name in pixels & columns.keys()}
-            for name, values in counts.items():
-                sums = values.reshape(-1, 256).sum(1, dtype=float)
-                possible = values.min() >= 0 and 1 <= sums.min() <= sums.max() < 2**40
-                if values.dtype != np.int64 or not possible:
-                    raise ValueError(f"{name} has other values than counts of pixels")
             first = start = rows[-1]["dataset_to_index"] if rows else 0
-            table = parquet.read_table(path, dict.fromkeys(names, 1)).to_pylist()
-            for k, row in enumerate(table):
+            for row in open_file(path).read(columns=names).to_pylist():
                 end = start + row["length"]
                 _check_row(row, place(shard, len(rows), first, start, end), types)
                 start = end
-                rows.append(row | {name: values[k] for name, values in counts.items()})
+                rows.append(row)
         for video in videos:
-            path = lerobot.shard_path(folder, lerobot.VIDEO, shard, video)
-            with readable(path):
-                check_video(path)
+            with readable(lerobot.shard_path(folder, lerobot.VIDEO, shard, video)):
+                pass  # it is there
     return rows
 
 
@@ -157,7 +166,7 @@ def _check_row(row: Mapping[str, Any], places: Mapping[str, Any], types: Mapping
         if row[name] != value:
             raise ValueError(f"row {number}: {name} is {row[name]!r:.60}, expected {value}")
     for name, dtype in types.items():
-        if type(row[name]) is not VALUE_DTYPES[dtype][1]:
+        if type(row[name]) is not VALUE_DTYPES[dtype]:
             raise ValueError(f"row {number}: {name} is {row[name]!r:.60}, expected {dtype}")
     if row["length"] < 1 or min(row["seed"], row["world"]) < 0 or len(row["tasks"]) != 1:
         raise ValueError(f"row {number} has no frames, no task, or a negative seed or world")

@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from mjstack.config.schema import CollectJobCfg, Config
-from mjstack.datasets import DatasetWriter, lerobot
+from mjstack.datasets import lerobot
 from mjstack.datasets.part import Part
+from mjstack.datasets.writer import DatasetWriter
 from mjstack.envs import demonstration_config
 from mjstack.episodes.batches import Batch, BatchPlan, play_batches
 from mjstack.episodes.rollout import require_episode
@@ -234,7 +235,7 @@ class Collection:
 
     def _commit(self, files: Sequence[Part]) -> None:
         """Commit the files of all ranks, and print what the batch has brought."""
-        self.writer.flush(files)
+        self.writer.commit(files)
         batch = self.batches[-1]
         self._stage.progress.print_line(
             f"collect, seed {batch.seed}: {batch.succeeded} of {batch.worlds} worlds succeeded,"

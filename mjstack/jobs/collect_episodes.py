@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from mjstack.datasets import DatasetSpec, EpisodeData
 from mjstack.datasets.part import Part, PartWriter
+from mjstack.datasets.spec import DatasetSpec, EpisodeData
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.batches import Batch
@@ -90,8 +90,8 @@ class EpisodeSource:
     ) -> list[Part]:
         """Write this rank's part of a batch into hidden files: of the worlds of all ranks those
         that are ``chosen``. ``episode``, ``frame`` and ``task`` are numbers in the dataset: of the
-        first of these episodes, of its first frame, and of the task. A FolderError if an episode
-        does not fit the spec, an OSError if a file cannot be written.
+        first of these episodes, of its first frame, and of the task. An OSError if a file cannot
+        be written.
         """
         worlds = batch.plan.worlds
         order = {world: number for number, world in enumerate(chosen) if world in worlds}
@@ -103,7 +103,7 @@ class EpisodeSource:
             for count, (number, data) in enumerate(zip(order.values(), episodes, strict=True), 1):
                 if writer is None:
                     name = f"rank{self._stage.ranks.rank:04d}-{len(files)}"
-                    writer = PartWriter(self._folder, self._spec, name, images_gib=images_gib)
+                    writer = PartWriter(self._folder, self._spec, name, images_gib)
                 first_frame = frame + number * len(data.arrays[STATE])
                 writer.write(data, task, episode + number, first_frame)
                 if writer.is_full() or count == len(order):
