@@ -438,17 +438,23 @@ def test_another_configuration_is_refused(tmp_path: Path) -> None:
     others: list[tuple[dict[str, Any], str]] = [
         (
             {"config_sha256": "d" * 64},
-            f"has config_sha256={'c' * 64}, expected {'d' * 64}. Give another folder",
+            "configuration: config_sha256=c.*, expected d+. Set job.folder to",
         ),
-        ({"fps": 25}, "has fps=50, expected 25"),
-        ({"robot_type": "rebot"}, "has robot_type=so101, expected rebot"),
-        (with_feature("action", vector("shoulder", "hand")), r"has features\.action\.names=.*jaw"),
+        ({"fps": 25}, "configuration: fps=50, expected 25"),
+        ({"robot_type": "rebot"}, "configuration: robot_type=so101, expected rebot"),
+        (
+            with_feature("action", vector("shoulder", "hand")),
+            r"configuration: features\.action\.names=.*jaw",
+        ),
         (
             with_feature("next.success", vector("s")),
-            r"has .*features\.next\.success\.dtype=missing",
+            r"configuration: .*features\.next\.success\.shape=missing",
         ),
-        (with_feature("action", vector("shoulder", "jaw", unit="m")), r"has units\.action="),
-        ({"values": {}}, "has values"),
+        (
+            with_feature("action", vector("shoulder", "jaw", unit="m")),
+            r"configuration: units\.action=",
+        ),
+        ({"values": {}}, "configuration: values"),
     ]
     for changes, message in others:
         with pytest.raises(FolderError, match=message):
@@ -570,7 +576,11 @@ DAMAGE: dict[str, tuple[str, Any, str]] = {
     "robot": (INFO, lambda info: info.pop("robot_type"), "cannot be read .*'robot_type'"),
     "features": (INFO, lambda info: info.update(features=[3]), OTHER),
     "shape": (INFO, lambda info: info["features"]["action"].update(shape="x"), OTHER),
-    "dtype": (INFO, lambda info: info["features"]["action"].update(dtype="evil"), OTHER),
+    "dtype": (
+        INFO,
+        lambda info: info["features"]["action"].update(dtype="evil"),
+        "action.dtype=evil|cannot be read",
+    ),
     "values": (INFO, lambda info: info["mjstack"].update(values=["x"]), OTHER),
     "provenance": (INFO, lambda info: info["mjstack"].update(provenance=[3]), OTHER),
     "from_episode": (
@@ -588,7 +598,6 @@ DAMAGE: dict[str, tuple[str, Any, str]] = {
     "length": (ROWS, set_column("length", None), OTHER),
     "seed": (ROWS, set_column("seed", None), OTHER),
     "world": (ROWS, set_column("world", "x"), OTHER),
-    "dataset_from_index": (ROWS, set_column("dataset_from_index", 7), OTHER),
     "task": (lerobot.TASKS, set_column("task", None), OTHER),
     "task numbers": (lerobot.TASKS, set_column("task_index", 10**9), "task_index does not count"),
     "times": (DATA, change_column("timestamp", lambda t: 7 * t), "timestamp of frame 1 is 0.14"),
@@ -600,14 +609,11 @@ DAMAGE: dict[str, tuple[str, Any, str]] = {
         change_column("index", lambda i: 0 * i + -(2**63)),
         "index of frame 0 is -9223",
     ),
-    "far task": (DATA, change_column("task_index", lambda i: i + 10**9), "0 is 1000000000, exp"),
+    "far task": (DATA, change_column("task_index", lambda i: i + 10**9), "goes to 1000000000, w"),
     "null": (DATA, set_column("observation.state", None), "rows of observation.state without 3"),
     "null count": (DATA, set_column("count", None), "rows of count without 1 numbers"),
     "infinite": (DATA, change_column("next.reward", lambda r: r / 0), "reward has .* not finite"),
     "precision": (DATA, change_column("next.reward", lambda r: r.astype(float)), "float64, expec"),
-    "place": (ROWS, set_column("data/file_index", 7), "data/file_index is 7, expected 0"),
-    "row task": (ROWS, set_column("tasks", ["box"]), "task_index of frame 0 is 0, expected -1"),
-    "success": (ROWS, set_column("success", "yes"), "success is 'yes', expected bool"),
     "negative": (INFO, lambda info: info["mjstack"].update(shards=-1), "shards is -1"),
     "rate": (INFO, lambda info: info.update(fps=0), "fps is 0"),
     "nested": (
@@ -633,7 +639,8 @@ def test_damage_and_a_strangers_files_are_one_line(name: str, tmp_path: Path) ->
     else:
         edit_table(path, change)
     before = contents(tmp_path)
-    for use in (read_dataset, lambda folder: DatasetWriter(folder, SPEC)):
+    uses = (lambda folder: DatasetWriter(folder, SPEC), read_dataset)
+    for use in uses[: 1 + (name not in ("provenance", "from_episode"))]:  # a writer's alone
         with pytest.raises(FolderError, match=message) as caught:
             use(tmp_path)
         assert "\n" not in str(caught.value)

@@ -28,8 +28,7 @@ class StoredDataset:
         folder: The dataset.
         info: The content of info.json.
         tasks: Texts of the tasks, by index.
-        episodes: A row per episode: its columns but for the statistics. Of a dataset that mjstack
-            has not written: its length, and its seed if there is one.
+        episodes: A row per episode: its columns but for the statistics.
     """
 
     folder: Path
@@ -102,7 +101,7 @@ def read_dataset(folder: Path | str, used: Iterable[str] = ()) -> StoredDataset:
     require_names("feature", columns, info["features"])
     _check_counts(folder, info)
     tasks = tables.read_tasks(folder, info)
-    rows = (tables.read_lengths if is_foreign(info) else tables.read_rows)(folder, info)
+    rows = tables.read_rows(folder, info)
     stored = StoredDataset(folder=folder, info=info, tasks=tasks, episodes=rows)
     _check_frames(stored, columns)
     return stored
@@ -127,17 +126,22 @@ def read_begun(folder: Path, spec: DatasetSpec) -> StoredDataset | None:
     info = tables.read_info(folder)
     if is_foreign(info):
         raise FolderError(f"{folder} was not written by mjstack", "Give another folder")
-    if changes := differences(_identity(info), _identity(lerobot.make_info(spec))):
-        fix = "Give another folder, or what it was begun with"
-        raise FolderError(f"{folder} has {changes}", fix)
+    with tables.readable(folder / lerobot.INFO):
+        begun = _identity(info)
+    if changes := differences(begun, _identity(lerobot.make_info(spec, [spec.provenance]))):
+        fix = "Set job.folder to another folder, or these keys back"
+        raise FolderError(f"{folder} has episodes of another configuration: {changes}", fix)
     return read_dataset(folder)
 
 
 def _identity(info: dict[str, Any]) -> dict[str, Any]:
-    """Everything of info.json that stays while a dataset grows."""
-    block = {key: info["mjstack"][key] for key in ("config_sha256", "units", "values")}
+    """Everything that stays while a dataset grows, the configuration first."""
+    block = info["mjstack"]
+    digest = {"config_sha256": block["config_sha256"]}
+    config = [{}, *block["provenance"]][-1].get("config", digest)
     keys = ("codebase_version", "robot_type", "fps", "chunks_size", "features")
-    return block | {key: info[key] for key in keys}
+    same = {"units": block["units"], "values": block["values"]}
+    return {**config, **same, **{key: info[key] for key in keys}}
 
 
 def _check_counts(folder: Path, info: dict[str, Any]) -> None:
@@ -163,7 +167,7 @@ def _check_frames(stored: StoredDataset, names: Iterable[str]) -> None:
     info, tasks = stored.info, stored.tasks
     lengths = [row["length"] for row in stored.episodes]
     frames = info["total_frames"]
-    if min(lengths, default=1) < 1 or sum(lengths) != frames:
+    if sum(lengths) != frames:
         problem = f"{stored.folder} has episodes of {sum(lengths)} frames, expected {frames}"
         raise FolderError(f"{problem} as {lerobot.INFO} says. {_FIX}")
     frame = np.arange(frames) - np.repeat(np.cumsum([0, *lengths])[:-1], lengths)
@@ -173,10 +177,6 @@ def _check_frames(stored: StoredDataset, names: Iterable[str]) -> None:
         "index": np.arange(frames),
         "timestamp": (frame / info["fps"]).astype(np.float32),
     }
-    if not is_foreign(info):
-        numbers = {task: number for number, task in enumerate(tasks)}
-        task_numbers = [numbers.get(row["tasks"][0], -1) for row in stored.episodes]
-        expected["task_index"] = np.repeat(task_numbers, lengths)
     start = 0
     for path in tables.data_files(stored.folder, info):
         with tables.readable(path):

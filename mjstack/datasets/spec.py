@@ -6,8 +6,6 @@ from typing import Any
 
 import numpy as np
 
-DTYPES = ("float32", "float64", "int32", "int64", "bool")
-VALUE_DTYPES = {"float64": float, "int64": int, "bool": bool, "string": str}  # of an episode
 # Columns that the writer itself adds to every frame, with their types; LeRobot expects these names.
 INDICES = {
     "timestamp": "float32",
@@ -16,7 +14,7 @@ INDICES = {
     "index": "int64",
     "task_index": "int64",
 }
-OWN_VALUES = {"success": "bool", "seed": "int64", "world": "int64"}  # of every episode's row
+OWN_VALUES = ("success", "seed", "world")  # of every episode's row
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +22,7 @@ class Feature:
     """One column of the frames: a vector of named numbers.
 
     Attributes:
-        dtype: One of `DTYPES`.
+        dtype: Of NumPy, such as ``float32``.
         names: A name for each number, such as ``shoulder_pan.pos``.
         units: A unit for each number, such as ``rad``; ``1`` where there is none.
     """
@@ -67,8 +65,7 @@ class DatasetSpec:
         config_sha256: Hash of what the episodes depend on. A dataset is gone on with under the same
             hash only.
         videos: Images by name, such as ``observation.images.front``.
-        values: Values that each episode has beside success, seed and world, by name, as one of
-            `VALUE_DTYPES`.
+        values: Types of the values that each episode has beside success, seed and world, by name.
         provenance: Other facts about this call's episodes, such as seed and versions, in
             JSON's types.
     """

@@ -5,17 +5,17 @@ import math
 import re
 from collections.abc import Iterable, Mapping
 from contextlib import AbstractContextManager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mjstack.datasets import lerobot
-from mjstack.datasets.lerobot import is_foreign, videos_of
-from mjstack.datasets.spec import OWN_VALUES, VALUE_DTYPES
+from mjstack.datasets.lerobot import is_foreign
 from mjstack.errors import FolderError
 from mjstack.files import reading
+
+_WHOLE = {"length", "seed", "world"}  # columns of an episode's row
 
 
 def readable(path: Path) -> AbstractContextManager[None]:
@@ -123,50 +123,21 @@ def read_tasks(folder: Path, info: dict[str, Any]) -> list[str]:
     return [task for _, task in tasks]
 
 
-def read_lengths(folder: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
-    """Length and seed of every episode of a foreign dataset."""
+def read_rows(folder: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
+    """Rows of every episode, without what is counted of their numbers."""
     rows: list[dict[str, Any]] = []
     for path in data_files(folder, info, lerobot.EPISODES):
         with readable(path):
             file = open_file(path)
-            names = ["length", *({"seed"} & {*file.schema_arrow.names})]
+            counts = ("stats/", f"{lerobot.PIXELS}/")
+            names = [name for name in file.schema_arrow.names if not name.startswith(counts)]
             rows += file.read(columns=names).to_pylist()
-            if not all(type(value) is int for row in rows for value in row.values()):
-                raise ValueError("a length or a seed is no whole number")
-    return rows
-
-
-def read_rows(folder: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
-    """Rows of every episode."""
-    rows: list[dict[str, Any]] = []
-    videos = videos_of(info)
-    types = {**OWN_VALUES, **info["mjstack"]["values"]}
-    place = partial(lerobot.episode_columns, videos, info["fps"])
-    names = ["tasks", *types, *place(0, 0, 0, 0, 0)]
-    for shard, path in enumerate(data_files(folder, info, lerobot.EPISODES)):
-        with readable(path):
-            first = start = rows[-1]["dataset_to_index"] if rows else 0
-            for row in open_file(path).read(columns=names).to_pylist():
-                end = start + row["length"]
-                _check_row(row, place(shard, len(rows), first, start, end), types)
-                start = end
-                rows.append(row)
-        for video in videos:
-            with readable(lerobot.shard_path(folder, lerobot.VIDEO, shard, video)):
+            for number, row in enumerate(rows):
+                for name in _WHOLE & row.keys() | {"length"}:
+                    if type(row[name]) is not int or row[name] < (name == "length"):
+                        raise ValueError(f"row {number}: {name} is {row[name]!r:.60}")
+    for video in lerobot.videos_of(info) if not is_foreign(info) else ():
+        for path in data_files(folder, info, lerobot.VIDEO.replace("{video_key}", video)):
+            with readable(path):
                 pass  # it is there
     return rows
-
-
-def _check_row(row: Mapping[str, Any], places: Mapping[str, Any], types: Mapping[str, str]) -> None:
-    """Raise an error of any kind where a row is not that of an episode at these places, or has
-    values of other types.
-    """
-    number = places["episode_index"]
-    for name, value in places.items():
-        if row[name] != value:
-            raise ValueError(f"row {number}: {name} is {row[name]!r:.60}, expected {value}")
-    for name, dtype in types.items():
-        if type(row[name]) is not VALUE_DTYPES[dtype]:
-            raise ValueError(f"row {number}: {name} is {row[name]!r:.60}, expected {dtype}")
-    if row["length"] < 1 or min(row["seed"], row["world"]) < 0 or len(row["tasks"]) != 1:
-        raise ValueError(f"row {number} has no frames, no task, or a negative seed or world")

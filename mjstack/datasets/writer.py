@@ -102,10 +102,13 @@ class DatasetWriter:
         stored = reader.read_begun(self.folder, self.spec)
         if stored is not None:
             self._tasks = {task: index for index, task in enumerate(stored.tasks)}
-            self._provenance = stored.info["mjstack"]["provenance"]
             self._shards = stored.info["mjstack"]["shards"]
             for row in stored.episodes:
                 self._count(row)
+            with tables.readable(self.folder / lerobot.INFO):
+                for facts in stored.info["mjstack"]["provenance"]:
+                    if facts["from_episode"] < len(self.committed):
+                        self._provenance.append(facts)
             columns = [f"{lerobot.PIXELS}/{name}" for name in self._pixels]
             for path in tables.data_files(self.folder, stored.info, lerobot.EPISODES):
                 with tables.readable(path):
@@ -114,7 +117,6 @@ class DatasetWriter:
             path.unlink()
         # Where the last writer and this one differ, such as in a version, both are on record.
         count = len(self.committed)
-        self._provenance = [p for p in self._provenance if p["from_episode"] < count]
         now = json.loads(json.dumps(dict(self.spec.provenance)))
         *_, last = [{"from_episode": 0}, *self._provenance]
         if last != {"from_episode": last["from_episode"], **now}:
@@ -146,7 +148,7 @@ class DatasetWriter:
                 for number, row in enumerate(part.rows, len(self.committed)):
                     end = self.frames + row["length"]
                     row |= lerobot.episode_columns(
-                        self.spec.videos, self.spec.fps, shard, number, first, self.frames, end
+                        self.spec, shard, number, first, self.frames, end
                     )
                     self._count(row)
                     self._count_pixels(row)

@@ -12,17 +12,15 @@ from typing import Any
 import mujoco
 import torch
 
-from mjstack.config.fingerprint import WITHOUT_EFFECT, config_content, config_hash, differences
+from mjstack.config.fingerprint import WITHOUT_EFFECT, config_content, config_hash
 from mjstack.config.functions import offered
 from mjstack.config.schema import CollectJobCfg, Config, ObservationTermCfg
-from mjstack.datasets.lerobot import INFO
 from mjstack.datasets.reader import read_begun
 from mjstack.datasets.spec import DatasetSpec, Feature, Video, term_columns
-from mjstack.datasets.tables import read_info, readable
 from mjstack.datasets.video import check_encoder
 from mjstack.envs import Env, demonstration_config
 from mjstack.episodes.stage import Stage
-from mjstack.errors import ConfigError, FolderError
+from mjstack.errors import ConfigError
 from mjstack.files import lock_folder, reading
 from mjstack.jobs.runner import run_provenance
 from mjstack.mdp.starts.placement import SCHEMA
@@ -132,21 +130,10 @@ def check_folder(dataset: Path, spec: DatasetSpec) -> None:
     Raises:
         FolderError: It is of another configuration or damaged, or another process is writing it.
     """
-    if not os.path.lexists(dataset):
-        return
-    if not dataset.is_dir():
-        raise FolderError(f"{dataset} is no folder, expected one", "Set job.folder to another")
-    os.close(lock_folder(dataset))
-    if (dataset / INFO).is_file():
-        info = read_info(dataset)
-        with readable(dataset / INFO):
-            recorded = [{}, *info.get("mjstack", {"provenance": []})["provenance"]][-1]
-            changes = differences(recorded.get("config", {}), spec.provenance["config"])
-        if recorded and changes:
-            problem = f"{dataset} has episodes of another configuration: {changes}"
-            raise FolderError(problem, "Set job.folder to another folder, or these keys back")
-    read_begun(dataset, spec)
-    read_batches(dataset.parent / BATCHES)
+    if dataset.is_dir():
+        os.close(lock_folder(dataset))
+        read_begun(dataset, spec)
+        read_batches(dataset.parent / BATCHES)
 
 
 @dataclass(kw_only=True, slots=True)
