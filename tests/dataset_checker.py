@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import imageio_ffmpeg
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -49,6 +50,20 @@ def add(writer: DatasetWriter, *episodes: EpisodeData, commit: bool = True) -> P
     if commit:
         writer.commit([complete])
     return complete
+
+
+def images_of(stored: StoredDataset, name: str, episode: int) -> np.ndarray:
+    """Decodes an episode's images, shape ``(frames, height, width, 3)``, uint8."""
+    row = stored.episodes[episode]
+    place = {key: row[f"data/{key}"] for key in ("chunk_index", "file_index")}
+    path = stored.folder / stored.info["video_path"].format(video_key=name, **place)
+    fps = stored.info["fps"]
+    seek = ["-ss", f"{max(0.0, row[f'videos/{name}/from_timestamp'] - 0.5 / fps):.6f}"]
+    count = ["-frames:v", str(row["length"])]
+    reader = imageio_ffmpeg.read_frames(path, input_params=seek, output_params=count)
+    next(reader)  # what ffmpeg says of the file
+    shape = (row["length"], *stored.info["features"][name]["shape"])
+    return np.frombuffer(b"".join(reader), np.uint8).reshape(shape)
 
 
 def with_column(table: pa.Table, name: str, values: Any) -> pa.Table:

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from mjstack.datasets.spec import INDICES, DatasetSpec, Video
+from mjstack.datasets.spec import INDICES, DatasetSpec
 from mjstack.errors import MissingExtra
 
 VERSION = "v3.0"
@@ -66,11 +66,6 @@ def require_pyarrow() -> tuple[Any, Any]:
 def shard_indices(shard: int) -> dict[str, int]:
     """Chunk and file index of a shard."""
     return {"chunk_index": shard // CHUNK, "file_index": shard % CHUNK}
-
-
-def shard_of(row: Mapping[str, Any]) -> int:
-    """The shard of an episode, by its row."""
-    return row["data/chunk_index"] * CHUNK + row["data/file_index"]
 
 
 def shard_path(folder: Path, files: str, shard: int, video: str = "") -> Path:
@@ -183,16 +178,12 @@ def check_info(info: Any) -> None:
     for name, feature in info["features"].items():
         if not all(type(number) is int and number > 0 for number in feature["shape"]):
             raise ValueError(f"the shape of {name} is {feature['shape']!r:.60}")
-    videos_of(info)
+    video_columns(info)
 
 
-def videos_of(info: Mapping[str, Any]) -> dict[str, Video]:
+def video_columns(info: Mapping[str, Any]) -> list[str]:
     """The videos of info.json."""
-    return {
-        name: Video(height=feature["shape"][0], width=feature["shape"][1])
-        for name, feature in info["features"].items()
-        if feature["dtype"] == "video"
-    }
+    return [name for name, feature in info["features"].items() if feature["dtype"] == "video"]
 
 
 def numeric_columns(info: Mapping[str, Any]) -> list[str]:

@@ -52,18 +52,6 @@ def join(paths: Sequence[Path], path: Path) -> None:
     listed.unlink()
 
 
-def decode(path: Path, video: Video, start: float, frames: int, fps: int) -> np.ndarray:
-    """Read so many images of a video, ``fps`` a second from ``start`` [s] on, shape ``(frames,
-    height, width, 3)``, uint8. An OSError if the file cannot be read.
-    """
-    seek = ["-ss", f"{max(0.0, start - 0.5 / fps):.6f}"]
-    content = _ffmpeg([*seek, "-i", str(path), "-frames:v", str(frames), *_PIXELS, "-"])
-    shape = (frames, video.height, video.width, 3)
-    if len(content) != np.prod(shape):
-        raise OSError(errno.EIO, f"{len(content)} bytes of images, expected {np.prod(shape)}")
-    return np.frombuffer(content, np.uint8).reshape(shape)
-
-
 def check_encoder(videos: Mapping[str, Video], fps: int) -> None:
     """Encode a few images as those of each video will be, and keep nothing.
 
@@ -83,8 +71,8 @@ def check_encoder(videos: Mapping[str, Video], fps: int) -> None:
             ) from error
 
 
-def _ffmpeg(arguments: Sequence[str], content: memoryview | None = None) -> bytes:
-    """The output of ffmpeg. Ctrl-C does not reach ffmpeg, so a video once begun is completed."""
+def _ffmpeg(arguments: Sequence[str], content: memoryview | None = None) -> None:
+    """Run ffmpeg. Ctrl-C does not reach ffmpeg, so a video once begun is completed."""
     try:
         import imageio_ffmpeg
 
@@ -104,7 +92,6 @@ def _ffmpeg(arguments: Sequence[str], content: memoryview | None = None) -> byte
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         line = text.splitlines()[0] if text else f"status {done.returncode}"
         raise OSError(errno.EIO, f"ffmpeg: {line}")
-    return done.stdout
 
 
 class VideoEncoder:

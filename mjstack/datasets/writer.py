@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from mjstack.datasets import lerobot, reader, tables
+from mjstack.datasets import lerobot, reader
 from mjstack.datasets.part import Part
 from mjstack.datasets.reader import StoredDataset
 from mjstack.datasets.spec import DatasetSpec
@@ -105,14 +105,14 @@ class DatasetWriter:
             self._shards = stored.info["mjstack"]["shards"]
             for row in stored.episodes:
                 self._count(row)
-            with tables.readable(self.folder / lerobot.INFO):
+            with reader.readable(self.folder / lerobot.INFO):
                 for facts in stored.info["mjstack"]["provenance"]:
                     if facts["from_episode"] < len(self.committed):
                         self._provenance.append(facts)
             columns = [f"{lerobot.PIXELS}/{name}" for name in self._pixels]
-            for path in tables.data_files(self.folder, stored.info, lerobot.EPISODES):
-                with tables.readable(path):
-                    self._count_pixels(tables.read_numbers(path, dict.fromkeys(columns, 3 * 256)))
+            for path in reader.data_files(self.folder, stored.info, lerobot.EPISODES):
+                with reader.readable(path):
+                    self._count_pixels(reader.read_numbers(path, dict.fromkeys(columns, 3 * 256)))
         for path in reader.uncommitted(self.folder, self._shards):
             path.unlink()
         # Where the last writer and this one differ, such as in a version, both are on record.
@@ -216,7 +216,7 @@ class DatasetWriter:
             yield
         except BaseException as error:
             self._open = False
-            info = tables.read_info(self.folder)
+            info = reader.read_info(self.folder)
             if info["total_frames"] == self.frames > self._described:  # not amid a commit
                 with contextlib.suppress(OSError):
                     self._write_statistics()
