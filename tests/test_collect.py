@@ -543,7 +543,7 @@ def test_finished_batches_are_kept(
     write = PartWriter.write
 
     def broken(self: PartWriter, episode: Any, *args: Any) -> None:
-        if episode.seed == 1 and len(self.part.rows) == 1:
+        if episode.row["seed"] == 1 and len(self.part.rows) == 1:
             raise error
         write(self, episode, *args)
 
@@ -623,10 +623,12 @@ def test_steps_come_to_the_host_in_chunks(monkeypatch: Patch) -> None:
     for size in (1, 2 * (6 * 3 + 5) * 4, 10**6):  # one world, two and all at once
         monkeypatch.setattr("mjstack.jobs.collect_episodes._CHUNK_BYTES", size)
         episodes = list(source.episodes(batch, [6, 0, 3]))
-        assert [episode.world for episode in episodes] == [6, 0, 3]
+        assert [episode.row["world"] for episode in episodes] == [6, 0, 3]
         for episode in episodes:
             for name, values in rows.items():
-                assert np.array_equal(episode.arrays[name], values[:5, episode.world].numpy())
+                assert np.array_equal(
+                    episode.arrays[name], values[:5, episode.row["world"]].numpy()
+                )
 
 
 @pytest.mark.full

@@ -51,7 +51,8 @@ def episode(world: int) -> EpisodeData:
         rgb = (60 + 20 * world + 2 * x, 200 - 3 * y, 90 + t % 60)
         images[name] = np.stack(rgb, axis=-1).astype(np.uint8)
     arrays = {"action": np.arange(frames, dtype=np.float32)}
-    return EpisodeData(arrays=arrays, images=images, task="t", success=True, seed=7, world=world)
+    row = {"success": True, "seed": 7, "world": world}
+    return EpisodeData(arrays=arrays, images=images, task="t", row=row)
 
 
 def write(folder: Path, worlds: range, *, spec: DatasetSpec = SPEC, batch: int = 3) -> None:
@@ -256,7 +257,7 @@ def test_a_dataset_has_the_images_of_the_environment(
     added: dict[tuple[int, int], dict[str, np.ndarray]] = {}
 
     def write(self: PartWriter, episode: EpisodeData, *args: Any) -> None:
-        added[episode.seed, episode.world] = dict(episode.images)
+        added[episode.row["seed"], episode.row["world"]] = dict(episode.images)
         write_part(self, episode, *args)
 
     monkeypatch.setattr(PartWriter, "write", write)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mjstack.datasets import lerobot
-from mjstack.datasets.spec import INDICES, OWN_VALUES, DatasetSpec, EpisodeData
+from mjstack.datasets.spec import INDICES, DatasetSpec, EpisodeData
 from mjstack.datasets.statistics import (
     by_name,
     count_pixels,
@@ -102,8 +102,7 @@ class PartWriter:
         statistics = {
             name: by_name(frame_statistics(columns[name]), length) for name in table.column_names
         }
-        row: dict[str, Any] = {"length": length, "tasks": [episode.task]}
-        row |= {name: getattr(episode, name) for name in OWN_VALUES} | dict(episode.values)
+        row: dict[str, Any] = {"length": length, "tasks": [episode.task], **episode.row}
         sampled = sampled_frames(length)
         for name in self._spec.videos:
             pixels = count_pixels(episode.images[name][sampled])

@@ -180,15 +180,8 @@ def _check_frames(stored: StoredDataset, names: Iterable[str]) -> None:
 def uncommitted(folder: Path, shards: int) -> list[Path]:
     """Files that an interrupted writer left: shards from this number on, and hidden ones."""
     counted = {lerobot.FILE.format(**lerobot.shard_indices(shard)) for shard in range(shards)}
-    places = {"data": "parquet", "meta/episodes": "parquet", "videos/*": "mp4"}
-    patterns = [
-        f"{place}/chunk-*/{name}"
-        for place, ending in places.items()
-        for name in (f"file-*.{ending}", f".file-*.{ending}*")
-    ]
-    totals = (lerobot.INFO, lerobot.STATS, lerobot.TASKS)
-    patterns += [f"meta/.{Path(name).name}.*" for name in totals]
-    paths = [path for pattern in patterns for path in folder.glob(pattern)]
+    patterns = ("chunk-*/file-*", "chunk-*/.file-*", "meta/.*.*.*")
+    paths = [path for pattern in patterns for path in folder.rglob(pattern)]
     return [path for path in paths if f"{path.parent.name}/{path.stem}" not in counted]
 
 

@@ -14,7 +14,6 @@ INDICES = {
     "index": "int64",
     "task_index": "int64",
 }
-OWN_VALUES = ("success", "seed", "world")  # of every episode's row
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,18 +88,12 @@ class EpisodeData:
         images: The images by video, each ``(frames, height, width, 3)``, uint8. Encoders read them
             after `PartWriter.write` too: do not write into them.
         task: The task in words.
-        success: Whether it was.
-        seed: The seed it was played with.
-        world: The world it was played in.
-        values: Other values of the episode, by the names of `DatasetSpec.values`.
+        row: ``success``, ``seed`` and ``world``, and the values of `DatasetSpec.values`.
     """
 
     arrays: Mapping[str, np.ndarray]
     task: str
-    success: bool
-    seed: int
-    world: int
-    values: Mapping[str, float | int | bool | str] = field(default_factory=dict)
+    row: Mapping[str, float | int | bool | str]
     images: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 

@@ -204,14 +204,9 @@ class DatasetWriter:
 
     @contextlib.contextmanager
     def guarded(self) -> Iterator[None]:
-        """If something goes wrong, close the writer and remove what is not committed.
-
-        Raises:
-            FolderError: The writer is closed, or something cannot be written.
+        """If something goes wrong, close the writer and remove what is not committed. A FolderError
+        if something cannot be written.
         """
-        if not self._open:
-            problem = f"{self.folder}: the writer is closed, expected an open one"
-            raise FolderError(problem, "Make another, which goes on")
         try:
             yield
         except BaseException as error:

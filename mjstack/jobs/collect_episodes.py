@@ -164,10 +164,10 @@ class EpisodeSource:
             arrays={name: arrays[name] for name in self._spec.features},
             images=images,
             task=task.instruction or task.name,
-            success=not broken,
-            seed=batch.plan.seed,
-            world=batch.plan.worlds[row],
-            values={
+            row={
+                "success": not broken,
+                "seed": batch.plan.seed,
+                "world": batch.plan.worlds[row],
                 "retries": int(batch.episode.retries[row]),
                 "failed_rules": broken,
                 "config_sha256": self._spec.config_sha256,
