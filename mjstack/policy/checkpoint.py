@@ -10,7 +10,6 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
-from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -37,7 +36,7 @@ _NAME_ANOTHER = ", or ".join(
     ["Name a policy that job=train has written, such as outputs/mine/last", *shipped_policies()]
 )
 _FLOATS = (torch.float32, torch.float16)  # of weights in a file
-_MOST = 1_000_000  # of any count
+_MOST_STEPS = 1_000_000  # between two queries
 
 
 @dataclass(slots=True)
@@ -245,26 +244,27 @@ def _from_facts(facts: Facts, path: Path) -> Policy:
     """The policy of a file, its weights without memory, so that sizes of a stranger take none."""
     seen = facts["observation"]
     action = facts["action"]
-    # A term may have no numbers here, such as headings where nothing is a box.
-    widths = {name: _whole(name, width, least=0) for name, width in seen["widths"].items()}
+    widths = seen["widths"]
     key = f"observation.{seen['group']}"
     group = typed(key, {"noise": seen["noise"]}, ObservationGroupCfg)
     group.terms = _read_terms(f"{key}.terms", seen["terms"], ObservationTermCfg, path)
-    vision = _read_vision(facts)
+    layers = facts["network"]
+    vision = Vision()
+    if images := seen.get("images"):
+        vision = Vision(sizes=images, channels=layers["channels"], features=layers["features"])
+    execute = action["execute"]
+    if type(execute) is not int or not 1 <= execute <= _MOST_STEPS:
+        raise ValueError(f"action.execute is {execute!r}, not a whole number of steps")
     with torch.device("meta"):
         network = PolicyNetwork(
-            sum(widths.values()),
-            _whole("action.width", action["width"]),
-            _whole("action.chunk", action["chunk"]),
-            [_whole("network.hidden", width) for width in facts["network"]["hidden"]],
-            vision,
+            sum(widths.values()), action["width"], action["chunk"], layers["hidden"], vision
         )
     policy = Policy(
         network=network,
         group=str(seen["group"]),
         observation=group,
         widths=widths,
-        execute=_whole("action.execute", action["execute"]),
+        execute=execute,
         action=_read_terms("action", action["terms"], TermCfg, path),
         config=facts["config"],
         training=dict(facts["training"]),
@@ -275,31 +275,9 @@ def _from_facts(facts: Facts, path: Path) -> Policy:
         raise ValueError("observation, action and config do not fit together")
     required = _requirements(policy.config, list(vision.sizes))  # they are all there
     for name, size in vision.sizes.items():
-        if required.get(f"scene.cameras.{name}.size") != list(size):
+        if required.get(f"scene.cameras.{name}.size") != size:
             raise ValueError(f"images of {name} are not those of config")
     return policy
-
-
-def _read_vision(facts: Facts) -> Vision:
-    """The images that the policy of a file sees."""
-    images = facts["observation"].get("images", {})
-    if not images:
-        return Vision()
-    network = facts["network"]
-    if not network["channels"]:
-        raise ValueError("network.channels has 0 layers, expected at least 1")
-    side = partial(_whole, "observation.images")
-    return Vision(
-        sizes={name: (side(height), side(width)) for name, (height, width) in images.items()},
-        channels=[_whole("network.channels", width) for width in network["channels"]],
-        features=_whole("network.features", network["features"]),
-    )
-
-
-def _whole(name: str, value: object, least: int = 1) -> int:
-    if type(value) is not int or not least <= value <= _MOST:
-        raise ValueError(f"{name} is {value!r}, not a whole number from {least} to {_MOST}")
-    return value
 
 
 def _weights_name(digest: str) -> str:
