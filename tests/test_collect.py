@@ -25,8 +25,8 @@ from mjstack.cli import run
 from mjstack.config.check import validate
 from mjstack.config.fingerprint import config_hash, differences
 from mjstack.config.schema import Backend, Config
-from mjstack.datasets.part import PartWriter
 from mjstack.datasets.spec import INDICES, DatasetSpec, Feature
+from mjstack.datasets.part import PartWriter
 from mjstack.datasets.writer import DatasetWriter
 from mjstack.envs import Env, build_env, demonstration_config
 from mjstack.episodes.batches import Batch, BatchPlan
@@ -332,6 +332,10 @@ def folder(tmp_path: Path, monkeypatch: Patch) -> Path:
         (["task=reach", "task.check=null"], "task=reach"),
         ([f"+observation.state={{terms: {{q: {JOINT_POS}}}}}"], "observation.state=a group"),
         (["job.folder=taken"], "taken cannot be written"),
+        (
+            ["cameras=[front]", "scene.cameras.front.size=[33,32]"],
+            "scene.cameras.front.size=[33, 32]: expected even numbers",
+        ),
     ],
 )
 def test_bad_input_is_one_line(args: list[str], words: str, folder: Path, refused: Refused) -> None:
