@@ -25,8 +25,8 @@ from mjstack.cli import run
 from mjstack.config.check import validate
 from mjstack.config.fingerprint import config_hash, differences
 from mjstack.config.schema import Backend, Config
-from mjstack.datasets.spec import INDICES, DatasetSpec, Feature
 from mjstack.datasets.part import PartWriter
+from mjstack.datasets.spec import INDICES, DatasetSpec, Feature
 from mjstack.datasets.writer import DatasetWriter
 from mjstack.envs import Env, build_env, demonstration_config
 from mjstack.episodes.batches import Batch, BatchPlan
