@@ -107,8 +107,8 @@ def read_begun(folder: Path, spec: DatasetSpec) -> StoredDataset | None:
     if is_foreign(info):
         raise FolderError(f"{folder} was not written by mjstack", "Give another folder")
     with readable(folder / lerobot.INFO):
-        begun = _identity(info)
-    if changes := differences(begun, _identity(lerobot.make_info(spec, [spec.provenance]))):
+        stored = _identity(info)
+    if changes := differences(stored, _identity(lerobot.make_info(spec, [spec.provenance]))):
         fix = "Set job.folder to another folder, or these keys back"
         raise FolderError(f"{folder} has episodes of another configuration: {changes}", fix)
     return read_dataset(folder)
