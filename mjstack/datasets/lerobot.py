@@ -159,22 +159,15 @@ def is_foreign(info: Mapping[str, Any]) -> bool:
 
 
 def check_info(info: Any) -> None:
-    """Raise an error of any kind where info.json is not what `make_info` makes; of a foreign
-    dataset, where its features and counts are not.
-    """
-    empty = make_info(DatasetSpec(robot_type="", fps=1, features={}, config_sha256=""))
-    foreign = is_foreign(info)
-    used = ("codebase_version", "fps", "features", "total_episodes", "total_frames")
-    blocks = [(info, {name: empty[name] for name in used} if foreign else empty)]
-    if not foreign:
-        blocks.append((info["mjstack"], empty["mjstack"]))
-    for block, model in blocks:
-        for name, value in model.items():
-            kinds = {"video_path": str | None, "fps": int | float}.get(name, type(value))
-            number = block[name] if isinstance(block[name], int | float) else 0
-            right = isinstance(block[name], kinds) and not isinstance(block[name], bool)
-            if not right or not 0 <= number < math.inf or (name == "fps" and not number):
-                raise ValueError(f"{name} is {block[name]!r:.60}")
+    """Raise an error of any kind where counts and features of info.json cannot be used."""
+    counts = {name: info[name] for name in ("fps", "total_episodes", "total_frames")}
+    if not is_foreign(info):
+        counts["shards"] = info["mjstack"]["shards"]
+    for name, value in counts.items():
+        if (type(value) is not int and name != "fps") or not 0 <= value < math.inf:
+            raise ValueError(f"{name} is {value!r:.60}")
+    if not info["fps"]:
+        raise ValueError("fps is 0")
     for name, feature in info["features"].items():
         if not all(type(number) is int and number > 0 for number in feature["shape"]):
             raise ValueError(f"the shape of {name} is {feature['shape']!r:.60}")
