@@ -58,7 +58,7 @@ def test_a_dataset_has_what_the_expert_would_show(dataset: Path, tmp_path: Path)
     """The same starts, so the same steps; torchrun's processes share the episodes."""
     cfg = load_config([*TRAIN, "job.episodes=3", f"job.dataset={dataset}"])
     stage = Stage(cfg)
-    played = make_round(stage, tmp_path, None, 0)
+    played = make_round(stage, tmp_path, None, 0, None)
     read = read_demonstrations(stage, played.widths)
     assert torch.equal(read.ends, played.ends)
     torch.testing.assert_close(read.seen, played.seen)
