@@ -251,7 +251,8 @@ def _from_facts(facts: Facts, path: Path) -> Policy:
     layers = facts["network"]
     vision = Vision()
     if images := seen.get("images"):
-        vision = Vision(sizes=images, channels=layers["channels"], features=layers["features"])
+        sizes = {name: tuple(size) for name, size in images.items()}
+        vision = Vision(sizes=sizes, channels=layers["channels"], features=layers["features"])
     execute = action["execute"]
     if type(execute) is not int or not 1 <= execute <= _MOST_STEPS:
         raise ValueError(f"action.execute is {execute!r}, not a whole number of steps")
@@ -275,7 +276,7 @@ def _from_facts(facts: Facts, path: Path) -> Policy:
         raise ValueError("observation, action and config do not fit together")
     required = _requirements(policy.config, list(vision.sizes))  # they are all there
     for name, size in vision.sizes.items():
-        if required.get(f"scene.cameras.{name}.size") != size:
+        if required.get(f"scene.cameras.{name}.size") != list(size):
             raise ValueError(f"images of {name} are not those of config")
     return policy
 
