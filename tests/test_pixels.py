@@ -170,7 +170,10 @@ def test_other_cameras_are_refused(trained: Path, capsys: Capture) -> None:
     ("change", "says"),
     [
         ({"observation": {"images": {"front": [16, 16]}}}, "images of front are not those of conf"),
-        ({"observation": {"images": {"front": [10**9, 16]}}}, "images of front are not those of config"),
+        (
+            {"observation": {"images": {"front": [10**9, 16]}}},
+            "images of front are not those of config",
+        ),
         ({"network": {"channels": []}}, "IndexError"),
         ({"network": {"features": 9}}, "loading state_dict"),
     ],

@@ -298,11 +298,11 @@ def read_rows(folder: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
             file = open_file(path)
             counts = ("stats/", f"{lerobot.PIXELS}/")
             names = [name for name in file.schema_arrow.names if not name.startswith(counts)]
-            rows += file.read(columns=names).to_pylist()
-            for number, row in enumerate(rows):
+            for row in file.read(columns=names).to_pylist():
                 for name in _WHOLE & row.keys() | {"length"}:
                     if type(row[name]) is not int or row[name] < (name == "length"):
-                        raise ValueError(f"row {number}: {name} is {row[name]!r:.60}")
+                        raise ValueError(f"row {len(rows)}: {name} is {row[name]!r:.60}")
+                rows.append(row)
     for video in video_columns(info) if not is_foreign(info) else ():
         for path in data_files(folder, info, lerobot.VIDEO.replace("{video_key}", video)):
             with readable(path):
