@@ -44,7 +44,7 @@ def add(writer: DatasetWriter, *episodes: EpisodeData, commit: bool = True) -> P
         part = PartWriter(writer.folder, writer.spec, "rank0000-0", 1.0)
         frame = writer.frames
         for number, episode in enumerate(episodes, len(writer.committed)):
-            part.write(episode, writer.number_task(episode.task), number, frame)
+            part.write(episode, number, frame)
             frame += part.part.rows[-1]["length"]
         complete = part.complete()
     if commit:

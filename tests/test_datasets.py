@@ -42,6 +42,7 @@ def vector(*names: str, dtype: str = "float32", unit: str = "rad") -> Feature:
 SPEC = DatasetSpec(
     robot_type="so101",
     fps=50,
+    task="stack",
     features={
         "observation.state": vector(*JOINTS),
         "action": vector("shoulder", "jaw"),
@@ -55,7 +56,7 @@ SPEC = DatasetSpec(
 )
 
 
-def episode(world: int, *, frames: int = 0, seed: int = 7, task: str = "stack") -> EpisodeData:
+def episode(world: int, *, frames: int = 0, seed: int = 7) -> EpisodeData:
     """Random frames that depend on the world alone; the number of frames too, unless it
     is given.
     """
@@ -79,7 +80,7 @@ def episode(world: int, *, frames: int = 0, seed: int = 7, task: str = "stack") 
         "settled": world % 2 == 0,
         "note": f"w{world}",
     }
-    return EpisodeData(arrays=arrays, task=task, row=row)
+    return EpisodeData(arrays=arrays, row=row)
 
 
 def write(folder: Path, worlds: range, *, batch: int = 3, spec: DatasetSpec = SPEC) -> None:
@@ -260,20 +261,6 @@ def test_writers_that_differ_are_on_record(tmp_path: Path) -> None:
     assert versions == [(0, "4.0.0"), (2, "4.2.0")]
 
 
-def test_tasks_keep_their_indices(tmp_path: Path) -> None:
-    with DatasetWriter(tmp_path, SPEC) as writer:
-        add(writer, episode(0, task="stack"), episode(1, task="box"))
-    with DatasetWriter(tmp_path, SPEC) as writer:
-        add(writer, episode(2, task="reach"), episode(3, task="box"))
-    assert read_dataset(tmp_path).tasks == ["stack", "box", "reach"]
-    path = tmp_path / lerobot.TASKS
-    pq.write_table(pq.read_table(path).take([2, 0, 1]), path, row_group_size=1)
-    assert read_dataset(tmp_path).tasks == ["stack", "box", "reach"]
-    table = pq.read_table(tmp_path / "data")
-    rows = {row["episode_index"]: row["task_index"] for row in table.to_pylist()}
-    assert rows == {0: 0, 1: 1, 2: 2, 3: 1}
-
-
 def test_chunks_follow_one_another(tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.setattr(lerobot, "CHUNK", 2)
     write(tmp_path, range(3), batch=1)
@@ -305,7 +292,7 @@ def test_a_kill_at_any_moment_keeps_what_was_committed(tmp_path: Path, monkeypat
         add(writer, *map(episode, range(3)))
         with monkeypatch.context() as patch:
             patch.setattr(os, "replace", copied)
-            add(writer, *(episode(world, task="box") for world in range(3, 6)))
+            add(writer, *(episode(world) for world in range(3, 6)))
             copied()
     assert len(copies) == 6
     for folder in copies:
@@ -317,7 +304,7 @@ def test_a_kill_at_any_moment_keeps_what_was_committed(tmp_path: Path, monkeypat
             assert writer.committed == [(7, world) for world in range(kept)]
             assert not leftover(folder)
             if kept < 6:
-                add(writer, *(episode(world, task="box") for world in range(kept, 6)))
+                add(writer, *(episode(world) for world in range(kept, 6)))
         assert contents(folder) == contents(whole)
 
 

@@ -36,6 +36,7 @@ SIZES = {"observation.images.front": (32, 48), "observation.images.wrist": (16, 
 SPEC = DatasetSpec(
     robot_type="so101",
     fps=50,
+    task="t",
     features={"action": Feature(dtype="float32", names=("jaw",), units=("rad",))},
     videos={name: Video(height=h, width=w) for name, (h, w) in SIZES.items()},
     config_sha256="c" * 64,
@@ -52,7 +53,7 @@ def episode(world: int) -> EpisodeData:
         images[name] = np.stack(rgb, axis=-1).astype(np.uint8)
     arrays = {"action": np.arange(frames, dtype=np.float32)}
     row = {"success": True, "seed": 7, "world": world}
-    return EpisodeData(arrays=arrays, images=images, task="t", row=row)
+    return EpisodeData(arrays=arrays, images=images, row=row)
 
 
 def write(folder: Path, worlds: range, *, spec: DatasetSpec = SPEC, batch: int = 3) -> None:

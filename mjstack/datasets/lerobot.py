@@ -85,7 +85,6 @@ def make_info(
     *,
     episodes: int = 0,
     frames: int = 0,
-    tasks: int = 0,
     shards: int = 0,
 ) -> dict[str, Any]:
     """The content of info.json. LeRobot does not read the block ``mjstack``.
@@ -114,7 +113,7 @@ def make_info(
         "fps": spec.fps,
         "total_episodes": episodes,
         "total_frames": frames,
-        "total_tasks": tasks,
+        "total_tasks": min(1, episodes),
         "chunks_size": CHUNK,
         "data_files_size_in_mb": DATA_MB,
         "video_files_size_in_mb": VIDEO_MB,  # LeRobot wants a number without videos too
@@ -214,8 +213,8 @@ def frames_table(schema: Any, columns: Mapping[str, np.ndarray]) -> Any:
     return pa.Table.from_arrays(arrays, schema=schema)
 
 
-def tasks_table(tasks: Sequence[str]) -> Any:
+def tasks_table(task: str) -> Any:
     """Task texts as a pandas data frame whose index is the text: so LeRobot reads them."""
     pa, _ = require_pyarrow()
-    table = pa.table({"task_index": range(len(tasks)), "task": list(tasks)})
+    table = pa.table({"task_index": [0], "task": [task]})
     return table.replace_schema_metadata({"pandas": _PANDAS})

@@ -77,7 +77,7 @@ class PartWriter:
         share = max(data, self._videos.megabytes() / lerobot.VIDEO_MB, rows / lerobot.MOST_ROWS)
         return share * (1.0 + 1.0 / rows) > 1.0
 
-    def write(self, episode: EpisodeData, task: int, number: int, start: int) -> None:
+    def write(self, episode: EpisodeData, number: int, start: int) -> None:
         """Write an episode as a row group, so that it can be read without the others: its number,
         that of its first frame (``start``) and of its task are those in the dataset. An OSError if
         it cannot be written.
@@ -93,7 +93,7 @@ class PartWriter:
             "frame_index": frame,
             "episode_index": np.full(length, number),
             "index": start + frame,
-            "task_index": np.full(length, task),
+            "task_index": np.zeros(length, int),
         }
         columns |= {name: values[:, None] for name, values in indices.items()}
         table = lerobot.frames_table(self._writer.schema, columns)
@@ -102,7 +102,7 @@ class PartWriter:
         statistics = {
             name: by_name(frame_statistics(columns[name]), length) for name in table.column_names
         }
-        row: dict[str, Any] = {"length": length, "tasks": [episode.task], **episode.row}
+        row: dict[str, Any] = {"length": length, "tasks": [self._spec.task], **episode.row}
         sampled = sampled_frames(length)
         for name in self._spec.videos:
             pixels = count_pixels(episode.images[name][sampled])

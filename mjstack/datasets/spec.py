@@ -58,6 +58,7 @@ class DatasetSpec:
     Attributes:
         robot_type: The robot, such as ``so101``.
         fps: Frames per second of simulated time [Hz].
+        task: The task in words.
         features: Columns of the frames by name. LeRobot reads ``observation.state``,
             ``observation.environment_state``, ``action``, ``next.reward``, ``next.done`` and
             ``next.success`` by these names; others are kept as they are.
@@ -71,6 +72,7 @@ class DatasetSpec:
 
     robot_type: str
     fps: int
+    task: str
     features: Mapping[str, Feature]
     config_sha256: str
     videos: Mapping[str, Video] = field(default_factory=dict)
@@ -87,12 +89,10 @@ class EpisodeData:
             finite, and of types that go into the feature's.
         images: The images by video, each ``(frames, height, width, 3)``, uint8. Encoders read them
             after `PartWriter.write` too: do not write into them.
-        task: The task in words.
         row: ``success``, ``seed`` and ``world``, and the values of `DatasetSpec.values`.
     """
 
     arrays: Mapping[str, np.ndarray]
-    task: str
     row: Mapping[str, float | int | bool | str]
     images: Mapping[str, np.ndarray] = field(default_factory=dict)
 

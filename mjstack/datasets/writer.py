@@ -58,7 +58,6 @@ class DatasetWriter:
         self._open = True
         self._shards = 0
         self._provenance: list[dict[str, Any]] = []
-        self._tasks: dict[str, int] = {}
         self._described = 0  # frames that the statistics are of
         self._pixels = {name: np.zeros((3, 256), np.int64) for name in spec.videos}
         self._sampled = 0  # frames whose pixels are counted
@@ -83,10 +82,6 @@ class DatasetWriter:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def number_task(self, task: str) -> int:
-        """The number of a task in the dataset; a new one gets the next."""
-        return self._tasks.setdefault(task, len(self._tasks))
-
     def close(self) -> None:
         """Bring the statistics up to date, and let another writer in."""
         try:
@@ -101,7 +96,6 @@ class DatasetWriter:
         """Count what is committed, and clear away what is not."""
         stored = reader.read_begun(self.folder, self.spec)
         if stored is not None:
-            self._tasks = {task: index for index, task in enumerate(stored.tasks)}
             self._shards = stored.info["mjstack"]["shards"]
             for row in stored.episodes:
                 self._count(row)
@@ -135,7 +129,7 @@ class DatasetWriter:
         if not parts:
             return
         with self.guarded():
-            self._write_table(lerobot.tasks_table(list(self._tasks)), self.folder / lerobot.TASKS)
+            self._write_table(lerobot.tasks_table(self.spec.task), self.folder / lerobot.TASKS)
             for shard, part in enumerate(parts, self._shards):
                 moves = {lerobot.shard_path(self.folder, lerobot.DATA, shard): part.path}
                 for name, hidden in part.videos.items():
@@ -198,7 +192,6 @@ class DatasetWriter:
             provenance=self._provenance,
             episodes=len(self.committed),
             frames=self.frames,
-            tasks=len(self._tasks),
             shards=self._shards,
         )
 
