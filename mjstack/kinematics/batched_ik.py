@@ -9,6 +9,7 @@ import numpy as np
 import torch
 import warp as wp
 from numpy import ndarray
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from mjstack.config.schema import RobotCfg
@@ -25,6 +26,8 @@ _DAMPING = 0.005
 # CUDA threads per block. Few, because a world is one thread, and many processors share the worlds.
 _BLOCK_DIM = 32
 _MAX_STEP = 0.3  # [rad, m] largest change of any joint per iteration
+# [rad, m] off home, of each ik joint: every start has its own branch of solutions
+_STARTS = (0.0, -0.6, 0.6)
 _NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
 
 _Pose = tuple[ndarray, ndarray]  # position and quaternion (wxyz)
@@ -312,3 +315,21 @@ class BatchedIk:
             shapes = (f"shape {tuple(shape)}" for shape in (values.shape, buffer.shape))
             raise ArgumentError(name, *shapes)
         buffer.copy_(values)
+
+
+def find_reach(
+    model: mujoco.MjModel, robot: RobotCfg, points: ndarray, gripper: ArrayLike
+) -> tuple[Tensor, Tensor]:
+    """Bring the grasp point as near to points [m], shape ``(n, 3)``, as possible, from home and
+    from both sides of it, without collisions. The gripper's joints are at positions [rad, m] of
+    shape ``(n_gripper,)`` or ``(n, n_gripper)``. Returns joint positions, shape ``(3, n, nu)``, and
+    the distances that are left [m], shape ``(3, n)``.
+    """
+    q = np.tile(locked_home(robot), (len(_STARTS), len(points), 1))
+    q[..., len(robot.arm_joints) :] = gripper
+    moving = [robot.joints.index(name) for name in robot.ik_joints]
+    q[..., moving] += np.reshape(_STARTS, (-1, 1, 1))
+    targets = torch.from_numpy(np.tile(points, (len(_STARTS), 1)))
+    ik = BatchedIk(model, robot, len(targets), "cpu", iterations=40)
+    solution, distance = ik.solve(torch.from_numpy(q).flatten(0, 1), targets)
+    return solution.view(q.shape), distance.view(q.shape[:2])

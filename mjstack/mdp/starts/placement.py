@@ -13,7 +13,6 @@ from torch import Tensor
 
 from mjstack.config.schema import Config, ObjectCfg, SceneCfg
 from mjstack.errors import ParameterError
-from mjstack.kinematics.reach import PointReach
 from mjstack.managers.view import EnvView
 from mjstack.rng import uniform
 from mjstack.scene.index import gripper_targets
@@ -266,6 +265,8 @@ def out_of_reach(env: EnvView, name: str, xy: np.ndarray) -> tuple[int, str] | N
     """The position of an object that is farthest out of reach, by its row in ``xy``, where it may
     stand [m], shape ``(n, 2)``, and a sentence on it; None if the arm reaches them all.
     """
+    from mjstack.kinematics.batched_ik import find_reach  # loads Warp
+
     # How far the grasp point stays from each target at each position
     scene = env.cfg.scene
     targets = object_targets(env.cfg)[name]
@@ -275,13 +276,10 @@ def out_of_reach(env: EnvView, name: str, xy: np.ndarray) -> tuple[int, str] | N
     for column, (_, target) in enumerate(targets):
         points[:, column, :2] = target_xy(target, sources)
         points[:, column, 2] = target.z
-    distances = np.zeros(points.shape[:2])
-    for width in {phase.width for phase, _ in targets}:
-        (gripper,) = gripper_targets(env.sim.model, env.cfg.robot, [width])
-        reach = PointReach(env.sim.model, env.cfg.robot, gripper.tolist())
-        columns = [phase.width == width for phase, _ in targets]
-        left = reach.solve(points[:, columns].reshape(-1, 3))[1]
-        distances[:, columns] = left.reshape(len(xy), -1)
+    model, robot = env.sim.model, env.cfg.robot
+    grips = gripper_targets(model, robot, [phase.width for phase, _ in targets])
+    _, left = find_reach(model, robot, points.reshape(-1, 3), np.tile(grips, (len(xy), 1)))
+    distances = left.amin(0).view(len(xy), -1).numpy()
     if (distances <= env.cfg.controller.ik_tolerance).all():
         return None
 
