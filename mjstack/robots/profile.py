@@ -201,7 +201,9 @@ def _guess_home(
     model: mujoco.MjModel, hand: Hand, grip: Grip, space: Workspace, limits: ndarray
 ) -> Iterator[Guess]:
     home = _within(np.concatenate((space.home, grip.opened)), limits)
-    why = f"hand down {100 * space.height:.0f} cm above the table's middle, by inverse kinematics"
+    why = (
+        f"hand down {100 * space.arm.height:.0f} cm above the table's middle, by inverse kinematics"
+    )
     yield Guess(
         "home", home, f"{why}; off the vertical by {math.degrees(space.tilt):.0f} deg at most"
     )
@@ -213,9 +215,9 @@ def _guess_home(
     if roll:
         yield Guess("roll_joint", roll, "its axis is the approach axis")
         yield Guess("yaw_alignment", 1.0, "the jaws turn to a face")
-    if space.upright and len(names) - len(space.locked) > 3:
+    if space.arm.upright and len(names) - len(space.locked) > 3:
         yield Guess("approach_gain", 0.5, "the first joint is upright, and joints are left")
-    yield Guess("approach_height", space.height, "m above an object")
+    yield Guess("approach_height", space.arm.height, "m above an object")
     yield Guess("finger_room", 0.03, "m beside an object")
 
 
@@ -317,12 +319,12 @@ def _effort(data: mujoco.MjData, joint: int) -> float:
 
 def _guess_table(space: Workspace, scene: SceneCfg) -> Iterator[Guess]:
     """Where the arm stands, the table before it, and what stands on it."""
-    distance = float(np.linalg.norm((space.center - space.shoulder)[:2]))
+    distance = float(np.linalg.norm((space.center - space.arm.shoulder)[:2]))
     cos, sin = math.cos(space.azimuth), math.sin(space.azimuth)
     turn = np.array([[cos, sin], [-sin, cos]])  # so that the table is ahead
     shift = np.array([0.0, 0.0, max(0.0, _FLOOR - space.center[2], -space.lowest)])
-    if space.azimuth or distance < 0.15 or np.linalg.norm(space.shoulder[:2]) > 0.1:
-        shift[:2] = -turn @ space.shoulder[:2]
+    if space.azimuth or distance < 0.15 or np.linalg.norm(space.arm.shoulder[:2]) > 0.1:
+        shift[:2] = -turn @ space.arm.shoulder[:2]
         shift[0] += _AWAY * (distance < 0.15)
     if space.azimuth or shift.any():
         quat = [math.cos(-0.5 * space.azimuth), 0.0, 0.0, math.sin(-0.5 * space.azimuth)]
@@ -333,10 +335,10 @@ def _guess_table(space: Workspace, scene: SceneCfg) -> Iterator[Guess]:
     x, y = _numbers(turn @ space.center[:2] + shift[:2], 3)
     top = float(space.center[2] + shift[2])
     half = [round(min(0.14, max(0.09, distance - 0.1)) if distance > 0.15 else 0.14, 3)]
-    sides = np.linspace(-space.apart, space.apart, len(scene.objects))
+    sides = np.linspace(-space.arm.apart, space.arm.apart, len(scene.objects))
     places = {
         "table_center": [x, y, round(top - _THICK, 3)],
-        "table_half": [*half, round(space.apart + 0.12, 3), _THICK],
+        "table_half": [*half, round(space.arm.apart + 0.12, 3), _THICK],
         "objects": {
             name: [x, round(y + s, 3)] for name, s in zip(scene.objects, sides, strict=True)
         },
