@@ -15,6 +15,7 @@ from torch import Tensor
 from mjstack.config.schema import RobotCfg
 from mjstack.errors import ArgumentError, ConfigError, MjstackError
 from mjstack.kinematics.ik_kernels import HINGE, SLIDE, Chain, Shape, forward_kernel, solve_kernel
+from mjstack.robots.bodies import ancestors
 from mjstack.robots.posture import posture
 from mjstack.scene.index import approach_body, joint_limits, locked_home
 from mjstack.sim.warp_setup import torch_stream_scope
@@ -54,8 +55,8 @@ def build_chain(model: mujoco.MjModel, robot: RobotCfg) -> tuple[Chain, Shape]:
 
     # Links from the world to the jaws, and from there to each site
     first, second = (model.site(name).id for name in robot.grasp_sites)
-    first_path = _path(model, model.site_bodyid[first])
-    second_path = _path(model, model.site_bodyid[second])
+    first_path = [*ancestors(model, model.site_bodyid[first])][::-1]
+    second_path = [*ancestors(model, model.site_bodyid[second])][::-1]
     shared = len({*first_path} & {*second_path})
     chain = Chain()
     links: list[_Link] = []
@@ -136,11 +137,6 @@ def _read_link(model: mujoco.MjModel, joint: int, pose: _Pose) -> tuple[_Pose, n
     else:
         back = (-zero * axis, turn)
     return _compose(pose, back), axis, kind
-
-
-def _path(model: mujoco.MjModel, body: int) -> list[int]:
-    """Bodies from the world, which is left out, to the given one."""
-    return [*_path(model, model.body_parentid[body]), int(body)] if body else []
 
 
 def _compose(a: _Pose, b: _Pose) -> _Pose:

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import combinations, product
+from itertools import combinations
 
 import mujoco
 import numpy as np
@@ -14,6 +14,7 @@ from torch import Tensor
 from mjstack.config.schema import RobotCfg, SceneCfg
 from mjstack.errors import ConfigError, require_names
 from mjstack.math import lowest_point, quat_mul, quat_to_matrix
+from mjstack.robots.bodies import place, solid_geoms
 from mjstack.robots.guest import OWN_WORLD
 from mjstack.robots.jaws import Jaws
 from mjstack.robots.posture import Posture, idle_servos, posture
@@ -109,13 +110,11 @@ class SceneIndex:
                 span = model.actuator(name).ctrlrange.tolist()
                 raise ConfigError(f"ctrlrange of joint {name}", span, expected)
         self.n_arm = len(robot.arm_joints)
-        data = mujoco.MjData(model)
-        mujoco.mj_kinematics(model, data)
         first = model.jnt_bodyid[joints[0]]
         carrier = model.body_parentid[first]
         if model.body(carrier).name in (WORLD, OWN_WORLD):
             carrier = first
-        self.base = data.xpos[carrier, :2].tolist()
+        self.base = place(model).xpos[carrier, :2].tolist()
         self.grasp_sites = [model.site(name).id for name in robot.grasp_sites]
         self.objects = {
             name: (int(model.joint(name).qposadr[0]), int(model.joint(name).dofadr[0]))
@@ -303,24 +302,11 @@ def turn_sign(model: mujoco.MjModel, robot: RobotCfg) -> float:
     Raises:
         ConfigError: It does not turn about the vertical.
     """
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    up = float(data.joint(robot.arm_joints[0]).xaxis[2])
+    up = float(place(model).joint(robot.arm_joints[0]).xaxis[2])
     if abs(up) < 0.999:
         expected = f"0, because joint {robot.arm_joints[0]} does not turn about the vertical"
         raise ConfigError("robot.approach_gain", robot.approach_gain, expected)
     return math.copysign(1.0, up)
-
-
-def geom_corners(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray:
-    """Corners of the boxes around some geoms, by signs [m], shape ``(n, 8, 3)``."""
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    signs = np.array(list(product((-1.0, 1.0), repeat=3)))
-    middle, half = model.geom_aabb[geoms].reshape(-1, 2, 3).swapaxes(0, 1)
-    corners = middle[:, None] + signs * half[:, None]
-    turned = corners @ data.geom_xmat[geoms].reshape(-1, 3, 3).swapaxes(1, 2)
-    return data.geom_xpos[geoms][:, None] + turned
 
 
 def lowest_height(
@@ -333,10 +319,8 @@ def lowest_height(
     Of shapes that objects do not have, such as meshes, the bounding box counts, which reaches
     lower, never higher.
     """
-    owners = [model.body(name).id for name in bodies]
-    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     lowest = []
-    for geom in np.flatnonzero(collides & np.isin(model.geom_bodyid, owners)):
+    for geom in solid_geoms(model, [model.body(name).id for name in bodies]):
         shape = _SHAPES.get(model.geom_type[geom], "box")
         middle, half = model.geom_aabb[geom].reshape(2, 3)
         size = half if shape == "box" else model.geom_size[geom]
