@@ -107,14 +107,12 @@ def build_chain(model: mujoco.MjModel, robot: RobotCfg) -> tuple[Chain, Shape]:
     chain.table_low = wp.array(coupling.low, dtype=float)
     chain.table_step = wp.array(coupling.step, dtype=float)
     chain.table_value = wp.array2d(coupling.value, dtype=float)
-    moving = [c in moved for c in column]  # or goes along
-    ik_links = tuple(c in moved and row < 0 for c, row in zip(column, rows, strict=True))
-    link = {c: k for k, c in enumerate(column) if ik_links[k]}
-    leaders = tuple(-1 if row < 0 else link.get(c, -1) for c, row in zip(column, rows, strict=True))
-    if not any(ik_links) or any(moving[chain.trunk :]):
+    link = {c: k for k, (c, row) in enumerate(zip(column, rows, strict=True)) if row < 0}
+    mover = tuple(link.get(c, -1) if c in moved else -1 for c in column)
+    if max(mover, default=-1) < 0 or {*moved} & {*column[chain.trunk :]}:
         expected = f"joints that move both grasp sites, {' and '.join(robot.grasp_sites)}"
         raise ConfigError("robot.ik_joints", robot.ik_joints, expected)
-    return chain, Shape(tuple(kinds), ik_links, leaders, chain.trunk, chain.fork, chain.end)
+    return chain, Shape(tuple(kinds), mover, chain.trunk, chain.fork, chain.end)
 
 
 def _read_link(model: mujoco.MjModel, joint: int, pose: _Pose) -> tuple[_Pose, ndarray, int]:
@@ -282,15 +280,11 @@ class BatchedIk:
         Raises:
             ArgumentError: A shape is wrong.
         """
-        self._copy_in("q", q)
-        self._copy_in("target", target)
-        names = ["q", "target", "home", "down"]
-        if posture is not None:
-            self._copy_in("posture", posture)
-            names[2] = "posture"
-        if approach is not None:
-            self._copy_in("approach", approach)
-            names[3] = "approach"
+        bend = "home" if posture is None else "posture"
+        names = ["q", "target", bend, "down" if approach is None else "approach"]
+        for name, values in zip(names, (q, target, posture, approach), strict=True):
+            if values is not None:
+                self._copy_in(name, values)
         self._launch(self._kernel, names, self._settings, ["solution", "distance"])
         self._coupling.project(self._view["solution"], self._moving)
         return self._view["solution"], self._view["distance"]

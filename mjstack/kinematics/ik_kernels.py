@@ -57,8 +57,9 @@ class Shape:
     """
 
     kinds: tuple[int, ...]  # HINGE or SLIDE, of each link
-    moved: tuple[bool, ...]  # whether inverse kinematics moves it; of the trunk alone
-    leader: tuple[int, ...]  # number of the moved link that it follows, or -1
+    # Number of the link of the trunk whose joint, moved by inverse kinematics, moves it: its own, or
+    # the one that it follows; -1 where it stands
+    mover: tuple[int, ...]
     trunk: int
     fork: int
     end: int
@@ -147,7 +148,8 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
     Joints behind the last moved one, such as the wrist's roll and the fingers, are followed once
     per solve. An iteration then follows the END links up to it.
     """
-    END = max(i + 1 for i, moved in enumerate(shape.moved) if moved or shape.leader[i] >= 0)
+    mover = shape.mover
+    END = max(i + 1 for i, link in enumerate(mover) if link >= 0)
     Values = wp.types.vector(length=END, dtype=float)
     Rows = wp.types.matrix(shape=(END, 3), dtype=float)  # a vector per link
 
@@ -226,7 +228,7 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
             high[i] = chain.high[i]
             q[i] = within(start[w, j], low[i], high[i])
             home[i] = posture[w, j]
-            if wp.static(shape.moved[i]):
+            if wp.static(mover[i] == i):
                 solution[w, j] = q[i]
         if not finite:
             distance[w] = NAN
@@ -247,8 +249,9 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
             axes = Rows()
             slopes = Values()
             for i in range(END):
-                if wp.static(shape.leader[i] >= 0):
-                    pair = position(chain, i, q[wp.static(shape.leader[i])])
+                slopes[i] = 1.0
+                if wp.static(mover[i] >= 0 and mover[i] != i):
+                    pair = position(chain, i, q[wp.static(mover[i])])
                     q[i] = pair[0]
                     slopes[i] = pair[1]
             link = wp.transform(wp.vec3(), wp.quat_identity())
@@ -269,30 +272,21 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
                 # Jacobian of the midpoint
                 jacobian = Rows()
                 for i in range(END):
-                    if wp.static(shape.moved[i]):
+                    if wp.static(mover[i] >= 0):
                         direction = axes[i]
                         if wp.static(shape.kinds[i] == HINGE):
                             direction = wp.cross(direction, midpoint - anchors[i])
-                        jacobian[i] = direction
-                for i in range(END):
-                    if wp.static(shape.leader[i] >= 0):
-                        direction = axes[i]
-                        if wp.static(shape.kinds[i] == HINGE):
-                            direction = wp.cross(direction, midpoint - anchors[i])
-                        jacobian[wp.static(shape.leader[i])] += slopes[i] * direction
+                        jacobian[wp.static(mover[i])] += slopes[i] * direction
                 # Null-space motion, and the step
                 guide = Values()
                 if iteration < guided:
                     lever = wp.cross(wp.transform_vector(link, approach), desired[w])
                     for i in range(END):
-                        if wp.static(shape.moved[i]):
-                            guide[i] = posture_gain * (home[i] - q[i])
-                            if wp.static(shape.kinds[i] == HINGE):
-                                guide[i] += approach_gain * wp.dot(axes[i], lever)
-                    for i in range(END):
-                        if wp.static(shape.leader[i] >= 0 and shape.kinds[i] == HINGE):
+                        if wp.static(mover[i] == i):
+                            guide[i] += posture_gain * (home[i] - q[i])
+                        if wp.static(mover[i] >= 0 and shape.kinds[i] == HINGE):
                             turned = slopes[i] * wp.dot(axes[i], lever)
-                            guide[wp.static(shape.leader[i])] += approach_gain * turned
+                            guide[wp.static(mover[i])] += approach_gain * turned
                 step = find_step(jacobian, q, guide, low, high, error, damping)
                 largest = wp.float32(0.0)
                 for i in range(END):
@@ -301,7 +295,7 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
                 for i in range(END):
                     q[i] = wp.clamp(q[i] + scale * step[i], low[i], high[i])
         for i in range(END):
-            if wp.static(shape.moved[i]):
+            if wp.static(mover[i] == i):
                 solution[w, chain.column[i]] = best[i]
         distance[w] = nearest
 

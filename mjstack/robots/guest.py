@@ -145,7 +145,7 @@ def mujoco_errors(robot: str) -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        fix = "Correct the robot's file or the scene, whose names (floor, table and the objects) the"
+        fix = "Correct the robot's file or the scene, whose names (floor, table and objects) the"
         fix += " robot cannot have"
         raise MjstackError(f"robot {robot}: {mujoco_lines(error)}", fix) from error
 
