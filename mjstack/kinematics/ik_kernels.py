@@ -57,8 +57,8 @@ class Shape:
     """
 
     kinds: tuple[int, ...]  # HINGE or SLIDE, of each link
-    # Number of the link of the trunk whose joint, moved by inverse kinematics, moves it: its own, or
-    # the one that it follows; -1 where it stands
+    # Link of the trunk whose joint, which inverse kinematics moves, moves it: itself, or the one that
+    # it follows; -1 where it stands
     mover: tuple[int, ...]
     trunk: int
     fork: int

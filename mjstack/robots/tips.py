@@ -101,21 +101,21 @@ class Fingers:
         hand = self._hand
         middle = self._ranges.mean(axis=1)
         self.settle(middle)
-        clouds = {body: self.points([body]) for body in hand.bodies}
-        bodies = [body for body, cloud in clouds.items() if len(cloud)]
+        bodies = [body for body in hand.bodies if len(self.points([body]))]
         if not bodies:
             raise ValueError("the fingers have no geoms that collide")
-        centres = np.array([clouds[body].mean(axis=0) for body in bodies])
-        ways = np.zeros((len(middle), len(bodies), 3))  # from a joint's lower end to its upper
-        for number, ends in enumerate(self._ranges):
-            for end, sign in zip(ends, (-1.0, 1.0), strict=True):
-                target = middle.copy()
-                target[number] = end
-                self.settle(target)
-                means = [self.points([body]).mean(axis=0) for body in bodies]
-                ways[number] += sign * np.array(means)
+
+        def centres(gripper: ndarray) -> ndarray:
+            self.settle(gripper)
+            return np.array([self.points([body]).mean(axis=0) for body in bodies])
+
+        ways = np.empty((len(middle), len(bodies), 3))  # from a joint's lower end to its upper
+        for number in range(len(middle)):
+            still = np.arange(len(middle)) != number
+            low, high = (centres(np.where(still, middle, ends)) for ends in self._ranges.T)
+            ways[number] = high - low
         closing = np.linalg.svd(ways.reshape(-1, 3))[2][0]
-        along = centres @ closing
+        along = centres(middle) @ closing
         right = along > 0.5 * (along.min() + along.max())
         if right[0]:  # the first jaw is the one that the file has first
             closing, right = -closing, ~right
@@ -129,20 +129,20 @@ class Fingers:
                 closing = -closing
         elif not second:  # all move in step
             raise ValueError("its fingers do not close on each other")
-        moves = ways @ closing
-        opens = moves[:, right].mean(axis=1)
-        if not right.all():
-            opens = opens - moves[:, ~right].mean(axis=1)
+
+        def relative(moves: ndarray) -> ndarray:
+            """How the second side moves, seen from the first, from the bodies' ways."""
+            first_way = 0.0 if right.all() else moves[~right].mean(axis=0)
+            return moves[right].mean(axis=0) - first_way
+
+        opens = relative((ways @ closing).T)
         low, high = self._ranges.T
         opened = self._agree(np.where(opens > 0.0, high, low))
         shut = self._agree(np.where(opens > 0.0, low, high))
-        nearly = []  # shut: there a jaw on a hinge lies along the approach axis
-        for share in (0.15, 0.0):
-            self.settle(shut + share * (opened - shut))
-            nearly.append(np.array([self.points([body]).mean(axis=0) for body in bodies]))
-        away = nearly[0] - nearly[1]
-        away = away[right].mean(axis=0) - (0.0 if right.all() else away[~right].mean(axis=0))
-        approach = self._approach(nearly[1].mean(axis=0), _unit(away))
+        # Nearly shut a jaw on a hinge lies along the approach axis
+        nearly, closed = (centres(shut + share * (opened - shut)) for share in (0.15, 0.0))
+        away = relative(nearly - closed)
+        approach = self._approach(closed.mean(axis=0), _unit(away))
         closing = _unit(away - (away @ approach) * approach)
         self._frame = np.stack((np.cross(approach, closing), approach, closing), axis=1)
         self._sides = first, second
