@@ -49,9 +49,8 @@ def build_chain(model: mujoco.MjModel, robot: RobotCfg) -> tuple[Chain, Shape]:
             columns[joint] = (int(leader), row)
     moved = [column for column in moved if column not in coupling.coupled]
     limits = np.tile(np.array([[-np.inf], [np.inf]], dtype=np.float32), len(robot.joints))
-    ranges = joint_limits(model, robot, moved)
-    for side, values in enumerate(ranges):
-        limits[side, moved] = _round_inwards(values, 1.0 - 2.0 * side)
+    for side, values in enumerate(joint_limits(model, robot)):
+        limits[side, moved] = _round_inwards(values[moved], 1.0 - 2.0 * side)
 
     # Links from the world to the jaws, and from there to each site
     first, second = (model.site(name).id for name in robot.grasp_sites)

@@ -57,8 +57,8 @@ class Shape:
     """
 
     kinds: tuple[int, ...]  # HINGE or SLIDE, of each link
-    # Link of the trunk whose joint, which inverse kinematics moves, moves it: itself, or the one that
-    # it follows; -1 where it stands
+    # Link of the trunk whose joint moves it, by inverse kinematics: itself, or the one that it
+    # follows; -1 where it stands
     mover: tuple[int, ...]
     trunk: int
     fork: int

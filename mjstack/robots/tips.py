@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from numpy import ndarray
 
+from mjstack.robots.bodies import geom_corners, solid_geoms
 from mjstack.robots.hand import Hand
 from mjstack.robots.posture import Posture
 
@@ -71,7 +72,6 @@ class Fingers:
         self._ranges = ranges
         self._posture = Posture(model, [model.joint(j).name for j in (*hand.arm, *hand.gripper)])
         self._arm = self._posture.rest[self._posture.commanded[: len(hand.arm)]]
-        self._solid = np.flatnonzero((model.geom_contype | model.geom_conaffinity) != 0)
         palm = model.body_weldid[hand.palm]
         self._fixed = np.flatnonzero(model.body_weldid == palm) if palm else np.array([hand.palm])
 
@@ -86,12 +86,19 @@ class Fingers:
         return whole[len(self._arm) :]
 
     def points(self, bodies: Sequence[int]) -> ndarray:
-        """Points of the solid geoms of bodies in the palm's frame [m], shape ``(n, 3)``."""
+        """Vertices of the solid meshes of bodies, and corners of the boxes around other solid geoms,
+        in the palm's frame [m], shape ``(n, 3)``.
+        """
         model, data = self.model, self._data
         clouds = [np.zeros((0, 3))]
-        for geom in self._solid[np.isin(model.geom_bodyid[self._solid], bodies)]:
-            local = _corners(model, geom) @ data.geom_xmat[geom].reshape(3, 3).T
-            clouds.append(self._to_palm(local + data.geom_xpos[geom]))
+        for geom in solid_geoms(model, bodies):
+            cloud = geom_corners(data, [geom])[0]
+            if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
+                mesh = model.geom_dataid[geom]
+                first = model.mesh_vertadr[mesh]
+                cloud = model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
+                cloud = cloud @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
+            clouds.append(self._to_palm(cloud))
         return np.concatenate(clouds)
 
     def measure(self, width: float, deepest: float = math.inf) -> Grip:
@@ -235,7 +242,7 @@ class Fingers:
         turn = data.xmat[self._hand.palm].reshape(3, 3)
         data.geom_xmat[self._plate] = (turn @ self._frame).ravel()
         nearest = (_FAR, -1)
-        for geom in self._solid[np.isin(model.geom_bodyid[self._solid], bodies)]:
+        for geom in solid_geoms(model, bodies):
             left = mujoco.mj_geomDistance(model, data, self._plate, geom, _FAR, None)
             nearest = min(nearest, (left, int(geom)))
         return nearest
@@ -247,16 +254,6 @@ class Fingers:
     def _from_palm(self, point: ndarray) -> ndarray:
         palm = self._hand.palm
         return self._data.xpos[palm] + self._data.xmat[palm].reshape(3, 3) @ point
-
-
-def _corners(model: mujoco.MjModel, geom: int) -> ndarray:
-    """Vertices of a mesh, or corners of the box around another geom, in its frame [m]."""
-    mesh = model.geom_dataid[geom]
-    if mesh >= 0 and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
-        first = model.mesh_vertadr[mesh]
-        return model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
-    middle, half = model.geom_aabb[geom].reshape(2, 3)
-    return middle + half * np.stack(np.meshgrid(*[[-1, 1]] * 3), axis=-1).reshape(-1, 3)
 
 
 def _last(gaps: ndarray, gap: float) -> float:

@@ -224,18 +224,14 @@ def _check_poses(places: Posture, robot: RobotCfg) -> None:
             raise ConfigError(f"robot.{key} of {name}", float(command[k]), expected)
 
 
-def joint_limits(
-    model: mujoco.MjModel, robot: RobotCfg, numbers: Sequence[int] | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Narrower of the range of each joint, or of those of some numbers, as far as what follows it
-    can, and its servo's: low and high limits [rad, m], each of shape ``(n,)``; infinite where there
-    is none.
+def joint_limits(model: mujoco.MjModel, robot: RobotCfg) -> tuple[np.ndarray, np.ndarray]:
+    """Narrower of the range of each joint, as far as what follows it can, and its servo's: low and
+    high limits [rad, m], each of shape ``(n,)``; infinite where there is none.
     """
     servos = [model.actuator(name).id for name in robot.joints]
     limited = model.actuator_ctrllimited[servos, None]
     span = np.where(limited, model.actuator_ctrlrange[servos], [-np.inf, np.inf])
     spans = np.stack((posture(model, tuple(robot.joints)).limits, span))
-    spans = spans if numbers is None else spans[:, list(numbers)]
     return spans[..., 0].max(axis=0), spans[..., 1].min(axis=0)
 
 
@@ -251,7 +247,7 @@ def gripper_targets(
     """
     names = (robot.joints, robot.gripper_joints, robot.jaw_bodies, robot.grasp_sites)
     jaws = _jaws(model, *map(tuple, names))
-    low, high = joint_limits(model, robot, range(len(robot.arm_joints), len(robot.joints)))
+    low, high = (limits[len(robot.arm_joints) :] for limits in joint_limits(model, robot))
     opened, closed = (
         np.clip(end, low, high) if target is None else np.array(target, dtype=float)
         for end, target in ((jaws.opened, robot.gripper_open), (jaws.shut, robot.gripper_closed))
