@@ -7,11 +7,13 @@ import mujoco
 import numpy as np
 
 from mjstack.robots.bodies import ancestors, below
+from mjstack.robots.posture import actuator_moment
 
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)  # hinges follow; others are not an arm's
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
-_TENDON = int(mujoco.mjtTrn.mjTRN_TENDON)
-_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+_JOINT_OR_TENDON = [
+    int(getattr(mujoco.mjtTrn, f"mjTRN_{kind}")) for kind in ("JOINT", "JOINTINPARENT", "TENDON")
+]
 _BASE = 0.4  # m: a geom of the world that is all so near an arm is its base
 _FINGER = 3  # joints with a servo that a finger has at most; an arm has more
 
@@ -96,14 +98,10 @@ def _driven(model: mujoco.MjModel) -> set[int]:
     """Joints with an actuator, also by a tendon; where a hand or arm has none, each that no
     equality ties to another.
     """
-    driven: set[int] = set()
-    for kind, (target, _) in zip(model.actuator_trntype, model.actuator_trnid, strict=True):
-        if kind in _JOINT:
-            driven.add(int(target))
-        elif kind == _TENDON:
-            first = model.tendon_adr[target]
-            wraps = range(first, first + model.tendon_num[target])
-            driven |= {int(model.wrap_objid[w]) for w in wraps if model.wrap_type[w] == 1}
+    data = mujoco.MjData(model)
+    mujoco.mj_fwdPosition(model, data)
+    moved = actuator_moment(data)[np.isin(model.actuator_trntype, _JOINT_OR_TENDON)] != 0.0
+    driven = {*model.dof_jntid[moved.any(axis=0)].tolist()}
     joint = int(mujoco.mjtEq.mjEQ_JOINT)
     ties = zip(model.eq_type, model.eq_obj1id, model.eq_obj2id, strict=True)
     followers = {int(follower) for kind, follower, leader in ties if kind == joint and leader >= 0}

@@ -11,15 +11,15 @@ import mujoco
 import numpy as np
 from numpy import ndarray
 
-from mjstack.config.mjcf import read_mjcf
+from mjstack.config.mjcf import compile_scene
 from mjstack.config.schema import ModelCfg, RobotCfg, SceneCfg, ServoCfg
 from mjstack.config.schema.robot import BasePoseCfg
 from mjstack.errors import ConfigError, MjstackError
-from mjstack.robots.guest import compile_scene, mujoco_errors
+from mjstack.robots.guest import mujoco_errors
 from mjstack.robots.hand import Hand, find_hands, find_root
 from mjstack.robots.posture import actuator_moment, posture
 from mjstack.robots.servos import prepare_servos, servo_problem
-from mjstack.robots.source import robot_spec
+from mjstack.robots.source import read_robot, robot_spec
 from mjstack.robots.tips import Fingers, Grip
 from mjstack.robots.workspace import Workspace, find_workspace
 
@@ -35,6 +35,7 @@ _TURN = 6.283  # rad either way, for a hinge without a range
 _BANDWIDTH = 40.0  # rad/s of a servo that is made
 _FLOOR = 0.024  # m: a table's top, at least
 _THICK = 0.012  # m: half of a table's thickness
+_BUILTIN = ModelCfg(source="builtin")  # of the file itself
 _AWAY = 0.4  # m: to a table below a gantry
 
 
@@ -57,19 +58,12 @@ def guess_profile(file: Path, scene: SceneCfg, arm: str = "") -> list[Guess]:
     Raises:
         MjstackError: The file cannot be read, or no arm with a gripper in it can be used.
     """
-    spec = read_mjcf(file, "Correct the file.")
-    for number, body in enumerate(spec.bodies):  # as `read_robot` names them
-        body.name = body.name or f"unnamed_{number}"
+    spec = read_robot(RobotCfg(name="guess", file=str(file)), _BUILTIN)
     spec.compiler.fusestatic = False
     with mujoco_errors(str(file)):
         model = spec.copy().compile()
     hands, problems = [], []
     for hand in find_hands(model):
-        bare = [j for j in (*hand.arm, *hand.gripper) if not model.joint(j).name]
-        if bare:
-            body = model.body(model.jnt_bodyid[bare[0]]).name
-            problems.append(f"the joint of body {body} has no name")
-            continue
         try:
             servos, limits = _fit(spec, model, hand)
             grip = Fingers(spec, hand, limits[len(hand.arm) :]).measure(_WIDTH)
@@ -262,7 +256,7 @@ def _guess_scene(
     made = {name: ServoCfg(**servo) for name, servo in servos.items()}
     robot = RobotCfg(name="guess", file=str(file), servos=made, base=base, **values)
     with mujoco_errors(str(file)):
-        model = compile_scene(robot_spec(robot, ModelCfg(source="builtin")))
+        model = compile_scene(robot_spec(robot, _BUILTIN))
     gripper = [model.actuator(name).id for name in robot.gripper_joints]
     gains, damping = model.actuator_gainprm[gripper, 0], -model.actuator_biasprm[gripper, 2]
     limited = model.actuator_forcelimited[gripper]

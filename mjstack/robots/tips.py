@@ -86,7 +86,7 @@ class Fingers:
         return whole[len(self._arm) :]
 
     def points(self, bodies: Sequence[int]) -> ndarray:
-        """Vertices of the solid meshes of bodies, and corners of the boxes around other solid geoms,
+        """Vertices of the solid meshes of bodies, corners of the boxes around other solid geoms,
         in the palm's frame [m], shape ``(n, 3)``.
         """
         model, data = self.model, self._data
