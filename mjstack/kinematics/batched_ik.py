@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mjstack.config.schema import RobotCfg
 from mjstack.errors import ArgumentError, ConfigError, MjstackError
-from mjstack.kinematics.ik_kernels import HINGE, SLIDE, Chain, Shape, forward_kernel, solve_kernel
+from mjstack.kinematics.ik_kernels import HINGE, SLIDE, Chain, forward_kernel, solve_kernel
 from mjstack.robots.bodies import ancestors
 from mjstack.robots.posture import posture
 from mjstack.scene.index import approach_body, joint_limits, locked_home
@@ -35,9 +35,11 @@ _Pose = tuple[ndarray, ndarray]  # position and quaternion (wxyz)
 _Link = tuple[_Pose, ndarray, int, int, int]  # frame, axis, kind, column and row as in `Chain`
 
 
-def build_chain(model: mujoco.MjModel, robot: RobotCfg) -> tuple[Chain, Shape]:
+def build_chain(
+    model: mujoco.MjModel, robot: RobotCfg
+) -> tuple[Chain, tuple[int, ...], tuple[int, ...]]:
     """Read the bodies of a compiled model from the world to each site: the chain, in Warp arrays on
-    the current device, and its shape.
+    the current device, and kinds and movers of its links, see `solve_kernel`.
     """
     # Columns of the joint targets: the joint of each, those that move, and their limits
     columns = {model.joint(name).id: (column, -1) for column, name in enumerate(robot.joints)}
@@ -111,7 +113,7 @@ def build_chain(model: mujoco.MjModel, robot: RobotCfg) -> tuple[Chain, Shape]:
     if max(mover, default=-1) < 0 or {*moved} & {*column[chain.trunk :]}:
         expected = f"joints that move both grasp sites, {' and '.join(robot.grasp_sites)}"
         raise ConfigError("robot.ik_joints", robot.ik_joints, expected)
-    return chain, Shape(tuple(kinds), mover, chain.trunk, chain.fork, chain.end)
+    return chain, tuple(kinds), mover
 
 
 def _read_link(model: mujoco.MjModel, joint: int, pose: _Pose) -> tuple[_Pose, ndarray, int]:
@@ -220,7 +222,7 @@ class BatchedIk:
 
         # The chain and all buffers, each a Warp array and a torch view of it
         with torch_stream_scope(self._device):
-            self._chain, shape = build_chain(model, robot)
+            self._chain, *links = build_chain(model, robot)
             self._array = {
                 "home": wp.array(np.tile(locked_home(robot), (nworld, 1)), dtype=float),
                 "down": wp.full(nworld, wp.vec3(0.0, 0.0, -1.0), dtype=wp.vec3),
@@ -235,7 +237,7 @@ class BatchedIk:
         wp.synchronize_device(self._device)
 
         # Kernels are compiled and loaded here: a capture may do neither.
-        self._kernel = solve_kernel(shape)
+        self._kernel = solve_kernel(*links)
         self.forward(self._view["q"])
         self.solve(self._view["q"], self._view["target"])
         wp.synchronize_device(self._device)
