@@ -14,7 +14,6 @@ import mujoco
 import numpy as np
 from numpy import ndarray
 
-from mjstack.robots.bodies import solid_geoms
 from mjstack.robots.posture import posture
 
 _BESIDE = 0.005  # [m] that a pad may be farther from the grasp point than another one
@@ -75,7 +74,9 @@ class Jaws:
         self._columns = [joints.index(name) for name in gripper]
         self._sites = [model.site(name).id for name in sites]
         members = jaw_bodies(model, jaws)
-        self._pads = [pad for m in members if (pad := solid_geoms(model, m)).size]
+        collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+        geoms = [np.flatnonzero(collides & np.isin(model.geom_bodyid, m)) for m in members]
+        self._pads = [part for part in geoms if part.size]
         owners = [[body in m for m in members] for body in model.site_bodyid[self._sites]]
         self.carry_sites = all(map(any, owners)) and owners[0] != owners[1]
 

@@ -72,6 +72,7 @@ class Fingers:
         self._ranges = ranges
         self._posture = Posture(model, [model.joint(j).name for j in (*hand.arm, *hand.gripper)])
         self._arm = self._posture.rest[self._posture.commanded[: len(hand.arm)]]
+        self._solid = solid_geoms(model)
         palm = model.body_weldid[hand.palm]
         self._fixed = np.flatnonzero(model.body_weldid == palm) if palm else np.array([hand.palm])
 
@@ -242,7 +243,7 @@ class Fingers:
         turn = data.xmat[self._hand.palm].reshape(3, 3)
         data.geom_xmat[self._plate] = (turn @ self._frame).ravel()
         nearest = (_FAR, -1)
-        for geom in solid_geoms(model, bodies):
+        for geom in self._solid[np.isin(model.geom_bodyid[self._solid], bodies)]:
             left = mujoco.mj_geomDistance(model, data, self._plate, geom, _FAR, None)
             nearest = min(nearest, (left, int(geom)))
         return nearest
