@@ -143,7 +143,7 @@ class ArmReach:
         rolls = np.flatnonzero(self.hinge & (np.abs(axes @ approach) > 0.95))
         moved = np.linalg.norm(linear, axis=0)
         roll = int(rolls[-1]) if rolls.size and moved[rolls[-1]] < 0.06 else None
-        idle = {roll} - {None, 0}
+        idle: set[int] = {roll} if roll else set()
         if self.upright:
             away = point - self.data.xanchor[self.hand.arm[0]]
             side = np.cross([0.0, 0.0, 1.0], away / np.linalg.norm(away))
