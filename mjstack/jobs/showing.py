@@ -21,7 +21,7 @@ from mjstack.report.geometry import geom_colors, with_fields, write_fields
 from mjstack.report.page import Page, World, frame_stride
 from mjstack.report.table import Console
 from mjstack.report.write import safely_write
-from mjstack.robots.bodies import geom_corners, place
+from mjstack.robots.bodies import forward_kinematics, geom_corners
 from mjstack.sim import Simulation
 
 _STILL = 1e-3  # m
@@ -58,7 +58,7 @@ def draw_episode(
     qpos = pictured.qpos
     model = with_fields(stage.assets.visual_model, pictured.fields)
     colors = geom_colors(model)
-    data = place(model)
+    data = forward_kinematics(model)
     objects = {}
     for name in stage.index.objects:
         geoms = np.flatnonzero(model.geom_bodyid == model.body(name).id)

@@ -15,7 +15,7 @@ from torch import Tensor
 from mjstack.config.schema import RobotCfg
 from mjstack.errors import ArgumentError, ConfigError, MjstackError
 from mjstack.kinematics.ik_kernels import HINGE, SLIDE, Chain, forward_kernel, solve_kernel
-from mjstack.robots.bodies import ancestors, place
+from mjstack.robots.bodies import ancestors, forward_kinematics
 from mjstack.robots.posture import posture
 from mjstack.scene.index import approach_body, joint_limits, locked_home
 from mjstack.sim.warp_setup import torch_stream_scope
@@ -84,7 +84,7 @@ def build_chain(
     # Frames with these joints at 0, at their anchors, turned as their bodies; the last: the world
     qpos = model.qpos0.copy()
     qpos[model.jnt_qposadr[joints]] = 0.0
-    data = place(model, qpos)
+    data = forward_kinematics(model, qpos)
     back = (model.jnt_type == SLIDE) * model.qpos0[model.jnt_qposadr]
     anchors = np.vstack((data.xanchor - back[:, None] * data.xaxis, np.zeros(3)))
     quats = data.xquat[[*model.jnt_bodyid, 0]]

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 _SIGNS = np.array(list(product((-1.0, 1.0), repeat=3)))
 
 
-def place(model: mujoco.MjModel, qpos: ArrayLike | None = None) -> mujoco.MjData:
+def forward_kinematics(model: mujoco.MjModel, qpos: ArrayLike | None = None) -> mujoco.MjData:
     """A model's bodies where some positions [rad, m] bring them, shape ``(nq,)``; by default those
     of the file.
     """
@@ -29,7 +29,7 @@ def ancestors(model: mujoco.MjModel, body: int) -> Iterator[int]:
         body = model.body_parentid[body]
 
 
-def below(model: mujoco.MjModel, body: int) -> list[int]:
+def subtree(model: mujoco.MjModel, body: int) -> list[int]:
     """A body and those that it carries."""
     return [b for b in range(body, model.nbody) if b == body or body in ancestors(model, b)]
 

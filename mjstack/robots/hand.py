@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from mjstack.robots.bodies import ancestors, below
+from mjstack.robots.bodies import ancestors, subtree
 from mjstack.robots.posture import actuator_moment
 
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)  # hinges follow; others are not an arm's
@@ -44,7 +44,7 @@ def find_hands(model: mujoco.MjModel) -> list[Hand]:
     is there.
     """
     driven = _driven(model)
-    subtrees = [below(model, body) for body in range(model.nbody)]
+    subtrees = [subtree(model, body) for body in range(model.nbody)]
     jointed = {int(body) for body in model.jnt_bodyid}
 
     def branches(body: int) -> list[list[int]]:
@@ -124,7 +124,7 @@ def find_root(model: mujoco.MjModel, hand: Hand) -> int:
     """
     arm_joints = {*hand.arm, *_joints(model, hand.bodies)}
     path = [*reversed([*ancestors(model, hand.palm)])]
-    root = next(b for b in path if {*_joints(model, below(model, b))} <= arm_joints)
+    root = next(b for b in path if {*_joints(model, subtree(model, b))} <= arm_joints)
     tops = np.flatnonzero(model.body_parentid == 0)[1:]
     free = {t for t in tops if _FREE in model.jnt_type[_joints(model, [t])]}
     plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE

@@ -24,7 +24,7 @@ from mjstack.config.mjcf import (
 from mjstack.config.schema import BoxCfg, CameraCfg, Config, ObjectCfg, SceneCfg
 from mjstack.errors import ConfigError, MjstackError, UnknownName, require_names
 from mjstack.robots import robot_spec
-from mjstack.robots.bodies import place
+from mjstack.robots.bodies import forward_kinematics
 from mjstack.robots.guest import SOLVER, WORLD, compile_robot_scene, mujoco_errors
 from mjstack.robots.jaws import jaw_members
 
@@ -250,7 +250,7 @@ def _require_objects(scene: SceneCfg) -> None:
 
 def _require_clear(model: mujoco.MjModel, scene: SceneCfg) -> None:
     """Raise a `ConfigError` for the first moving object that starts inside of another thing."""
-    data = place(model)
+    data = forward_kinematics(model)
     root = model.body_rootid[model.geom_bodyid]
     geoms = {name: np.flatnonzero(root == model.body(name).id) for name in scene.objects}
     walls = [model.geom(geom).name.startswith("box_") for geom in range(model.ngeom)]

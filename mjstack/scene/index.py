@@ -14,7 +14,7 @@ from torch import Tensor
 from mjstack.config.schema import RobotCfg, SceneCfg
 from mjstack.errors import ConfigError, require_names
 from mjstack.math import lowest_point, quat_mul, quat_to_matrix
-from mjstack.robots.bodies import place, solid_geoms
+from mjstack.robots.bodies import forward_kinematics, solid_geoms
 from mjstack.robots.guest import OWN_WORLD
 from mjstack.robots.jaws import Jaws
 from mjstack.robots.posture import Posture, idle_servos, posture
@@ -114,7 +114,7 @@ class SceneIndex:
         carrier = model.body_parentid[first]
         if model.body(carrier).name in (WORLD, OWN_WORLD):
             carrier = first
-        self.base = place(model).xpos[carrier, :2].tolist()
+        self.base = forward_kinematics(model).xpos[carrier, :2].tolist()
         self.grasp_sites = [model.site(name).id for name in robot.grasp_sites]
         self.objects = {
             name: (int(model.joint(name).qposadr[0]), int(model.joint(name).dofadr[0]))
@@ -293,7 +293,7 @@ def turn_sign(model: mujoco.MjModel, robot: RobotCfg) -> float:
     Raises:
         ConfigError: It does not turn about the vertical.
     """
-    up = float(place(model).joint(robot.arm_joints[0]).xaxis[2])
+    up = float(forward_kinematics(model).joint(robot.arm_joints[0]).xaxis[2])
     if abs(up) < 0.999:
         expected = f"0, because joint {robot.arm_joints[0]} does not turn about the vertical"
         raise ConfigError("robot.approach_gain", robot.approach_gain, expected)

@@ -15,7 +15,7 @@ from mjstack.config.schema import Config, ObjectCfg, SceneCfg
 from mjstack.errors import ParameterError
 from mjstack.managers.view import EnvView
 from mjstack.rng import uniform
-from mjstack.robots.bodies import place, solid_geoms, world_boxes
+from mjstack.robots.bodies import forward_kinematics, solid_geoms, world_boxes
 from mjstack.scene.index import gripper_targets
 from mjstack.scene.phases import nominal_xy, object_targets, source_names, target_xy
 
@@ -72,7 +72,7 @@ class Placement:
         objects = list(scene.free.values())
         radii = [thing.footprint for thing in objects]
         self._apart = [[a + b + gap for b in radii] for a in radii]
-        data = place(model, env.index.posture.qpos(np.array(pose)))
+        data = forward_kinematics(model, env.index.posture.qpos(np.array(pose)))
         mujoco.mj_comPos(model, data)
         geoms = solid_geoms(model)
         owners = model.geom_bodyid[geoms]
