@@ -83,21 +83,19 @@ class Terms(Observer):
 
 
 class JudgeWithoutPhases(Observer):
-    """Judges every world as if the driver had no phases, and asks what is placed in both ways."""
+    """Judges every world as if the driver had no phases, and asks what is placed."""
 
     def start(self, env: Env, driver: Driver) -> None:
         self.check = make_check(env.cfg)
         self.check.start(env, driver.steps)
         self.view = self.check.view(env)
-        self.carried = self.view.columns([*self.check.goals(self.view.step())])
+        self.carried = self.view.columns([*self.check.goals(self.view)])
         self.placed: list[torch.Tensor] = []
 
     def update(self) -> None:
         self.check.update()
         if self.carried.indices:
-            placed = self.carried.read(self.check.placed(self.view.step()))
-            assert torch.equal(self.check.placed_of(self.view.step(), self.carried), placed)
-            self.placed.append(placed)
+            self.placed.append(self.carried.read(self.check.placed(self.view)))
 
     def finish(self) -> None:
         self.failed = self.check.result().failed

@@ -430,9 +430,8 @@ def rested(rec: SimpleNamespace, *views: torch.Tensor, since: np.ndarray) -> np.
 
 
 def env_of(rec: SimpleNamespace, nworld: int) -> SimpleNamespace:
-    return SimpleNamespace(
-        nworld=nworld, device=torch.device("cpu"), cfg=rec.cfg, index=rec.index, sim=StubViews()
-    )
+    views = {"cfg": rec.cfg, "index": rec.index, "sim": StubViews(), "check": make_check(rec.cfg)}
+    return SimpleNamespace(nworld=nworld, device=torch.device("cpu"), **views)
 
 
 FROM = 115  # where trajectories are altered: the world has been successful for a while

@@ -1,7 +1,7 @@
 """The environment: one step order over any simulation."""
 
 from collections.abc import Callable
-from functools import partial
+from functools import cached_property, partial
 
 import torch
 from torch import Tensor
@@ -11,17 +11,19 @@ from mjstack.envs.camera_schedule import CameraSchedule
 from mjstack.envs.command_delay import CommandDelay
 from mjstack.envs.faults import FaultLatch
 from mjstack.envs.outputs import EpisodeStatistics, Outputs, ResetResult, StepResult
+from mjstack.envs.schedule import Schedule
 from mjstack.envs.threads import few_threads
 from mjstack.errors import ArgumentError
 from mjstack.managers.action import ActionManager
 from mjstack.managers.episode import ResetManager, RewardManager, TerminationManager
 from mjstack.managers.observation import ObservationManager
-from mjstack.managers.term import Term, branches, current_term, first_value, in_one_pass
-from mjstack.mdp.geometry import lost_state
+from mjstack.managers.state import in_one_pass
+from mjstack.managers.term import Term, current_term, first_value
 from mjstack.rng import check_seed
 from mjstack.scene import SceneIndex
 from mjstack.sim import Simulation
-from mjstack.sim.graph import StepGraph, side_by_side, where_any
+from mjstack.sim.graph import StepGraph, where_any
+from mjstack.tasks.check import EpisodeCheck, make_check
 
 
 class Env:
@@ -67,7 +69,10 @@ class Env:
         cameras: What draws them, with the names in their segmentation; None without cameras.
     """
 
+    termination_manager: TerminationManager
+    reward_manager: RewardManager
     observation_manager: ObservationManager
+    faults: FaultLatch
 
     def __init__(
         self,
@@ -135,7 +140,13 @@ class Env:
         self.episode.fill_(-1)
         self._outputs = Outputs(self)
         self.faults = FaultLatch(self, check=check_faults)
+        self._schedule = Schedule(self, self._outputs)
         self.graph = self.captured(self.advance, "env.step")
+
+    @cached_property
+    def check(self) -> EpisodeCheck:
+        """The task's check, which terms, drivers and observers of this environment share."""
+        return make_check(self.cfg)
 
     @property
     def max_episode_steps(self) -> int:
@@ -287,49 +298,9 @@ class Env:
         last.
         """
         self.episode_step += 1 if ended is None else ~ended
-
-        def look() -> tuple[Tensor, Tensor | None]:
-            ends = self.termination_manager
-            rewards = self.reward_manager
-            observations = self.observation_manager
-            # A held step is seen by what remembers it alone.
-            observe = (observations.compute,) if last or observations.remembers else ()
-            early = observe if observations.ignores_success else ()
-
-            def begin_ends() -> Tensor:
-                lost = lost_state(self)
-                ends.begin()
-                return lost
-
-            succeed = partial(self.success_term or (lambda _: self.sim.no_worlds), self)
-            begun = [partial(rewards.begin, name) for name in rewards.early]
-            achieved, lost, *_ = branches(self.device, succeed, begin_ends, *begun, *early)
-            # None where the host can see that there are none
-            none_lost = lost is self.sim.no_worlds or not (lost.is_cuda or bool(lost.any()))
-            broken = None if none_lost else lost
-            if ended is not None:  # their success stays
-                achieved = torch.where(ended, self.success, achieved)
-            torch.gt(achieved, lost, out=self.success)  # achieved and not lost
-
-            def reward() -> None:
-                ends.compute(ended)
-                rewards.compute(void=broken, ended=ended)
-                if lost.is_cuda:  # elsewhere the host looks
-                    self.faults.record_reward()
-
-            def keep() -> None:
-                for compute in () if early else observe:
-                    compute()
-                if last:
-                    record = [partial(self.faults.record, lost)] if lost.is_cuda else []
-                    side_by_side(self.device, partial(self._outputs.write_final, broken), *record)
-
-            branches(self.device, reward, keep)
-            return lost, broken
-
-        lost, broken = in_one_pass(look)
+        broken = self._schedule.evaluate(ended, last)
         current_term.label = ""
-        self.faults.look(lost, broken)
+        self.faults.look(broken)
         done = self.termination_manager.done
         if last:
             self._reset_ended(done, broken)

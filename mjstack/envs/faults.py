@@ -50,18 +50,18 @@ class FaultLatch:
         self._lost = POOL if "overflow" in ends_on else LOST_PHYSICS
         self._state_ends = "non_finite" in ends_on
 
-    def look(self, lost: Tensor, broken: Tensor | None) -> None:
+    def look(self, broken: Tensor | None) -> None:
         """Record the faults of a step and raise the first, on the CPU; a short look at all numbers
         shows that there are none. Takes worlds whose state is not finite, shape ``(nworld,)``,
-        bool; ``broken`` is None if there are none.
+        bool; None if there are none.
         """
-        if lost.is_cuda or not self._check:
+        if self._reward.is_cuda or not self._check:
             return
         env = self._env
         numbers = (env.reward_manager.reward, *env.observation_manager.groups.values())
         fine = broken is None and not self._any and all_finite(*numbers)
         if not fine or bool(env.sim.overflow.any()):
-            self.record(lost)
+            self.record(broken)
             self.record_reward()
             self.raise_first()
 
@@ -71,14 +71,15 @@ class FaultLatch:
         if self._check and self._faults.is_cuda and self._steps % FAULT_WINDOW == 0:
             self.raise_first()
 
-    def record(self, broken: Tensor) -> None:
-        """Add the faults of a step except for its reward's, before a reset can erase them, with the
-        worlds whose state is not finite, shape ``(nworld,)``, bool.
+    def record(self, broken: Tensor | None) -> None:
+        """Add the faults of a step except for its reward's, before a reset can erase them; argument
+        as of `look`.
         """
         if not self._check:
             return
         env = self._env
         self._any = True
+        broken = self._none if broken is None else broken
         self._overflow |= env.sim.overflow & self._lost
         groups = env.observation_manager.groups.values()
         seen = not_finite(*groups) if groups else self._none

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from mjstack.errors import require_names
-from mjstack.managers.term import shared
+from mjstack.managers.state import shared
 from mjstack.managers.view import EnvView, episode_draw
 from mjstack.math import all_finite, lowest_point, norm, not_finite
 from mjstack.scene.index import RobotTensors, SceneIndex

@@ -1,5 +1,6 @@
 """Reward in stages for tasks in which objects are carried to their goals."""
 
+from functools import partial
 from math import inf
 
 import torch
@@ -7,17 +8,17 @@ from torch import Tensor
 
 from mjstack.config.fields import Fraction, Positive
 from mjstack.errors import ConfigError
-from mjstack.managers.term import branches
-from mjstack.managers.view import EnvView, ignores_success
+from mjstack.managers.state import branches
+from mjstack.managers.view import EnvView, offers
 from mjstack.math import norm
 from mjstack.mdp.observation import grasp_point_pos
-from mjstack.tasks.check import make_check
+from mjstack.tasks.check import EpisodeCheck
 
 STAGES = ("reach", "lift", "carry", "place", "release")
 BELOW = 0.005  # m below its goal that an object over it may be: contacts are soft
 
 
-@ignores_success
+@offers(reads="state")
 class Progress:
     """Progress of a task whose check has `EpisodeCheck.goals`, from 0 to 1.
 
@@ -62,9 +63,9 @@ class Progress:
         Raises:
             MjstackError: The task has no check, or one without goals.
         """
-        self._check = make_check(env.cfg)
+        self._check = EpisodeCheck.from_env(env)
         self._view = self._check.view(env)
-        names = list(self._check.goals(self._view.step()))
+        names = list(self._check.goals(self._view))
         if not names:
             expected = "a check with goals, which this reward follows"
             raise ConfigError("task.check.func", type(self._check).__name__, expected)
@@ -87,7 +88,9 @@ class Progress:
 
     def __call__(self, env: EnvView) -> Tensor:
         """The reward, shape ``(nworld,)``."""
-        (distances, heights, in_hand), placed = branches(env.device, self._measure, self._placed)
+        works = (self._measure, partial(self._view.value, self._check.placed))
+        (distances, heights, in_hand), placed = branches(env.device, *works)
+        placed = self._columns.read(placed)
         if self._beyond_reach(distances, in_hand, placed):
             value = self._stages(distances + (heights or self._heights()), in_hand, placed)
         else:
@@ -126,25 +129,22 @@ class Progress:
         torch.sub(self._nearest, nearness.abs_().tanh_(), out=nearness)
         return worth.clamp_(0.0, 1.0).add_(self._number).mul_(reached).amax(-1) / len(STAGES)
 
-    def _placed(self) -> Tensor:
-        return self._check.placed_of(self._view.step(), self._columns)
-
     def _measure(self) -> tuple[list[Tensor], list[Tensor], Tensor]:
         """Of each object: its distance from the grasp point, and from its goal horizontally and
         upwards [m]; on CUDA, where the host cannot look first, `_heights`; and whether it is in the
         hand; each ``(nworld, objects)``.
         """
-        step = self._view.step()
+        step = self._view
         pos = self._columns.read(step.pos)
         goals = list(self._check.goals(step).values())
         offset = pos - (torch.stack(goals, dim=1) if len(goals) > 1 else goals[0][:, None])
-        away = norm(pos - grasp_point_pos(step.view.env).float()[:, None])
+        away = norm(pos - grasp_point_pos(step.env).float()[:, None])
         distances = [away, norm(offset[..., :2]), offset[..., 2]]
         heights = self._heights() if away.is_cuda else []
         return distances, heights, self._columns.read(step.in_hand)
 
     def _heights(self) -> list[Tensor]:
         """The height of each object's lowest point [m], and the gripper's opening."""
-        step = self._view.step()
+        step = self._view
         low = self._columns.read(step.height)
         return [low, step.narrowest.expand_as(low)]
