@@ -16,12 +16,7 @@ CASTS = {"bool", "int", "float"}
 # The code that runs within a step, by file and class, "" for functions; None for all of a file.
 PATHS: dict[str, dict[str, str] | None] = {
     "envs/env.py": {"Env": "advance _step_physics _evaluate _reset_ended _begin _start"},
-    "envs/schedule.py": {
-        "Schedule": (
-            "evaluate _run _broken _achieved _judge_success _judge_ends _observe _keep_final "
-            "_record_faults"
-        )
-    },
+    "envs/schedule.py": None,
     "envs/command_delay.py": {"CommandDelay": "late reset"},
     "envs/faults.py": {"FaultLatch": "record record_reward"},
     "envs/outputs.py": {
@@ -69,8 +64,8 @@ PATHS: dict[str, dict[str, str] | None] = {
     "tasks/check.py": {"EpisodeCheck": "update"},
     "tasks/view.py": {
         "Step": (
-            "clear value pose pos center quat velocity turn height bounds speed corner_speed pressed "
-            "tilt in_hand untouched narrowest supported judged _judged _of_each _sensed"
+            "clear value pose pos center quat velocity turn height bounds speed corner_speed "
+            "pressed tilt in_hand untouched narrowest supported judged _judged _of_each _sensed"
         ),
         "AllOf": "__call__ apart __and__",
     },

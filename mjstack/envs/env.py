@@ -11,13 +11,13 @@ from mjstack.envs.camera_schedule import CameraSchedule
 from mjstack.envs.command_delay import CommandDelay
 from mjstack.envs.faults import FaultLatch
 from mjstack.envs.outputs import EpisodeStatistics, Outputs, ResetResult, StepResult
-from mjstack.envs.schedule import Schedule
+from mjstack.envs.schedule import run, step_order
 from mjstack.envs.threads import few_threads
 from mjstack.errors import ArgumentError
 from mjstack.managers.action import ActionManager
 from mjstack.managers.episode import ResetManager, RewardManager, TerminationManager
 from mjstack.managers.observation import ObservationManager
-from mjstack.managers.state import in_one_pass
+from mjstack.managers.state import in_one_pass, lost_state
 from mjstack.managers.term import Term, current_term, first_value
 from mjstack.rng import check_seed
 from mjstack.scene import SceneIndex
@@ -140,7 +140,6 @@ class Env:
         self.episode.fill_(-1)
         self._outputs = Outputs(self)
         self.faults = FaultLatch(self, check=check_faults)
-        self._schedule = Schedule(self, self._outputs)
         self.graph = self.captured(self.advance, "env.step")
 
     @cached_property
@@ -298,17 +297,22 @@ class Env:
         last.
         """
         self.episode_step += 1 if ended is None else ~ended
-        broken = self._schedule.evaluate(ended, last)
-        current_term.label = ""
-        self.faults.look(broken)
+
+        def evaluate() -> bool:
+            run(self.device, step_order(self, self._outputs, ended, last))
+            current_term.label = ""
+            self.faults.look()
+            return lost_state(self) is not self.sim.no_worlds
+
+        maybe_lost = in_one_pass(evaluate)
         done = self.termination_manager.done
         if last:
-            self._reset_ended(done, broken)
+            self._reset_ended(done, maybe_lost)
         return None if last else done.clone()
 
-    def _reset_ended(self, done: Tensor, broken: Tensor | None) -> None:
+    def _reset_ended(self, done: Tensor, maybe_lost: bool) -> None:
         """Terminal images, statistics, the reset of the worlds that are ``done``, and what is
-        observed then. Of ``broken`` worlds the state is not finite; None if there are none.
+        observed then. The host sees where it cannot be that a state is not finite.
         """
         # On CUDA the host cannot look, because that would stop the device: the graph does.
         ending = self.termination_manager.values.shape[1] > 0 and (done.is_cuda or bool(done.any()))
@@ -320,7 +324,7 @@ class Env:
         self._draws.draw_ended(done)
         if ending:
             where_any(done, restart)
-        elif broken is not None:
+        elif maybe_lost:
             self._outputs.restore_observations()
 
     def _begin(self, mask: Tensor) -> None:

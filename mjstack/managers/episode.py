@@ -10,6 +10,7 @@ from torch import Tensor
 
 from mjstack.config.functions import offered
 from mjstack.config.schema import RewardTermCfg, TermCfg, TerminationTermCfg
+from mjstack.managers.state import lost_state
 from mjstack.managers.term import Term, blamed, first_value, render_table
 from mjstack.managers.view import EnvView, zero_rows
 
@@ -48,7 +49,9 @@ def required_fields(*resets: Mapping[str, TermCfg]) -> tuple[str, ...]:
 
 
 class _ValueManager:
-    """Terms that give every world a value at every step."""
+    """Terms that give every world a value at every step; ``early`` are those that read the state
+    alone.
+    """
 
     def __init__(
         self, kind: str, env: EnvView, cfg: Mapping[str, TermCfg], dtype: torch.dtype
@@ -57,6 +60,7 @@ class _ValueManager:
         self.terms = [Term(f"{kind}.{name}", term, env) for name, term in cfg.items()]
         for term in self.terms:
             first_value(term, env, boolean=dtype is torch.bool)
+        self.early = [term for term in self.terms if term.reads_state]
         self.names = list(cfg)
         self.values = torch.zeros((env.nworld, len(cfg)), dtype=dtype, device=env.device)
 
@@ -97,12 +101,11 @@ class RewardManager(_ValueManager):
         self.reward = self.values.sum(1)
         self.episode_sums = torch.zeros_like(self.values)
 
-    def compute(self, void: Tensor | None = None, ended: Tensor | None = None) -> Tensor:
-        """Write `values` and `reward`, and return `reward`.
+    def compute(self, ended: Tensor | None = None) -> Tensor:
+        """Write `values` and `reward`, and return `reward`. A world whose state is not finite gets
+        none for this step.
 
         Args:
-            void: Worlds whose state is not finite, shape ``(nworld,)``, bool: they get no reward
-                for this step.
             ended: Within a decision that holds its action for several control steps: worlds whose
                 episode ended in an earlier one, which get no reward, shape ``(nworld,)``, bool. The
                 rewards of the others are added to those before.
@@ -111,8 +114,8 @@ class RewardManager(_ValueManager):
         if self.terms:
             torch.stack(self._term_values(), dim=1, out=self.values)
             self.values *= self.weights
-        for worthless in (void, ended):
-            if worthless is not None:
+        for worthless in (lost_state(self._env), ended):
+            if worthless is not None and worthless is not self._env.sim.no_worlds:
                 self.values.masked_fill_(worthless[:, None], 0.0)
         self.episode_sums += self.values
         if before is not None:

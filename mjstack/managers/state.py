@@ -8,7 +8,10 @@ from functools import partial, wraps
 from typing import Any, ParamSpec, TypeVar
 
 import torch
+from torch import Tensor
 
+from mjstack.managers.view import EnvView
+from mjstack.math import all_finite, not_finite
 from mjstack.sim.graph import side_by_side
 
 Result = TypeVar("Result")
@@ -69,3 +72,13 @@ def shared(compute: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
         return once((compute, *args, *named.items()), compute, *args, **named)
 
     return value
+
+
+@shared
+def lost_state(env: EnvView) -> Tensor:
+    """Whether a state is not finite, shape ``(nworld,)``, bool; ``sim.no_worlds`` where the host
+    can see that none is. Do not write into it.
+    """
+    sim = env.sim
+    fine = all_finite(sim.qpos, sim.qvel)
+    return sim.no_worlds if fine else not_finite(sim.qpos, sim.qvel)

@@ -8,7 +8,7 @@ from torch import Tensor
 from mjstack.errors import require_names
 from mjstack.managers.state import shared
 from mjstack.managers.view import EnvView, episode_draw
-from mjstack.math import all_finite, lowest_point, norm, not_finite
+from mjstack.math import lowest_point, norm
 from mjstack.scene.index import RobotTensors, SceneIndex
 from mjstack.sim.simulation import Simulation
 
@@ -62,16 +62,6 @@ def pose_w(env: EnvView, name: str) -> Tensor:
     parts = {"body_pos": pose[:, :3], "body_quat": pose[:, 3:]}
     moved = [env.sim.fields[f][:, body] if f in env.sim.fields else parts[f] for f in parts]
     return pose if parts.keys().isdisjoint(env.sim.fields) else torch.cat(moved, dim=1)
-
-
-@shared
-def lost_state(env: EnvView) -> Tensor:
-    """Whether a state is not finite, shape ``(nworld,)``, bool; ``sim.no_worlds`` where the host
-    can see that none is. Do not write into it.
-    """
-    sim = env.sim
-    fine = all_finite(sim.qpos, sim.qvel)
-    return sim.no_worlds if fine else not_finite(sim.qpos, sim.qvel)
 
 
 @shared

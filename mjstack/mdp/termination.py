@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from mjstack.config.fields import Count, NotNegative
+from mjstack.managers.state import lost_state
 from mjstack.managers.view import EnvView, offers
-from mjstack.mdp.geometry import lost_state, robot
+from mjstack.mdp.geometry import robot
 from mjstack.mdp.observation import joint_pos
 from mjstack.sim import LOST_PHYSICS
 from mjstack.sim.simulation import Columns

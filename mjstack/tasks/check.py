@@ -15,8 +15,9 @@ from mjstack.config.fields import field_range
 from mjstack.config.functions import resolve_func
 from mjstack.config.schema import Config
 from mjstack.errors import ConfigError, TermError, require_names
+from mjstack.managers.state import lost_state
 from mjstack.managers.view import EnvView
-from mjstack.mdp.geometry import LOADED, lost_state
+from mjstack.mdp.geometry import LOADED
 from mjstack.scene.phases import Phase
 from mjstack.sim.simulation import LOST_PHYSICS
 from mjstack.tasks.view import PhaseNames, Step
