@@ -267,8 +267,8 @@ def _edge(w: World, axis: int, by: float) -> float:
     side.
     """
     scene = w.stage.cfg.scene
-    assert scene.box is not None
-    return scene.box.center[axis] + scene.box.half[axis] - scene.objects["red"].half_height + by
+    box = scene.objects["box"]
+    return box.xy[axis] + box.parts["floor"].size[axis] - scene.objects["red"].half_height + by
 
 
 # Places: the rules that break, when, along which axis the cube is beyond the inside of the box, and
@@ -571,10 +571,9 @@ def test_a_fall_over_the_box_is_a_drop_without_phases() -> None:
         alter, color = name.rsplit("_", 1)
         cube = RED if color == "red" else BLUE
         hold = world.steps(f"hold_{color}")
-        box = world.stage.cfg.scene.box
-        assert box is not None
+        floor = 2.0 * world.stage.cfg.scene.objects["box"].parts["floor"].size[2]
         thing = world.stage.cfg.scene.objects[color]
-        rest = world.stage.cfg.scene.table_top + box.floor + thing.half_height
+        rest = world.stage.cfg.scene.table_top + floor + thing.half_height
         if alter in ("caught", "caught_late", "one_jaw"):
             for jaw in (0, 1)[: 1 if alter == "one_jaw" else 2]:
                 world.jaw(cube, jaw)[hold[: 30 if alter == "caught_late" else 1]] = 0.0

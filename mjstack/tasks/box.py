@@ -50,6 +50,8 @@ class BoxCheck(EpisodeCheck):
         """The objects, in the order in which they go into the box."""
         places: list[str] = spec()
         """The place of each in the box."""
+        into: str = spec()
+        """The box: a fixed object along the world's axes, with a part ``floor`` between others."""
         force: float = spec(unit="N", gt=0.0)
         """A jaw, or a support, that presses with more than this touches."""
         grasp_steps: int = spec(unit="steps", ge=1, le=1_000_000)
@@ -158,12 +160,19 @@ class BoxCheck(EpisodeCheck):
         """Read the scene's box, and raise unless every object fits into it at its place."""
         t = self.t
         scene = self.cfg.scene
-        box = scene.box
-        if box is None:
-            raise ConfigError("scene", scene.name, "a scene with a box", "Set scene=box")
-        top = scene.table_top
-        self._low = [*(box.center[i] - box.half[i] for i in (0, 1)), top + box.floor]
-        self._high = [*(box.center[i] + box.half[i] for i in (0, 1)), top + box.height]
+        require_names("task.check.into: object", [t.into], scene.objects)
+        box = scene.objects[t.into]
+        floor = box.parts.get("floor")
+        if floor is None or box.yaw or box.quat or box.pos:
+            expected = "a fixed object on the table, not turned, with a part floor"
+            raise ConfigError("task.check.into", t.into, expected, "Set scene=box")
+        center = [box.xy[i] + floor.pos[i] for i in (0, 1)]
+        bottom, rim = (
+            scene.table_top + max(part.pos[2] + part.size[2] for part in parts)
+            for parts in ([floor], box.parts.values())
+        )
+        self._low = [*(center[i] - floor.size[i] for i in (0, 1)), bottom]
+        self._high = [*(center[i] + floor.size[i] for i in (0, 1)), rim]
         if len(t.places) != len(t.objects):
             raise ConfigError("task.check.places", t.places, "a place for each object")
         self.slots = dict(zip(t.objects, t.places, strict=True))
@@ -173,7 +182,7 @@ class BoxCheck(EpisodeCheck):
                 continue  # the base class reports it
             xy = scene.places[slot].xy
             half = scene.objects[name].half
-            if not all(abs(xy[i] - box.center[i]) <= box.half[i] - half[i] for i in (0, 1)):
+            if not all(abs(xy[i] - center[i]) <= floor.size[i] - half[i] for i in (0, 1)):
                 raise ConfigError(f"scene.places.{slot}.xy", xy, f"a place in the box for {name}")
 
     @shared
