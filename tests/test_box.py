@@ -50,7 +50,7 @@ def small_env(*overrides: str, robot: str = "so101", nworld: int = 3) -> Env:
 
 def extent(model: mujoco.MjModel, name: str) -> tuple[np.ndarray, np.ndarray]:
     geom = model.geom(name)
-    pos = geom.pos + model.body(geom.bodyid).pos
+    pos = geom.pos + model.body(geom.bodyid[0]).pos
     return pos - geom.size, pos + geom.size
 
 
@@ -78,7 +78,7 @@ def test_the_scene_is_the_protocols(robot: str) -> None:
         assert (high - low)[other] >= (0.33, 0.25)[other] - 1e-9
     for part in PARTS:
         geom = model.geom(f"box_{part}")
-        assert (model.body(geom.bodyid).name, int(geom.condim[0])) == ("box", 3)
+        assert (model.body(geom.bodyid[0]).name, int(geom.condim[0])) == ("box", 3)
         np.testing.assert_allclose(geom.friction, [0.8, 0.005, 0.0005])
         solref = [-4444.444444, -266.666667] if part == "floor" else [0.01, 1.0]
         np.testing.assert_allclose(geom.solref, solref)
@@ -131,14 +131,14 @@ def test_sensors_tell_supports_from_jaws(robot: str) -> None:
         assert not any(pressed([*index.jaw_force[RED], *index.jaw_force[BLUE]]))
         return [pressed(index.support_force[name]) for name in (RED, BLUE)]
 
-    assert forces() == [[True, False], [True, False]]
+    assert forces() == [[True, False, False], [True, False, False]]  # world, cube, box
     mujoco.mj_resetData(model, data)
     data.qpos[red : red + 3] = [*cfg.scene.places["red_slot"].xy, top + 0.006 + 0.022]
     data.qpos[blue + 2] += 0.3
-    assert forces() == [[True, False], [False, False]]
+    assert forces() == [[False, False, True], [False, False, False]]
     mujoco.mj_resetData(model, data)
     data.qpos[red : red + 3] = np.add(data.qpos[blue : blue + 3], [0.0, 0.0, 0.044])
-    assert forces() == [[False, True], [True, True]]
+    assert forces() == [[False, True, False], [True, True, False]]
 
 
 # The start
@@ -342,7 +342,7 @@ def test_lowest_point_of_a_turned_geom(kind: str) -> None:
     ("override", "parts"),
     [
         ("task.check.into=red", ["task.check.into=red", "a part floor"]),
-        ("task.check.into=tray", ["tray", "red, blue, box"]),
+        ("task.check.into=tray", ["tray", "blue, box, red"]),
         ("scene.objects.box.yaw=0.1", ["task.check.into=box", "not turned"]),
         ("scene.objects.box.parts.near.solref=[1]", ["near.solref", "2 numbers"]),
         ("scene.places.red_slot.xy=[0.46,0.26]", ["red_slot.xy", "a place in the box"]),

@@ -81,7 +81,7 @@ PATHS: dict[str, dict[str, str] | None] = {
         "StackSuccess": "_look _replace_oldest __call__",
     },
     "tasks/box.py": {
-        "BoxCheck": "airborne outside over placed goals at_slot",
+        "BoxCheck": "airborne outside over placed goals",
         "_CarriedOver _Release _Settled _Order": "update",
         "_Drop": "update holds",
         "BoxSuccess": "__init__",

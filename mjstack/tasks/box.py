@@ -215,13 +215,12 @@ class BoxCheck(EpisodeCheck):
 
     @override
     def goals(self, step: Step) -> dict[str, Tensor]:
-        return {name: self.at_slot(step.env, name).float() for name in self.objects}
-
-    def at_slot(self, env: EnvView, name: str) -> Tensor:
-        """Centre of an object that rests at its place in the box [m], shape ``(nworld, 3)``."""
-        xy = place_xy(env, self.slots[name])
-        height = self._low[2] + self.cfg.scene.objects[name].half_height
-        return torch.cat((xy, torch.full_like(xy[:, :1], height)), dim=1)
+        goals = {}
+        for name, slot in self.slots.items():
+            xy = place_xy(step.env, slot).float()
+            height = self._low[2] + self.cfg.scene.objects[name].half_height
+            goals[name] = torch.cat((xy, torch.full_like(xy[:, :1], height)), dim=1)
+        return goals
 
     @override
     def trace(self, step: Step) -> dict[str, Tensor]:

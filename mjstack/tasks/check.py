@@ -354,29 +354,18 @@ class EpisodeCheck(ABC):
         return ", ".join(f"{name} {value:.4g}" for name, value in named.items())
 
 
-def check_class(cfg: Config) -> type[EpisodeCheck] | None:
-    """The class of the task's check; None for a task that can be trained, not verified.
-
-    Raises:
-        TermError: ``task.check.func`` names none, or one that lacks a method.
-    """
-    if cfg.task.check is None:
-        return None
-    name = str(cfg.task.check.get("func"))
-    check = cast(type[EpisodeCheck], resolve_func("task.check", name, base=EpisodeCheck))
-    for method in sorted(check.__abstractmethods__):
-        raise TermError("task.check.func", f"{name}: method '{method}' is missing")
-    return check
-
-
 def make_check(cfg: Config) -> EpisodeCheck:
     """The task's check, its thresholds checked.
 
     Raises:
-        MjstackError: The task has none, or a threshold cannot be used.
+        MjstackError: The task has none, ``task.check.func`` names none or one that lacks a method,
+            or a threshold cannot be used.
     """
-    check = check_class(cfg)
-    if check is None:
+    if cfg.task.check is None:
         expected = f"a check of task {cfg.task.name}: without one it can be trained, not verified"
         raise ConfigError("task.check", "null", expected, "Train it: mjstack.make_env")
+    name = str(cfg.task.check.get("func"))
+    check = cast(type[EpisodeCheck], resolve_func("task.check", name, base=EpisodeCheck))
+    for method in sorted(check.__abstractmethods__):
+        raise TermError("task.check.func", f"{name}: method '{method}' is missing")
     return check(cfg)
