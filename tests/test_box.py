@@ -103,10 +103,9 @@ def test_the_motion_is_the_protocols(robot: str) -> None:
 
 
 @pytest.mark.full
-def test_other_scenes_have_no_box_and_pay_for_no_sensor_of_it(robot: str) -> None:
+def test_other_scenes_pay_for_no_sensor_of_supports(robot: str) -> None:
     cfg = load_config([f"robot={robot}"])
     model = build_model(cfg)
-    assert not any(model.geom(i).name.startswith("box_") for i in range(model.ngeom))
     assert model.nsensor == 4
     assert SceneIndex(model, cfg.robot, cfg.scene).support_force == {}
 
