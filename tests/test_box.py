@@ -220,7 +220,7 @@ def test_terms_know_the_box(robot: str) -> None:
     np.testing.assert_allclose(offsets[RED][1:3], 0.0, atol=1e-6)
     wanted = np.subtract(places[BLUE], env.sim.model.body(BLUE).pos)
     np.testing.assert_allclose(offsets[BLUE][0], wanted, atol=1e-6)
-    placed = check.placed(check.view(env)).int().tolist()
+    placed = check.placed(env.state).int().tolist()
     assert placed == [[0, 0], [1, 0], [1, 1], [0, 0]]
     progress = Progress(env)
     grasp_point = 0.5 * sum(env.sim.site_xpos[0, s] for s in env.index.grasp_sites)

@@ -111,7 +111,7 @@ def test_a_check_of_ones_own_judges_native_worlds() -> None:
     broken = [check.rules.broken(int(bits)) for bits in result.failed]
     assert broken == [["GRASP"], ["GRASP", "AT_PLACE"], []]
     assert result.values["grasp_steps"].tolist() == [0.0, 0.0, 5.0]
-    assert check.placed(check.view(env))[:, 0].tolist() == [True, False, True]
+    assert check.placed(env.state)[:, 0].tolist() == [True, False, True]
     told = check.report(result)
     assert told["GRASP"] == ("grasp_steps 0", "at least 3")
     assert told["AT_PLACE"] == ("at_place_steps 20", "at least 10")

@@ -218,7 +218,7 @@ def test_the_expert_plays_at_the_beginning(tmp_path: Path) -> None:
     keys = [f"reset.expert.params.{name}={value}" for name, value in params.items()]
     env = on_new_sim("native", 16, configure("reset=expert_states", "action=ee_tilt", *keys))
     env.reset(seed=0)
-    view = env.check.view(env)
+    view = env.state
     for step in range(50):
         env.step(torch.zeros((16, 6)))
         if step == 0:

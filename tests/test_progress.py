@@ -86,16 +86,16 @@ class JudgeWithoutPhases(Observer):
     """Judges every world as if the driver had no phases, and asks what is placed."""
 
     def start(self, env: Env, driver: Driver) -> None:
+        super().start(env, driver)
         self.check = make_check(env.cfg)
         self.check.start(env, driver.steps)
-        self.view = self.check.view(env)
-        self.carried = self.view.columns([*self.check.goals(self.view)])
+        self.carried = env.state.columns([*self.check.goals(env.state)])
         self.placed: list[torch.Tensor] = []
 
     def update(self) -> None:
         self.check.update()
         if self.carried.indices:
-            self.placed.append(self.carried.read(self.check.placed(self.view)))
+            self.placed.append(self.carried.read(self.check.placed(self.env.state)))
 
     def finish(self) -> None:
         self.failed = self.check.result().failed

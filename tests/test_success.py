@@ -275,14 +275,14 @@ def monitor(
     counts = torch.zeros(n, dtype=torch.int32)
     sim = SimpleNamespace(qpos=torch.zeros(n, 3), qvel=torch.zeros(n, 3), overflow=counts)
     driver = SimpleNamespace(phase=torch.zeros(n, dtype=torch.int64), phases=build_phases(cfg))
-    view = SimpleNamespace(value=lambda condition: condition(view))
-    check = SimpleNamespace(objects=make_check(cfg).objects, view=lambda _: view, placed=None)
-    cpu = torch.device("cpu")
-    env = SimpleNamespace(nworld=n, device=cpu, sim=sim, index=None, cfg=cfg, check=check)
+    state = SimpleNamespace(value=lambda condition: condition(state))
+    check = SimpleNamespace(objects=make_check(cfg).objects)
+    views = {"sim": sim, "index": None, "cfg": cfg, "check": check, "state": state}
+    env = SimpleNamespace(nworld=n, device=torch.device("cpu"), **views)
     watch = FailureMonitor()
     watch.start(env, driver)
     for step in range(len(phase)):
-        view.in_hand = torch.from_numpy(in_hand[step])
+        state.in_hand = torch.from_numpy(in_hand[step])
         check.placed = lambda _, step=step: torch.from_numpy(placed[step])
         for tensor, values in ((driver.phase, phase), (sim.qpos, qpos), (sim.overflow, overflow)):
             tensor.copy_(torch.from_numpy(values[step]))

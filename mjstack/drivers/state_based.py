@@ -110,7 +110,6 @@ class StateBasedDriver(FeedbackDriver):
 
         # The task: objects, the phases that move each, and its column of `EpisodeCheck.placed`
         self._check = env.check
-        self._view = env.check.view(env)
         moved = find_roles(cfg, plan)
         things = list(cfg.scene.objects)
         judged = self._check.objects
@@ -244,7 +243,7 @@ class StateBasedDriver(FeedbackDriver):
             near = norm(miss) <= _BESIDE
             between[:, k] = near & (off[:, 2] <= _BESIDE)
             grasped[:, k] = between[:, k] & (state.opening <= _SHUT)
-        placed = self._view.value(self._check.placed)
+        placed = self._env.state.value(self._check.placed)
         unknown = torch.zeros_like(placed[:, :1])  # of an object that the check does not judge
         placed = torch.cat((unknown, placed), dim=1).index_select(1, self._judged)
         places = [self._point(state, row[Role.place].expand(len(pos))) for row in self._roles]

@@ -24,6 +24,7 @@ from mjstack.scene import SceneIndex
 from mjstack.sim import Simulation
 from mjstack.sim.graph import StepGraph, where_any
 from mjstack.tasks.check import EpisodeCheck, make_check
+from mjstack.tasks.view import Step
 
 
 class Env:
@@ -146,6 +147,11 @@ class Env:
     def check(self) -> EpisodeCheck:
         """The task's check, which terms, drivers and observers of this environment share."""
         return make_check(self.cfg)
+
+    @cached_property
+    def state(self) -> Step:
+        """The state of the check's objects, without phases, which they share too."""
+        return Step(self, self.check.objects, force=self.check.force)
 
     @property
     def max_episode_steps(self) -> int:

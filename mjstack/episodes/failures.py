@@ -71,7 +71,6 @@ class FailureMonitor(Observer):
         super().start(env, driver)
         device = env.device
         self._check = env.check
-        self._view = env.check.view(env)
         # Numbers of objects are the check's. Without phases there is one, which moves nothing.
         names = list(env.cfg.scene.objects)
         column = {names.index(name): place for place, name in enumerate(self._check.objects)}
@@ -96,8 +95,8 @@ class FailureMonitor(Observer):
         """Process the end of a step. Fixed shapes, no host read."""
         sim = self.env.sim
         phase = self.driver.phase
-        loaded = self._view.in_hand
-        placed = self._view.value(self._check.placed)
+        loaded = self.env.state.in_hand
+        placed = self.env.state.value(self._check.placed)
 
         lost = not_finite(sim.qpos, sim.qvel) | ((sim.overflow & LOST_PHYSICS) != 0)
         entered = phase > self._at

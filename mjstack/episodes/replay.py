@@ -39,7 +39,6 @@ def _read_trace(env: Env, driver: Driver) -> Read:
     """State, objects and the check's values, by name in the file."""
     state = read_state(env, driver)
     check = env.check
-    task = check.view(env)
     objects = Step(env, list(env.cfg.scene.free))
 
     def read() -> dict[str, Tensor]:
@@ -48,7 +47,7 @@ def _read_trace(env: Env, driver: Driver) -> Read:
             "object_pos_m": objects.pos,
             "object_speed_m_per_s": objects.speed,
             "object_height_m": objects.height,
-            **check.trace(task),
+            **check.trace(env.state),
             "phase": driver.phase,
         }
 

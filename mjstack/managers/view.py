@@ -54,6 +54,10 @@ class EnvView(Protocol):
     def check(self) -> Any:
         """The task's check, an `EpisodeCheck`, made where it is asked for first."""
 
+    @property
+    def state(self) -> Any:
+        """The state of the check's objects, a `Step`."""
+
 
 def offers(kind: str = "", /, **attributes: Any) -> Callable[[Any], Any]:
     """Mark a term with its kind, and with what others may ask of it.

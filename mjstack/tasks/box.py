@@ -373,4 +373,4 @@ class BoxSuccess(HeldSuccess):
         """
         check = BoxCheck.from_env(env)
         let_go = parts.released(*check.objects, open_fraction=check.t.open_fraction)
-        super().__init__(env, check.view(env), [check.resting, let_go], check.settle_steps)
+        super().__init__(env, [check.resting, let_go], check.settle_steps)

@@ -181,7 +181,6 @@ class EpisodeCheck(ABC):
         node = dict(cfg.task.check or {})
         node.pop("func", None)
         self.cfg = cfg
-        self._view: Step | None = None
         self.t: Any = typed("task.check", node, self.Thresholds)
         phases = cfg.controller.phases
         steps = sum(round(phase.seconds / cfg.timing.step_dt) for phase in phases.values())
@@ -218,12 +217,6 @@ class EpisodeCheck(ABC):
     def settle_steps(self) -> int:
         """Length of the window at the episode's end in which everything has to be at rest."""
         return getattr(self.t, "window", 0)
-
-    def view(self, env: EnvView) -> Step:
-        """The task's objects in an environment, without phases: the same at every call."""
-        if self._view is None or self._view.env is not env:
-            self._view = Step(env, self.objects, force=self.force)
-        return self._view
 
     def start(self, env: EnvView, steps: int, phases: Sequence[Phase] = ()) -> None:
         """Allocate for an episode.

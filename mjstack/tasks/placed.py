@@ -11,27 +11,21 @@ from torch import Tensor
 from mjstack.config.fields import Count, Fraction
 from mjstack.managers.state import branches
 from mjstack.managers.view import EnvView
-from mjstack.tasks.check import EpisodeCheck
 from mjstack.tasks.parts import Condition, released
-from mjstack.tasks.view import Step
 
 
 class HeldSuccess:
     """Achieved while conditions have held for some steps in a row."""
 
-    def __init__(
-        self, env: EnvView, view: Step, conditions: Sequence[Condition], steps: int
-    ) -> None:
+    def __init__(self, env: EnvView, conditions: Sequence[Condition], steps: int) -> None:
         """Allocate the streaks.
 
         Args:
             env: The environment.
-            view: Of the task's objects.
             conditions: All have to hold, each shape ``(nworld, n)``, bool.
             steps: How many steps in a row.
         """
-        self._view = view
-        self._conditions = [partial(view.value, condition) for condition in conditions]
+        self._conditions = [partial(env.state.value, condition) for condition in conditions]
         self._steps = steps
         self._length = torch.zeros(env.nworld, dtype=torch.int32, device=env.device)
 
@@ -69,8 +63,7 @@ class Placed(HeldSuccess):
         Raises:
             MjstackError: The task has no check, or the number is out of range.
         """
-        check = EpisodeCheck.from_env(env)
-        conditions: list[Condition] = [check.placed]
+        conditions: list[Condition] = [env.check.placed]
         if open_fraction is not None:
-            conditions.append(released(*check.objects, open_fraction=open_fraction))
-        super().__init__(env, check.view(env), conditions, steps)
+            conditions.append(released(*env.check.objects, open_fraction=open_fraction))
+        super().__init__(env, conditions, steps)

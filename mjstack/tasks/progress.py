@@ -12,7 +12,6 @@ from mjstack.managers.state import branches
 from mjstack.managers.view import EnvView, offers
 from mjstack.math import norm
 from mjstack.mdp.observation import grasp_point_pos
-from mjstack.tasks.check import EpisodeCheck
 
 STAGES = ("reach", "lift", "carry", "place", "release")
 BELOW = 0.005  # m below its goal that an object over it may be: contacts are soft
@@ -63,18 +62,18 @@ class Progress:
         Raises:
             MjstackError: The task has no check, or one without goals.
         """
-        self._check = EpisodeCheck.from_env(env)
-        self._view = self._check.view(env)
-        names = list(self._check.goals(self._view))
+        self._check = env.check
+        self._state = env.state
+        names = list(self._check.goals(self._state))
         if not names:
             expected = "a check with goals, which this reward follows"
             raise ConfigError("task.check.func", type(self._check).__name__, expected)
-        self._columns = self._view.columns(names)
+        self._columns = self._state.columns(names)
         self._scale, self._near = scale, near
         # Of away, across, above, low and opening, see `_measure`: the range over which each counts
         # (an open_fraction of 0 takes any opening), the number of the stage that it measures, and
         # from where to where it unlocks stages.
-        constant = self._view.constant
+        constant = self._state.constant
         self._ranges = constant(scale, scale, scale, height, max(open_fraction, 1e-6))
         self._nearest = constant(1.0)
         self._number = constant(0.0, 2.0, 3.0, 1.0, 4.0)
@@ -88,7 +87,7 @@ class Progress:
 
     def __call__(self, env: EnvView) -> Tensor:
         """The reward, shape ``(nworld,)``."""
-        works = (self._measure, partial(self._view.value, self._check.placed))
+        works = (self._measure, partial(self._state.value, self._check.placed))
         (distances, heights, in_hand), placed = branches(env.device, *works)
         placed = self._columns.read(placed)
         if self._beyond_reach(distances, in_hand, placed):
@@ -134,7 +133,7 @@ class Progress:
         upwards [m]; on CUDA, where the host cannot look first, `_heights`; and whether it is in the
         hand; each ``(nworld, objects)``.
         """
-        step = self._view
+        step = self._state
         pos = self._columns.read(step.pos)
         goals = list(self._check.goals(step).values())
         offset = pos - (torch.stack(goals, dim=1) if len(goals) > 1 else goals[0][:, None])
@@ -145,6 +144,6 @@ class Progress:
 
     def _heights(self) -> list[Tensor]:
         """The height of each object's lowest point [m], and the gripper's opening."""
-        step = self._view
+        step = self._state
         low = self._columns.read(step.height)
         return [low, step.narrowest.expand_as(low)]

@@ -140,19 +140,19 @@ class StackSuccess(HeldSuccess):
             MjstackError: The task has another check.
         """
         check = StackCheck.from_env(env)
-        view = check.view(env)
-        super().__init__(env, view, [check.placed, check.released], check.t.window)
-        ring = (check.t.window, len(view.objects))
+        super().__init__(env, [check.placed, check.released], check.t.window)
+        self._state = state = env.state
+        ring = (check.t.window, len(state.objects))
         # Where the oldest step is, in every world.
         self._slot = torch.zeros(1, dtype=torch.int64, device=env.device)
-        self._pose = view.zeros(*ring, 7)
-        self._energy = view.zeros(*ring)  # squared speed
+        self._pose = state.zeros(*ring, 7)
+        self._energy = state.zeros(*ring)  # squared speed
         # Squared distance to later steps, and 1 - |cosine of half the angle| to them
-        self._apart = view.zeros(*ring, 2)
+        self._apart = state.zeros(*ring, 2)
         t = check.t
         rotation = 1.0 - math.cos(0.5 * math.radians(t.rest_rotation_deg))
-        speeds = [t.rest_speed**2] * len(view.objects)
-        self._limits = view.constant(*speeds, t.rest_position**2, rotation)
+        speeds = [t.rest_speed**2] * len(state.objects)
+        self._limits = state.constant(*speeds, t.rest_position**2, rotation)
 
     def __call__(self, env: EnvView) -> Tensor:
         """Process a step; shape ``(nworld,)``, bool."""
@@ -171,7 +171,7 @@ class StackSuccess(HeldSuccess):
         where_any(self._length, self._replace_oldest)
 
     def _replace_oldest(self) -> None:
-        step = self._view
+        step = self._state
         self._pose.index_copy_(1, self._slot, step.pose[:, None])
         self._energy.index_copy_(1, self._slot, step.speed.square()[:, None])
         self._apart.index_fill_(1, self._slot, 0.0)
