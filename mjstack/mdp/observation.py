@@ -8,6 +8,7 @@ from torch import Tensor
 from mjstack.errors import require_names
 from mjstack.managers.state import shared
 from mjstack.managers.view import EnvView, offers
+from mjstack.math import constant
 from mjstack.mdp.geometry import jaw_forces, place_xy, pose_w, robot
 
 _in = partial(offers, "observation term", reads="state")
@@ -127,7 +128,7 @@ def headings(env: EnvView) -> Tensor:
 def object_velocity(env: EnvView, *, object: str) -> Tensor:
     """Linear [m/s, world frame] and angular [rad/s, body frame] velocity, shape ``(nworld, 6)``."""
     if object in env.index.fixed:
-        return env.index.constant([0.0] * 6, env.sim.qvel).expand(env.nworld, -1)
+        return constant([0.0] * 6, env.sim.qvel).expand(env.nworld, -1)
     return env.sim.part("qvel", env.index.object_columns(object)[1])
 
 

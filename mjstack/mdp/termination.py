@@ -8,6 +8,7 @@ from torch import Tensor
 from mjstack.config.fields import Count, NotNegative
 from mjstack.managers.state import lost_state
 from mjstack.managers.view import EnvView, offers
+from mjstack.math import constant
 from mjstack.mdp.geometry import robot
 from mjstack.mdp.observation import joint_pos
 from mjstack.sim import LOST_PHYSICS
@@ -41,7 +42,7 @@ class ObjectOffTable:
         scene = env.cfg.scene
         x, y, _ = scene.table_half
         triples = ([*scene.table_center[:2], 0.0], [-x, -y, scene.table_top], [x, y, math.inf])
-        numbers = [env.index.constant(three * len(scene.free), env.sim.qpos) for three in triples]
+        numbers = [constant(three * len(scene.free), env.sim.qpos) for three in triples]
         self._center, self._low, self._high = numbers
         columns = [first + axis for first in env.index.object_qpos for axis in range(3)]
         self._columns = Columns(columns, env.device)

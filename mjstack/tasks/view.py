@@ -15,7 +15,7 @@ from torch import Tensor
 from mjstack.errors import ConfigError, MjstackError, require_names
 from mjstack.managers.state import shared
 from mjstack.managers.view import EnvView
-from mjstack.math import atan2, lowest_point, norm, quat_to_matrix
+from mjstack.math import atan2, constant, lowest_point, norm, quat_to_matrix
 from mjstack.mdp.geometry import LOADED, gripper_opening, pose_w
 from mjstack.mdp.observation import fixture_pos, object_velocity
 from mjstack.scene.phases import Phase
@@ -113,7 +113,7 @@ class Step:
 
     def constant(self, *values: float) -> Tensor:
         """Numbers on the device, copied there once, shape ``(n,)``, float32."""
-        return self.env.index.constant(values, self.half)
+        return constant(values, self.half)
 
     def zeros(self, *shape: int, fill: float = 0.0) -> Tensor:
         """A buffer, shape ``(nworld, *shape)``, float32."""
