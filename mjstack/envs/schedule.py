@@ -35,7 +35,7 @@ def step_order(env: "Env", outputs: Outputs, ended: Tensor | None, last: bool) -
     return [
         (  # What needs the state alone: what comes after knows its values
             partial(success, env),
-            [partial(work, env) for work in (lost_state, *ends.early)],
+            [partial(lost_state, env), *(partial(term, env) for term in ends.early)],
             *(partial(term, env) for term in rewards.early),
             *early,
         ),
