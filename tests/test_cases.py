@@ -25,7 +25,7 @@ from mjstack.config.schema import Config
 from mjstack.config.schema.robot import BasePoseCfg
 from mjstack.envs import build_env
 from mjstack.episodes.stage import Stage
-from mjstack.gates.success import find_regions
+from mjstack.gates.regions import find_regions
 from mjstack.report.page import Map
 from mjstack.report.sections import table_map
 from mjstack.robots import read_robot

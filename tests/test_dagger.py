@@ -87,8 +87,7 @@ def test_the_report_of_a_training_that_fails(tmp_path: Path) -> None:
     metrics = gates["train"]["metrics"]
     assert metrics["expert_s"] > rows["played_s"].sum()  # the expert's own round too
     assert gates["success"]["metrics"]["failed.REACHED"] > 0
-    assert np.load(tmp_path / "motion_success.npz")["failed"].any()  # on the page
-    assert (tmp_path / "episode.html").exists()
+    assert ": REACHED" in str(messages(tmp_path / "episode.html"))  # a failed world on the page
 
 
 def test_rules_are_counted_over_batches_and_ranks() -> None:

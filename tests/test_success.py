@@ -21,6 +21,7 @@ from environments import (
     at_double_speed,
     configure,
     gate_of,
+    judge,
     on_cuda,
     one_second_episode,
 )
@@ -30,20 +31,11 @@ from mjstack.config.schema import Config
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.failures import FailureMonitor, Sign
-from mjstack.episodes.record import FAILING
 from mjstack.episodes.rollout import Hook, reset_worlds, rollout
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Progress, Stage
-from mjstack.gates.success import (
-    Goal,
-    describe_region,
-    find_doubts,
-    find_regions,
-    radial_yaw_deg,
-    regions_table,
-    run_success,
-    success_config,
-)
+from mjstack.gates.episodes import Goal, find_doubts, gate_config
+from mjstack.gates.regions import describe_region, find_regions, radial_yaw_deg, regions_table
 from mjstack.jobs.gates import check_machine
 from mjstack.math import wilson_interval
 from mjstack.report.record import GateResult, Status
@@ -52,6 +44,7 @@ from mjstack.sim import Simulation
 from mjstack.tasks.check import make_check
 
 RULES = rules_of("stack")
+FAILING = "success_failing.csv"
 
 PHASES = list(configure().controller.phases)
 
@@ -80,8 +73,7 @@ def rows_of(path: Path) -> list[dict[str, str]]:
 
 def play(run: Run, folder: Path | None = None) -> GateResult:
     run.folder = folder
-    (result,) = run_success(run)
-    return result
+    return judge(run, "success")
 
 
 def test_small_region_passes(passed: Path) -> None:
@@ -93,8 +85,8 @@ def test_small_region_passes(passed: Path) -> None:
     assert (metrics["success_rate_low95"], metrics["success_rate_high95"]) == wilson_interval(6, 6)
     assert gate["thresholds"]["success_rate_min"] == 0.99
     assert "objects within 0.03 x 0.03 m" in gate["notes"]["starts"]
-    files = """.hydra episode.html motion_success.npz report.html report.json report.md run.log
-        starts_seed0.npz success_regions.csv success_seed0.npz"""
+    files = """.hydra episode.html report.html report.json report.md run.log
+        success_regions.csv success_seed0.npz success_starts_seed0.npz"""
     assert sorted(path.name for path in passed.iterdir()) == files.split()
     assert "no region of at least 2 episodes had a failure" in gate["details"]
     assert not [table for table in gate["tables"] if "region" in table["title"]]
@@ -173,9 +165,8 @@ def test_seeds_add_up_and_the_rate_decides(hasty: NewRun, tmp_path: Path) -> Non
     (signs,) = [table for table in result.tables if "first sign" in table.header[0]]
     # Every failed episode is in one line, with a sign or without
     assert sum(int(row[1]) for row in signs.rows) == 4
-    rows = rows_of(tmp_path / "success_failing_worlds.csv")
+    rows = rows_of(tmp_path / FAILING)
     assert [row["seed"] + row["world"] for row in rows] == ["00", "01", "10", "11"]
-    assert not (tmp_path / FAILING).exists()  # that is the batch gate's
 
     result = play(hasty("gate.success.rate=0"))
     assert result.status is Status.passed
@@ -193,7 +184,7 @@ def test_replay_plays_the_gates_world(passed: Path, tmp_path: Path) -> None:
     assert gate["details"][-1] == "first sign of failure: none; grasps tried again: 0"
 
 
-FILE = "reset=starts_file starts={run}/starts_seed0.npz"
+FILE = "reset=starts_file starts={run}/success_starts_seed0.npz"
 NO_REGION = "null, because no reset term of the success gate has a region"
 BAD = [
     ("gate.success.region=[0.5,0.02]", "expected a region with a free position for every object"),
@@ -223,9 +214,9 @@ def test_region_is_the_gates_alone() -> None:
     """Without the gate, its region is not tried; with it, no other start changes."""
     check_machine(load_config(["sim=native", "gates=[batch]", "gate.success.region=[0.1,0.1]"]))
     cfg = load_config(["gate.success.region=[0.01,0.02]"])
-    assert success_config(cfg).reset["cubes"].params["xy"] == [0.01, 0.02]
+    assert gate_config(cfg, "success").reset["cubes"].params["xy"] == [0.01, 0.02]
     assert cfg.gate.success.reset["cubes"].params["xy"] == [0.05, 0.05]
-    assert success_config(cfg).controller.name == "closed_loop"
+    assert gate_config(cfg, "success").controller.name == "closed_loop"
     assert cfg.controller.name == "open_loop"
 
 
@@ -320,7 +311,7 @@ def test_signs_in_real_episodes(new_run: NewRun) -> None:
     undisturbed.
     """
     base = new_run("sim=native", "nworld=6")
-    run = base.on(base.stage.with_config(success_config(base.cfg)))
+    run = base.on(base.stage.with_config(gate_config(base.cfg, "success")))
     red, _ = run.stage.index.object_qpos
     at = {name: run.stage.phase(name).start for name in PHASES}
     done = at["done"] + 5
@@ -438,7 +429,7 @@ def test_worst_regions_of_made_up_episodes() -> None:
 def test_steps_with_the_tracker_are_one_graph(robot: str, new_run: NewRun, tmp_path: Path) -> None:
     device = ("sim=mjwarp", "sim.device=cuda:0", "nworld=64")
     base = new_run(*device, "graph=require", robot=robot)
-    run = base.on(base.stage.with_config(success_config(base.cfg)))
+    run = base.on(base.stage.with_config(gate_config(base.cfg, "success")))
     sim = run.stage.batch_simulation(64)
     watch = FailureMonitor()
     episode = run.stage.play(sim, run.cfg.reset, [watch])

@@ -18,15 +18,14 @@ from mjstack.config.load import load_config
 from mjstack.config.schema import Backend, Config
 from mjstack.episodes.batches import BatchPlan, play_batches
 from mjstack.episodes.motion import motion_recorder, moving_worlds
-from mjstack.episodes.replay import simulate_alone
 from mjstack.episodes.rollout import require_episode
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
 from mjstack.episodes.tally import rate_metrics
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.files import to_csv, write_atomic
+from mjstack.gates.episodes import gate_config
 from mjstack.gates.runner import run_guarded
-from mjstack.gates.success import success_config
 from mjstack.jobs.gates import check_machine
 from mjstack.jobs.runner import CheckedJob, Job
 from mjstack.math import mcnemar_p_value
@@ -37,6 +36,7 @@ from mjstack.report.sweep_picture import Plot, save_sweep
 from mjstack.report.table import Table
 
 NAME = "compare"
+GATE = "success"  # whose episodes are played
 TABLE = "compare.csv"
 _SIDES = ("a", "b")
 _PAGE_WORLDS = 8  # worlds on the page that only one side won, of each side
@@ -67,14 +67,14 @@ def check_compare(cfg: Config, overrides: Sequence[str]) -> CheckedJob:
     for name, side in zip(_SIDES, (cfg, load_config([*unchanged, *against])), strict=True):
         content = config_content(side)
         equal = {key: content[key] for key in ("task", "nworld", "seed")}
-        success = {"success.seeds": side.gate.success.seeds}
-        facts.append(equal | {"robot": side.robot.name, "gate": success})
+        seeds = {f"{GATE}.seeds": side.gate.success.seeds}
+        facts.append(equal | {"robot": side.robot.name, "gate": seeds})
         if changes := differences(facts[-1], facts[0]):
             expected = f"the same robot, task, worlds and seeds ({changes})"
             raise ConfigError("job.against", against, expected)
         require_episode(side)
-        stage = check_machine(replace(side, gates=["success"]))
-        sides[name] = stage.with_config(success_config(stage.cfg))
+        stage = check_machine(replace(side, gates=[GATE]))
+        sides[name] = stage.with_config(gate_config(stage.cfg, GATE))
         driver = (sides[name].cfg.controller.name, content.get("policy", ""))
         notes[name] = " ".join(filter(None, driver))
     first, second = map(_start_of_first_world, sides.values())
@@ -95,7 +95,7 @@ def _key(override: str) -> str:
 
 def _start_of_first_world(stage: Stage) -> dict[str, np.ndarray]:
     """How world 0 of the first seed starts on native MuJoCo, by the arrays of a starts file."""
-    with closing(simulate_alone(stage, Backend.native, "cpu")) as sim:
+    with closing(stage.simulate_alone(Backend.native, "cpu")) as sim:
         return start_arrays(stage.start(sim, stage.cfg.reset, worlds=[0]))
 
 
@@ -196,12 +196,10 @@ def _replay(sides: Sides, rows: Sequence[Mapping[str, Any]]) -> list[World]:
     moving: dict[str, list[World]] = {name: [] for name in sides}
     for name, stage in sides.items():
         channels = motion_recorder(stage.cfg.timing.step_dt).channels
-        simulate = partial(simulate_alone, stage, *stage.backend)
-        for batch in play_batches(stage, plans, channels, simulate=simulate):
-            worlds = batch.plan.worlds
-            names = {row: f"{batch.plan.seed}:{world} {name}" for row, world in enumerate(worlds)}
+        for batch in play_batches(stage, plans, channels, alone=stage.backend):
+            labels = [f"{batch.plan.seed}:{world} {name}" for world in batch.plan.worlds]
             failed, qpos = batch.episode.failed, batch.rows["qpos"]
-            moving[name] += moving_worlds(stage, batch.env, qpos, failed, names, 0)
+            moving[name] += moving_worlds(stage, batch.env, qpos, failed, dict(enumerate(labels)))
     return [world for pair in zip(*moving.values(), strict=True) for world in pair]
 
 
