@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from browser import messages
 from compositions import load_config
 from environments import SHORT_REACH, Patch
 from policies import curve, interrupted, report, run_as_torchrun, same

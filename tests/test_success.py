@@ -3,6 +3,7 @@ both backends.
 """
 
 import csv
+import shutil
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
@@ -15,6 +16,7 @@ import torch
 from check_cases import rules_of
 from compositions import load_config
 from environments import (
+    Capture,
     NewRun,
     Patch,
     Refused,
@@ -24,6 +26,7 @@ from environments import (
     judge,
     on_cuda,
     one_second_episode,
+    report_of,
 )
 
 from mjstack.cli import run
@@ -182,6 +185,47 @@ def test_replay_plays_the_gates_world(passed: Path, tmp_path: Path) -> None:
     assert gate["reason"].endswith("; as recorded, and it ends bit for bit where it did")
     assert len(gate["details"]) == len(RULES) + 1
     assert gate["details"][-1] == "first sign of failure: none; grasps tried again: 0"
+
+
+SITE = """\
+# The starts of one file
+defaults:
+  - /reset@reset: starts_file
+  - _self_
+
+func: mjstack.gates.episodes.judge_episodes
+rate: 0.9
+reset: {starts: {params: {path: layouts.npz}}}
+"""
+
+
+@pytest.mark.full
+def test_a_gate_of_ones_own_is_a_file(
+    passed: Path, tmp_path: Path, monkeypatch: Patch, capsys: Capture
+) -> None:
+    """It starts worlds from a file, and reports, keeps and replays them as *success* does."""
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "conf" / "gate" / "site.yaml"
+    path.parent.mkdir(parents=True)
+    path.write_text(SITE)
+    shutil.copy(passed / "success_starts_seed0.npz", "layouts.npz")
+    conf = ["--config-dir", "conf", "sim=native"]
+    args = [*conf, *at_double_speed(), "nworld=3", "gates=[batch,site]", "gate.batch.rate=0"]
+    assert run([*args, "hydra.run.dir=run"]) == 0
+    _, site = report_of(Path("run"))["gates"]
+    assert (site["name"], site["metrics"]["succeeded"]) == ("site", 3)
+    assert site["thresholds"]["success_rate_min"] == 0.9
+    with np.load("run/site_seed0.npz") as ours, np.load(passed / "success_seed0.npz") as theirs:
+        assert np.allclose(ours["start_places"], theirs["start_places"][:3], atol=1e-6)
+    with np.load("run/batch_seed0.npz") as held:  # which starts as ever
+        assert "sign" not in held
+    Path("layouts.npz").unlink()
+    assert run([*conf[:2], "job=replay", "run=run", "world=site:2", "hydra.run.dir=again"]) == 0
+    assert "bit for bit where it did" in gate_of(Path("again"))["reason"]
+    assert run([*conf, "gates=[site]", "gate.site.rate=2"]) == 2
+    assert "gate.site.rate=2: expected a number from 0 to 1" in capsys.readouterr().err
+    assert run([*conf[:2], "--help", "gate.site.cell"]) == 0
+    assert "gate.site.cell=0.02" in capsys.readouterr().out
 
 
 FILE = "reset=starts_file starts={run}/success_starts_seed0.npz"

@@ -98,7 +98,8 @@ def _run(cfg: Config) -> Checks:
     played = cfg.job.name in ("play", "export")
     wrong = cfg.policy is not None and not (played or offered(cfg.controller.func, "plays_policy"))
     yield "policy", wrong, expected
-    wrong = cfg.starts is not None and not reads_starts_file(cfg.reset)
+    resets = (cfg.reset, *(t.reset for t in cfg.gate.episodes().values()))
+    wrong = cfg.starts is not None and not any(map(reads_starts_file, resets))
     yield "starts", wrong, "null, because no reset term reads it. Add reset=starts_file"
 
 

@@ -241,13 +241,14 @@ class Starts(Observer):
 
     @override
     def start(self, env: Env, driver: Driver) -> None:
-        self.arrays = start_arrays(env)
+        self.arrays = {name: array.copy() for name, array in start_arrays(env).items()}
 
 
 def _describe_start(cfg: Config, gate: str) -> str:
     """How worlds start, in a few words."""
-    if reads_starts_file(cfg.reset):
-        return f"starts={cfg.starts}"
+    for term in cfg.reset.values():
+        if reads_starts_file({"": term}):
+            return f"starts={cfg.starts or term.params['path']}"
     regions = [term.params["xy"] for term in cfg.reset.values() if places_objects(term)]
     where = "".join(f", objects within {x:g} x {y:g} m of their places" for x, y in regions)
     return f"gate.{gate}.reset ({', '.join(cfg.reset)}{where})"
