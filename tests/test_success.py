@@ -223,7 +223,7 @@ def test_a_gate_of_ones_own_is_a_file(
     assert run([*conf[:2], "job=replay", "run=run", "world=site:2", "hydra.run.dir=again"]) == 0
     assert "bit for bit where it did" in gate_of(Path("again"))["reason"]
     assert run([*conf, "gates=[site]", "gate.site.rate=2"]) == 2
-    assert "gate.site.rate=2: expected a number from 0 to 1" in capsys.readouterr().err
+    assert "gate.site.rate=2.0: expected a number from 0 to 1" in capsys.readouterr().err
     assert run([*conf[:2], "--help", "gate.site.cell"]) == 0
     assert "gate.site.cell=0.02" in capsys.readouterr().out
 
@@ -438,9 +438,8 @@ def test_worst_regions_of_made_up_episodes() -> None:
     corner = (places[:, 0, 0] >= 0.34) & (places[:, 0, 0] < 0.36) & (places[:, 0, 1] < -0.12)
     turned = (radial_yaw_deg(places[:, 1]) >= 30.0) & (radial_yaw_deg(places[:, 1]) < 45.0)
     succeeded = ~(corner & (rng.random(n) < 0.9)) & ~(turned & (rng.random(n) < 0.5))
-    cfg = load_config(["gate.success.worst_regions=2"]).gate.success
-    assert (cfg.cell, cfg.yaw_cell_deg, cfg.cell_episodes) == (0.02, 15.0, 20)
-    regions = find_regions(cfg, places, succeeded, ("red", "blue"), (0.0, 0.0))
+    assert load_config().gate.success.cell_episodes == 20
+    regions = find_regions(20, places, succeeded, ("red", "blue"), (0.0, 0.0))
     assert [region["rate"] for region in regions] == sorted(region["rate"] for region in regions)
     assert all(region["episodes"] >= 20 for region in regions)
     assert not any(region["object"] == "red" and region.get("x_min_m") == 0.4 for region in regions)
@@ -463,7 +462,7 @@ def test_worst_regions_of_made_up_episodes() -> None:
     assert len({str(region) for region in regions}) == len(regions)
     # A region without a failure has no place among the worst
     flawless = worst | {"object": "blue", "succeeded": worst["episodes"]}
-    (table,) = regions_table(cfg, [worst, flawless])
+    (table,) = regions_table(20, [worst, flawless])
     assert table.title == "Worst regions of at least 20 episodes (1 of 1 with a failure)"
     assert [row[0] for row in table.rows] == [text]
 

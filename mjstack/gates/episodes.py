@@ -102,13 +102,13 @@ def judge_episodes(run: Run) -> list[GateResult]:
         if retried:
             words.append(f"{retried} retried, {retried_succeeded} of them succeeded")
         tally.details += find_doubts(distinct, tally.episodes, tally.successes, lost or 0, t.rate)
-        regions = find_regions(t, rows, succeeded, list(places), run.stage.index.base)
+        regions = find_regions(t.cell_episodes, rows, succeeded, list(places), run.stage.index.base)
         if all(region["succeeded"] == region["episodes"] for region in regions):
             more = f"(gate.{run.gate}.cell_episodes): more seeds have more"
             there = "had a failure" if regions else more
             tally.details.append(f"no region of at least {t.cell_episodes} episodes {there}")
         tally.write(f"{run.gate}_regions.csv", write_atomic, to_csv(regions, ("object", *BOUNDS)))
-        tables = regions_table(t, regions)
+        tables = regions_table(t.cell_episodes, regions)
     return [
         tally.result(
             words, passed=rate >= t.rate, metrics=metrics, thresholds=thresholds, tables=tables

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from mjstack.config.schema import EpisodesGateCfg
 from mjstack.episodes.tally import rate_cells
 from mjstack.math import rate_interval
 from mjstack.report.table import Table
@@ -17,6 +16,9 @@ the cell has, of x and y of its centre [m] and of its direction [deg], as of `ra
 many ``episodes``, and how many ``succeeded``, their ``rate`` and its 95 % interval."""
 
 BOUNDS = (*("x_min_m", "x_max_m", "y_min_m", "y_max_m"), "yaw_min_deg", "yaw_max_deg")
+_CELL = 0.02  # m, width of a cell in x and y
+_YAW_CELL = 15.0  # deg, width of a cell in an object's direction
+_SHOWN = 12  # regions in report.md
 _EDGE = 1e-9  # cells: a place this close below a cell's edge is on it
 
 
@@ -32,7 +34,7 @@ def radial_yaw_deg(places: np.ndarray) -> np.ndarray:
 
 
 def find_regions(
-    cfg: EpisodesGateCfg,
+    least: int,
     places: np.ndarray,
     succeeded: np.ndarray,
     objects: Sequence[str],
@@ -43,7 +45,7 @@ def find_regions(
     direction ends at 90.
 
     Args:
-        cfg: The configuration of the gate, with their widths and the least number of episodes.
+        least: The least number of episodes.
         places: x and y [m] and rotation about z [rad] of each object at the start, NaN for a place,
             shape ``(n, objects, 3)``.
         succeeded: Whether each episode was, shape ``(n,)``, bool.
@@ -51,18 +53,18 @@ def find_regions(
         base: x and y of the arm's base [m].
     """
     out: list[Region] = []
-    widths = np.array([cfg.cell, cfg.cell, cfg.yaw_cell_deg])
+    widths = np.array([_CELL, _CELL, _YAW_CELL])
     ends = np.array([math.inf, math.inf, 90.0])
     for number, name in enumerate(objects):
         yaw = radial_yaw_deg(places[:, number] - [*base, 0.0])
         keys = np.floor(np.column_stack((places[:, number, :2], yaw)) / widths + _EDGE)
-        keys[keys[:, 2] * cfg.yaw_cell_deg >= 90.0, 2] = 0.0  # on the edge of 90, which is 0
+        keys[keys[:, 2] * _YAW_CELL >= 90.0, 2] = 0.0  # on the edge of 90, which is 0
         for axes in ([0, 1],) if np.isnan(yaw).any() else ([0, 1], [2], [0, 1, 2]):
             cells, which = np.unique(keys[:, axes], axis=0, return_inverse=True)
             for row, key in enumerate(cells):
                 outcomes = succeeded[which.ravel() == row]
                 n = len(outcomes)
-                if n < cfg.cell_episodes:
+                if n < least:
                     continue
                 k = int(outcomes.sum())
                 edges = (key * widths[axes], np.minimum((key + 1.0) * widths[axes], ends[axes]))
@@ -83,17 +85,17 @@ def describe_region(region: Region) -> str:
     return f"{region['object']}: {', '.join(parts)}"
 
 
-def regions_table(cfg: EpisodesGateCfg, regions: list[Region]) -> list[Table]:
+def regions_table(least: int, regions: list[Region]) -> list[Table]:
     """The regions with the lowest rates; no table where none has a failure."""
     failing = [r for r in regions if r["succeeded"] < r["episodes"]]
     if not failing:
         return []
     rows = []
-    for region in failing[: cfg.worst_regions]:
+    for region in failing[:_SHOWN]:
         n, k = region["episodes"], region["succeeded"]
         rows.append([describe_region(region), str(n), str(k), *rate_cells(k, n)])
     title = (
-        f"Worst regions of at least {cfg.cell_episodes} episodes ({len(rows)} of {len(failing)}"
+        f"Worst regions of at least {least} episodes ({len(rows)} of {len(failing)}"
         " with a failure)"
     )
     header = ["where the object started", "episodes", "succeeded", "rate", "95 % interval"]

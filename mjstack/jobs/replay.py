@@ -35,8 +35,12 @@ from mjstack.sim import resolve_backend, resolve_device
 
 TABLE = "replayed_worlds.csv"
 _TABLE_ROWS = 100  # worlds in report.md
-# Besides versions, what arithmetic depends on
-_PLACES = {"git_commit": "mjstack's commit", "cpu": "the processor"}
+_FACTS = {  # besides versions, on which a result or its last bits depend
+    "git_commit": "mjstack's commit",
+    "cpu": "the processor",
+    "policy": "the policy",
+    "model_sha256": "the compiled model",
+}
 # [m, rad], and of quaternions: backends differ by rounding, another start by more
 _SAME_START = 1e-6
 _NATIVE = (Backend.native, "cpu")
@@ -203,19 +207,14 @@ def _replay_all(plan: _Plan, run: Run, folder: Path) -> None:
 def _changes(recorded: dict, current: dict) -> list[str]:
     """Facts that differ from the earlier run's and could change a result, or its last bits."""
     before, now = (
-        facts["versions"] | {name: facts.get(key) for key, name in _PLACES.items()}
+        facts["versions"] | {words: facts.get(key) for key, words in _FACTS.items()}
         for facts in (recorded, current)
     )
-    lines = [
+    return [
         f"{name} was {shorten(str(before[name]), 100)} in that run and is {value} now"
         for name, value in now.items()
         if name in before and before[name] != value
     ]
-    if recorded.get("policy") != current.get("policy"):
-        lines.append("the policy is not the same as in that run: it was written anew")
-    if recorded.get("model_sha256") != current["model_sha256"]:
-        lines.append("the compiled model is not the same as in that run: this is another physics")
-    return lines
 
 
 def _replay(

@@ -242,14 +242,8 @@ class EpisodesGateCfg(GateFuncCfg):
     fails; a step takes a little longer."""
     region: list[float] | None = spec(None, unit="m", length=2, ge=0.0)
     """Half-widths of the objects' region in x and y; null: as ``reset`` has them."""
-    cell: float = spec(0.02, unit="m", gt=0.0)
-    """Width of the cells in which start positions are counted, in x and y."""
-    yaw_cell_deg: float = spec(15.0, unit="deg", gt=0.0, le=90.0)
-    """Width of the bins of an object's yaw relative to its direction as seen from the base."""
     cell_episodes: int = spec(20, unit="episodes", ge=1, le=MOST_COUNT)
-    """Episodes below which a cell has no rate."""
-    worst_regions: int = spec(12, unit="cells", ge=1, le=MOST_COUNT)
-    """Worst cells in report.md."""
+    """Episodes below which a cell of start positions has no rate."""
     reset: dict[str, Any] = spec({})
     """Reset terms of its own, with which closed_loop plays in the place of a plan; what they add to
     the task's own terms of ``reset``, or replace by name. ``reset=starts_file`` takes the place of
