@@ -38,10 +38,9 @@ def reads_starts_file(reset: Mapping[str, TermCfg]) -> bool:
 
 def gate_reset(cfg: Config, gate: str) -> Mapping[str, TermCfg]:
     """Reset terms under which a gate of episodes plays."""
-    own = cfg.gate[gate].reset
-    return (
-        own if own and (reads_starts_file(own) or not reads_starts_file(cfg.reset)) else cfg.reset
-    )
+    reset = cfg.gate[gate].reset
+    from_file = reads_starts_file(cfg.reset) and not reads_starts_file(reset)
+    return cfg.reset if from_file or not reset else reset
 
 
 def places_objects(term: TermCfg) -> bool:

@@ -1,10 +1,8 @@
-"""The record of all episodes of one seed: arrays for programs, and rows of the failing ones for
-people.
-"""
+"""The record of all episodes of one seed, as arrays."""
 
 import re
 import socket
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +14,6 @@ from mjstack.distributed import Ranks
 from mjstack.episodes.batches import Batch
 from mjstack.episodes.failures import FailureMonitor, Sign
 from mjstack.files import read_npz, reading
-from mjstack.tasks.check import Rules
 
 _FACTS = ("seed", "backend", "device", "seconds", "steps")
 _NAMES = ("object_names", "phase_names")
@@ -176,41 +173,6 @@ class EpisodeRecord:
             arrays["sign_names"] = [sign.name for sign in Sign]
         ranks = {"rank_first_world": list(self.ranks), "rank_place": list(self.ranks.values())}
         return arrays | ranks
-
-    def failing_rows(
-        self, rules: Rules, places: Mapping[str, np.ndarray]
-    ) -> list[dict[str, object]]:
-        """Cells of every failing episode by column: rules, circumstances, ``places`` at its start
-        as of `start_places`, and all measurements.
-        """
-        return [
-            {
-                "seed": self.seed,
-                "world": world,
-                "rules": " ".join(rules.broken(self.failed[world])),
-                **(self._sign_cells(world) if "sign" in self.worlds else {}),
-                **{
-                    f"{name}_{part}": f"{number:.6g}"
-                    for name, rows in places.items()
-                    for part, number in zip(("x_m", "y_m", "yaw_rad"), rows[world], strict=True)
-                    if not np.isnan(number)
-                },
-                **{name: f"{values[world]:.6g}" for name, values in self.values.items()},
-            }
-            for world in np.flatnonzero(self.failed).tolist()
-        ]
-
-    def _sign_cells(self, world: int) -> dict[str, object]:
-        """A world's circumstances as cells of the table of failing episodes, by column."""
-        row = {name: values[world] for name, values in self.worlds.items()}
-        phase = row["sign_phase"]
-        return {
-            "sign": Sign(row["sign"]).name,
-            "phase": self.phase_names[phase] if 0 <= phase < len(self.phase_names) else "",
-            "step": row["sign_step"] if row["sign_step"] >= 0 else "",
-            "retries": row["retries"],
-            "unreachable": int(row["unreachable"]),
-        }
 
 
 def _items(array: np.ndarray) -> Any:

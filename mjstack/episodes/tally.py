@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from mjstack.config.explain import assign, command
-from mjstack.episodes.failures import describe_sign
+from mjstack.episodes.failures import Sign, describe_sign
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.stage import Stage
 from mjstack.errors import name_worlds
@@ -114,13 +114,28 @@ class EpisodeTally:
         return [f"{seeds[seed]}{world}" for seed, world in places]
 
     def write_failing(self) -> None:
-        """Write the table of failing episodes, if any."""
+        """Write the table of failing episodes, if any: rules, signs, where objects were at the
+        start, and all measurements.
+        """
         rows = []
-        places = self.places if self.records else {}
-        for number, record in enumerate(self.records):
-            share = slice(number * len(record.failed), (number + 1) * len(record.failed))
-            starts = {name: values[share] for name, values in places.items()}
-            rows += record.failing_rows(self.check.rules, starts)
+        failed = np.flatnonzero(self.array("failed")).tolist() if self.records else []
+        places = self.places if failed else {}
+        for episode in failed:
+            number, world = divmod(episode, len(self.records[0].failed))
+            record = self.records[number]
+            values = {name: array[world] for name, array in record.worlds.items()}
+            row: dict[str, object] = {"seed": record.seed, "world": world}
+            row["rules"] = " ".join(self.check.rules.broken(values["failed"]))
+            if "sign" in values:
+                row["sign"] = Sign(values["sign"]).name
+                row["phase"] = [*record.phase_names, ""][values["sign_phase"]]
+                row["step"] = values["sign_step"] if values["sign_step"] >= 0 else ""
+                row |= {"retries": values["retries"], "unreachable": int(values["unreachable"])}
+            for name, starts in places.items():
+                cells = zip(("x_m", "y_m", "yaw_rad"), starts[episode], strict=True)
+                row |= {f"{name}_{end}": f"{x:.6g}" for end, x in cells if not np.isnan(x)}
+            row |= {name: f"{values[f'value.{name}']:.6g}" for name in record.values}
+            rows.append(row)
         if rows:
             name = f"{self.gate}_failing.csv"
             remark = f"{name} has every failing episode with what was measured"

@@ -57,10 +57,9 @@ def judge_episodes(run: Run) -> list[GateResult]:
     """Play the task in nworld worlds under every seed of the running gate, and hold the share of
     episodes that succeed against its ``rate``.
     """
-    own = gate_config(run.cfg, run.gate)
-    if own is not run.cfg:
-        run = run.on(run.stage.with_config(own))
-    cfg = run.cfg
+    cfg = gate_config(run.cfg, run.gate)
+    if cfg is not run.cfg:
+        run = run.on(run.stage.with_config(cfg))
     t = cfg.gate[run.gate]
     tally = EpisodeTally(gate=run.gate, check=run.stage.check, folder=run.folder)
     run.records[run.gate] = tally.records
@@ -83,7 +82,7 @@ def judge_episodes(run: Run) -> list[GateResult]:
     if tally.episodes > 1 and max(ends, starts) < t.distinct_fraction * tally.episodes:
         problem = f"only {ends} distinct final states of {tally.episodes} episodes"
         tally.problems.append(f"{problem}: identical worlds prove nothing, use reset=jitter")
-    if t.diagnosis:
+    if t.reset:
         places = tally.places
         rows = np.stack([*places.values()], axis=1)
         distinct = _count_distinct(np.nan_to_num(rows).reshape(len(rows), -1), 6)
@@ -131,11 +130,11 @@ def _play(run: Run, tally: EpisodeTally) -> int | None:
     snapshots = Snapshots([carry])
     motion = motion_recorder(cfg.timing.step_dt)
     starts = Starts()
-    monitor = FailureMonitor() if t.diagnosis else None
-    goal = Goal(ranks) if t.diagnosis and not stage.driver_class.needs_phases else None
+    monitor = FailureMonitor() if t.reset else None
+    goal = Goal(ranks) if t.reset and not stage.driver_class.needs_phases else None
 
     def observe(plan: BatchPlan) -> list[Observer]:
-        watching = [starts, monitor, goal] if t.diagnosis else []
+        watching = [starts, monitor, goal] if t.reset else []
         first = [snapshots, motion if run.page.motion else None] if plan.seed == seeds[0] else []
         return [observer for observer in (*watching, *first) if observer is not None]
 
@@ -147,9 +146,9 @@ def _play(run: Run, tally: EpisodeTally) -> int | None:
                 record = EpisodeRecord.join(ranks.gather(part))
                 # Before the next one can break or be stopped. A full disk takes no result back.
                 tally.write(record_name(run.gate, record.seed), write_npz, record.arrays())
-                if t.diagnosis:
-                    own = ranks.gather(starts.arrays)
-                    arrays = {name: np.concatenate([a[name] for a in own]) for name in own[0]}
+                if t.reset:
+                    shares = ranks.gather(starts.arrays)
+                    arrays = {k: np.concatenate([share[k] for share in shares]) for k in shares[0]}
                     tally.write(f"{run.gate}_starts_seed{record.seed}.npz", write_npz, arrays)
                 if record.seed == seeds[0]:
                     sim = batch.env.sim

@@ -18,7 +18,7 @@ many ``episodes``, and how many ``succeeded``, their ``rate`` and its 95 % inter
 BOUNDS = (*("x_min_m", "x_max_m", "y_min_m", "y_max_m"), "yaw_min_deg", "yaw_max_deg")
 _CELL = 0.02  # m, width of a cell in x and y
 _YAW_CELL = 15.0  # deg, width of a cell in an object's direction
-_SHOWN = 12  # regions in report.md
+_WORST = 12  # regions in report.md
 _EDGE = 1e-9  # cells: a place this close below a cell's edge is on it
 
 
@@ -91,12 +91,11 @@ def regions_table(least: int, regions: list[Region]) -> list[Table]:
     if not failing:
         return []
     rows = []
-    for region in failing[:_SHOWN]:
+    for region in failing[:_WORST]:
         n, k = region["episodes"], region["succeeded"]
         rows.append([describe_region(region), str(n), str(k), *rate_cells(k, n)])
     title = (
-        f"Worst regions of at least {least} episodes ({len(rows)} of {len(failing)}"
-        " with a failure)"
+        f"Worst regions of at least {least} episodes ({len(rows)} of {len(failing)} with a failure)"
     )
     header = ["where the object started", "episodes", "succeeded", "rate", "95 % interval"]
     return [Table(title=title, header=header, rows=rows)]

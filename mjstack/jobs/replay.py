@@ -225,7 +225,7 @@ def _replay(
     backend, device = plan.where[number]
     stage = run.stage
     check = stage.check
-    monitors = [FailureMonitor()] if stage.cfg.gate[plan.gate].diagnosis else []
+    monitors = [FailureMonitor()] if stage.cfg.gate[plan.gate].reset else []
     trace = WorldTrace()
     observers = [trace, *(run.viewers if first else []), *monitors]
     facts = {"seed": plan.seed, "world": plan.world}
