@@ -427,9 +427,29 @@ def test_without_viser_a_run_says_how_to_have_the_page(
     assert "mjstack[web]" in (out / "report.html").read_text()
 
 
-def labels_of(path: Path) -> list[str]:
-    """Texts of the worlds of a page."""
-    return [m["props"]["text"] for _, m in messages(path) if m["type"] == "LabelMessage"]
+def labels_of(path: Path, rule: str = "") -> list[str]:
+    """Texts of the worlds of a page, or of those of a rule."""
+    return [m["props"]["text"] for _, m in messages(path, rule) if m["type"] == "LabelMessage"]
+
+
+RED, AMBER = (219, 89, 82), (217, 154, 43)
+
+
+def test_a_page_filters_and_colours_by_rule(get_stage: GetStage, tmp_path: Path) -> None:
+    path = tmp_path / "episode.html"
+    broken = (["A"], ["B", "A"], [], ["B"])
+    moving = zip(motion(get_stage, 4, 3), broken, strict=True)
+    worlds = [replace(world, rules=rules) for world, rules in moving]
+    save_episode(path, get_stage("so101").assets.visual_model, worlds, 0.04)
+    assert labels_of(path) == ["0: A", "1: B A", "2", "3: B"]
+    assert labels_of(path, "A") == ["0: A", "1: B A"]
+    assert labels_of(path, "B") == ["1: B A", "3: B"]
+    for rule, first, second in (("", RED, AMBER), ("A", RED, AMBER), ("B", AMBER, AMBER)):
+        sent = [m["props"] for _, m in messages(path, rule) if "props" in m]
+        colors = np.concatenate([p["batched_colors"] for p in sent if "batched_colors" in p])
+        tables = {tuple(color) for color in colors.reshape(-1, 3).tolist()}
+        assert {first, second} <= tables
+    assert max(time for time, _ in messages(path, "A")) == max(t for t, _ in messages(path))
 
 
 @pytest.fixture(scope="module")
@@ -498,6 +518,7 @@ def test_a_browser_plays_the_episode(get_stage: GetStage, tmp_path: Path, tab: T
     tab.wait("document.querySelector('canvas') !== null")
     clock = "parseFloat([...document.querySelectorAll('input')].map(i => i.value)[0])"
     tab.wait(f"{clock} > 0.5")  # it plays
+    tab.wait("document.querySelector('#rules').options.length === 2")
     seen = colored(tab)
     assert seen["arm"] > 500
     assert seen["red"] > 40
