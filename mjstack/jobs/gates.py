@@ -45,8 +45,8 @@ def check_machine(cfg: Config) -> Stage:
         load_images(cfg)
         require_offscreen(stage.model)
     _check_starts(stage)
-    many = cfg.episode_gates or "throughput" in cfg.gates
-    if many and stage.backend[0] is Backend.native:
+    batch = cfg.episode_gates or "throughput" in cfg.gates
+    if batch and stage.backend[0] is Backend.native:
         _check_memory(stage)
     return stage
 
