@@ -470,6 +470,11 @@ DAMAGE: dict[str, tuple[str, str | tuple[str, str] | None, str]] = {
     "empty": (CONFIG, "", "is missing, expected every key of this version"),
     "another tool's": (CONFIG, "model: resnet\n", "config.yaml: cannot be read"),
     "a key too many": (CONFIG, ("nworld: 5\n", "nworld: 5\ncolour: red\n"), "colour"),
+    "another version": (
+        CONFIG,
+        ("    rate: 1.0\n", "    failed_worlds: 0\n"),
+        "run of another version",
+    ),
     "a value out of range": (CONFIG, ("nworld: 5", "nworld: 0"), "nworld=0"),
     "a key too few": (CONFIG, ("nworld: 5\n", ""), "nworld is missing"),
     "another nworld": (

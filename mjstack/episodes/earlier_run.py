@@ -34,8 +34,8 @@ class EarlierRun:
     provenance: dict[str, Any]
 
     @classmethod
-    def read(cls, name: str, key: str = "run") -> "EarlierRun":
-        """Read a run's folder, which a configuration key names.
+    def read(cls, name: str) -> "EarlierRun":
+        """Read a run's folder.
 
         Raises:
             FolderError: There is no such run; the message says what is missing.
@@ -46,7 +46,7 @@ class EarlierRun:
         for path in (saved, report):
             if not path.is_file():
                 raise FolderError(
-                    f"{key}={name}: has no {path.relative_to(folder)}, expected the folder of a"
+                    f"run={name}: has no {path.relative_to(folder)}, expected the folder of a"
                     " run, such as outputs/2026-11-21/04-02-05 (of a sweep: one of its jobs'). Name"
                     " another folder."
                 )
@@ -54,12 +54,14 @@ class EarlierRun:
         with suppress(Exception):  # `load_saved` says what is wrong with it
             job = str(read_yaml(saved)["job"]["name"]).partition("\n")[0]
         if job != "gates":  # before the rest, which has keys of that job alone
-            problem = f"{key}={name}: is a run of job={job}, expected one of job=gates"
+            problem = f"run={name}: is a run of job={job}, expected one of job=gates"
             raise FolderError(problem, "Name that run's folder")
         try:
             cfg = load_saved(saved)
         except MjstackError as error:
-            raise FolderError(f"{key}={name}{made_by(folder)}: {error}") from error
+            keys = "ConfigKeyError" in str(error) or " is missing" in str(error)
+            fix = "A run of another version is replayed by that version" if keys else ""
+            raise FolderError(f"run={name}{made_by(folder)}: {error}", fix) from error
         with reading(report, "Name another folder"):
             provenance = dict(read_json(report, "provenance"))
             provenance["versions"] = dict(provenance["versions"])
