@@ -36,7 +36,7 @@ from mjstack.envs import Env
 from mjstack.episodes.failures import FailureMonitor, Sign
 from mjstack.episodes.rollout import Hook, reset_worlds, rollout
 from mjstack.episodes.run import Run
-from mjstack.episodes.stage import Progress, Stage
+from mjstack.episodes.stage import Stage
 from mjstack.gates.episodes import Goal, find_doubts, gate_config
 from mjstack.gates.regions import describe_region, find_regions, radial_yaw_deg, regions_table
 from mjstack.jobs.gates import check_machine
@@ -150,15 +150,11 @@ def hasty() -> NewRun:
 def test_seeds_add_up_and_the_rate_decides(hasty: NewRun, tmp_path: Path) -> None:
     """The threshold is on the rate itself; what fails is named all the same."""
     run = hasty("gates=[batch,success]", "gate.success.seeds=2", "gate.success.cell_episodes=2")
-    lines: list[str] = []
-    run.stage.progress = Progress(lines.append)
     result = play(run, tmp_path)
     assert result.status is Status.failed
-    assert "0 of 4 episodes succeeded" in result.reason
     assert "4 of 4 episodes (0:0, 0:1, 1:0, 1:1) failed: " in result.reason
     assert result.reason.endswith(f"job=replay run={tmp_path} world=success:0:0")
     assert result.metrics["distinct_starts"] == 4
-    assert [line.split(":")[0] for line in lines] == ["success, seed 0", "success, seed 1"]
     seeds = next(table for table in result.tables if table.title == "Seeds")
     assert [row[:3] for row in seeds.rows] == [["0", "2", "0"], ["1", "2", "0"]]
     title = "Worst regions of at least 2 episodes"
@@ -168,9 +164,6 @@ def test_seeds_add_up_and_the_rate_decides(hasty: NewRun, tmp_path: Path) -> Non
     (signs,) = [table for table in result.tables if "first sign" in table.header[0]]
     # Every failed episode is in one line, with a sign or without
     assert sum(int(row[1]) for row in signs.rows) == 4
-    rows = rows_of(tmp_path / FAILING)
-    assert [row["seed"] + row["world"] for row in rows] == ["00", "01", "10", "11"]
-
     result = play(hasty("gate.success.rate=0"))
     assert result.status is Status.passed
     assert "2 of 2 episodes (0, 1) failed: " in result.reason
