@@ -36,7 +36,7 @@ def reads_starts_file(reset: Mapping[str, TermCfg]) -> bool:
     )
 
 
-def gate_reset(cfg: Config, gate: str) -> Mapping[str, TermCfg]:
+def gate_reset(cfg: Config, gate: str) -> dict[str, TermCfg]:
     """Reset terms under which a gate of episodes plays."""
     reset = cfg.gate[gate].reset
     from_file = reads_starts_file(cfg.reset) and not reads_starts_file(reset)
