@@ -217,8 +217,8 @@ def test_a_gate_of_ones_own_is_a_file(
     assert "bit for bit where it did" in gate_of(Path("again"))["reason"]
     assert run([*conf, "gates=[site]", "gate.site.rate=2"]) == 2
     assert "gate.site.rate=2.0: expected a number from 0 to 1" in capsys.readouterr().err
-    assert run([*conf[:2], "--help", "gate.site.cell"]) == 0
-    assert "gate.site.cell=0.02" in capsys.readouterr().out
+    assert run([*conf[:2], "--help", "gate.site.cell_episodes"]) == 0
+    assert "gate.site.cell_episodes=20" in capsys.readouterr().out
 
 
 FILE = "reset=starts_file starts={run}/success_starts_seed0.npz"
