@@ -183,6 +183,12 @@ class MjwarpSimulation(Simulation):
         self._usage.clear(self._mask)
 
     @override
+    def switch(self, flag: int, *, off: bool) -> None:
+        option = self._m.opt
+        option.disableflags = option.disableflags | flag if off else option.disableflags & ~flag
+        self._graphs.clear()
+
+    @override
     def option_values(self) -> dict[str, float | int | str]:
         opt = self._m.opt
         primitive = opt.disableflags & mjw.DisableBit.NATIVECCD

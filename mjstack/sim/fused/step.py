@@ -149,18 +149,15 @@ def links_bodies(m: mjw.Model) -> bool:
 
 
 def find_velocities(m: mjw.Model, d: mjw.Data) -> None:
-    """Compute what rows of connect and weld read: the velocities of bodies and axes. `make_constraint`
-    of MJWarp comes before them, so its rows have those of the step before; native MuJoCo's have
-    those of the step itself, and so have all steps here.
+    """Compute the velocities of bodies and axes, which rows of connect and weld read. MJWarp makes
+    these rows first, of velocities of the step before; native MuJoCo has those of the step itself.
     """
     if links_bodies(m):
         mjw._src.smooth.com_vel(m, d)
 
 
 def prepare_stock(m: mjw.Model, d: mjw.Data) -> None:
-    """Let the rows of a `mujoco_warp.forward` or `step` that follows read the velocities of the
-    state that it starts from.
-    """
+    """Compute these velocities for a `mujoco_warp.forward` or `step` that follows."""
     if links_bodies(m):
         mjw.fwd_kinematics(m, d)
         find_velocities(m, d)
