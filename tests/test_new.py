@@ -263,7 +263,9 @@ def test_the_reason_tells_the_force_of_the_jaws(here: Path) -> None:
         assert f"to press with {min(limit, 20.0):.0f} N\n" in text
         assert "servos" not in robot
     # As much as they do, though a cube gives way
-    cfg = mjstack.load_config([f"robot={robot['name']}", "sim=native"], config_dir=f"{robot['name']}/conf")
+    cfg = mjstack.load_config(
+        [f"robot={robot['name']}", "sim=native"], config_dir=f"{robot['name']}/conf"
+    )
     stage = Stage(cfg)
     forces: list[Any] = []
     look = Hook(lambda _, sim: forces.append(jaw_forces(stage.index, sim, "red")[0].tolist()))
@@ -387,7 +389,9 @@ REFUSED = {
         "expected an arm of two joints or more with a gripper; no body has fingers",
     ),
     "a loose finger": (
-        gantry(ball="<body name='tip' pos='0 0 -.1'><joint type='ball'/><geom size='.005'/></body>"),
+        gantry(
+            ball="<body name='tip' pos='0 0 -.1'><joint type='ball'/><geom size='.005'/></body>"
+        ),
         "body tip of its hand hangs on a ball joint, which no servo moves",
     ),
     "a finger that is held": (

@@ -71,7 +71,9 @@ class Posture:
         held = (m.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)) & m.eq_active0 & constant
         for name, number in zip(joints, numbers, strict=True):
             if number in m.eq_obj1id[held]:
-                problem = f"joint {name} is held at one place by an equality, expected one that moves"
+                problem = (
+                    f"joint {name} is held at one place by an equality, expected one that moves"
+                )
                 raise MjstackError(problem, "Leave it out of arm_joints and gripper_joints")
 
         # Rest

@@ -96,8 +96,8 @@ def guess_profile(file: Path, scene: SceneCfg, arm: str = "") -> list[Guess]:
     space = find_workspace(model, hand, grip, limits[: len(hand.arm)])
     if space is None:
         raise MjstackError(
-            f"{file}: the hand of {model.body(hand.palm).name} cannot point down over a table within the arm's reach,"
-            " which the drivers' grasps from above need."
+            f"{file}: the hand of {model.body(hand.palm).name} cannot point down over a table"
+            " within the arm's reach, which the drivers' grasps from above need."
         )
     if space.tilt > _LEANS:
         with suppress(ValueError):  # a tip of a hand that leans reaches lower
@@ -229,7 +229,9 @@ def _guess_home(
     roll = None if space.roll is None else names[space.roll]
     if roll:
         yield Guess("roll_joint", roll, "its axis is the approach axis")
-        yield Guess("yaw_alignment", 1.0, "the jaws turn to a face; at home to one of the first cube")
+        yield Guess(
+            "yaw_alignment", 1.0, "the jaws turn to a face; at home to one of the first cube"
+        )
     if space.upright and len(names) - len(space.locked) > 3:
         yield Guess("approach_gain", 0.5, "the first joint is upright, and joints are left")
     yield Guess("approach_height", space.height, "m above an object")

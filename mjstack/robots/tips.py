@@ -190,7 +190,9 @@ class Fingers:
             tops = [cloud[:, 1].max() for cloud in clouds]
             high = 2.0 * self.model.geom_size[self._plate, 1] - _TIP  # of an object, over the point
             level = min(min(tops) + max(high - _HELD, -_EDGE), max(tops) - depth)
-            tips = [c[c[:, 1] > min(level, top) - _EDGE] for c, top in zip(clouds, tops, strict=True)]
+            tips = [
+                c[c[:, 1] > min(level, top) - _EDGE] for c, top in zip(clouds, tops, strict=True)
+            ]
             start = np.array([tips[1][:, 0].mean(), level, np.mean([t[:, 2].mean() for t in tips])])
             gaps = np.array([self._gap(opened + s * (shut - opened), start)[0] for s in _SHARES])
             if gaps.min() > width - 0.01:
@@ -243,7 +245,7 @@ class Fingers:
         data.geom_xmat[self._plate] = (turn @ self._frame).ravel()
         way, geom = 0.0, -1
         for _ in range(_ADVANCES):  # by the distance, which is less where the surface is slanted
-            at = point + [0.0, -back, sign * way]
+            at = point + np.array([0.0, -back, sign * way])
             data.geom_xpos[self._plate] = self._from_palm(self._frame @ at)
             left = _FAR
             for solid in self._solid[np.isin(model.geom_bodyid[self._solid], bodies)]:
