@@ -20,13 +20,12 @@ from mjstack.config.schema import Config
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError
 from mjstack.kinematics.mink_ik import GraspIk
-from mjstack.kinematics.reach import PointReach
 from mjstack.robots import read_robot
 from mjstack.robots.guest import left_behind
 from mjstack.robots.jaws import Jaws
 from mjstack.robots.posture import Posture
 from mjstack.scene import build_model
-from mjstack.scene.index import SceneIndex, gripper_targets
+from mjstack.scene.index import SceneIndex, gripper_targets, jaws_of
 
 SERVO = '<position name="right" class="finger" joint="right"/>'
 FINGERS = '<joint name="fingers" joint1="left" joint2="right" polycoef="0 1 0 0 0"/>'
@@ -150,7 +149,7 @@ def coupled_arm(tmp_path: Path, kind: str) -> Config:
 
 @pytest.mark.parametrize("kind", COUPLINGS)
 def test_inverse_kinematics_takes_what_follows_along(kind: str, tmp_path: Path) -> None:
-    """mink, the batched solver and the reach agree with MuJoCo's grasp point, and reach it."""
+    """mink and the batched solver agree with MuJoCo's grasp point, and reach it."""
     cfg = coupled_arm(tmp_path, kind)
     ik = GraspIk(cfg.robot, cfg.model, tolerance=1e-4)
     places = Posture(ik.model, cfg.robot.joints)
@@ -167,10 +166,6 @@ def test_inverse_kinematics_takes_what_follows_along(kind: str, tmp_path: Path) 
     for k, point in enumerate(points):
         assert np.linalg.norm(ik.grasp_point(command[k].double().numpy()) - point) < 1e-5
         assert ik.solve(point, ik.home)[1] < 1e-4
-    reach = PointReach(ik.model, cfg.robot, cfg.robot.home[4:])
-    q, left = reach.solve(points)
-    assert left.max() < 1e-5
-    np.testing.assert_allclose(reach.forward(q)[1], points, atol=1e-5)
 
 
 def test_a_joint_that_follows_two_is_refused(tmp_path: Path) -> None:
@@ -359,12 +354,9 @@ def test_an_idle_joint_follows_none(where: str, tmp_path: Path) -> None:
     ik = GraspIk(cfg.robot, cfg.model, tolerance=1e-4)
     assert Posture(ik.model, cfg.robot.joints).leader.max(initial=-1) <= 4  # the fingers' alone
     assert not ik._frozen.along
-    reach = PointReach(ik.model, cfg.robot, cfg.robot.home[4:])
-    assert reach._native is None
     goals = np.tile(ik.home, (4, 1))
     goals[:, :3] += np.random.default_rng(1).uniform(-0.15, 0.15, (4, 3)) * [1.0, 1.0, 0.2]
     points = np.array([ik.grasp_point(goal) for goal in goals])
-    np.testing.assert_allclose(reach.forward(goals[:, :3])[1], points, atol=1e-9)
     solver = Arm(ik.model, cfg.robot).solver(4, iterations=40)
     np.testing.assert_allclose(solver.forward(torch.from_numpy(goals))[0], points, atol=1e-6)
 
@@ -410,6 +402,16 @@ def test_joint_targets_follow_from_the_jaws_where_none_are_given(
     stiffness = model.actuator("left").gainprm[0]
     for target, width in zip(closed, widths[1:], strict=True):
         assert stiffness * (0.5 * width - target[0]) == pytest.approx(20.0, rel=1e-3)
+
+
+def test_one_jaw_closes_where_no_target_is_given() -> None:
+    """It presses with 20 N too; its pads are beside its own site, wherever it is open."""
+    cfg = load_config()
+    model = build_model(cfg)
+    robot = replace(cfg.robot, gripper_closed=None)
+    (closed,) = gripper_targets(model, robot, [0.044])
+    assert jaws_of(model, robot).gap([closed]) == pytest.approx([0.044], abs=1e-3)
+    assert closed[0] == pytest.approx(0.40, abs=0.02)
 
 
 def test_a_joint_target_of_a_task_is_for_any_object(tmp_path: Path) -> None:

@@ -19,11 +19,11 @@ from mjstack import load_config
 from mjstack.cli import run
 from mjstack.config.fingerprint import config_content
 from mjstack.config.load import load_saved
-from mjstack.config.schema import Config
+from mjstack.config.schema import Config, RobotCfg
 from mjstack.config.session import search_path
 from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.errors import ConfigError, MjstackError, UnknownName
-from mjstack.kinematics.reach import PointReach
+from mjstack.kinematics.batched_ik import find_reach
 from mjstack.robots import robot_spec
 from mjstack.scene import build_model
 
@@ -248,6 +248,25 @@ def test_grasp_sites_are_added_where_the_file_lacks_them(tmp_path: Path) -> None
     np.testing.assert_allclose(site.pos, [0.0, 0.0, -0.1])
 
 
+def test_grasp_sites_need_not_be_named(tmp_path: Path) -> None:
+    """They go to where the jaws touch an object, or the line says why there is no such place."""
+    cfg = scara()
+    robot = replace(cfg.robot, grasp_sites=RobotCfg().grasp_sites, grasp_parts={})
+    model = build_model(replace(cfg, robot=robot))
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    own, made = (
+        np.mean([data.site(name).xpos for name in sites], axis=0)
+        for sites in (cfg.robot.grasp_sites, robot.grasp_sites)
+    )
+    assert made == pytest.approx(own, abs=0.012)
+    assert made[:2] == pytest.approx(own[:2], abs=1e-4)
+    thick = changed(tmp_path, 'range="0 0.05"', 'range="0 0.01"')
+    lost = replace(thick.robot, grasp_sites=robot.grasp_sites, grasp_parts={})
+    line = "expected two sites of the robot's file. Name them: its fingers open by"
+    refusal(lambda: build_model(replace(thick, robot=lost)), line)
+
+
 def test_fingers_on_a_tendon_move_as_its_own_servo_moves_them(tmp_path: Path) -> None:
     """The file's servo takes 0 to 250 for 0 to 0.05 m, and pushes with 3 N at most."""
     fingers = re.search(r'<position name="left".*<position name="right"[^>]*>', MJCF, re.DOTALL)
@@ -280,17 +299,16 @@ def test_reach_of_an_arm_with_a_slide_is_mujocos() -> None:
     cfg = scara()
     model = build_model(cfg)
     arm = Arm(model, cfg.robot)
-    reach = PointReach(model, cfg.robot, cfg.robot.gripper_open)
     points = scara_points(30)
-    solutions, distances = reach.solve(points)
-    assert distances.max() < 1e-6
-    commands = arm.at_home(30)
-    commands[:, arm.moved] = solutions
-    assert np.linalg.norm(arm.grasp_point(commands) - points, axis=1).max() < 1e-6
+    commands, distances = find_reach(model, cfg.robot, points, cfg.robot.gripper_open)
+    assert distances.max() < 1e-5
+    for start in commands.double().numpy():
+        assert np.linalg.norm(arm.grasp_point(start) - points, axis=1).max() < 1e-5
     # Above the slide's range the point is as far away as it is above.
-    q, distances = reach.solve(np.array([[0.4, 0.0, 0.28 + 0.1]]))
-    assert distances[0] == pytest.approx(0.1, abs=1e-4)
-    assert q[0, 2] == pytest.approx(0.25, abs=1e-9)
+    point = np.array([[0.4, 0.0, 0.28 + 0.1]])
+    q, distances = find_reach(model, cfg.robot, point, cfg.robot.gripper_open)
+    assert distances.min() == pytest.approx(0.1, abs=1e-4)
+    assert q[distances[:, 0].argmin(), 0, 2] == pytest.approx(0.25, abs=1e-6)
 
 
 def test_mink_plans_an_arm_with_a_slide() -> None:

@@ -82,7 +82,7 @@ def _compare(run: Run, mjwarp: Simulation) -> GateResult:
 
     headline = run.stage.check.headline(judged)
     run.print_line(f"{cfg.task.name} check: {headline} ({mjwarp.description})")
-    run.show_world("parity", "parity, MJWarp", world.qpos, status, world.env, "parity world")
+    run.show_world("parity", "parity, MJWarp", world.qpos, episode, world.env, "parity world")
     summary = "; ".join([headline, *ends])
     if "images" in result.notes:
         summary += "; images were not compared"

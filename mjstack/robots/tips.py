@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from numpy import ndarray
 
+from mjstack.robots.bodies import geom_corners, solid_geoms
 from mjstack.robots.hand import Hand
 from mjstack.robots.posture import Posture
 
@@ -17,9 +18,11 @@ _DEPTHS = ((0.016, 0.013), (0.010, 0.013), (0.005, 0.013), (0.005, 0.004))
 _REACH = 0.018  # m that they may at most, which a jaw on a hinge changes as it opens
 _ROOM = 0.016  # m beside an object that is enough
 _EDGE = 0.002  # m from a tip's end at least
+_HELD = 0.012  # m of an object's side that the shorter tip touches
 _PLATE = [0.004, 0.013, 0.0005]  # m: half sizes of the patch of a surface that counts
 _TIP = 0.004  # m of it that is beyond the grasp point; the rest is as high as an object there
 _FAR = 0.3  # m
+_ADVANCES = 8
 _WIDE = 0.085  # m: as far as jaws open, with room beside a cube
 _SHARES = np.linspace(0.0, 1.0, 33)  # of the way from open to shut
 
@@ -71,7 +74,7 @@ class Fingers:
         self._ranges = ranges
         self._posture = Posture(model, [model.joint(j).name for j in (*hand.arm, *hand.gripper)])
         self._arm = self._posture.rest[self._posture.commanded[: len(hand.arm)]]
-        self._solid = np.flatnonzero((model.geom_contype | model.geom_conaffinity) != 0)
+        self._solid = solid_geoms(model)
         palm = model.body_weldid[hand.palm]
         self._fixed = np.flatnonzero(model.body_weldid == palm) if palm else np.array([hand.palm])
 
@@ -86,12 +89,19 @@ class Fingers:
         return whole[len(self._arm) :]
 
     def points(self, bodies: Sequence[int]) -> ndarray:
-        """Points of the solid geoms of bodies in the palm's frame [m], shape ``(n, 3)``."""
+        """Vertices of the solid meshes of bodies, corners of the boxes around other solid geoms,
+        in the palm's frame [m], shape ``(n, 3)``.
+        """
         model, data = self.model, self._data
         clouds = [np.zeros((0, 3))]
-        for geom in self._solid[np.isin(model.geom_bodyid[self._solid], bodies)]:
-            local = _corners(model, geom) @ data.geom_xmat[geom].reshape(3, 3).T
-            clouds.append(self._to_palm(local + data.geom_xpos[geom]))
+        for geom in solid_geoms(model, bodies):
+            cloud = geom_corners(data, [geom])[0]
+            if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
+                mesh = model.geom_dataid[geom]
+                first = model.mesh_vertadr[mesh]
+                cloud = model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
+                cloud = cloud @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
+            clouds.append(self._to_palm(cloud))
         return np.concatenate(clouds)
 
     def measure(self, width: float, deepest: float = math.inf) -> Grip:
@@ -101,21 +111,21 @@ class Fingers:
         hand = self._hand
         middle = self._ranges.mean(axis=1)
         self.settle(middle)
-        clouds = {body: self.points([body]) for body in hand.bodies}
-        bodies = [body for body, cloud in clouds.items() if len(cloud)]
+        bodies = [body for body in hand.bodies if len(self.points([body]))]
         if not bodies:
             raise ValueError("the fingers have no geoms that collide")
-        centres = np.array([clouds[body].mean(axis=0) for body in bodies])
-        ways = np.zeros((len(middle), len(bodies), 3))  # from a joint's lower end to its upper
-        for number, ends in enumerate(self._ranges):
-            for end, sign in zip(ends, (-1.0, 1.0), strict=True):
-                target = middle.copy()
-                target[number] = end
-                self.settle(target)
-                means = [self.points([body]).mean(axis=0) for body in bodies]
-                ways[number] += sign * np.array(means)
+
+        def centres(gripper: ndarray) -> ndarray:
+            self.settle(gripper)
+            return np.array([self.points([body]).mean(axis=0) for body in bodies])
+
+        ways = np.empty((len(middle), len(bodies), 3))  # from a joint's lower end to its upper
+        for number in range(len(middle)):
+            still = np.arange(len(middle)) != number
+            low, high = (centres(np.where(still, middle, ends)) for ends in self._ranges.T)
+            ways[number] = high - low
         closing = np.linalg.svd(ways.reshape(-1, 3))[2][0]
-        along = centres @ closing
+        along = centres(middle) @ closing
         right = along > 0.5 * (along.min() + along.max())
         if right[0]:  # the first jaw is the one that the file has first
             closing, right = -closing, ~right
@@ -129,20 +139,20 @@ class Fingers:
                 closing = -closing
         elif not second:  # all move in step
             raise ValueError("its fingers do not close on each other")
-        moves = ways @ closing
-        opens = moves[:, right].mean(axis=1)
-        if not right.all():
-            opens = opens - moves[:, ~right].mean(axis=1)
+
+        def relative(moves: ndarray) -> ndarray:
+            """How the second side moves, seen from the first, from the bodies' ways."""
+            first_way = 0.0 if right.all() else moves[~right].mean(axis=0)
+            return moves[right].mean(axis=0) - first_way
+
+        opens = relative((ways @ closing).T)
         low, high = self._ranges.T
         opened = self._agree(np.where(opens > 0.0, high, low))
         shut = self._agree(np.where(opens > 0.0, low, high))
-        nearly = []  # shut: there a jaw on a hinge lies along the approach axis
-        for share in (0.15, 0.0):
-            self.settle(shut + share * (opened - shut))
-            nearly.append(np.array([self.points([body]).mean(axis=0) for body in bodies]))
-        away = nearly[0] - nearly[1]
-        away = away[right].mean(axis=0) - (0.0 if right.all() else away[~right].mean(axis=0))
-        approach = self._approach(nearly[1].mean(axis=0), _unit(away))
+        # Nearly shut a jaw on a hinge lies along the approach axis
+        nearly, closed = (centres(shut + share * (opened - shut)) for share in (0.15, 0.0))
+        away = relative(nearly - closed)
+        approach = self._approach(closed.mean(axis=0), _unit(away))
         closing = _unit(away - (away @ approach) * approach)
         self._frame = np.stack((np.cross(approach, closing), approach, closing), axis=1)
         self._sides = first, second
@@ -186,8 +196,11 @@ class Fingers:
             self.settle(opened + share * (shut - opened))
             clouds = [self.points(side) @ frame for side in self._sides]
             tops = [cloud[:, 1].max() for cloud in clouds]
-            level = min(min(tops) - _EDGE, max(tops) - depth)
-            tips = [cloud[cloud[:, 1] > level - _EDGE] for cloud in clouds]
+            high = 2.0 * self.model.geom_size[self._plate, 1] - _TIP  # of an object, over the point
+            level = min(min(tops) + max(high - _HELD, -_EDGE), max(tops) - depth)
+            tips = [
+                c[c[:, 1] > min(level, top) - _EDGE] for c, top in zip(clouds, tops, strict=True)
+            ]
             start = np.array([tips[1][:, 0].mean(), level, np.mean([t[:, 2].mean() for t in tips])])
             gaps = np.array([self._gap(opened + s * (shut - opened), start)[0] for s in _SHARES])
             if gaps.min() > width - 0.01:
@@ -223,22 +236,33 @@ class Fingers:
         self.settle(gripper)
         point = start.copy()
         for _ in range(4):
-            (left, first), (right, second) = (self._touch(point, side) for side in self._sides)
+            (left, first), (right, second) = (
+                self._touch(point, side, sign)
+                for side, sign in zip(self._sides, (-1.0, 1.0), strict=True)
+            )
             point[2] += 0.5 * (right - left)
         return left + right + 2.0 * _PLATE[2], point, [first, second]
 
-    def _touch(self, point: ndarray, bodies: Sequence[int]) -> tuple[float, int]:
-        """How far the nearest solid geom of some bodies is from the plate, and which it is."""
+    def _touch(self, point: ndarray, bodies: Sequence[int], sign: float) -> tuple[float, int]:
+        """How far the plate goes along the closing axis until it touches a solid geom of some
+        bodies, and which one.
+        """
         model, data = self.model, self._data
         back = model.geom_size[self._plate, 1] - _TIP
-        data.geom_xpos[self._plate] = self._from_palm(self._frame @ (point - [0.0, back, 0.0]))
         turn = data.xmat[self._hand.palm].reshape(3, 3)
         data.geom_xmat[self._plate] = (turn @ self._frame).ravel()
-        nearest = (_FAR, -1)
-        for geom in self._solid[np.isin(model.geom_bodyid[self._solid], bodies)]:
-            left = mujoco.mj_geomDistance(model, data, self._plate, geom, _FAR, None)
-            nearest = min(nearest, (left, int(geom)))
-        return nearest
+        way, geom = 0.0, -1
+        for _ in range(_ADVANCES):  # by the distance, which is less where the surface is slanted
+            at = point + np.array([0.0, -back, sign * way])
+            data.geom_xpos[self._plate] = self._from_palm(self._frame @ at)
+            left = _FAR
+            for solid in self._solid[np.isin(model.geom_bodyid[self._solid], bodies)]:
+                near = mujoco.mj_geomDistance(model, data, self._plate, solid, _FAR, None)
+                left, geom = min((left, geom), (near, int(solid)))
+            way += left
+            if way >= _WIDE or abs(left) < 1e-5:
+                break
+        return min(way, _WIDE), geom
 
     def _to_palm(self, points: ndarray) -> ndarray:
         palm = self._hand.palm
@@ -247,16 +271,6 @@ class Fingers:
     def _from_palm(self, point: ndarray) -> ndarray:
         palm = self._hand.palm
         return self._data.xpos[palm] + self._data.xmat[palm].reshape(3, 3) @ point
-
-
-def _corners(model: mujoco.MjModel, geom: int) -> ndarray:
-    """Vertices of a mesh, or corners of the box around another geom, in its frame [m]."""
-    mesh = model.geom_dataid[geom]
-    if mesh >= 0 and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
-        first = model.mesh_vertadr[mesh]
-        return model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
-    middle, half = model.geom_aabb[geom].reshape(2, 3)
-    return middle + half * np.stack(np.meshgrid(*[[-1, 1]] * 3), axis=-1).reshape(-1, 3)
 
 
 def _last(gaps: ndarray, gap: float) -> float:

@@ -31,8 +31,6 @@ class PlacementsCfg:
     """x and y of each place."""
     random_xy: list[float] = spec(unit="m", length=2, ge=0.0)
     """How far ``reset=randomized`` moves each object, plus or minus."""
-    box_center: list[float] | None = spec(None, unit="m", length=2)
-    """Centre of the box."""
     grasp_offset: float = spec(0.0, unit="m")
     """How far above an object's centre it is held."""
     home: list[float] | None = spec(None, unit="rad, m")
@@ -116,8 +114,9 @@ class RobotCfg:
     jaw_bodies: list[str] = MISSING
     """Bodies that touch a grasped object, each with all below it. A sensor measures the force of
     each on each object."""
-    grasp_sites: list[str] = spec(length=2)
-    """Two sites, one on each jaw, or both on the palm. Their midpoint is the grasp point."""
+    grasp_sites: list[str] = spec(["grasp_first", "grasp_second"], length=2)
+    """Two sites, one on each jaw, or both on the palm. Their midpoint is the grasp point. Those of
+    the default, which no key places and the file lacks, go to where the jaws touch an object."""
     grasp_parts: dict[str, list[str]] = spec({})
     """Where a grasp site goes that the file lacks: the mean of these geoms of a jaw, or a body."""
     grasp_pos: dict[str, Any] = spec({}, vectors=True, unit="m", length=3)
