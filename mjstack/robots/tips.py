@@ -211,8 +211,8 @@ class Fingers:
         _, point, geoms = self._gap(touching, start)
         tall = self.model.geom_size[self._plate, 1]
         self.model.geom_size[self._plate, 1] = _TIP
-        ends = (self._gap(touching, point - [0.0, up, 0.0])[0] for up in (0.0, 0.5 * width))
-        spread = float(np.subtract(*ends))
+        apart = (self._gap(touching, point - [0.0, up, 0.0])[0] for up in (0.0, 0.5 * width))
+        spread = float(np.subtract(*apart))
         self.model.geom_size[self._plate, 1] = tall
         jaws = [int(self.model.geom_bodyid[geom]) for geom in geoms]
         sites = []
