@@ -219,8 +219,7 @@ class Fingers:
         _, point, geoms = self._gap(touching, start)
         tall = self.model.geom_size[self._plate, 1]
         self.model.geom_size[self._plate, 1] = _TIP
-        apart = (self._gap(touching, point - [0.0, up, 0.0])[0] for up in (0.0, 0.5 * width))
-        spread = float(np.subtract(*apart))
+        here, above = (self._gap(touching, point - [0.0, up, 0.0])[0] for up in (0.0, 0.5 * width))
         self.model.geom_size[self._plate, 1] = tall
         jaws = [int(self.model.geom_bodyid[geom]) for geom in geoms]
         sites = []
@@ -239,10 +238,8 @@ class Fingers:
             reaches.append(float(top - np.mean(touches, axis=0) @ frame[:, 1]))
         gap = (float(gaps.max()), float(gaps.min()))
         point, (_, approach, closing) = frame @ point, frame.T
-        beyond = max(reaches)
-        return Grip(
-            wide, touching, shut, gap, beyond, spread, point, closing, approach, jaws, sites
-        )
+        measures = (gap, max(reaches), here - above)
+        return Grip(wide, touching, shut, *measures, point, closing, approach, jaws, sites)
 
     def _gap(self, gripper: ndarray, start: ndarray) -> tuple[float, ndarray, list[int]]:
         """Distance of the sides [m] along the closing axis, the point between them, in the grasp's
