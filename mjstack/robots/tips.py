@@ -19,6 +19,8 @@ _REACH = 0.018  # m that they may at most, which a jaw on a hinge changes as it 
 _ROOM = 0.016  # m beside an object that is enough
 _EDGE = 0.002  # m from a tip's end at least
 _HELD = 0.012  # m of an object's side that the shorter tip touches
+_SPREAD = 0.015  # m that the jaws may be wider at the point than at an object's upper edge
+_SHALLOW = -0.010  # m for a depth then: jaws press it out, the less the higher they grasp it
 _PLATE = [0.004, 0.013, 0.0005]  # m: half sizes of the patch of a surface that counts
 _TIP = 0.004  # m of it that is beyond the grasp point; the rest is as high as an object there
 _FAR = 0.3  # m
@@ -37,6 +39,7 @@ class Grip:
         shut: The same, at the other end of their ranges.
         gap: Distance of the surfaces at both ends [m].
         beyond: How far a tip reaches beyond the middle of the sites, open or around it [m].
+        spread: Distance of the surfaces at that middle, less that half a width above it [m].
         point: Middle between the surfaces [m].
         closing: Unit vector from the first jaw to the second.
         approach: Unit vector from the wrist towards the tips.
@@ -49,6 +52,7 @@ class Grip:
     shut: ndarray
     gap: tuple[float, float]
     beyond: float
+    spread: float
     point: ndarray
     closing: ndarray
     approach: ndarray
@@ -160,6 +164,9 @@ class Fingers:
         depths = [pair for pair in _DEPTHS if pair[0] <= deepest]
         for depth, self.model.geom_size[self._plate, 1] in depths:
             grip = self._grasp(width, (opened, shut), depth)
+            if grip.spread > _SPREAD:
+                grip = self._grasp(width, (opened, shut), _SHALLOW)
+                break
             grips.append(grip)
             if grip.gap[0] >= width + _ROOM and grip.beyond <= _REACH:
                 break
@@ -210,6 +217,10 @@ class Fingers:
         wide = opened + _last(gaps, min(most, float(gaps.max()))) * (shut - opened)
         touching = opened + share * (shut - opened)
         _, point, geoms = self._gap(touching, start)
+        tall = self.model.geom_size[self._plate, 1]
+        self.model.geom_size[self._plate, 1] = _TIP
+        here, above = (self._gap(touching, point - [0.0, up, 0.0])[0] for up in (0.0, 0.5 * width))
+        self.model.geom_size[self._plate, 1] = tall
         jaws = [int(self.model.geom_bodyid[geom]) for geom in geoms]
         sites = []
         for jaw, sign in zip(jaws, (-0.5, 0.5), strict=True):
@@ -227,7 +238,8 @@ class Fingers:
             reaches.append(float(top - np.mean(touches, axis=0) @ frame[:, 1]))
         gap = (float(gaps.max()), float(gaps.min()))
         point, (_, approach, closing) = frame @ point, frame.T
-        return Grip(wide, touching, shut, gap, max(reaches), point, closing, approach, jaws, sites)
+        measures = (gap, max(reaches), here - above)
+        return Grip(wide, touching, shut, *measures, point, closing, approach, jaws, sites)
 
     def _gap(self, gripper: ndarray, start: ndarray) -> tuple[float, ndarray, list[int]]:
         """Distance of the sides [m] along the closing axis, the point between them, in the grasp's

@@ -21,7 +21,7 @@ from mjstack.robots.posture import Posture, idle_servos, posture
 from mjstack.scene.build import CAPSULE_TURN, WORLD, force_sensor
 from mjstack.sim.simulation import Columns
 
-_jaws = lru_cache(maxsize=8)(Jaws)  # probed once per model
+_jaws = lru_cache(maxsize=8)(Jaws)
 _APART = 1e-4  # [rad, m] that a joint value may be off
 _OFF_EQUALITY = 1e-3  # of the joint's range, that it may besides: values in files are rounded
 _GRIP = 20.0  # [N] of each jaw on an object, where the configuration has no joint target
@@ -235,8 +235,7 @@ def gripper_targets(
     is given, it is for any object; where it is not given either, the jaws press with 20 N.
     ``widths`` are those of the objects across the jaws [m]; None is for the open gripper.
     """
-    names = (robot.joints, robot.gripper_joints, robot.jaw_bodies, robot.grasp_sites)
-    jaws = _jaws(model, *map(tuple, names))
+    jaws = jaws_of(model, robot)
     low, high = (limits[len(robot.arm_joints) :] for limits in joint_limits(model, robot))
     opened, closed = (
         np.clip(end, low, high) if target is None else np.array(target, dtype=float)
@@ -262,6 +261,12 @@ def gripper_targets(
     if not probed:
         rows[wide == robot.closed_width] = closed
     return rows
+
+
+def jaws_of(model: mujoco.MjModel, robot: RobotCfg) -> Jaws:
+    """The robot's jaws, probed once per model."""
+    names = (robot.joints, robot.gripper_joints, robot.jaw_bodies, robot.grasp_sites)
+    return _jaws(model, *map(tuple, names))
 
 
 def locked_home(robot: RobotCfg) -> np.ndarray:
