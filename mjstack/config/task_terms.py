@@ -36,7 +36,10 @@ def complete_terms(cfg: DictConfig, overrides: Sequence[str]) -> None:
         if cfg.job.name == "train" and not chosen:  # judged from starts as training has them
             terms = {name: f"${{reset.{name}}}" for name in cfg.reset}
             cfg.gate.success.reset = terms | _written(cfg, _JUDGED)
-        gates = [name for name, gate in cfg.gate.items() if gate.get("reset")]
+        played = [
+            name for name in cfg.gate if OmegaConf.select(cfg, f"gate.{name}.func") == EPISODES
+        ]
+        gates = ["baseline", "capacity", *(name for name in played if cfg.gate[name].get("reset"))]
         lines = [line for name in gates for line in _complete_copy(cfg, name)]
         cfg.unused_terms = [*lines, *_left_out(cfg), *_unseen(cfg)]
 
