@@ -28,8 +28,8 @@ from mjstack.episodes.stage import Stage
 from mjstack.errors import FolderError, MissingExtra, MjstackError
 from mjstack.jobs import play as play_job
 from mjstack.jobs.export import check_export, export_facts
+from mjstack.jobs.export_lerobot import lerobot_files
 from mjstack.policy import Vision, lerobot, load_policy, save_policy
-from mjstack.policy.lerobot import lerobot_files
 from mjstack.policy.onnx import to_onnx
 
 SEEN = ("observation=state", "+observation.policy.terms.joint_vel.history=2")
@@ -281,9 +281,9 @@ def test_lerobots_folder_has_its_own_files_and_the_weights(
 def test_lerobots_robots_take_joint_targets_alone(tmp_path: Path) -> None:
     cfg = configure("action=ee_delta", "timing.policy_decimation=5")
     save_policy(tmp_path / "policy", make_policy(cfg, chunk=1, execute=5))
-    limits = np.zeros((6, 2))
+    stage = Stage(replace(configure("job=export"), policy=str(tmp_path / "policy")))
     with pytest.raises(FolderError, match=r"its actions are arm, gripper, expected joint targets"):
-        lerobot_files(load_policy(tmp_path / "policy"), limits)
+        lerobot_files(stage)
 
 
 def test_a_missing_lerobot_and_another_version_are_one_line(monkeypatch: Patch) -> None:

@@ -13,7 +13,7 @@ from importlib import import_module
 from typing import Any, NamedTuple
 
 from mjstack.config.complete import typed
-from mjstack.config.fields import accepted, field_docs
+from mjstack.config.fields import CHANGES, accepted, field_docs, field_range
 from mjstack.config.fingerprint import shipped_policies
 from mjstack.config.functions import find_object, offered
 from mjstack.config.schema import Config
@@ -78,12 +78,15 @@ Exit status: 0 passed, 1 a gate failed, 2 bad configuration or input, 130 interr
 
 
 class Key(NamedTuple):
-    """A dotted configuration key, its value, its type with range and unit, and its meaning."""
+    """A dotted configuration key, its value, its type with range and unit, its meaning, and which
+    results depend on it.
+    """
 
     name: str
     value: str
     accepts: str
     words: str
+    effect: str = ""
 
 
 def list_groups() -> dict[str, tuple[list[str], str]]:
@@ -100,7 +103,9 @@ def list_groups() -> dict[str, tuple[list[str], str]]:
     }
 
 
-def list_keys(value: Any, name: str = "", *, named: bool = True) -> Iterator[Key]:
+def list_keys(
+    value: Any, name: str = "", *, named: bool = True, inherited: Sequence[str] = ()
+) -> Iterator[Key]:
     """Keys of a configuration at and below one of its parts, whose dotted key is ``name``.
 
     With ``named``, entries that users name, such as terms, are listed each. Otherwise the first one
@@ -110,16 +115,17 @@ def list_keys(value: Any, name: str = "", *, named: bool = True) -> Iterator[Key
     for item in fields(value) if is_dataclass(value) else ():
         part = getattr(value, item.name)
         key = f"{name}.{item.name}".lstrip(".")
+        changes = field_range(item).changes or inherited
         if is_dataclass(part):
-            yield from list_keys(part, key, named=named)
+            yield from list_keys(part, key, named=named, inherited=changes)
         elif isinstance(part, dict) and any(map(is_dataclass, part.values())):
             for entry in part if named else list(part)[:1]:
-                yield from list_keys(
-                    part[entry], f"{key}.{entry if named else 'NAME'}", named=named
-                )
+                path = f"{key}.{entry if named else 'NAME'}"
+                yield from list_keys(part[entry], path, named=named, inherited=changes)
         else:
             text = "" if ".NAME" in key else _yaml(part)
-            yield Key(key, text, accepted(type(value), item), docs.get(item.name, ""))
+            effect = " ".join(filter(None, map(CHANGES.get, changes)))
+            yield Key(key, text, accepted(type(value), item), docs.get(item.name, ""), effect)
 
 
 def key_help(cfg: Config, prefix: str, width: int) -> str:
@@ -140,7 +146,8 @@ def key_help(cfg: Config, prefix: str, width: int) -> str:
         raise UnknownName("key", prefix, {".".join(names[:depth]) for names in beside})
     lines = []
     for key in matching:
-        words = textwrap.wrap(f"{key.words} Accepts {key.accepts}.".strip(), width - 2)
+        text = f"{key.words} Accepts {key.accepts}. {key.effect}"
+        words = textwrap.wrap(text.strip(), width - 2)
         lines += [f"{key.name}={key.value}", *(f"  {line}" for line in words)]
     return "\n".join(lines)
 

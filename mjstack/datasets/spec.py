@@ -29,7 +29,7 @@ INDICES = {
 OWN_VALUES = {"success": "bool", "seed": "int64", "world": "int64"}  # of every episode's row
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Feature:
     """One column of the frames: a vector of named numbers.
 
@@ -143,18 +143,6 @@ class EpisodeData:
     world: int
     values: Mapping[str, float | int | bool | str] = field(default_factory=dict)
     images: Mapping[str, np.ndarray] = field(default_factory=dict)
-
-
-def term_columns(term: str, dim: int, history: int) -> list[str]:
-    """Names of the ``dim`` numbers of an observation term, over all steps of its ``history``:
-    ``red_pose.2``, and ``red_pose.2.t-1`` one step before.
-    """
-    width = dim // history
-    return [
-        f"{term}{f'.{i}' if width > 1 else ''}{f'.t-{age}' if age else ''}"
-        for age in range(history - 1, -1, -1)
-        for i in range(width)
-    ]
 
 
 def typed_episode(

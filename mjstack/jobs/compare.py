@@ -75,7 +75,7 @@ def check_compare(cfg: Config, overrides: Sequence[str]) -> CheckedJob:
         require_episode(side)
         stage = check_machine(replace(side, gates=["success"]))
         sides[name] = stage.with_config(success_config(stage.cfg))
-        driver = (sides[name].cfg.controller.name, content.get("policy", ""))
+        driver = (sides[name].cfg.controller.name, content["policy"])
         notes[name] = " ".join(filter(None, driver))
     first, second = map(_start_of_first_world, sides.values())
     if first.keys() != second.keys() or any((first[k] != second[k]).any() for k in first):

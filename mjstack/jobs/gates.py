@@ -11,7 +11,6 @@ from mjstack.config.schema import Backend, Config
 from mjstack.drivers.driver import check_driver
 from mjstack.envs import driven_config
 from mjstack.episodes.earlier_run import EarlierRun
-from mjstack.episodes.record import STEMS
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, FolderError, MjstackError, Unreachable, renamed_keys
 from mjstack.gates.images import load_images
@@ -195,11 +194,8 @@ def _check_resumed(stage: Stage, name: str) -> list[str]:
 
 def _played_config(cfg: Config) -> dict[str, Any]:
     """Everything that the episodes of batch and success depend on; more seeds may be asked for."""
-    config = config_content(cfg, ("gates", "view", "video", "graph"))
-    config["sim"] = {"backend": resolve_backend(cfg)[0], "step": cfg.sim.step}
-    config["gate"] = {name: config["gate"][name] for name in STEMS}
-    for gate in config["gate"].values():
-        del gate["seeds"]
+    config = config_content(cfg, "gates", "training", "episodes")
+    config["sim"]["backend"] = resolve_backend(cfg)[0]
     return config
 
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
-from mjstack.config.fields import MOST_COUNT, MOST_WORLDS, spec
+from mjstack.config.fields import FITS, MOST_COUNT, MOST_WORLDS, spec
 
 
 class Backend(StrEnum):
@@ -28,7 +28,7 @@ class TimingCfg:
     the policy's driver repeats each action."""
     control_hz: float = spec(50.0, unit="Hz", gt=0.0, le=1e6)
     """Control rate that these make: ``task.control_hz`` of the built-in tasks."""
-    command_delay: int = spec(0, unit="control steps", ge=0, le=1000)
+    command_delay: int = spec(0, unit="control steps", ge=0, le=1000, changes=FITS)
     """Control steps between a command and its effect; until then the start's command holds."""
     random_delay: int = spec(0, unit="control steps", ge=0, le=1000)
     """The most that commands are later still: each world draws 0 to this for each episode."""
@@ -84,9 +84,9 @@ class SimCfg:
 
     backend: Backend = spec()
     """Physics engine of batch and throughput: auto is MJWarp where there is CUDA."""
-    device: str = spec()
+    device: str = spec(changes=("report",))
     """auto, cpu or cuda:N."""
-    step: str = spec(choices=("auto", "stock"))
+    step: str = spec(choices=("auto", "stock"), changes=("training",))
     """MJWarp's step. stock: ``mujoco_warp.step``; auto: its stages as parallel branches, and
     contact rows, the solver and smooth dynamics as a few kernels, where these do all that the model
     needs."""
@@ -244,7 +244,7 @@ class SuccessGateCfg(GateFuncCfg):
     """Seeds of nworld episodes each: the configured one and those after it."""
     rate: float = spec(ge=0.0, le=1.0)
     """Share of the episodes that must succeed."""
-    region: list[float] | None = spec(None, unit="m", length=2, ge=0.0)
+    region: list[float] | None = spec(None, unit="m", length=2, ge=0.0, changes=("gates",))
     """Half-widths of the objects' region in x and y; null: as ``reset`` has them."""
     cell: float = spec(unit="m", gt=0.0)
     """Width of the cells in which start positions are counted, in x and y."""
@@ -254,7 +254,7 @@ class SuccessGateCfg(GateFuncCfg):
     """Episodes below which a cell has no rate."""
     worst_regions: int = spec(unit="cells", ge=1, le=MOST_COUNT)
     """Worst cells in report.md."""
-    reset: dict[str, Any] = spec({})
+    reset: dict[str, Any] = spec({}, changes=("gates",))
     """Reset terms, unless ``reset=starts_file`` names a file: what they add to the task's own terms
     of ``reset``, or replace by name."""
 
