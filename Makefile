@@ -12,7 +12,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-com
 .PHONY: demo run test test-rest test-long test-all test-lerobot fuzz docs dist setup clean
 
 demo: $(READY)
-	$(BIN)/mjstack demo $(ARGS)
+	$(BIN)/mjstack experiment=demo $(ARGS)
 
 run: $(READY)
 	$(BIN)/python scripts/run.py robot=so101 nworld=32 $(ARGS)

@@ -88,17 +88,13 @@ def run(args: list[str]) -> int:
 
 def _dispatch(flags: Namespace, overrides: list[str]) -> int:
     """Do what the flags ask for, on the current search path."""
-    demonstrates = overrides[:1] == ["demo"]
-    if demonstrates and any(override.startswith("experiment=") for override in overrides):
-        raise MjstackError("demo: expected no experiment=NAME, because it is one. Leave it out.")
-    if demonstrates:
-        overrides = ["experiment=demo", *overrides[1:]]
+    command = overrides[0] if overrides else ""
     with hydra_session() as hydra:
-        if overrides[:1] == ["list"]:
+        if command == "list":
             print(list_text(overrides[1:]), flush=True)
-        elif overrides[:1] == ["new"]:
+        elif command == "new":
             return _write_new(overrides[1:], flags.arm)
-        elif overrides[:1] == ["doctor"]:
+        elif command == "doctor":
             from mjstack.jobs.doctor import findings  # it loads Warp
 
             for name, words in findings(overrides[1:]):
@@ -112,13 +108,7 @@ def _dispatch(flags: Namespace, overrides: list[str]) -> int:
         elif flags.multirun:
             return _sweep(hydra, overrides)
         else:
-            status = _run_one(hydra, overrides)
-            if demonstrates and _results:
-                from mjstack.jobs.demo import show_demo  # the other commands need no browser
-
-                arm = "so101" if "robot=rebot" in overrides else "rebot"
-                show_demo(_results[-1].folder, arm)
-            return status
+            return _run_one(hydra, overrides)
     return 0
 
 

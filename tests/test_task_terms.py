@@ -158,7 +158,7 @@ def test_training_is_judged_from_the_starts_of_the_task(turned: Path, tmp_path: 
     assert list(composed(turned, "job=train", "reset=jitter", extra).gate.success.reset)[-1] == (
         "more"
     )
-    chosen = composed(turned, "job=train", "reset=jitter", "gate.success.reset=randomized")
+    chosen = composed(turned, "job=train", "reset=jitter", "reset@gate.success.reset=randomized")
     assert list(chosen.gate.success.reset) == [*SHIPPED, "turn", "slide"]
     # An experiment's choice counts as one of the command line
     (turned / "experiment").mkdir()
@@ -258,7 +258,7 @@ def test_a_policy_sees_what_a_task_writes(turned: Path) -> None:
     assert not load_config(more).unused_terms  # the policy has that term, by another name
     more[0] = more[0].replace("goals", "gripper_opening")
     assert "the task's own seen it does not see" in load_config(more).unused_terms[-1]
-    chosen = load_config([*more, "job.observation=task"])
+    chosen = load_config([*more, "observation@job.observation=task"])
     assert chosen.job.observation == chosen.observation
     assert not chosen.unused_terms
 

@@ -60,8 +60,11 @@ def starts_midway(term: TermCfg) -> bool:
 
 def _value(cfg: Config, key: str) -> Any:
     value: Any = cfg
-    for name in key.split("."):
+    while key:
+        names = value if isinstance(value, dict) else dir(value)
+        name = max((n for n in names if f"{key}.".startswith(f"{n}.")), key=len)  # it may have dots
         value = value[name] if isinstance(value, dict) else getattr(value, name)
+        key = key[len(name) + 1 :]
     return list(value) if isinstance(value, dict) else value
 
 
@@ -90,8 +93,8 @@ def _run(cfg: Config) -> Checks:
     wrong = cfg.devices is not None and not _DEVICES.fullmatch(cfg.devices)
     yield "devices", wrong, "all, or a number of GPUs of at least 1"
     expected = "null, because no policy drives the worlds. Add controller=policy"
-    played = cfg.job.name in ("play", "export")
-    wrong = cfg.policy is not None and not (played or offered(cfg.controller.func, "plays_policy"))
+    wrong = cfg.policy is not None and cfg.job.name != "export"
+    wrong = wrong and not offered(cfg.controller.func, "plays_policy")
     yield "policy", wrong, expected
     wrong = cfg.starts is not None and not reads_starts_file(cfg.reset)
     yield "starts", wrong, "null, because no reset term reads it. Add reset=starts_file"

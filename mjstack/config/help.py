@@ -32,11 +32,12 @@ mjstack: a task of a robot arm, from native MuJoCo to thousands of MuJoCo Warp w
 
 Usage: mjstack [group=choice ...] [key=value ...] [flags]
        mjstack list [tasks|robots|terms|conditions|gates|trainers|policies]
-       mjstack demo    16 worlds stack by a shipped policy, shown in a browser
        mjstack new task|driver|action|robot NAME [FILE.xml]    your own folder
 In a checkout: python scripts/run.py ...  What this machine has: mjstack doctor
 
 Examples:
+  mjstack experiment=demo
+    16 worlds stack by a shipped policy; the run's episode.html shows them
   mjstack robot=rebot nworld=64
     all gates this machine can run
   mjstack -m robot=so101,rebot timing=default,fine
@@ -51,7 +52,7 @@ Examples:
     a policy that imitates the expert, judged by gate success; resumes
   mjstack controller=policy policy=outputs/mine/last 'gates=[success]'
     the policy in the expert's place, in any gate
-  mjstack job=play policy=outputs/mine/last
+  mjstack job=play controller=policy policy=outputs/mine/last
     four worlds of the policy as a video; view=true: in MuJoCo's viewer
 
 Groups, to be set as group=choice, and their choices, the default first:

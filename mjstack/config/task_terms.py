@@ -38,7 +38,19 @@ def complete_terms(cfg: DictConfig, overrides: Sequence[str]) -> None:
             terms = {name: f"${{reset.{name}}}" for name in cfg.reset}
             cfg.gate.success.reset = terms | _written(cfg, _JUDGED)
         lines = [line for key in _COPIES for line in _complete_copy(cfg, key)]
-        cfg.unused_terms = [*lines, *_left_out(cfg), *_unseen(cfg)]
+        cfg.unused_terms = [*_choices(cfg, overrides), *lines, *_left_out(cfg), *_unseen(cfg)]
+
+
+def _choices(cfg: DictConfig, overrides: Sequence[str]) -> Iterator[str]:
+    """A line for a choice of starts or looks on the command line, which gate *success* has not."""
+    judges = "success" in cfg.gates or cfg.job.name == "compare"
+    for override in overrides if judges and cfg.job.name != "train" else ():
+        group, _, name = override.partition("=")
+        key = f"{group}@{_JUDGED}="
+        missed = group in ("reset", "looks") and name not in ("starts_file", "null")
+        if missed and not any(o.lstrip("+").startswith(key) for o in overrides):
+            cure = f"{'+' * (group == 'looks')}{key}{name}"
+            yield f"{override} does not act in gate success: {cure} chooses it there"
 
 
 def _complete_copy(cfg: DictConfig, key: str) -> Iterator[str]:

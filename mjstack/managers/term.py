@@ -48,7 +48,9 @@ def check_params(
         return
     for name in params:
         if name not in options:
-            raise TermError(label, f"parameter '{name}' does not exist. {suggest(name, options)}")
+            advice = f"Of an earlier function: ~{label}.params.{name} leaves it out."
+            problem = f"parameter '{name}' does not exist. {suggest(name, options)}"
+            raise TermError(label, f"{problem} {advice}")
     for name, option in options.items():
         if option.default is option.empty and name not in params:
             raise TermError(label, f"parameter '{name}' is missing: set {label}.params.{name}")
