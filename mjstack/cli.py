@@ -226,9 +226,7 @@ def _sweep(hydra: Any, overrides: list[str]) -> int:
     check_jobs(master, jobs, _check)
     begin_job()
     from mjstack.jobs.sweep import list_jobs
-    from mjstack.jobs.sweep_table import sweep_config
 
-    sweep = sweep_config(master)
     reports: dict[int, Report] = {}
     with claim_sweep(master, jobs) as claimed:
         try:
@@ -237,7 +235,7 @@ def _sweep(hydra: Any, overrides: list[str]) -> int:
             reports = dict(enumerate(_results))
         finally:
             if reports or any(job.report() for job in list_jobs(claimed)):
-                print_sweep(claimed, sweep, reports)
+                print_sweep(claimed, reports)
     return _status()
 
 
@@ -279,7 +277,7 @@ def run_job(cfg: DictConfig) -> Report:
             _save_config(cfg, folder)
         result = checked.run(folder, overrides)
         if sweep is not None:
-            update_summary(sweep, cfg, {settings.job.num: result})
+            update_summary(sweep, {settings.job.num: result})
     _results.append(result)
     if result.status is Status.interrupted:
         raise KeyboardInterrupt

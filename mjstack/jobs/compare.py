@@ -44,8 +44,8 @@ _LEVEL = 0.05  # of significance
 _ENDS = {"min": "low", "max": "high"}  # of the picture's whiskers, in metrics of a rate
 _ROUNDING = 1e-6  # [m, rad], by which equal starts on two backends or devices may differ
 _PANELS = {
-    "success rate, 95 % interval": {"": "success_rate"},
-    "episodes that only this one won": {"": "only"},
+    "success rate, 95 % interval": "success_rate",
+    "episodes that only this one won": "only",
 }
 
 Sides = Mapping[str, Stage]

@@ -11,7 +11,6 @@ from mjstack.config.schema.run import (
     GateCfg,
     SimCfg,
     SolverCfg,
-    SweepCfg,
     TimingCfg,
     WebCfg,
 )
@@ -77,8 +76,6 @@ class Config:
     """Write a video of the same; job=play without view does so."""
     web: WebCfg = spec(WebCfg, changes=("nothing",))
     """Worlds in a browser."""
-    sweep: SweepCfg = spec(SweepCfg, changes=("nothing",))
-    """Table and picture of a sweep."""
     starts: str | None = spec(None)
     """reset=starts_file: an npz file with one row per world, from which all of them start."""
     policy: str | None = spec(None)

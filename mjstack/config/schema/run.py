@@ -93,25 +93,6 @@ class SimCfg:
 
 
 @dataclass(slots=True)
-class SweepCfg:
-    """The table and the picture of a sweep, ``-m``. A name is that of a key of the command line, of
-    a metric of a gate, or ``job``, ``status`` or ``reason``.
-    """
-
-    title: str = ""
-    """Above both."""
-    over: str | None = None
-    """Name of the values over which the picture is drawn; null: of the first key with several."""
-    columns: dict[str, str] = spec({})
-    """Names by the columns' titles; empty: the keys with several values, and the gates' results."""
-    panels: dict[str, dict[str, str]] = spec({})
-    """Curves of each panel by its label: names by the curves' labels, or names with a factor, such
-    as ``NAME * 10``; empty: success and rates."""
-    notes: list[str] = spec([])
-    """Sentences below the table."""
-
-
-@dataclass(slots=True)
 class WebCfg:
     """Worlds in a browser, which the extra ``web`` shows."""
 
