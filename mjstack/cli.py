@@ -29,9 +29,8 @@ from mjstack.config.help import help_text, key_help, list_text
 from mjstack.config.load import compose, extended_search_path, to_config
 from mjstack.config.session import (
     CONFIG_NAME,
-    command_line,
+    added_folders,
     hydra_session,
-    lacking_folders,
     list_items,
     search_path,
     search_path_args,
@@ -67,7 +66,7 @@ def run(args: list[str]) -> int:
             print(f"mjstack {__version__}")
             return 0
         flags = _parse(args)
-        with command_line(), extended_search_path(flags.overrides, flags.config_dir) as overrides:
+        with extended_search_path(flags.overrides, flags.config_dir) as overrides:
             return _dispatch(flags, overrides)
     except KeyboardInterrupt:  # the job has said so
         return EXIT_CODE
@@ -260,7 +259,7 @@ def run_job(cfg: DictConfig) -> Report:
     logging.raiseExceptions = False  # a full disk would print a traceback for each line of run.log
     settings = HydraConfig.get()
     overrides = list(settings.overrides.task)
-    with search_path(lacking_folders(settings.runtime.config_sources)):
+    with search_path(added_folders(settings.runtime)):
         folder = Path(settings.runtime.output_dir)
         sweep = Path(settings.sweep.dir) if settings.mode is RunMode.MULTIRUN else None
         if sweep is not None:

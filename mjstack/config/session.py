@@ -11,7 +11,7 @@ import os
 import re
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from importlib.metadata import entry_points
@@ -49,7 +49,6 @@ _ENTRY = re.compile(
 )
 
 _added: ContextVar[tuple[Path, ...]] = ContextVar("search path", default=())
-_on_command_line: ContextVar[bool] = ContextVar("command line", default=False)
 
 
 @contextmanager
@@ -69,23 +68,6 @@ def search_path(entries: Sequence[str | os.PathLike]) -> Iterator[None]:
         _added.reset(token)
 
 
-@contextmanager
-def command_line() -> Iterator[None]:
-    """Let advice inside be that for a command line, not for Python."""
-    token = _on_command_line.set(True)
-    try:
-        yield
-    finally:
-        _on_command_line.reset(token)
-
-
-def folder_advice(folders: Sequence[Path] = ()) -> str:
-    """The words that add folders to the search path where they are needed; any folder if none."""
-    if _on_command_line.get():
-        return shlex.join(search_path_args(folders)) or "--config-dir DIR"
-    return " and ".join(f"config_dir='{folder}'" for folder in folders) or "config_dir=DIR"
-
-
 def search_path_args(folders: Sequence[Path] | None = None) -> list[str]:
     """Arguments of a command that adds folders; those of the current search path if None."""
     folders = _added.get() if folders is None else folders
@@ -97,24 +79,21 @@ def add_folder(saved: Path, *more: Path) -> str:
     ``more``, where it lacks none of these.
     """
     folders = [folder for folder in used_folders(saved) if folder not in config_folders()]
-    return f"If you trust the folder that it had used, add {folder_advice(folders or more)}."
+    args = shlex.join(search_path_args(folders or more)) or "--config-dir DIR"
+    return f"If you trust the folder that it had used, add {args} (in Python config_dir)."
 
 
 def used_folders(saved: Path) -> list[Path]:
-    """Folders of the search path of the run of a config.yaml beside mjstack's; none if it does not
-    say.
-    """
+    """Folders that the run of a config.yaml had added to its search path, as far as it says."""
     try:
-        sources = read_yaml(saved.with_name("hydra.yaml"))["hydra"]["runtime"]["config_sources"]
-        return [Path(source["path"]) for source in sources if source["provider"] == PROVIDER]
+        return added_folders(read_yaml(saved.with_name("hydra.yaml"))["hydra"]["runtime"])
     except Exception:  # the file may be missing, or hold anything
         return []
 
 
-def lacking_folders(sources: Iterable[Any]) -> list[Path]:
-    """Added folders among Hydra's sources of a composition that the current search path lacks."""
-    used = [Path(source["path"]) for source in sources if source["provider"] == PROVIDER]
-    return [folder for folder in used if folder not in config_folders()]
+def added_folders(runtime: Any) -> list[Path]:
+    """Folders that were added to the search path of a composition, from ``hydra.runtime``."""
+    return [Path(s["path"]) for s in runtime["config_sources"] if s["provider"] == PROVIDER]
 
 
 def read_yaml(path: Path) -> Any:
@@ -241,7 +220,8 @@ class _Folders(SearchPathPlugin):
     @override
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         for folder in config_folders():
-            search_path.append(PROVIDER, f"{_Folder.scheme()}://{folder}")
+            provider = PROVIDER if folder in _added.get() else f"{PROVIDER}.registered"
+            search_path.append(provider, f"{_Folder.scheme()}://{folder}")
 
 
 def _compose_once(loader: Any) -> None:

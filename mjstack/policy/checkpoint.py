@@ -99,7 +99,8 @@ class Policy:
         )
 
     def _compare(self, trained: Facts, here: Facts) -> None:
-        for key in dict.fromkeys([*trained, *here]):
+        keys = dict.fromkeys([*trained, *here])
+        for key in sorted(keys, key=lambda key: not key.endswith(".name")):
             before = trained.get(key, "missing")
             now = here.get(key, "missing")
             if before != now:

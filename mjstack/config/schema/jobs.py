@@ -84,8 +84,6 @@ class TrainJobCfg(JobCfg):
     """The group that it sees."""
     leave_out: list[str] = spec([])
     """Terms of the group that the policy does not see; NAME? if there is that one."""
-    observation_noise: bool = spec()
-    """Whether its observations have their noise."""
     hidden: list[int] = spec(ge=1, le=65536)
     """Widths of the network's hidden layers."""
     learning_rate: float = spec(gt=0.0)
@@ -153,8 +151,6 @@ class CloneJobCfg(TrainJobCfg):
     loss: str = spec(choices=("squared", "absolute"))
     """Error of a joint target. Where the expert's action jumps, an absolute error picks one of the
     two actions, and a squared error averages them."""
-    averaging: float = spec(ge=0.0, le=1.0)
-    """Share of the policy's weights that a batch keeps: they are an average."""
     episodes: int = spec(unit="episodes", ge=1)
     """Episodes that the expert plays."""
     batches: int = spec(ge=1)
@@ -194,14 +190,10 @@ class PpoJobCfg(TrainJobCfg):
     """Parts into which they are divided."""
     gamma: float = spec(ge=0.0, le=1.0)
     """Discount per decision."""
-    gae_lambda: float = spec(ge=0.0, le=1.0)
-    """Of the generalised advantage estimation."""
     clip: float = spec(gt=0.0)
     """Largest change of an action's probability that counts."""
     std: float = spec(gt=0.0)
     """Standard deviation of the actions at the start."""
-    entropy: float = spec(ge=0.0)
-    """Weight of the entropy."""
     desired_kl: float = spec(gt=0.0)
     """Change of the policy per iteration to which rsl_rl adapts the learning rate."""
 

@@ -148,5 +148,3 @@ class ControllerCfg:
     """Share of the turn of the jaws to an object's nearest face."""
     speed_limit: float = spec(ge=1.0, le=100.0)
     """How many times as fast a world may go after a retry."""
-    rest_seconds: float = spec(unit="s", ge=0.0, le=600.0)
-    """Time between the last motion and the window of rest after a retry."""
