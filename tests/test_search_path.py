@@ -161,10 +161,7 @@ def test_a_file_that_does_not_fit_is_named(
 def test_a_sweep_and_a_replay(lean: Path, tmp_path: Path) -> None:
     flags = ["--config-dir", str(lean), "-m", "task=stack", "gates=[upright]"]
     reset = "+reset.lean={func: lean.lean}"
-    swapped = (
-        "reward.progress.func=mjstack.mdp.reward.action_rate"  # without the other's parameters
-    )
-    assert run([*flags, reset, swapped, "seed=1,2"]) == 0
+    assert run([*flags, reset, "seed=1,2"]) == 0
     first, _ = sorted(tmp_path.rglob("report.json"))
     assert json.loads(first.read_text())["status"] == "pass"
     saved = first.parent / ".hydra" / "config.yaml"
