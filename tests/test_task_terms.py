@@ -269,7 +269,7 @@ def test_terms_that_are_null(turned: Path) -> None:
     assert cfg.job.observation == cfg.observation
     assert "shoulder" not in cfg.job.observation["policy"].terms
     assert not [line for line in cfg.unused_terms if "does not see" in line]
-    cfg = composed(turned, "job=train", "job.observation.policy.terms.shoulder=null")
+    cfg = composed(turned, "job=train", "++job.observation.policy.terms.shoulder=null")
     assert "shoulder" not in cfg.job.observation["policy"].terms
     (line,) = [line for line in cfg.unused_terms if "does not see" in line]
     assert "the task's own shoulder it does not see" in line

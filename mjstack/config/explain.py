@@ -124,7 +124,7 @@ def explain(error: Exception, overrides: Sequence[str] = ()) -> MjstackError:
         choices = error.options or session.list_choices().get(group, [])
         problem: MjstackError = UnknownName(f"{group}={name}:", name, choices)
         if not session.config_folders() and not group.startswith("hydra/"):
-            advice = "A choice of your own needs --config-dir DIR (in Python config_dir)."
+            advice = "A choice of your own needs --config-dir DIR (Python: config_dir)."
             problem = MjstackError(f"{problem} {advice}")
     else:
         problem = _explain(error, overrides)

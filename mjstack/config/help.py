@@ -214,7 +214,7 @@ def _files(group: str) -> Iterator[tuple[str, str]]:
     """Choices of a group, and the comments that their files begin with."""
     for folder in (CONFIG_FOLDER, *config_folders()):
         for path in sorted(folder.glob(f"{group}/*.yaml")):
-            comment = re.search("(?m)^# (?!@)(.+)", path.read_text("utf-8-sig"))
+            comment = re.search("(?m)^# (?!@)(.+)", path.read_text("utf-8"))
             yield path.stem, comment[1] if comment else ""
 
 
@@ -225,7 +225,7 @@ def _functions(kind: str, with_parameters: bool) -> Iterator[tuple[str, str]]:
     if kind == "terms":  # also those that the search path's files name
         modules = [f"mjstack.mdp.{name}" for name in _TERMS]
         paths = [path for folder in config_folders() for path in sorted(folder.rglob("*.yaml"))]
-        text = "".join(path.read_text("utf-8-sig") for path in paths)
+        text = "".join(path.read_text("utf-8") for path in paths)
     names = [f"{m}.{name}" for m in modules for name in vars(import_module(m)) if name[0] != "_"]
     for name in dict.fromkeys([*names, *re.findall(r"func: ([\w.]+)", text)]):
         func: Any = find_object("list", name)
