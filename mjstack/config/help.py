@@ -32,12 +32,11 @@ mjstack: a task of a robot arm, from native MuJoCo to thousands of MuJoCo Warp w
 
 Usage: mjstack [group=choice ...] [key=value ...] [flags]
        mjstack list [tasks|robots|terms|conditions|gates|trainers|policies]
+       mjstack experiment=demo    16 worlds stack by a shipped policy: see episode.html
        mjstack new task|driver|action|robot NAME [FILE.xml]    your own folder
 In a checkout: python scripts/run.py ...  What this machine has: mjstack doctor
 
 Examples:
-  mjstack experiment=demo
-    16 worlds stack by a shipped policy; the run's episode.html shows them
   mjstack robot=rebot nworld=64
     all gates this machine can run
   mjstack -m robot=so101,rebot timing=default,fine

@@ -2,7 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import ClassVar
 
@@ -48,7 +48,7 @@ def bounds(name: str, values: Sequence[float]) -> tuple[float, float]:
         ParameterError: They are no two numbers, not positive, or not in order.
     """
     try:
-        low, high = map(float, values)
+        low, high = map(float, () if isinstance(values, str | Mapping) else values)
     except (TypeError, ValueError):
         low = high = math.nan
     if not 0.0 < low <= high < math.inf:
