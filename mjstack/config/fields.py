@@ -167,7 +167,8 @@ def _derived(owner: type, names: Collection[str]) -> type | None:
     """A dataclass, or one that derives from it, whose fields have exactly these names."""
     if {item.name for item in fields(owner)} == {*names}:
         return owner
-    return next(filter(None, (_derived(sub, names) for sub in owner.__subclasses__())), None)
+    derived: list[type] = owner.__subclasses__()
+    return next(filter(None, (_derived(child, names) for child in derived)), None)
 
 
 def check_fields(key: str, value: Any) -> None:

@@ -33,9 +33,9 @@ def config_content(cfg: Config, *changes: str) -> dict[str, Any]:
         *path, last = key.split(".")
         reduce(getitem, path, config)[last] = _content(key, file)
     if cfg.policy is not None:
-        files = [policy_folder(cfg.policy) / name for name in (POLICY_FILE, _LEROBOT_FILE)]
-        file = next(filter(Path.is_file, files), files[0])
-        config["policy"] = _content("policy", str(file))
+        folder = policy_folder(cfg.policy)
+        name = POLICY_FILE if (folder / POLICY_FILE).exists() else _LEROBOT_FILE
+        config["policy"] = _content("policy", str(folder / name))
     for name, term in cfg.reset.items():
         path = term.params.get("path")
         params = config["reset"][name]["params"]
