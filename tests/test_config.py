@@ -23,6 +23,7 @@ import mjstack
 from mjstack.config import fields as config_fields
 from mjstack.config import load_config, schema
 from mjstack.config.check import validate
+from mjstack.config.fingerprint import config_content
 from mjstack.config.help import list_keys
 from mjstack.config.load import compose
 from mjstack.config.schema import Backend, CloneJobCfg, Config
@@ -413,6 +414,32 @@ def test_the_next_composition_is_not_touched(tmp_path: Path) -> None:
         seen = [compose(o).action.arm.func for o in (swapped, plain, swapped, plain)]
     assert seen[0] == seen[2] == "lab.mine"
     assert seen[1] == seen[3] == "mjstack.mdp.action.JointPosition"
+
+
+RESULTS = ("report", "training", "episodes", "policy", "images")  # as of `fields.CHANGES`
+EFFECTS = {
+    "web.port=9000": "",
+    "graph=off": "report",
+    "gate.batch.seeds=2": "report",
+    "job.test_seed=7": "report",
+    "sim.device=cpu": "report",
+    "nworld=3": "training",
+    "job.length=0.5": "training",
+    "seed=1": "episodes",
+    "scene.cameras.front.rate=10": "episodes",
+    "robot.home=[0,0,0.5,1.1,1.5,0.7]": "episodes policy",
+    "scene.objects.red.size=[0.02,0.02,0.02]": "episodes policy",
+    "scene.cameras.front.fovy=50": "episodes policy images",
+}
+
+
+@pytest.mark.parametrize("override", EFFECTS)
+def test_which_results_depend_on_a_key(override: str) -> None:
+    args = ["job=train", "cameras=front", "sim=native"]
+    before, after = (load_config([*args, *more]) for more in ([], [override]))
+    changed = [r for r in RESULTS if config_content(before, r) != config_content(after, r)]
+    assert changed == EFFECTS[override].split()
+    assert (config_content(before) != config_content(after)) == bool(changed)
 
 
 def test_a_name_may_have_dots() -> None:
