@@ -274,7 +274,7 @@ def test_a_policy_with_terms_of_ones_own_plays_in_python(lean: Path, tmp_path: P
         with pytest.raises(MjstackError) as caught:
             call()
         assert "expected one of the observation terms of mjstack" in str(caught.value)
-        assert "add --config-dir DIR (Python: config_dir)." in str(caught.value)
+        assert "add --config-dir DIR." in str(caught.value)
 
 
 def test_the_package_lists_its_public_names() -> None:

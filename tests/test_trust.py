@@ -135,7 +135,7 @@ def test_a_replay_runs_no_command_of_its_folder(key: str, stranger: Path) -> Non
         return
     line = refused_call(lambda: replay(stranger))
     assert f"{key}.func=pydoc.pipepager: expected one of the" in line
-    assert line.endswith("add --config-dir DIR (Python: config_dir).")
+    assert line.endswith("add --config-dir DIR.")
 
 
 def test_no_run_brings_a_policy_of_lerobots(stranger: Path) -> None:
@@ -270,7 +270,7 @@ FOLLOWED = {
     "environment": ("task.instruction", "${oc.env:HOME}", "it has ${...}"),
     "robot's name": ("robot.name", "../../x", "robot.name=../../x: expected a name that"),
     "absolute name": ("robot.menagerie_file", "/etc/passwd", "robot.menagerie_file=/etc/passwd"),
-    "robot's file": ("robot.file", "stranger/arm.xml", "add --config-dir {stranger} (Py"),
+    "robot's file": ("robot.file", "stranger/arm.xml", "add --config-dir {stranger}."),
     "object's file": ("scene.objects.red.file", "/none.xml", "expected a file beside a folder of"),
 }
 

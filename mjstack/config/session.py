@@ -78,7 +78,7 @@ def add_folder(saved: Path, *more: Path) -> str:
     """
     folders = [folder for folder in used_folders(saved) if folder not in config_folders()]
     args = shlex.join(search_path_args(folders or more)) or "--config-dir DIR"
-    return f"If you trust the folder that it used, add {args} (Python: config_dir)."
+    return f"If you trust the folder that it used, add {args}."
 
 
 def used_folders(saved: Path) -> list[Path]:
