@@ -386,19 +386,12 @@ def test_a_damaged_run_is_one_line(name: str, stranger: Path, monkeypatch: Patch
     assert says in refused_call(lambda: replay(stranger))
 
 
-def crowd(facts: Any) -> None:
-    terms = facts["observation"]["terms"]
-    terms.update({f"x{n}": next(iter(terms.values())) for n in range(110)})
-    facts["observation"]["widths"] = dict.fromkeys(terms, 1)
-
-
 def set_action(**params: Any) -> Callable[[Any], None]:
     term = {"func": "mjstack.mdp.action.EndEffectorDelta", "params": params}
     return lambda facts: facts["action"]["terms"].update(evil=term)
 
 
 POLICIES: dict[str, tuple[Callable[[Any], object], str]] = {
-    "terms": (crowd, "terms, expected at most 100"),
     "clip": (
         lambda facts: next(iter(facts["observation"]["terms"].values())).update(clip=[True, True]),
         ".clip=[True, True]: expected a list of 2 numbers",

@@ -8,13 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mjstack.drivers.feedback import STAY, FeedbackDriver, measure_planar
+from mjstack.drivers.feedback import STAY, FeedbackDriver
 from mjstack.drivers.open_loop import OpenLoopPlanner, smoothstep
 from mjstack.envs import Env
 from mjstack.managers.view import EnvView, offers
 from mjstack.math import atan2, norm
 from mjstack.mdp.geometry import jaw_forces, objects_in_hand, robot
-from mjstack.tasks.check import make_check
 
 _QUARTER = 0.5 * math.pi
 _ROLL_STEP = 0.05  # rad per step
@@ -76,8 +75,7 @@ class ClosedLoopDriver(FeedbackDriver):
         over = smoothstep((2.0 * u - 1.0).clamp(min=0.0))
         share = torch.where(self._again[:, None], torch.stack((over, over, up), dim=1), s)
         target = torch.lerp(self._from[:, :3], self._to[:, :3], share)
-        posture = self._nominal[self.phase]
-        start = torch.where(fresh[:, None], posture, self._command)
+        start = torch.where(fresh[:, None], self._nominal[self.phase], self._command)
         start[:, self._n_arm :] = torch.lerp(self._from[:, 3:], self._to[:, 3:], s)
         self._at.copy_(torch.cat((target, start[:, self._n_arm :]), dim=1))
         if self._aligns:
@@ -86,9 +84,7 @@ class ClosedLoopDriver(FeedbackDriver):
         if self._tilt is not None:
             there = self._aim(self._tilt.place[self.phase])
             approach = self._tilt.desired_approach(start, self.phase, there, fresh)
-        command, distance = self._ik.solve(
-            start, target, posture if self._cfg.controller.posture_gain > 0.0 else None, approach
-        )
+        command, distance = self._solve(start, target, self.phase, approach)
         self._keep_finite(command)
         _put(self.error, self._time >= length - _DONE, torch.maximum(self.error, distance))
         return self._command
@@ -187,8 +183,7 @@ class ClosedLoopDriver(FeedbackDriver):
 
     def _carried_pose(self) -> Tensor:
         """x, y [m] and yaw [rad] of the carried object, shape ``(nworld, 3)``."""
-        poses = [measure_planar(self._env, name) for name in self._cfg.scene.objects]
-        return torch.stack(poses, dim=1)[self._worlds, self._carried[self.phase]]
+        return self._planar()[self._worlds, self._carried[self.phase]]
 
     def _build_timetable(self) -> None:
         """Make tensors of when and how the phases follow each other, a row per phase."""
@@ -221,7 +216,7 @@ class ClosedLoopDriver(FeedbackDriver):
         self._until_within = column(s.until_within or -1.0 for s in specs)
         self._handled = column(max(phase.grasped, phase.carried, 0) for phase in phases)
         self._numbers = torch.arange(len(objects), device=self.phase.device)
-        window = 0 if cfg.task.check is None else make_check(cfg).settle_steps
+        window = 0 if cfg.task.check is None else self._env.check.settle_steps
         self._rest = window + math.ceil(_REST / cfg.timing.step_dt)
 
 
