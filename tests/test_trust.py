@@ -301,7 +301,7 @@ def test_only_regular_files_are_read(kind: str, policy: Path, stranger: Path) ->
     says = "it is no regular file"
     swap(next(policy.glob("weights-*")))
     assert says in refused_call(lambda: load_policy(policy))
-    swap(stranger / "worlds_seed0.npz")
+    swap(stranger / "batch_seed0.npz")
     assert says in refused_call(lambda: replay(stranger))
     swap(stranger / ".hydra/hydra.yaml")
     edit(stranger, "task.check.func", "os.system")
@@ -320,7 +320,7 @@ def put_array(name: str, shape: tuple[int, ...], times: int = 1) -> Callable[[Pa
         header = io.BytesIO()
         claim = {"descr": "<U0" if shape[0] > 1 else "<f8", "fortran_order": False, "shape": shape}
         np.lib.format.write_array_header_1_0(header, claim)
-        with zipfile.ZipFile(folder / "worlds_seed0.npz", "a", zipfile.ZIP_DEFLATED) as file:
+        with zipfile.ZipFile(folder / "batch_seed0.npz", "a", zipfile.ZIP_DEFLATED) as file:
             for number in range(times):
                 data = header.getvalue() + bytes(8 * (shape[0] == 1))
                 file.writestr(f"{name}{number if times > 1 else ''}.npy", data)
@@ -338,8 +338,8 @@ def write(name: str, content: bytes) -> Callable[[Path], object]:
 
 
 def put_zeros(folder: Path) -> None:
-    np.savez_compressed(folder / "worlds_seed0.npz", zeros=np.zeros(2**20))
-    assert (folder / "worlds_seed0.npz").stat().st_size < 2**14
+    np.savez_compressed(folder / "batch_seed0.npz", zeros=np.zeros(2**20))
+    assert (folder / "batch_seed0.npz").stat().st_size < 2**14
 
 
 def put_versions(folder: Path) -> None:
@@ -349,7 +349,7 @@ def put_versions(folder: Path) -> None:
 
 def change_record(**changes: Any) -> Callable[[Path], object]:
     def apply(folder: Path) -> None:
-        path = folder / "worlds_seed0.npz"
+        path = folder / "batch_seed0.npz"
         with np.load(path) as held:
             np.savez(path, **dict(held) | changes)
 
@@ -372,8 +372,8 @@ RUNS: dict[str, tuple[Callable[[Path], object], str]] = {
     "deep report": (write("report.json", b"[" * 10_000), "report.json: cannot be read (Recursion"),
     "no report": (write("report.json", b'{"provenance": []}'), "report.json: cannot be read"),
     "bytes": (write(CONFIG, bytes(range(256))), "config.yaml: cannot be read"),
-    "a scalar": (change_record(failed=np.int32(0)), "worlds_seed0.npz: cannot be read"),
-    "a device": (change_record(device="cuda:x"), "worlds_seed0.npz: cannot be read"),
+    "a scalar": (change_record(failed=np.int32(0)), "batch_seed0.npz: cannot be read"),
+    "a device": (change_record(device="cuda:x"), "batch_seed0.npz: cannot be read"),
 }
 
 

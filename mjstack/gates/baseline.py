@@ -54,7 +54,7 @@ def run_baseline(run: Run) -> list[GateResult]:
         causes += contacts
     world = run.nominal.world
     label = "baseline, native"
-    run.show_world("baseline", label, world.qpos, status, world.env, "baseline world")
+    run.show_world("baseline", label, world.qpos, episode, world.env, "baseline world")
     result = GateResult(name="baseline", status=status, reason=reason or headline)
     result.thresholds = thresholds
     result.metrics = metrics

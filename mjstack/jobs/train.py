@@ -19,8 +19,8 @@ from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Assets, Stage
 from mjstack.errors import ConfigError, FolderError
 from mjstack.files import made_by, reading, to_csv, write_atomic
+from mjstack.gates.episodes import judge_episodes
 from mjstack.gates.runner import run_guarded
-from mjstack.gates.success import run_success
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import CheckedJob, Job
 from mjstack.jobs.showing import check_showing
@@ -89,7 +89,7 @@ def _run(trainer: Trainer, run: Run, folder: Path) -> None:
     run_guarded(run, NAME, partial(_train, trainer, folder), "worlds")
     if run.artifacts.results[NAME].status is Status.passed:
         judged = run.on(judged_stage(run.stage, folder / LAST))
-        run_guarded(judged, "success", run_success)
+        run_guarded(judged, "success", judge_episodes)
         trained = run.artifacts.results[NAME]
         times = {name: trained.metrics[name] for name in _TIMES if name in trained.metrics}
         times["judgement_s"] = judged.artifacts.results["success"].seconds
