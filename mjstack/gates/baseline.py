@@ -2,7 +2,7 @@
 
 from mjstack.episodes.run import Run, needs_episode
 from mjstack.gates.scene_physics import scene_faults
-from mjstack.gates.tracking import find_cause, start_contacts, waypoint_errors
+from mjstack.gates.tracking import find_cause, loose_grips, start_contacts, waypoint_errors
 from mjstack.report.record import GateResult, Status
 from mjstack.robots import read_robot
 from mjstack.robots.guest import SAG, left_behind, object_left_behind
@@ -33,6 +33,7 @@ def run_baseline(run: Run) -> list[GateResult]:
     }
     thresholds = run.stage.check.thresholds()
     causes: list[str] = []
+    loose = [*loose_grips(run.stage)]
     if errors := waypoint_errors(run.stage, run.nominal.states, run.nominal.targets):
         worst = max(errors, key=errors.__getitem__)
         metrics["waypoint_error_m"] = errors[worst]
@@ -50,7 +51,7 @@ def run_baseline(run: Run) -> list[GateResult]:
             beyond.append("waypoint_error_m")
     if status is Status.failed:
         contacts = [*start_contacts(run.stage, episode.start[0])]
-        reason = "; ".join(filter(None, (reason, *causes, *(contacts if causes else ()))))
+        reason = "; ".join(filter(None, (reason, *causes, *loose, *(contacts if causes else ()))))
         causes += contacts
     world = run.nominal.world
     label = "baseline, native"
@@ -67,5 +68,5 @@ def run_baseline(run: Run) -> list[GateResult]:
         if thing.file is not None:
             lines = object_left_behind(thing.file, run.stage.model, fixed=thing.fixed)
             result.details += [f"file of {name}: {line}" for line in lines]
-    result.details += causes
+    result.details += [*loose, *causes]
     return [result]
