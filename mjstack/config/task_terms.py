@@ -16,7 +16,7 @@ from mjstack.config.session import CONFIG_FOLDER, TASK_SEEN
 Terms = dict[str, Any]
 
 _JUDGED = "gate.success.reset"
-_COPIES = ("gate.baseline.reset", "gate.capacity.reset", _JUDGED)
+_COPIES = ("gate.baseline.reset", _JUDGED)
 # Groups that a job leaves out, and what stands in their place
 _LEFT_OUT = {
     "action": "drivers command controller.action, policies their own action",

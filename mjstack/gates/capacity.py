@@ -3,61 +3,45 @@ they be?
 """
 
 import math
-from contextlib import closing
-from functools import partial, reduce
 
 import numpy as np
 
 from mjstack.config.schema import Backend
-from mjstack.envs.buffers import (
-    Peaks,
-    Play,
-    join_peaks,
-    play_random_actions,
-    recommend_sizes,
-)
+from mjstack.envs.buffers import Peaks, join_peaks, recommend_sizes
 from mjstack.episodes.run import Run, each_rank, needs_episode
-from mjstack.errors import Unreachable, name_worlds
+from mjstack.errors import name_worlds
 from mjstack.report.record import GateResult, Status
 from mjstack.sim import BatchSizes, resolve_sizes
 from mjstack.sim.cameras import image_bytes
-from mjstack.sim.sizes import apply_configured, configured_sizes, resolve_env_sizes
+from mjstack.sim.sizes import apply_configured, configured_sizes
 
-# Of thousands of worlds. Peaks of a whole episode are less than the margin higher there, not in the
-# few worlds that a CPU plays: docs/history/first-run-2026-11-27.md.
-_RANDOM_STEPS = 200
-_TITLES = {"task": "driven task", "env": "environments (random actions, randomised starts)"}
+_TITLES = {"task": "driven task", "env": "environments (random actions)"}
 
 
 @each_rank
 @needs_episode
 def run_capacity(run: Run) -> list[GateResult]:
-    """Find the buffer sizes that the driven task, randomised starts and random actions need.
+    """Find the buffer sizes that the driven task needs, for the batch, and those that the task and
+    random actions need, for environments.
 
     Peaks are over all steps and all worlds, in room that grows, up to a limit, until nothing is
     lost: a world that has lost physics moves differently. A workload that has lost nothing is not
     played again: room for a peak holds it exactly, and what follows plays in the sizes in force.
     """
     cfg = run.cfg
-    t = cfg.gate.capacity
-    nworld = run.stage.measuring_nworld
+    loads = {"": run.stage.measure(), "random_actions.": run.stage.measure(driven=False)}
+    task = loads[""]
+    nworld = len(task.rows)
     result = GateResult(name="capacity", status=Status.passed, metrics={"worlds": nworld})
-
-    stage = run.stage
-    most = _RANDOM_STEPS if stage.backend[1].startswith("cuda") else cfg.task.episode_steps
-    steps = t.random_steps or min(most, cfg.task.episode_steps)
-    act: Play = partial(play_random_actions, cfg, steps, advance=stage.progress.advance)
-    with closing(stage.measuring_worlds(t.reset)) as worlds:
-        loads = {"random_actions": worlds.play(act)}
-        try:
-            loads["randomized"] = worlds.play(partial(stage.drive, reset=t.reset), driven=True)
-        except Unreachable as error:  # starts of the user's own; the rest stands
-            result.details.append(f"randomised starts: not measured: {error}")
-        loads["task"] = worlds.play(partial(stage.drive, reset=cfg.reset), driven=True)
-    task = loads.pop("task")
-    sizes, shortages = _judge(run, "task", resolve_sizes(cfg), {"task": task}, result)
+    for prefix, load in loads.items():
+        result.metrics |= {
+            f"{prefix}peak_contacts_per_world": int(load.contacts.max()),
+            **{f"{prefix}pool_{key}": peak for key, peak in load.pools.items()},
+            f"{prefix}peak_constraint_rows_per_world": int(load.rows.max()),
+        }
+    sizes, shortages = _judge(run, "task", task, result)
     problems = list(shortages.values())
-    _, shortages = _judge(run, "env", resolve_env_sizes(cfg), loads, result)
+    _, shortages = _judge(run, "env", join_peaks(*loads.values()), result)
     for key, text in shortages.items():
         # A size that was set may be meant for the batch alone; those of the robot's profile should
         # do for both.
@@ -73,7 +57,7 @@ def run_capacity(run: Run) -> list[GateResult]:
     result.thresholds = {
         "contacts_per_world": sizes.nconmax,
         "njmax": sizes.njmax,
-        "margin": t.margin,
+        "margin": cfg.gate.capacity.margin,
     }
     result.notes |= {"backend": task.description, "sizes_from": sizes.source}
     if cameras := cfg.scene.cameras:
@@ -84,44 +68,34 @@ def run_capacity(run: Run) -> list[GateResult]:
 
 
 def _judge(
-    run: Run, name: str, sizes: BatchSizes, loads: dict[str, Peaks], result: GateResult
+    run: Run, name: str, peaks: Peaks, result: GateResult
 ) -> tuple[BatchSizes, dict[str, str]]:
-    """Add a group of workloads whose worlds have the same sizes to the result: peaks, memory and
-    the recommended sizes, in which later gates play with ``batch=auto``.
-
-    ``name`` is ``task`` or ``env``; ``sizes`` are in force unless ``batch=auto`` takes those that
-    are recommended.
+    """Add what the peaks of ``task`` or ``env`` need to the result: memory and the recommended
+    sizes, in which later gates play with ``batch=auto``.
 
     Returns:
         The sizes in force, and why they are too small, by key as of `find_shortages`.
     """
     cfg = run.cfg
+    driven = name == "task"
+    sizes = resolve_sizes(cfg, driven=driven)
+    native = peaks.sizes is None
+    if peaks.loss and not native:  # motion that lost physics sizes nothing
+        line = f"{_TITLES[name]}: not known, physics was lost"
+        run.print_line(line)
+        result.details.append(line)
+        return sizes, {"": peaks.loss}
     margin = cfg.gate.capacity.margin
-    peaks = reduce(join_peaks, loads.values())
     how = f"batch=auto: gate capacity, {len(peaks.rows)} worlds, times {margin:g}"
     advice = recommend_sizes(peaks, margin, how if cfg.batch.auto else "gate capacity")
-    sizes = apply_configured(cfg, advice) if cfg.batch.auto else sizes
-    native = peaks.sizes is None
-    for workload, load in loads.items():
-        prefix = "" if workload == "task" else f"{workload}."
-        result.metrics |= {
-            f"{prefix}peak_contacts_per_world": int(load.contacts.max()),
-            **{f"{prefix}pool_{key}": peak for key, peak in load.pools.items()},
-            f"{prefix}peak_constraint_rows_per_world": int(load.rows.max()),
-        }
-    # Motion that lost physics sizes nothing.
-    lost = "; ".join(load.loss for load in loads.values() if not native and load.loss)
+    if cfg.batch.auto:
+        run.stage.measured[name] = sizes = apply_configured(cfg, advice)
     line = f"{_TITLES[name]}: {advice.as_overrides()}"
-    if lost:
-        line = f"{_TITLES[name]}: not known, physics was lost"
-    elif native and name == "task":
+    if native and driven:
         line += " (contacts alone: native MuJoCo does not count the pairs that share their pool)"
     run.print_line(line)
     result.details.append(line)
-    if lost:
-        return sizes, {"": lost}
-    run.stage.measured[name] = advice
-    prefix = "recommended" if name == "task" else "recommended_env"
+    prefix = "recommended" if driven else "recommended_env"
     for key, size in configured_sizes(advice).items():
         result.metrics[f"{prefix}.{key}"] = size
     if not native:

@@ -147,7 +147,11 @@ def _on_environment(
     gc.collect()
     began = time.perf_counter()
     worlds = build_env(
-        cfg, model=run.stage.model, backend=backend, device=device, sizes=run.stage.env_sizes
+        cfg,
+        model=run.stage.model,
+        backend=backend,
+        device=device,
+        sizes=run.stage.measured.get("env"),
     )
     build_seconds = time.perf_counter() - began
     with closing(worlds) as env:

@@ -23,7 +23,7 @@ from mjstack.rng import check_seed
 from mjstack.robots.units import LEROBOT
 from mjstack.sim import StateRenderer
 from mjstack.sim.cameras import with_outputs
-from mjstack.sim.sizes import resolve_env_sizes
+from mjstack.sim.sizes import resolve_sizes
 from mjstack.tasks.check import make_check
 
 Info = dict[str, Any]
@@ -128,7 +128,7 @@ class LerobotVectorEnv(VectorEnv):
             scene=replace(cfg.scene, cameras=with_outputs(cfg.scene.cameras, ["rgb"], cameras)),
         )
         self._check = make_check(played)
-        sim = stage.simulation(nworld, *stage.backend, sizes=resolve_env_sizes(cfg))
+        sim = stage.simulation(nworld, *stage.backend, sizes=resolve_sizes(cfg, driven=False))
         self.inner = env = Env(sim, stage.index, played, check_faults=False)
         self.words = LerobotWords(env, env.observation_manager.groups, env.images, units)
         self._phase = torch.zeros(nworld, dtype=torch.int64, device=env.device)
