@@ -39,7 +39,7 @@ from mjstack.envs.buffers import (
 )
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Progress, Stage
-from mjstack.errors import FaultError
+from mjstack.errors import FaultError, Unreachable
 from mjstack.gates.batch import run_batch
 from mjstack.gates.capacity import find_shortages, run_capacity
 from mjstack.managers.episode import required_fields
@@ -331,8 +331,10 @@ def test_worlds_of_the_recommended_sizes_have_the_same_peaks(
     """Every workload once more, in exactly these sizes."""
     run, result, _ = too_small
     stage = run.stage
+    other = stage.with_config(replace(run.cfg, reset=run.cfg.gate.success.reset))
     plays: dict[str, Callable[[Simulation], object]] = {
         "": stage.drive,
+        "randomized.": other.drive,
         "random_actions.": partial(play_random_actions, run.cfg, 20),
     }
     m = result.metrics
@@ -342,7 +344,7 @@ def test_worlds_of_the_recommended_sizes_have_the_same_peaks(
             run.cfg,
             2,
             backend=Backend.mjwarp,
-            fields=required_fields(run.cfg.reset),
+            fields=required_fields(run.cfg.reset, other.cfg.reset),
             sizes=recommended(result, "recommended_env" if prefix else "recommended"),
         )
         play(sim)
@@ -383,9 +385,21 @@ def test_defaults_too_small_for_environments_fail(new_run: NewRun) -> None:
 
 
 @pytest.mark.full
-def test_native_tells_what_it_cannot_know(new_run: NewRun) -> None:
+def test_native_tells_what_it_cannot_know_and_a_layout_out_of_reach_leaves_the_rest(
+    new_run: NewRun, monkeypatch: Patch
+) -> None:
+    drive = Stage.drive
+
+    def unreachable(stage: Stage, sim: Simulation) -> None:
+        if stage.cfg.reset is stage.cfg.gate.success.reset:
+            raise Unreachable(0, "grasp_red", "red", (0.9, 0.0, 0.0), 0.3, 5e-4)
+        drive(stage, sim)
+
+    monkeypatch.setattr(Stage, "drive", unreachable)
     _, result, lines = measure(new_run, *NATIVE, "nworld=1", "gate.capacity.random_steps=5")
     assert result.status is Status.passed
+    assert any("randomised starts: not measured: world 0" in text for text in result.details)
+    assert "randomized.pool_contacts" not in result.metrics
     assert not {"pool_pairs", "pool_ccd_pairs"} & result.metrics.keys()
     assert not [name for name in result.metrics if name.startswith("memory.")]
     assert any("does not count the pairs" in line for line in lines)

@@ -3,36 +3,44 @@ they be?
 """
 
 import math
+from dataclasses import replace
+from functools import reduce
 
 import numpy as np
 
 from mjstack.config.schema import Backend
 from mjstack.envs.buffers import Peaks, join_peaks, recommend_sizes
 from mjstack.episodes.run import Run, each_rank, needs_episode
-from mjstack.errors import name_worlds
+from mjstack.errors import Unreachable, name_worlds
 from mjstack.report.record import GateResult, Status
 from mjstack.sim import BatchSizes, resolve_sizes
 from mjstack.sim.cameras import image_bytes
 from mjstack.sim.sizes import apply_configured, configured_sizes
 
-_TITLES = {"task": "driven task", "env": "environments (random actions)"}
+_TITLES = {"task": "driven task", "env": "environments (random actions, randomised starts)"}
 
 
 @each_rank
 @needs_episode
 def run_capacity(run: Run) -> list[GateResult]:
-    """Find the buffer sizes that the driven task needs, for the batch, and those that the task and
-    random actions need, for environments.
+    """Find the buffer sizes that the driven task needs, for the batch, and those that the task,
+    also from the starts of gate *success*, and random actions need, for environments.
 
     Peaks are over all steps and all worlds, in room that grows, up to a limit, until nothing is
     lost: a world that has lost physics moves differently. A workload that has lost nothing is not
     played again: room for a peak holds it exactly, and what follows plays in the sizes in force.
     """
     cfg = run.cfg
-    loads = {"": run.stage.measure(), "random_actions.": run.stage.measure(driven=False)}
-    task = loads[""]
+    stage = run.stage
+    task = stage.measure()
     nworld = len(task.rows)
     result = GateResult(name="capacity", status=Status.passed, metrics={"worlds": nworld})
+    loads = {"": task, "random_actions.": stage.measure(driven=False)}
+    try:
+        randomized = stage.with_config(replace(cfg, reset=cfg.gate.success.reset))
+        loads["randomized."] = randomized.measure()
+    except Unreachable as error:  # starts of the user's own; the rest stands
+        result.details.append(f"randomised starts: not measured: {error}")
     for prefix, load in loads.items():
         result.metrics |= {
             f"{prefix}peak_contacts_per_world": int(load.contacts.max()),
@@ -41,7 +49,7 @@ def run_capacity(run: Run) -> list[GateResult]:
         }
     sizes, shortages = _judge(run, "task", task, result)
     problems = list(shortages.values())
-    _, shortages = _judge(run, "env", join_peaks(*loads.values()), result)
+    _, shortages = _judge(run, "env", reduce(join_peaks, loads.values()), result)
     for key, text in shortages.items():
         # A size that was set may be meant for the batch alone; those of the robot's profile should
         # do for both.
@@ -61,8 +69,8 @@ def run_capacity(run: Run) -> list[GateResult]:
     }
     result.notes |= {"backend": task.description, "sizes_from": sizes.source}
     if cameras := cfg.scene.cameras:
-        mjwarp = run.stage.backend[0] is Backend.mjwarp
-        size = image_bytes(run.stage.model, cameras, cfg.nworld, mjwarp=mjwarp)
+        mjwarp = stage.backend[0] is Backend.mjwarp
+        size = image_bytes(stage.model, cameras, cfg.nworld, mjwarp=mjwarp)
         result.metrics["memory.images_mb"] = size / 1e6
     return [result]
 

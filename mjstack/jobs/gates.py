@@ -1,5 +1,6 @@
 """Job *gates*: a configuration and a folder in, gates run, a report left behind."""
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from mjstack.envs import driven_config
 from mjstack.episodes.earlier_run import EarlierRun
 from mjstack.episodes.record import STEMS
 from mjstack.episodes.stage import Stage
-from mjstack.errors import ConfigError, FolderError, MjstackError, renamed_keys
+from mjstack.errors import ConfigError, FolderError, MjstackError, Unreachable, renamed_keys
 from mjstack.gates.images import load_images
 from mjstack.gates.runner import find_gates, run_gates
 from mjstack.gates.success import success_config
@@ -73,6 +74,10 @@ def _check_memory(stage: Stage) -> None:
 def _check_starts(stage: Stage) -> None:
     """Raise if worlds cannot start as a gate has them, by the key that says so."""
     cfg = stage.cfg
+    if "capacity" in cfg.gates:
+        with suppress(Unreachable):  # the gate reports it
+            driven = driven_config(cfg, cfg.gate.success.reset)
+            check_env(stage, driven, reset="gate.success.reset")
     driven = driven_config(success_config(cfg))
     if "success" in cfg.gates and driven.reset != cfg.reset:
         check_env(stage, driven, reset="gate.success.reset")
