@@ -24,6 +24,7 @@ from mjstack.errors import MjstackError
 from mjstack.jobs import check_job, sweep, sweep_table
 from mjstack.jobs.sweep import LOG, SweepJob, add_jobs
 from mjstack.jobs.sweep_table import sweep_rows, write_summary
+from mjstack.report.figure import figures
 from mjstack.report.record import GateResult, Report, Status
 from mjstack.report.sweep_picture import Plot, Row, crossover, save_sweep
 from mjstack.report.write import write_report
@@ -116,7 +117,7 @@ def listed(folder: Path, *overrides: str) -> list[SweepJob]:
 
 def report(job: SweepJob, status: Status, reason: str = "", **metrics: float) -> Report:
     job.folder.mkdir(parents=True, exist_ok=True)
-    gate = GateResult(name="batch", status=status, reason=reason, metrics=metrics)
+    gate = GateResult(name="batch", status=status, reason=reason, figures=figures(**metrics))
     facts = {"git_commit": "abc"}
     made = Report(folder=job.folder, overrides=list(job.overrides), provenance=facts)  # type: ignore[arg-type]
     made.gates = [gate]

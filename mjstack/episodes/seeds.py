@@ -161,8 +161,7 @@ def _worlds(tally: EpisodeTally, run: Run) -> Worlds:
         names=tally.names(plotted),
         broken=[rules.broken(failed) for failed in bits[plotted].tolist()],
         rules=rules.texts,
-        values={name: values[plotted] for name, values in tally.values.items()},
-        limits=tally.check.limits,
+        values=[(tally.check.figures[key], v[plotted]) for key, v in tally.values.items()],
     )
     # What the check judges, and what else differs
     moving = run.page.worlds3d.get(tally.gate, [])

@@ -5,6 +5,7 @@ import numpy as np
 from mjstack.episodes.recorder import Snapshots
 from mjstack.episodes.run import Run, needs_episode, spread
 from mjstack.episodes.seeds import play_seeds
+from mjstack.report.figure import Figure
 from mjstack.report.record import GateResult
 
 
@@ -30,10 +31,14 @@ def run_batch(run: Run) -> list[GateResult]:
 
     distinct = len(np.unique(tally.array("end")))
     failed = tally.episodes - tally.successes
-    metrics: dict[str, float] = {"distinct_final_states": distinct}
+    measured = [
+        Figure("distinct_final_states", distinct),
+        Figure("failed_worlds", high=t.failed_worlds),
+        Figure("distinct_fraction", high=t.distinct_fraction),
+    ]
     if not failed:  # worlds that fail have no speed
         speed = sum(record.steps for record in tally.records) / tally.seconds
-        metrics |= {"episode_s": tally.seconds, "world_steps_per_s": speed}
+        measured += [Figure("episode", tally.seconds, "s"), Figure("world_steps", speed, "/s")]
     # Worlds that start apart may end alike, as a peg in its hole does.
     starts = len(np.unique(np.round(tally.array("start_qpos"), 4), axis=0))
     if tally.episodes > 1 and max(distinct, starts) < t.distinct_fraction * tally.episodes:
@@ -42,7 +47,6 @@ def run_batch(run: Run) -> list[GateResult]:
     result = tally.result(
         [f"{tally.summary}, {distinct} distinct"],
         passed=failed <= t.failed_worlds,
-        metrics=metrics,
-        thresholds={"failed_worlds": t.failed_worlds, "distinct_fraction": t.distinct_fraction},
+        figures=measured,
     )
     return [result]

@@ -12,6 +12,7 @@ from mjstack.config.schema import Backend
 from mjstack.envs.buffers import Peaks, join_peaks, recommend_sizes
 from mjstack.episodes.run import Run, each_rank, needs_episode
 from mjstack.errors import Unreachable, name_worlds
+from mjstack.report.figure import Figure, figures
 from mjstack.report.record import GateResult, Status
 from mjstack.sim import BatchSizes, resolve_sizes
 from mjstack.sim.cameras import image_bytes
@@ -34,19 +35,20 @@ def run_capacity(run: Run) -> list[GateResult]:
     stage = run.stage
     task = stage.measure()
     nworld = len(task.rows)
-    result = GateResult(name="capacity", status=Status.passed, metrics={"worlds": nworld})
-    loads = {"": task, "random_actions.": stage.measure(driven=False)}
+    result = GateResult(name="capacity", status=Status.passed, figures=figures(worlds=nworld))
+    loads = {"": task, "random_actions": stage.measure(driven=False)}
     try:
         randomized = stage.with_config(replace(cfg, reset=cfg.gate.success.reset))
-        loads["randomized."] = randomized.measure()
+        loads["randomized"] = randomized.measure()
     except Unreachable as error:  # starts of the user's own; the rest stands
         result.details.append(f"randomised starts: not measured: {error}")
-    for prefix, load in loads.items():
-        result.metrics |= {
-            f"{prefix}peak_contacts_per_world": int(load.contacts.max()),
-            **{f"{prefix}pool_{key}": peak for key, peak in load.pools.items()},
-            f"{prefix}peak_constraint_rows_per_world": int(load.rows.max()),
-        }
+    for workload, load in loads.items():
+        result.figures += figures(
+            workload,
+            peak_contacts_per_world=int(load.contacts.max()),
+            **{f"pool_{key}": peak for key, peak in load.pools.items()},
+            peak_constraint_rows_per_world=int(load.rows.max()),
+        )
     sizes, shortages = _judge(run, "task", task, result)
     problems = list(shortages.values())
     _, shortages = _judge(run, "env", reduce(join_peaks, loads.values()), result)
@@ -62,16 +64,16 @@ def run_capacity(run: Run) -> list[GateResult]:
     used = f"{task.contacts.max()} of {sizes.nconmax} contacts, {task.rows.max()} of"
     result.reason = "; ".join(problems) or f"{used} {sizes.njmax} rows, at most, in {nworld} worlds"
     result.status = Status.failed if problems else Status.passed
-    result.thresholds = {
-        "contacts_per_world": sizes.nconmax,
-        "njmax": sizes.njmax,
-        "margin": cfg.gate.capacity.margin,
-    }
+    result.figures += [
+        Figure("contacts_per_world", high=sizes.nconmax),
+        Figure("njmax", high=sizes.njmax),
+        Figure("margin", high=cfg.gate.capacity.margin),
+    ]
     result.notes |= {"backend": task.description, "sizes_from": sizes.source}
     if cameras := cfg.scene.cameras:
         mjwarp = stage.backend[0] is Backend.mjwarp
         size = image_bytes(stage.model, cameras, cfg.nworld, mjwarp=mjwarp)
-        result.metrics["memory.images_mb"] = size / 1e6
+        result.figures.append(Figure("images", size / 1e6, "MB", "memory"))
     return [result]
 
 
@@ -103,15 +105,14 @@ def _judge(
         line += " (contacts alone: native MuJoCo does not count the pairs that share their pool)"
     run.print_line(line)
     result.details.append(line)
-    prefix = "recommended" if driven else "recommended_env"
-    for key, size in configured_sizes(advice).items():
-        result.metrics[f"{prefix}.{key}"] = size
+    group = "recommended" if driven else "recommended_env"
+    result.figures += figures(group, **configured_sizes(advice))
     if not native:
         from mjstack.sim.usage import data_bytes  # loads Warp, which native runs do not need
 
         for which, rooms in (("current", sizes), ("recommended", advice)):
             size = data_bytes(run.stage.model, cfg.nworld, rooms)
-            result.metrics[f"memory.{name}.{which}_mb"] = size / 1e6
+            result.figures.append(Figure(which, size / 1e6, "MB", f"memory.{name}"))
     return sizes, find_shortages(peaks, sizes, advice)
 
 

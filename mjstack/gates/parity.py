@@ -4,6 +4,7 @@ import copy
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import closing
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -17,6 +18,7 @@ from mjstack.episodes.run import Run, needs_episode
 from mjstack.gates.images import compare_images
 from mjstack.managers.episode import required_fields
 from mjstack.math import quat_angle, quat_to_matrix
+from mjstack.report.figure import Figure
 from mjstack.report.record import GateResult, Status
 from mjstack.sim import Simulation, describe_overflow, make_simulation
 from mjstack.sim.native import NativeSimulation
@@ -50,12 +52,7 @@ def run_parity(run: Run) -> list[GateResult]:
 def _compare(run: Run, mjwarp: Simulation) -> GateResult:
     """The result of the gate, measured in one MJWarp world."""
     cfg = run.cfg
-    result = GateResult(
-        name="parity",
-        status=Status.passed,
-        thresholds=run.stage.check.thresholds(),
-        notes={"backend": mjwarp.description},
-    )
+    result = GateResult(name="parity", status=Status.passed, notes={"backend": mjwarp.description})
     problems = compare_states(run, mjwarp, result)
     for option, (native, uploaded, equal) in compare_options(run.nominal.sim, mjwarp).items():
         line = f"option {option}: native {native}, uploaded {uploaded}"
@@ -64,24 +61,25 @@ def _compare(run: Run, mjwarp: Simulation) -> GateResult:
 
     world = WorldRecorder()
     episode = run.stage.play(mjwarp, run.cfg.gate.baseline.reset, [*run.viewers, world])
-    status, reason, judged, result.beyond = run.judge_one(episode)
-    if status is Status.failed:
-        problems.append(reason)
+    judged, headline = run.judge_one("parity", episode)
+    result.beyond = judged.beyond
+    if judged.status is Status.failed:
+        problems.append(judged.reason)
     if bits := int(mjwarp.overflow[0]):
         problems.append(f"{describe_overflow(bits)} overflow: raise batch.njmax or batch.nconmax")
-    result.metrics |= judged | {
-        "peak_contacts": int(mjwarp.peak_contacts[0]),
-        "peak_constraint_rows": int(mjwarp.peak_constraints[0]),
-        "episode_s": episode.timing.seconds,
-    }
+    result.figures += [
+        *judged.figures,
+        Figure("peak_contacts", int(mjwarp.peak_contacts[0])),
+        Figure("peak_constraint_rows", int(mjwarp.peak_constraints[0])),
+        Figure("episode", episode.timing.seconds, "s"),
+    ]
     apart, ends = _compare_ends(run, world.qpos[-1], result, rounded=not problems)
     problems += apart
     if cfg.scene.cameras:
         problems += compare_images(run, result)
 
-    headline = run.stage.check.headline(judged)
     run.print_line(f"{cfg.task.name} check: {headline} ({mjwarp.description})")
-    run.show_world("parity", "parity, MJWarp", world.qpos, status, world.env, "parity world")
+    run.show_world("parity", "parity, MJWarp", world.qpos, judged.status, world.env, "parity world")
     summary = "; ".join([headline, *ends])
     if "images" in result.notes:
         summary += "; images were not compared"
@@ -129,9 +127,8 @@ def compare_states(run: Run, mjwarp: Simulation, result: GateResult) -> list[str
                     allowed = multiples[steps] * (allowed + rounding)
                 worst = int((apart[field] / allowed.clamp(min=1e-30)).argmax())
                 error, limit = float(apart[field][worst]), float(allowed[worst])
-                key = f"{name}.step{steps}.{field}"
-                result.metrics[key] = error
-                result.thresholds[key] = limit
+                group = f"{name}.step{steps}"
+                result.figures.append(Figure(field, error, group=group, high=limit))
                 if not error <= limit:
                     owner = _owner(model, field, worst)
                     text = f"{field} of {owner} differs by {error:.2g}, limit {limit:.2g}"
@@ -273,12 +270,14 @@ def _compare_ends(
     limits: they may be off from where it is in the nearest of these instead.
     """
     limits = run.cfg.gate.parity
-    allowed = {"position_m": limits.object_position, "rotation_deg": limits.object_rotation_deg}
-    result.thresholds |= {f"final.{key}": limit for key, limit in allowed.items()}
+    allowed = {
+        "position": Figure("position", unit="m", group="final", high=limits.object_position),
+        "rotation": Figure("rotation", unit="deg", group="final", high=limits.object_rotation_deg),
+    }
 
     def shares(target: np.ndarray) -> dict[str, float]:
         return {
-            name: float(np.max([v / max(allowed[key], 1e-30) for key, v in gaps.items()]))
+            name: float(np.max([v / max(allowed[key].high, 1e-30) for key, v in gaps.items()]))
             for name, gaps in _ends_apart(run, end, target).items()
         }
 
@@ -295,8 +294,11 @@ def _compare_ends(
     problems = []
     farthest: dict[bool, tuple[float, str]] = {}  # object, and other joint
     for name, gaps in _ends_apart(run, end, native).items():
-        result.metrics |= {f"final.{name}.{key}": value for key, value in gaps.items()}
-        values = [(v, "deg") if "deg" in key else (1e3 * v, "mm") for key, v in gaps.items()]
+        result.figures += [
+            replace(allowed[key], value=v, group=f"final.{name}", limit=allowed[key].key)
+            for key, v in gaps.items()
+        ]
+        values = [(v, "deg") if key == "rotation" else (1e3 * v, "mm") for key, v in gaps.items()]
         text = f"{name} ends {' and '.join(f'{v:.2f} {unit}' for v, unit in values)} from native's"
         problems += [] if share[name] <= 1.0 else [text]
         joint = name not in run.cfg.scene.objects
@@ -316,11 +318,11 @@ def _ends_apart(run: Run, *ends: np.ndarray) -> dict[str, dict[str, float]]:
         if name in run.cfg.robot.joints:
             continue
         slid, turned = np.split(moved[model.dof_jntid == number], [_SLIDES.get(int(kind), 0)])
-        pairs = {"position_m": slid, "rotation_deg": np.degrees(turned)}
+        pairs = {"position": slid, "rotation": np.degrees(turned)}
         out[name] = {key: float(np.linalg.norm(part)) for key, part in pairs.items() if part.size}
         if thing := run.cfg.scene.objects.get(name):
             quats = [torch.from_numpy(q[model.jnt_qposadr[number] :][3:7]) for q in ends]
-            out[name]["rotation_deg"] = math.degrees(turn_between(thing.shape, *quats))
+            out[name]["rotation"] = math.degrees(turn_between(thing.shape, *quats))
     return out
 
 

@@ -25,6 +25,7 @@ from mjstack.episodes.tally import rate_cells
 from mjstack.files import to_csv, write_atomic, write_npz
 from mjstack.math import rate_interval, wilson_interval
 from mjstack.mdp.starts.starts_file import start_arrays
+from mjstack.report.figure import Figure, figures
 from mjstack.report.record import GateResult
 from mjstack.report.table import Table
 from mjstack.report.text import format_percent
@@ -83,15 +84,14 @@ def run_success(run: Run) -> list[GateResult]:
     lost = sum(goal.lost for goal in goals)
     doubts = find_doubts(distinct, tally.episodes, tally.successes, lost, t.rate)
     tally.details = unwritten + doubts + tally.details
-    metrics = {
-        "distinct_starts": distinct,
+    counts = figures(
+        distinct_starts=distinct,
         **({"reached_and_lost": lost} if goals else {}),
-        "retried": retried,
-        "retries": int(retries.sum()),
-        "retried_succeeded": retried_succeeded,
-        "unreachable": int(tally.array("unreachable").sum()),
-        "episode_s": tally.seconds,
-    }
+        retried=retried,
+        retries=int(retries.sum()),
+        retried_succeeded=retried_succeeded,
+        unreachable=int(tally.array("unreachable").sum()),
+    )
     tally.notes["starts"] = _describe_start(cfg)
     parts = [f"{tally.summary}, {format_percent(t.rate)} wanted"]
     if retried:
@@ -106,8 +106,8 @@ def run_success(run: Run) -> list[GateResult]:
     result = tally.result(
         parts,
         passed=tally.successes / tally.episodes >= t.rate,
-        metrics=metrics,
-        thresholds={"success_rate_min": t.rate},
+        figures=[*counts, Figure("episode", tally.seconds, "s")],
+        rate=t.rate,
         tables=regions_table(t, regions),
     )
     return [result]

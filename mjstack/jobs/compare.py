@@ -31,6 +31,7 @@ from mjstack.jobs.gates import check_machine
 from mjstack.jobs.runner import CheckedJob, Job
 from mjstack.math import mcnemar_p_value
 from mjstack.mdp.starts.starts_file import start_arrays
+from mjstack.report.figure import figures
 from mjstack.report.page import World
 from mjstack.report.record import GateResult, Status
 from mjstack.report.sweep_picture import Plot, save_sweep
@@ -157,15 +158,13 @@ def _compare(sides: Sides, notes: Mapping[str, str], folder: Path, run: Run) -> 
             reason=f"{verdict} (McNemar's exact test, p = {p_value:.3g}): of {episodes} episodes a"
             f" succeeded in {rates['a']['succeeded']} and b in {rates['b']['succeeded']}, only a in"
             f" {only['a']}, only b in {only['b']}",
-            metrics={
-                "episodes": episodes,
-                "both": rates["a"]["succeeded"] - only["a"],
-                **{f"only_{name}": count for name, count in only.items()},
-                "neither": episodes - rates["a"]["succeeded"] - only["b"],
-                "p_value": p_value,
-                **{f"{name}.{key}": v for name, rate in rates.items() for key, v in rate.items()},
-                **{f"only_{s}.failed.{r}": n for s in _SIDES for r, n in broken[s].items()},
-            },
+            figures=[
+                *figures(episodes=episodes, both=rates["a"]["succeeded"] - only["a"]),
+                *figures(**{f"only_{name}": count for name, count in only.items()}),
+                *figures(neither=episodes - rates["a"]["succeeded"] - only["b"], p_value=p_value),
+                *(figure for name, rate in rates.items() for figure in figures(name, **rate)),
+                *(f for side in _SIDES for f in figures(f"only_{side}.failed", **broken[side])),
+            ],
             notes={**notes, "table": TABLE},
             tables=[table] if table.rows else [],
         )

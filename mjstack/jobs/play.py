@@ -21,6 +21,7 @@ from mjstack.gates.runner import run_guarded
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import VIEWS, CheckedJob, Job
 from mjstack.jobs.showing import check_showing
+from mjstack.report.figure import figures
 from mjstack.report.gl import require_offscreen
 from mjstack.report.page import World
 from mjstack.report.picture import save_video
@@ -84,9 +85,10 @@ def play_worlds(run: Run) -> list[GateResult]:
                 rollout(env, driver, observers, advance=advance, label=label)
             else:
                 episode = play_episode(env, driver, observers, advance=advance, label=label)
-                status, outcome, metrics, _ = run.judge_one(episode)
+                judged, headline = run.judge_one(NAME, episode)
+                status = judged.status
                 succeeded += status is Status.passed
-                outcome = outcome or f"succeeded, {stage.check.headline(metrics)}"
+                outcome = judged.reason or f"succeeded, {headline}"
             qpos = recorder.qpos
             seen = draw_seen(stage, qpos, sim) if cfg.video and job.camera is None else {}
             (fields,) = world_fields(stage, env, [0])
@@ -99,7 +101,7 @@ def play_worlds(run: Run) -> list[GateResult]:
         name=NAME,
         status=Status.passed,
         reason=f"{succeeded} of {cfg.nworld} worlds succeeded" if cfg.task.check else outcome,
-        metrics={"worlds": cfg.nworld, **({"succeeded": succeeded} if cfg.task.check else {})},
+        figures=figures(worlds=cfg.nworld, **({"succeeded": succeeded} if cfg.task.check else {})),
         notes={"backend": sim.description},
         details=details,
     )

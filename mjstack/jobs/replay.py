@@ -29,6 +29,7 @@ from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import VIEWS, CheckedJob, Job, run_provenance
 from mjstack.jobs.showing import check_showing
 from mjstack.policy.lerobot import PREFIX
+from mjstack.report.figure import figures
 from mjstack.report.record import GateResult, Status
 from mjstack.report.table import Table
 from mjstack.sim import resolve_backend, resolve_device
@@ -234,10 +235,10 @@ def _replay(
         episode = stage.play(sim, stage.cfg.reset, observers, seed=plan.seed, worlds=[plan.world])
         lines = trace.explain(episode)
         qpos = trace.arrays["qpos"]
-        status, reason, metrics, beyond = run.judge_one(episode)
+        result, headline = run.judge_one(f"replay_{backend}", episode)
         title = f"world {plan.world} of seed {plan.seed}, replayed ({backend})" if first else ""
         label = f"{plan.world}, {backend}"
-        run.show_world(f"replay_{backend}", label, qpos, status, trace.env, title)
+        run.show_world(f"replay_{backend}", label, qpos, result.status, trace.env, title)
     agrees, comparison = _compare(plan, number, episode, qpos[-1], changes, run)
     lines += [_first_sign(monitor, episode) for monitor in monitors]
     for line in lines:
@@ -246,18 +247,12 @@ def _replay(
     ends = {"backend": episode.description, "failed": int(episode.failed[0])}
     write_npz(folder / name, facts | ends | trace.arrays)
     recorded = check.rules.describe(plan.bits[plan.seed][plan.world]) or "succeeded"
-    return [
-        GateResult(
-            name=f"replay_{backend}",
-            status=status if agrees else Status.failed,
-            reason=f"{reason or f'succeeded, {check.headline(metrics)}'}; {comparison}",
-            thresholds=check.thresholds(),
-            metrics=facts | metrics,
-            beyond=beyond,
-            notes={"backend": episode.description, "recorded": recorded, "trajectory": name},
-            details=lines + changes,
-        )
-    ]
+    result.status = result.status if agrees else Status.failed
+    result.reason = f"{result.reason or f'succeeded, {headline}'}; {comparison}"
+    result.figures = figures(**facts) + result.figures
+    result.notes = {"backend": episode.description, "recorded": recorded, "trajectory": name}
+    result.details = lines + changes
+    return [result]
 
 
 def _first_sign(monitor: FailureMonitor, episode: Episode) -> str:
@@ -347,7 +342,7 @@ def _play_failing(
             status=Status.failed if again else Status.passed,
             reason=f"{again} of {len(played)} failing worlds fail again ({rate}, 95 % interval"
             f" {interval}), {same} by the same rules",
-            metrics={"worlds": len(played), "fail_again": again, "by_the_same_rules": same},
+            figures=figures(worlds=len(played), fail_again=again, by_the_same_rules=same),
             notes={"backend": f"{backend} on {device}", "table": TABLE},
             tables=[Table.of(columns, table_rows, f"Failing worlds (all of them: {TABLE})")],
         )
