@@ -15,7 +15,7 @@ from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
 from mjstack.errors import FolderError, MjstackError
 from mjstack.files import read_npz, reading, write_npz
-from mjstack.report.figure import Figure, suffix
+from mjstack.report.figure import Figure
 from mjstack.report.gl import require_offscreen
 from mjstack.report.picture import save_images
 from mjstack.report.record import GateResult
@@ -103,13 +103,12 @@ def _report(stage: Stage, result: GateResult, agreements: dict[str, _Agreement])
             Figure(thing, iou, group=f"{group}.iou", low=limits.image_iou, limit="images.iou")
             for thing, iou in camera.iou.items()
         ]
+        same = Figure("same_thing", camera.same, low=limits.image_same)
+        color = Figure("color_of_255", camera.color, high=limits.image_color)
+        depth = Figure("depth", camera.depth, "m", high=limits.image_depth)
         figures += [
-            Figure(quantity, value, unit, group, **limit, limit=f"images.{quantity}{suffix(unit)}")
-            for quantity, value, unit, limit in (
-                ("same_thing", camera.same, "", {"low": limits.image_same}),
-                ("color_of_255", camera.color, "", {"high": limits.image_color}),
-                ("depth", camera.depth, "m", {"high": limits.image_depth}),
-            )
+            replace(figure, group=group, limit=f"images.{figure.key}")
+            for figure in (same, color, depth)
         ]
         result.figures += figures
         stage.progress.print_line(

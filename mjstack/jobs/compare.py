@@ -42,7 +42,6 @@ TABLE = "compare.csv"
 _SIDES = ("a", "b")
 _PAGE_WORLDS = 8  # worlds on the page that only one side won, of each side
 _LEVEL = 0.05  # of significance
-_ENDS = {"min": "low", "max": "high"}  # of the picture's whiskers, in metrics of a rate
 _ROUNDING = 1e-6  # [m, rad], by which equal starts on two backends or devices may differ
 _PANELS = {
     "success rate, 95 % interval": {"": "success_rate"},
@@ -138,8 +137,7 @@ def _compare(sides: Sides, notes: Mapping[str, str], folder: Path, run: Run) -> 
         verdict = f"{'a' if only['a'] > only['b'] else 'b'} is better"
     bars = []
     for name, rate in rates.items():
-        ends = {f"success_rate_{end}": rate[f"success_rate_{at}95"] for end, at in _ENDS.items()}
-        bars.append({"side": name, "status": "pass", "only": only[name]} | rate | ends)
+        bars.append({"side": name, "only": only[name]} | rate)
     plot = Plot(title=f"{run.page.title}: {verdict}", over="side", lines=[], panels=_PANELS)
     run.draw(f"{NAME}.png", save_sweep, plot, bars)
     table = Table(

@@ -24,14 +24,13 @@ from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import CheckedJob, Job
 from mjstack.jobs.showing import check_showing
 from mjstack.report.figure import Figure
-from mjstack.report.picture import save_curves
 from mjstack.report.record import GateResult, Status
+from mjstack.report.sweep_picture import Plot, save_sweep
 from mjstack.report.table import Table
 from mjstack.train.trainer import FAILED, LAST, Trainer, whole_starts
 
 NAME = "train"
 CONFIG = "training.json"  # the configuration of the training in the folder
-_ENDS = ("low", "high")  # of an interval
 # Keys of the job; changing one of these changes no training.
 _WITHOUT_EFFECT = ("folder", "test_seed", "iterations", "minutes", "max_minutes")
 
@@ -128,15 +127,11 @@ def _train(trainer: Trainer, folder: Path, run: Run) -> list[GateResult]:
     if run.stage.ranks.writes:
         write_atomic(folder / f"{NAME}.csv", to_csv(rows))
         title = f"{run.cfg.robot.title}, task {run.cfg.task.name}: training"
-        lines = {words[name]: [row[name] for row in rows] for name in trained.lines}
-        at = [row[trained.abscissa] for row in rows]
-        bands = {
-            words[name]: [[row[f"{name}_{end}95"] for row in rows] for end in _ENDS]
-            for name in trained.lines
-            if all(f"{name}_low95" in row for row in rows)
-        }
-        picture = (at, lines, title, trained.abscissa, trained.scale, bands)
-        run.draw(f"{NAME}.png", save_curves, *picture)
+        curves = {words[name]: name for name in trained.lines}
+        plot = Plot(
+            title=title, over=trained.abscissa, lines=[], panels={"": curves}, log=trained.log
+        )
+        run.draw(f"{NAME}.png", save_sweep, plot, rows)
     seconds = time.perf_counter() - began
     reached = ", ".join(f"{words[name]} {last[name]:.4g}" for name in trained.lines)
     rules = {name.removeprefix(FAILED): name for name in last if name.startswith(FAILED)}

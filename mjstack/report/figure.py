@@ -91,6 +91,6 @@ def suffix(unit: str) -> str:
     return f"_{words.removeprefix('_')}" if words else ""
 
 
-def figures(group: str = "", **values: float) -> list[Figure]:
+def figures(group: str = "", /, **values: float) -> list[Figure]:
     """Figures of numbers by their names."""
     return [Figure(name, value, group=group) for name, value in values.items()]

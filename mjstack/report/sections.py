@@ -156,8 +156,10 @@ def _grade(figure: Figure) -> str:
     """Good, near or bad by its limits; empty without any."""
     if not figure.limits:
         return ""
-    near = figure.low == -math.inf and not figure.value <= 0.5 * figure.high
-    return "bad" if not figure.holds(figure.value) else "near" if near else "good"
+    if not figure.holds(figure.value):
+        return "bad"
+    near = math.isinf(figure.low) and not figure.holds(2.0 * (figure.value or 0.0))
+    return "near" if near else "good"
 
 
 def _episode_parts(worlds: Worlds) -> Iterator[Part]:

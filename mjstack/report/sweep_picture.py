@@ -1,4 +1,4 @@
-"""Pictures of a sweep: curves over a number, or bars over anything else."""
+"""Pictures of jobs or of a training: curves over a number, or bars over anything else."""
 
 import itertools
 import math
@@ -16,6 +16,7 @@ Row = dict[str, Any]
 
 _COLORS = ("#2a7d2e", "#2457c7", "#cc2a24", "#8a5a00", "#6a3d9a", "#555555")
 _STYLES = ("-o", "--s", ":^", "-.v")
+_TICKS = 12  # of the axis of numbers, at most; more have Matplotlib's
 _RED = "#cc2a24"
 
 
@@ -29,12 +30,14 @@ class Plot:
         lines: Further keys in which the jobs differ: each combination of their values is a line.
         panels: Curves of each panel by its label: a metric by the curve's label, which may be
             empty. ``metric * 10`` and ``metric / 10`` scale it.
+        log: Whether curves have a logarithmic scale.
     """
 
     title: str
     over: str
     lines: Sequence[str]
     panels: Mapping[str, Mapping[str, str]]
+    log: bool = False
 
     def shows(self, rows: Sequence[Row]) -> bool:
         """Whether some job has one of the metrics."""
@@ -62,43 +65,36 @@ class Plot:
 def save_sweep(path: Path, plot: Plot, rows: Sequence[Row]) -> None:
     """Draw a panel for each metric: curves over a number, else a bar for each job.
 
-    A job that did not pass interrupts its curves, and a cross marks it.
+    A job that did not pass interrupts its curves, and a cross marks it. Ranges and intervals of
+    metrics are bands or whiskers.
     """
     (_draw_curves if plot.is_numeric(rows) else _draw_bars)(path, plot, rows)
-
-
-def crossover(plot: Plot, rows: Sequence[Row]) -> float | None:
-    """Where one of two lines passes the other, in the first curve of the first panel; None if the
-    rows do not show it.
-
-    Interpolated between the two numbers that bracket it, straight in logarithms. Jobs that did not
-    pass do not count.
-    """
-    groups = [group for _, group in plot.groups(rows)]
-    if len(groups) != 2:
-        return None
-    metric = next(iter(next(iter(plot.panels.values())).values()))
-    first, second = ({row[plot.over]: _value(row, metric) for row in group} for group in groups)
-    points = [
-        (math.log(x), math.log(first[x] / second[x]))
-        for x in sorted(first.keys() & second.keys())
-        if x > 0 and first[x] > 0.0 and second[x] > 0.0
-    ]
-    for (x0, gap0), (x1, gap1) in itertools.pairwise(points):
-        if (gap0 > 0.0) != (gap1 > 0.0):
-            return math.exp(x0 - (x1 - x0) * gap0 / (gap1 - gap0))
-    return None
 
 
 def _value(row: Row, metric: str) -> float:
     """A metric of a job, scaled as it says; NaN where it was not measured, or is void."""
     name, *factor = metric.split(" ")
-    value = row.get(name, math.nan)
-    void = row["status"] != "pass" and not name.startswith("succe")
+    value = row.get(name)
+    void = _failed(row) and not name.startswith("succe")
     if void or not isinstance(value, int | float):
         return math.nan
     operator, number = factor or ("*", "1")
     return value * float(number) if operator == "*" else value / float(number)
+
+
+def _interval(rows: Sequence[Row], metric: str) -> tuple[np.ndarray, ...]:
+    """A metric of jobs, and the ends of its range or its 95 % interval, each ``(n,)``; NaN for no
+    number.
+    """
+    name, space, factor = metric.partition(" ")
+    stem = name.removesuffix(".median")
+    ends = (".min", ".max") if stem != name else ("_low95", "_high95")
+    names = (name, *(stem + end for end in ends))
+    return tuple(np.array([_value(row, n + space + factor) for row in rows]) for n in names)
+
+
+def _failed(row: Row) -> bool:
+    return row.get("status", "pass") != "pass"
 
 
 def _is_rate(curves: Mapping[str, str]) -> bool:
@@ -109,37 +105,33 @@ def _is_rate(curves: Mapping[str, str]) -> bool:
 
 
 def _draw_curves(path: Path, plot: Plot, rows: Sequence[Row]) -> None:
-    crossing = crossover(plot, rows)
     ticks = sorted({row[plot.over] for row in rows})
-    wide = ticks[0] > 0 and ticks[-1] / ticks[0] > 8
+    few = len(ticks) <= _TICKS
+    wide = few and ticks[0] > 0 and ticks[-1] / ticks[0] > 8
     size = (6.0 * len(plot.panels), 4.8)
-    title = f"{plot.title} (x: no figure)"
-    with figure(path, title, len(plot.panels), figsize=size, squeeze=False) as (_, (panels,)):
+    with figure(path, plot.title, len(plot.panels), figsize=size, squeeze=False) as (_, (panels,)):
         for axes, (label, curves) in zip(panels, plot.panels.items(), strict=True):
-            heights: list[float] = []
+            heights = [_value(row, metric) for row in rows for metric in curves.values()]
             for number, (name, group) in enumerate(plot.groups(rows)):
                 color = _COLORS[number % len(_COLORS)]
                 x = [row[plot.over] for row in group]
                 for (curve, metric), style in zip(curves.items(), itertools.cycle(_STYLES)):
-                    y = [_value(row, metric) for row in group]
+                    y, low, high = _interval(group, metric)
                     text = ", ".join(filter(None, (name, curve))) or label
-                    if not all(map(math.isnan, y)):
+                    if not np.isnan(y).all():
                         axes.plot(x, y, style, label=text, markersize=4, color=color)
-                    heights += y
-                failed = [row[plot.over] for row in group if row["status"] != "pass"]
+                        axes.fill_between(x, low, high, alpha=0.2, color=color)
+                failed = [row[plot.over] for row in group if _failed(row)]
                 marks = [0.02 + 0.04 * number] * len(failed)
                 axes.plot(failed, marks, "x", color=color, transform=axes.get_xaxis_transform())
-            # Axes
             axes.set(xlabel=plot.over, ylabel=label)
             if wide:
                 axes.set_xscale("log", base=2)
-            if wide and min((y for y in heights if not math.isnan(y)), default=0.0) > 0.0:
+            if plot.log or (wide and np.nanmin([*heights, math.inf]) > 0.0):
                 axes.set_yscale("log")
-            axes.set_xticks(ticks, [f"{tick:,}" for tick in ticks], rotation=45)
+            if few:
+                axes.set_xticks(ticks, [f"{tick:,}" for tick in ticks], rotation=45)
             axes.grid(alpha=0.3)
-            if crossing is not None:
-                text = f"crossover, {crossing:,.0f}"
-                axes.axvline(crossing, color="0.4", linestyle=":", label=text)
             if _is_rate(curves):
                 axes.set_ylim(top=1.0)
             if axes.get_legend_handles_labels()[0]:
@@ -151,9 +143,7 @@ def _draw_bars(path: Path, plot: Plot, rows: Sequence[Row]) -> None:
     rows = [row for row in rows if plot.shows([row])]
     keys = dict.fromkeys((plot.over, *plot.lines))
     names = [", ".join(str(row.get(key, "")) for key in keys) for row in rows]
-    marked = [
-        row["status"] != "pass" or row.get("succeeded", 0) < row.get("worlds", 0) for row in rows
-    ]
+    marked = [_failed(row) or row.get("succeeded", 0) < row.get("worlds", 0) for row in rows]
     colors = [_RED if failed else _COLORS[1] for failed in marked]
     places = np.arange(len(rows))
     size = (5.5 * len(plot.panels), 1.5 + 0.3 * len(rows))
@@ -161,12 +151,7 @@ def _draw_bars(path: Path, plot: Plot, rows: Sequence[Row]) -> None:
     with figure(path, plot.title, len(plot.panels), **options) as (_, (panels,)):
         for axes, (label, curves) in zip(panels, plot.panels.items(), strict=True):
             metric = next(iter(curves.values()))
-            stem = metric.removesuffix(".median")
-            joint = "." if stem != metric else "_"
-            middle, low, high = (
-                np.array([_value(row, name) for row in rows])
-                for name in (metric, f"{stem}{joint}min", f"{stem}{joint}max")
-            )
+            middle, low, high = _interval(rows, metric)
             whiskers = np.array((middle - low, high - middle))
             style = {} if np.isnan(whiskers).all() else {"xerr": np.nan_to_num(whiskers)}
             axes.barh(places, middle, color=colors, ecolor="0.4", capsize=2, **style)

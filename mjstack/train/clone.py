@@ -165,7 +165,7 @@ def _trained(job: CloneJobCfg, folder: Path, facts: Facts) -> Trained:
         curve = [{k: v for k, v in row.items() if k not in rules} | rules | row for row in curve]
         return Trained(figures=measured, notes=notes, curve=curve, abscissa="round")
     lines = ["loss", "validation_loss"]
-    return Trained(figures=measured, notes=notes, curve=curve, lines=lines, scale="log")
+    return Trained(figures=measured, notes=notes, curve=curve, lines=lines, log=True)
 
 
 TRAINER = Trainer(check_clone, train_clone)

@@ -33,7 +33,7 @@ class Trained:
     curve: list[Facts]  # rows of the training curve: values by column
     lines: list[str] = field(default_factory=lambda: ["success"])  # columns that are drawn
     abscissa: str = "batch"  # the column over which they are drawn
-    scale: str = "linear"  # of their axis: log or linear
+    log: bool = False  # whether their axis is logarithmic
 
 
 @dataclass(frozen=True)
