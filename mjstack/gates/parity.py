@@ -5,6 +5,7 @@ import math
 from collections.abc import Iterator, Mapping
 from contextlib import closing
 from dataclasses import replace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -269,15 +270,10 @@ def _compare_ends(
     With ``rounded``, native MuJoCo plays the task in rounded worlds if one is off by more than the
     limits: they may be off from where it is in the nearest of these instead.
     """
-    limits = run.cfg.gate.parity
-    allowed = {
-        "position": Figure("position", unit="m", group="final", high=limits.object_position),
-        "rotation": Figure("rotation", unit="deg", group="final", high=limits.object_rotation_deg),
-    }
 
     def shares(target: np.ndarray) -> dict[str, float]:
         return {
-            name: float(np.max([v / max(allowed[key].high, 1e-30) for key, v in gaps.items()]))
+            name: float(np.max([gap.value / max(gap.high, 1e-30) for gap in gaps]))
             for name, gaps in _ends_apart(run, end, target).items()
         }
 
@@ -294,11 +290,8 @@ def _compare_ends(
     problems = []
     farthest: dict[bool, tuple[float, str]] = {}  # object, and other joint
     for name, gaps in _ends_apart(run, end, native).items():
-        result.figures += [
-            replace(allowed[key], value=v, group=f"final.{name}", limit=allowed[key].key)
-            for key, v in gaps.items()
-        ]
-        values = [(v, "deg") if key == "rotation" else (1e3 * v, "mm") for key, v in gaps.items()]
+        result.figures += [replace(gap, group=f"final.{name}") for gap in gaps]
+        values = [(1e3 * f.value, "mm") if f.unit == "m" else (f.value, f.unit) for f in gaps]
         text = f"{name} ends {' and '.join(f'{v:.2f} {unit}' for v, unit in values)} from native's"
         problems += [] if share[name] <= 1.0 else [text]
         joint = name not in run.cfg.scene.objects
@@ -307,22 +300,30 @@ def _compare_ends(
     return problems, [text for _, text in farthest.values()]
 
 
-def _ends_apart(run: Run, *ends: np.ndarray) -> dict[str, dict[str, float]]:
-    """How far objects and joints that the robot does not command are apart at two ends [m, deg]."""
+def _ends_apart(run: Run, *ends: np.ndarray) -> dict[str, list[Figure]]:
+    """How far objects and joints that the robot does not command are apart at two ends."""
     model = run.stage.model
+    limits = run.cfg.gate.parity
     moved = np.empty(model.nv)
     mujoco.mj_differentiatePos(model, moved, 1.0, *ends)
-    out = {}
+    out: dict[str, list[Figure]] = {}
+    limit: dict[str, Any]
     for number, kind in enumerate(model.jnt_type):
         name = model.joint(number).name or f"joint {number}"
         if name in run.cfg.robot.joints:
             continue
         slid, turned = np.split(moved[model.dof_jntid == number], [_SLIDES.get(int(kind), 0)])
-        pairs = {"position": slid, "rotation": np.degrees(turned)}
-        out[name] = {key: float(np.linalg.norm(part)) for key, part in pairs.items() if part.size}
-        if thing := run.cfg.scene.objects.get(name):
-            quats = [torch.from_numpy(q[model.jnt_qposadr[number] :][3:7]) for q in ends]
-            out[name]["rotation"] = math.degrees(turn_between(thing.shape, *quats))
+        gaps = out[name] = []
+        if slid.size:
+            limit = {"high": limits.object_position, "limit": "final.position_m"}
+            gaps.append(Figure("position", float(np.linalg.norm(slid)), "m", **limit))
+        if turned.size:
+            angle = math.degrees(np.linalg.norm(turned))
+            if thing := run.cfg.scene.objects.get(name):
+                quats = [torch.from_numpy(q[model.jnt_qposadr[number] :][3:7]) for q in ends]
+                angle = math.degrees(turn_between(thing.shape, *quats))
+            limit = {"high": limits.object_rotation_deg, "limit": "final.rotation_deg"}
+            gaps.append(Figure("rotation", angle, "deg", **limit))
     return out
 
 

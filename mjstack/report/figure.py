@@ -24,7 +24,7 @@ class Figure:
     """
 
     name: str
-    value: float | None = None
+    value: Any = None
     unit: str = ""
     group: str = ""
     _: KW_ONLY

@@ -158,7 +158,7 @@ def _grade(figure: Figure) -> str:
         return ""
     if not figure.holds(figure.value):
         return "bad"
-    near = math.isinf(figure.low) and not figure.holds(2.0 * (figure.value or 0.0))
+    near = math.isinf(figure.low) and not figure.holds(2.0 * figure.value)
     return "near" if near else "good"
 
 

@@ -157,8 +157,7 @@ class AtLeast(Rule):
         least: The threshold.
         phases: For each object, the phases in which it counts.
         after: Without phases it counts once this rule holds.
-        value: Name of the number, with ``{}`` for the suffix of the object; by default that of the
-            rule, and steps.
+        value: Name of the number, with ``{}`` for the suffix of the object, if it is no steps.
         key: Of the phases, for `Step.judged`.
         best: The number so far, shape ``(nworld, objects)``, float32.
     """
