@@ -19,7 +19,7 @@ from mjstack.episodes.run import Run, needs_episode
 from mjstack.gates.images import compare_images
 from mjstack.managers.episode import required_fields
 from mjstack.math import quat_angle, quat_to_matrix
-from mjstack.report.figure import Figure
+from mjstack.report.figure import Figure, figures
 from mjstack.report.record import GateResult, Status
 from mjstack.sim import Simulation, describe_overflow, make_simulation
 from mjstack.sim.native import NativeSimulation
@@ -64,16 +64,14 @@ def _compare(run: Run, mjwarp: Simulation) -> GateResult:
     episode = run.stage.play(mjwarp, run.cfg.gate.baseline.reset, [*run.viewers, world])
     judged, headline = run.judge_one("parity", episode)
     result.beyond = judged.beyond
-    if judged.status is Status.failed:
-        problems.append(judged.reason)
+    problems += [judged.reason] if judged.reason else []
     if bits := int(mjwarp.overflow[0]):
         problems.append(f"{describe_overflow(bits)} overflow: raise batch.njmax or batch.nconmax")
-    result.figures += [
-        *judged.figures,
-        Figure("peak_contacts", int(mjwarp.peak_contacts[0])),
-        Figure("peak_constraint_rows", int(mjwarp.peak_constraints[0])),
-        Figure("episode", episode.timing.seconds, "s"),
-    ]
+    peaks = figures(
+        peak_contacts=int(mjwarp.peak_contacts[0]),
+        peak_constraint_rows=int(mjwarp.peak_constraints[0]),
+    )
+    result.figures += [*judged.figures, *peaks, Figure("episode", episode.timing.seconds, "s")]
     apart, ends = _compare_ends(run, world.qpos[-1], result, rounded=not problems)
     problems += apart
     if cfg.scene.cameras:
@@ -295,8 +293,7 @@ def _compare_ends(
         text = f"{name} ends {' and '.join(f'{v:.2f} {unit}' for v, unit in values)} from native's"
         problems += [] if share[name] <= 1.0 else [text]
         joint = name not in run.cfg.scene.objects
-        if share[name] > farthest.get(joint, (-1.0, ""))[0]:
-            farthest[joint] = (share[name], text)
+        farthest[joint] = max(farthest.get(joint, (-1.0, "")), (share[name], text))
     return problems, [text for _, text in farthest.values()]
 
 
