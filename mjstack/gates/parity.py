@@ -52,7 +52,6 @@ def run_parity(run: Run) -> list[GateResult]:
 
 def _compare(run: Run, mjwarp: Simulation) -> GateResult:
     """The result of the gate, measured in one MJWarp world."""
-    cfg = run.cfg
     result = GateResult(name="parity", status=Status.passed, notes={"backend": mjwarp.description})
     problems = compare_states(run, mjwarp, result)
     for option, (native, uploaded, equal) in compare_options(run.nominal.sim, mjwarp).items():
@@ -74,10 +73,10 @@ def _compare(run: Run, mjwarp: Simulation) -> GateResult:
     result.figures += [*judged.figures, *peaks, Figure("episode", episode.timing.seconds, "s")]
     apart, ends = _compare_ends(run, world.qpos[-1], result, rounded=not problems)
     problems += apart
-    if cfg.scene.cameras:
+    if run.cfg.scene.cameras:
         problems += compare_images(run, result)
 
-    run.print_line(f"{cfg.task.name} check: {headline} ({mjwarp.description})")
+    run.print_line(f"{run.cfg.task.name} check: {headline} ({mjwarp.description})")
     run.show_world("parity", "parity, MJWarp", world.qpos, judged.status, world.env, "parity world")
     summary = "; ".join([headline, *ends])
     if "images" in result.notes:
@@ -293,7 +292,8 @@ def _compare_ends(
         text = f"{name} ends {' and '.join(f'{v:.2f} {unit}' for v, unit in values)} from native's"
         problems += [] if share[name] <= 1.0 else [text]
         joint = name not in run.cfg.scene.objects
-        farthest[joint] = max(farthest.get(joint, (-1.0, "")), (share[name], text))
+        if share[name] > farthest.get(joint, (-1.0, ""))[0]:
+            farthest[joint] = (share[name], text)
     return problems, [text for _, text in farthest.values()]
 
 
