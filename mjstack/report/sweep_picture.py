@@ -111,7 +111,8 @@ def _draw_curves(path: Path, plot: Plot, rows: Sequence[Row]) -> None:
     size = (6.0 * len(plot.panels), 4.8)
     with figure(path, plot.title, len(plot.panels), figsize=size, squeeze=False) as (_, (panels,)):
         for axes, (label, curves) in zip(panels, plot.panels.items(), strict=True):
-            heights = [_value(row, metric) for row in rows for metric in curves.values()]
+            values = [_value(row, metric) for row in rows for metric in curves.values()]
+            heights = [value for value in values if not math.isnan(value)]
             for number, (name, group) in enumerate(plot.groups(rows)):
                 color = _COLORS[number % len(_COLORS)]
                 x = [row[plot.over] for row in group]
@@ -127,7 +128,7 @@ def _draw_curves(path: Path, plot: Plot, rows: Sequence[Row]) -> None:
             axes.set(xlabel=plot.over, ylabel=label)
             if wide:
                 axes.set_xscale("log", base=2)
-            if plot.log or (wide and np.nanmin([*heights, math.inf]) > 0.0):
+            if plot.log or (wide and min(heights, default=0.0) > 0.0):
                 axes.set_yscale("log")
             if few:
                 axes.set_xticks(ticks, [f"{tick:,}" for tick in ticks], rotation=45)
