@@ -106,8 +106,8 @@ def _is_rate(curves: Mapping[str, str]) -> bool:
 
 def _draw_curves(path: Path, plot: Plot, rows: Sequence[Row]) -> None:
     ticks = sorted({row[plot.over] for row in rows})
-    few = len(ticks) <= _TICKS
-    wide = few and ticks[0] > 0 and ticks[-1] / ticks[0] > 8
+    labelled = len(ticks) <= _TICKS
+    wide = labelled and ticks[0] > 0 and ticks[-1] / ticks[0] > 8
     size = (6.0 * len(plot.panels), 4.8)
     with figure(path, plot.title, len(plot.panels), figsize=size, squeeze=False) as (_, (panels,)):
         for axes, (label, curves) in zip(panels, plot.panels.items(), strict=True):
@@ -130,7 +130,7 @@ def _draw_curves(path: Path, plot: Plot, rows: Sequence[Row]) -> None:
                 axes.set_xscale("log", base=2)
             if plot.log or (wide and min(heights, default=0.0) > 0.0):
                 axes.set_yscale("log")
-            if few:
+            if labelled:
                 axes.set_xticks(ticks, [f"{tick:,}" for tick in ticks], rotation=45)
             axes.grid(alpha=0.3)
             if _is_rate(curves):
