@@ -141,9 +141,9 @@ def test_peaks_join() -> None:
     b = peaks(rows=20, contacts=3, pairs=50, ccd_pairs=0, overflow=np.array([0, 1, 0, 2]))
     both = join_peaks(a, b)
     assert (both.rows.max(), both.contacts.max()) == (20, 9)
-    assert (both.share, both.convex_share) == (50 / 4, 1 / 4)
+    assert both.needs == {"njmax": 20, "nconmax": 50 / 4, "nccdmax": 1 / 4}
     assert both.overflow.tolist() == [0, 1, 0, 2]
-    assert join_peaks(peaks(), peaks()).convex_share is None
+    assert "nccdmax" not in join_peaks(peaks(), peaks()).needs
 
 
 def tried(
@@ -267,9 +267,10 @@ def test_sizes_at_the_peak_are_enough_and_one_less_is_not(
 ) -> None:
     free = first_steps(BatchSizes(nconmax=128, njmax=300))
     assert not free.overflow.any()
-    assert 2 * free.share == free.pools["contacts"] >= free.pools["pairs"] > 0
+    share = free.needs["nconmax"]
+    assert 2 * share == free.pools["contacts"] >= free.pools["pairs"] > 0
     rows = int(free.rows.max())
-    exact = BatchSizes(nconmax=math.ceil(free.share), njmax=rows)
+    exact = BatchSizes(nconmax=math.ceil(share), njmax=rows)
     at_peak = first_steps(exact)
     assert not at_peak.overflow.any()
     assert at_peak.rows.tolist() == free.rows.tolist()

@@ -70,14 +70,15 @@ class Peaks:
     description: str
 
     @property
-    def share(self) -> float:
-        """Entries that the contact pool must have, per world."""
-        return max(self.pools["contacts"], self.pools.get("pairs", 0)) / len(self.rows)
-
-    @property
-    def convex_share(self) -> float | None:
-        """Convex pairs that must fit, per world; None where they are not counted."""
-        return self.pools["ccd_pairs"] / len(self.rows) if "ccd_pairs" in self.pools else None
+    def needs(self) -> dict[str, float]:
+        """Entries that each buffer must have, per world, by the key of its size. Pools are shared:
+        what all worlds had at once, divided by their number. Native MuJoCo counts no convex pairs.
+        """
+        pool = max(self.pools["contacts"], self.pools.get("pairs", 0))
+        needs = {"njmax": float(self.rows.max()), "nconmax": pool / len(self.rows)}
+        if "ccd_pairs" in self.pools:
+            needs["nccdmax"] = self.pools["ccd_pairs"] / len(self.rows)
+        return needs
 
     @property
     def loss(self) -> str:
@@ -118,24 +119,16 @@ def join_peaks(a: Peaks, b: Peaks) -> Peaks:
 
 
 def recommend_sizes(peaks: Peaks, margin: float, source: str) -> BatchSizes:
-    """Sizes with a margin over the peaks, in multiples of 8, from 256 on of 64.
-
-    Pools are shared: what all worlds had at once, divided by their number, is what each needs.
-    Where convex pairs are not counted, their room stays as much as there is for contacts.
+    """Sizes with a margin over the peaks, in multiples of 8, from 256 on of 64. Where convex pairs
+    are not counted, their room stays as much as there is for contacts.
     """
-
-    def size(peak: float) -> int:
-        step = _STEP if margin * peak <= _LARGE else _COARSE
-        return max(step, step * math.ceil(margin * peak / step))
-
-    nconmax = size(peaks.share)
-    convex = peaks.convex_share
-    return BatchSizes(
-        nconmax=nconmax,
-        njmax=size(peaks.rows.max()),
-        nccdmax=None if convex is None else min(nconmax, size(convex)),
-        source=source,
-    )
+    sizes = {}
+    for key, need in peaks.needs.items():
+        step = _STEP if margin * need <= _LARGE else _COARSE
+        sizes[key] = max(step, step * math.ceil(margin * need / step))
+    if "nccdmax" in sizes:
+        sizes["nccdmax"] = min(sizes["nccdmax"], sizes["nconmax"])
+    return BatchSizes(**sizes, source=source)
 
 
 def measure_peaks(

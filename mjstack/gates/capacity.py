@@ -18,6 +18,7 @@ from mjstack.sim import BatchSizes, resolve_sizes
 from mjstack.sim.cameras import image_bytes
 from mjstack.sim.sizes import apply_configured, configured_sizes
 
+_BUFFERS = {"njmax": "njmax", "nconmax": "contact pool", "nccdmax": "convex pairs"}
 _TITLES = {"task": "driven task", "env": "environments (random actions, randomised starts)"}
 
 
@@ -122,19 +123,16 @@ def find_shortages(peaks: Peaks, sizes: BatchSizes, advice: BatchSizes) -> dict[
     """
     shortages = {}
     rooms = configured_sizes(sizes)
-    # Buffer, most needed per world, and use of each world. MJWarp counts what all worlds hold at
-    # once. Convex pairs are in the contact pool too, so without a size of their own they fit.
-    needs: dict[str, tuple[str, float, np.ndarray]] = {
-        "njmax": ("njmax", peaks.rows.max(), peaks.rows),
-        "nconmax": ("contact pool", peaks.share, peaks.contacts),
-        "nccdmax": ("convex pairs", peaks.convex_share or 0.0, np.zeros(0)),
-    }
-    for key, (name, need, used) in needs.items():
+    for key, need in peaks.needs.items():
+        # Convex pairs are in the contact pool too, so without a size of their own they fit.
         room = rooms.get(key, math.inf)
         if need > room:
+            used = {"njmax": peaks.rows, "nconmax": peaks.contacts}.get(key, np.zeros(0))
             worlds = np.flatnonzero(used > room).tolist()
             where = f" in {name_worlds(worlds, len(used))}" if worlds else ""
             fix = f"Raise it: batch.{key}={getattr(advice, key)}"
-            problem = f"{name} overflow{where}; room for {room:g} per world, {need:g} needed"
+            problem = (
+                f"{_BUFFERS[key]} overflow{where}; room for {room:g} per world, {need:g} needed"
+            )
             shortages[key] = f"{problem}. {fix}"
     return shortages
