@@ -201,8 +201,7 @@ def _run_checked(hydra: Any, cfg: DictConfig, checked: "CheckedJob", overrides: 
         checked.assist(ranks.from_first(lambda: folder))
         return 0
     with ExitStack() as stack:
-        job = checked.resumes or (checked.resumable if resumed else "")
-        claim = claim_folder(folder, job, numbered=not (chosen or resumed))
+        claim = claim_folder(folder, checked.resumes, numbered=not (chosen or resumed))
         claimed = ranks.from_first(lambda: stack.enter_context(claim))
         cfg.hydra.run.dir = str(claimed)
         hydra.run(CONFIG_NAME, run_job, overrides)
@@ -281,9 +280,7 @@ def run_job(cfg: DictConfig) -> Report:
                 print(f"job {job.number}: {done.status}, done before", flush=True)
                 _save_config(cfg, folder)  # Hydra has just put one with interpolations there
                 return done
-            if job.set_aside():
-                cfg.resume = str(folder)
-                _checked.clear()
+            job.set_aside()
         checked = _checked.pop(tuple(overrides), None) or _check(cfg, overrides)
         with suppress(OSError):  # the job's error
             _save_config(cfg, folder)

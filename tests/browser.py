@@ -32,9 +32,13 @@ FLAGS = (
 EXECUTABLE = next(filter(None, map(shutil.which, NAMES)), None)
 
 
-def messages(path: Path) -> list[tuple[float, dict[str, Any]]]:
-    """What a page plays: time [s] and message."""
-    (held,) = re.findall(r'__VISER_EMBED_DATA__="([^"]+)"', path.read_text())
+def messages(path: Path, rule: str = "") -> list[tuple[float, dict[str, Any]]]:
+    """What a page plays, or of a rule's worlds alone: time [s] and message."""
+    text = path.read_text()
+    (held,) = re.findall(r'__VISER_EMBED_DATA__="([^"]+)"', text)
+    if rule:
+        (motions,) = re.findall(r"const motions = (\{.+\}), shown", text)
+        held = json.loads(motions)[rule][1]
     packed = base64.b64decode(held)
     plain = zstandard.ZstdDecompressor().decompress(packed[8:])
     size = int.from_bytes(plain[:8], "little")

@@ -22,7 +22,9 @@ from mjstack.envs import Env
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
+from mjstack.gates.episodes import judge_episodes
 from mjstack.managers import required_fields
+from mjstack.report.record import GateResult
 from mjstack.scene import SceneIndex, build_model
 from mjstack.sim import Simulation, make_simulation
 from mjstack.sim.sizes import resolve_sizes
@@ -78,6 +80,13 @@ def configure(*overrides: str, robot: str = "so101") -> Config:
 def on_cuda(test: Callable) -> Callable:
     """Mark a test that needs a CUDA device."""
     return reduce(lambda marked, mark: mark(marked), CUDA, test)
+
+
+def judge(run: Run, gate: str = "batch") -> GateResult:
+    """The result of a gate of episodes."""
+    run.gate = gate
+    (result,) = judge_episodes(run)
+    return result
 
 
 @contextmanager

@@ -64,7 +64,7 @@ mjstack.mdp.termination.time_out mjstack.mdp.action.JointPosition mjstack.tasks.
 mjstack.tasks.stack.StackCheck mjstack.tasks.box.BoxCheck mjstack.tasks.check.EpisodeCheck
 mjstack.tasks.stack.StackSuccess mjstack.tasks.progress.Progress
 mjstack.cli.run mjstack.cli.os.getcwd mjstack.cli.Path
-mjstack.jobs.gates.JOB mjstack.jobs.collect.JOB mjstack.gates.batch.run_batch
+mjstack.jobs.gates.JOB mjstack.jobs.collect.JOB mjstack.gates.episodes.judge_episodes
 mjstack.rng.uniform mjstack.errors.ConfigError mjstack.__main__.main mjstack.envs.Env
 builtins.max builtins.dict builtins.type builtins.print builtins.None builtins.object sys.exit
 os.getpid os.nope math.sqrt json.loads torch.zeros torch.nn.Linear numpy.zeros
@@ -460,7 +460,7 @@ def _dense_text(draw: random.Random, cwd: Path) -> list[str]:
 
 def _dense_record(draw: random.Random, cwd: Path) -> list[str]:
     """An array of a run's record that claims, or unpacks to, far more than it has."""
-    path = cwd / "run" / "worlds_seed0.npz"
+    path = cwd / "run" / "batch_seed0.npz"
     with np.load(path) as arrays:
         names = [*arrays, "value.x", "evil"]
     count = draw.choice((10**5, 3 * 10**7, 10**9, 10**18))

@@ -86,7 +86,7 @@ def assert_drives(policy: Path, out: Path, *overrides: str, nworld: int = 2) -> 
     """A policy drives gate *batch*, in which every world may fail."""
     drive = ["controller=policy", f"policy={policy}", "gates=[batch]", "sim=native"]
     drive.append("web.episode=false")
-    limits = [f"nworld={nworld}", f"gate.batch.failed_worlds={nworld}"]
+    limits = [f"nworld={nworld}", "gate.batch.rate=0.0"]
     assert run([*drive, *limits, *overrides, f"hydra.run.dir={out}"]) == 0
 
 

@@ -14,7 +14,7 @@ import pytest
 import torch
 from check_cases import BLUE, RED, Altered, Cases, rules_of
 from compositions import load_config
-from environments import CUDA, NOMINAL, at_double_speed
+from environments import CUDA, NOMINAL, at_double_speed, judge
 from recordings import World, faster_stage, feed, put_cube, recording
 
 from mjstack.cli import run
@@ -23,7 +23,6 @@ from mjstack.envs import Env
 from mjstack.episodes.failures import Sign
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
-from mjstack.gates.success import run_success
 from mjstack.report.record import Status
 from mjstack.sim import make_simulation
 
@@ -74,7 +73,7 @@ def scripted() -> SimpleNamespace:
 
     stage = faster_stage("so101", "sim=native", "nworld=2", "gates=[success]")
     with recording(stage, take_away) as recordings:
-        (result,) = run_success(Run(stage))
+        result = judge(Run(stage), "success")
     (rec,) = recordings
     rec.gate = result
     return rec

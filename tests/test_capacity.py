@@ -20,6 +20,7 @@ from environments import (
     NewRun,
     Patch,
     at_double_speed,
+    judge,
     on_cuda,
     one_second_episode,
 )
@@ -40,7 +41,6 @@ from mjstack.envs.buffers import (
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Progress, Stage
 from mjstack.errors import FaultError, Unreachable
-from mjstack.gates.batch import run_batch
 from mjstack.gates.capacity import find_shortages, run_capacity
 from mjstack.managers.episode import required_fields
 from mjstack.report.record import GateResult, Status
@@ -317,7 +317,7 @@ def test_too_small_is_found_and_the_printed_override_cures_it(
     task = next(line for line in lines if line.startswith("driven task: "))
     overrides = task.removeprefix("driven task: ").split()
     assert f"batch.njmax={result.metrics['recommended.njmax']}" in overrides
-    (batch,) = run_batch(new_run(*TOO_SMALL, *overrides))
+    batch = judge(new_run(*TOO_SMALL, *overrides))
     assert batch.status is Status.passed, batch.reason
     # Too few rows for environments are a remark, as they were set.
     assert "environments" not in result.reason
@@ -560,12 +560,14 @@ def test_batch_measures_where_capacity_does_not_run(new_run: NewRun) -> None:
     auto = ("sim=mjwarp", "sim.device=cpu", "nworld=1", "batch=auto", "gates=[batch]")
     run = new_run(*auto, *at_double_speed())
     run.stage.progress = Progress(said.append)
-    (result,) = run_batch(run)
+    result = judge(run)
     assert result.status is Status.passed, result.reason
     sizes = "batch.nconmax=40 batch.njmax=184 batch.nccdmax=8"
     text = f"{sizes} (batch=auto: the driven task in 1 worlds, times 1.25)"
     assert said == [result.notes["sizes"]] == [text]
-    assert result.reason.startswith("1 of 1 worlds succeeded (100 %, 95 % interval 20.65 to 100 %)")
+    assert result.reason.startswith(
+        "1 of 1 episodes succeeded (100 %, 95 % interval 20.65 to 100 %)"
+    )
     metrics = result.metrics
     assert metrics["world_steps_per_s"] == pytest.approx(3000 / metrics["episode_s"])
     assert int(metrics["peak_constraint_rows_per_world"]) <= 184
@@ -580,7 +582,7 @@ def test_gate_on_cuda(new_run: NewRun) -> None:
     assert m["worlds"] == 64
     sizes = run.stage.sizes
     assert sizes.source.startswith("batch=auto: gate capacity, 64 worlds")
-    (batch,) = run_batch(run)
+    batch = judge(run)
     assert batch.status is Status.passed, batch.reason
     env = build_env(run.cfg, model=run.stage.model, sizes=run.stage.measured["env"])
     play_random_actions(run.cfg, 100, env.sim)

@@ -25,7 +25,7 @@ from mjstack.config.schema import Config
 from mjstack.config.schema.robot import BasePoseCfg
 from mjstack.envs import build_env
 from mjstack.episodes.stage import Stage
-from mjstack.gates.success import find_regions
+from mjstack.gates.regions import find_regions
 from mjstack.report.page import Map
 from mjstack.report.sections import table_map
 from mjstack.robots import read_robot
@@ -567,12 +567,11 @@ def test_a_tilt_counts_from_the_arms_base(pos: list[float], yaw: float) -> None:
 
 
 def test_directions_and_maps_count_from_the_arms_base() -> None:
-    cfg = load_config([]).gate.success
-    angles = np.radians(np.arange(0.0, 90.0, 3.0)).repeat(cfg.cell_episodes)
+    angles = np.radians(np.arange(0.0, 90.0, 3.0)).repeat(20)
     base = np.array([0.9, -0.4])
     around = np.stack((np.cos(angles), np.sin(angles)), 1)
     places = np.column_stack((base + 0.3 * around, angles + np.radians(20.0)))[:, None]
-    regions = find_regions(cfg, places, np.ones(len(angles), bool), ["red"], base.tolist())
+    regions = find_regions(20, places, np.ones(len(angles), bool), ["red"], base.tolist())
     turned = [region for region in regions if "x_min_m" not in region]
     assert [(r["yaw_min_deg"], r["episodes"]) for r in turned] == [(15.0, len(angles))]
 

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 from check_cases import rules_of
-from environments import GetStage, MakeSim, NewRun, Patch, at_double_speed
+from environments import GetStage, MakeSim, NewRun, Patch, at_double_speed, judge
 
 from mjstack import interrupt
 from mjstack.config import Config
@@ -24,7 +24,6 @@ from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
 from mjstack.episodes.tally import EpisodeTally
 from mjstack.errors import ConfigError, MjstackError
-from mjstack.gates.batch import run_batch
 from mjstack.gates.runner import run_guarded
 from mjstack.gates.throughput import run_throughput
 from mjstack.jobs import gates
@@ -123,7 +122,7 @@ def test_batch_gate_names_world_and_rule_and_voids_throughput(
         return play_episode(env, driver, [*observers, Hook(teleport(run.stage, 2))], **kwargs)
 
     monkeypatch.setattr(gate_module, "play_episode", broken_episode)
-    (batch,) = run_batch(run)
+    batch = judge(run)
     assert batch.status is Status.failed
     assert "1 of 4 worlds (2) failed" in batch.reason
     assert "not stacked" in batch.reason
@@ -152,7 +151,7 @@ def test_batch_gate_names_world_and_rule_and_voids_throughput(
 
 
 def test_batch_gate_refuses_identical_worlds(new_run: NewRun) -> None:
-    (batch,) = run_batch(new_run("sim=native", "nworld=2", "reset=nominal", *at_double_speed()))
+    batch = judge(new_run("sim=native", "nworld=2", "reset=nominal", *at_double_speed()))
     assert batch.status is Status.failed
     assert batch.metrics["distinct_final_states"] == 1
     assert "reset=jitter" in batch.reason
@@ -165,7 +164,7 @@ def test_batch_gate_takes_worlds_that_start_apart_and_end_alike(
     monkeypatch.setattr(
         EpisodeTally, "array", lambda tally, name: array(tally, name) * (name != "end")
     )
-    (batch,) = run_batch(new_run("sim=native", "nworld=2", *at_double_speed()))
+    batch = judge(new_run("sim=native", "nworld=2", *at_double_speed()))
     assert batch.metrics["distinct_final_states"] == 1
     assert batch.status is Status.passed
 

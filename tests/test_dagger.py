@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from browser import messages
 from compositions import load_config
 from environments import SHORT_REACH, Patch
 from policies import curve, interrupted, report, run_as_torchrun, same
@@ -87,8 +88,7 @@ def test_the_report_of_a_training_that_fails(tmp_path: Path) -> None:
     metrics = gates["train"]["metrics"]
     assert metrics["expert_s"] > rows["played_s"].sum()  # the expert's own round too
     assert gates["success"]["metrics"]["failed.REACHED"] > 0
-    assert np.load(tmp_path / "motion_success.npz")["failed"].any()  # on the page
-    assert (tmp_path / "episode.html").exists()
+    assert ": REACHED" in str(messages(tmp_path / "episode.html"))  # a failed world on the page
 
 
 def test_rules_are_counted_over_batches_and_ranks() -> None:

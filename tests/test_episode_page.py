@@ -16,17 +16,15 @@ import numpy as np
 import pytest
 import torch
 from browser import EXECUTABLE, Tab, browse, messages
-from environments import Capture, GetStage, MakeSim, Patch, configure, one_second_episode
+from environments import Capture, GetStage, MakeSim, Patch, configure
 from torch import Tensor
 
 import mjstack.report.web as web
 from mjstack.cli import run
 from mjstack.config.load import load_config
 from mjstack.config.schema import TermCfg
-from mjstack.episodes.motion import load_worlds, motion_recorder
+from mjstack.episodes.motion import motion_recorder, moving_worlds
 from mjstack.episodes.rollout import Hook
-from mjstack.episodes.run import Run
-from mjstack.episodes.seeds import _show as show_worlds
 from mjstack.episodes.stage import Stage
 from mjstack.managers import EnvView, random_uniform, uses_fields
 from mjstack.math import quat_to_matrix
@@ -220,8 +218,8 @@ def placed_meshes(path: Path) -> list[tuple[list[int], np.ndarray]]:
 
 
 def test_a_page_shows_the_model_fields_of_each_world(tmp_path: Path) -> None:
-    """A body that stands still is moved and turned, its geom resized and painted: page, file of
-    motion, and MuJoCo agree.
+    """A body that stands still is moved and turned, its geom resized and painted: page and MuJoCo
+    agree.
     """
     wall = "+scene.objects.wall={fixed: true, size: [0.01, 0.05, 0.02], xy: [0.2, 0.15]}"
     cfg = configure(wall, "sim=native", "nworld=3")
@@ -230,36 +228,34 @@ def test_a_page_shows_the_model_fields_of_each_world(tmp_path: Path) -> None:
     sim = stage.batch_simulation(3)
     env = stage.start(sim, stage.cfg.reset)
     failed = np.array([0, stage.check.rules["STACKED"], 0], np.int32)
-    played = Run(stage)
-    show_worlds(played, "batch", tmp_path / "m.npz", sim.qpos[None], env, failed)
+    order = (1, 0, 2)
+    worlds = moving_worlds(stage, env, sim.qpos[None], failed, {w: str(w) for w in order})
+    assert [world.caption for world in worlds] == ["1: STACKED", "0", "2"]
     visual = stage.assets.visual_model
     assert visual.ngeom > sim.model.ngeom  # so that numbers of geoms differ
     table_size = 2.0 * np.array(stage.cfg.scene.table_half[:2])
-    for worlds in (played.page.worlds3d["batch"], load_worlds(tmp_path / "m.npz")):
-        save_episode(tmp_path / "episode.html", visual, worlds, 0.04)
-        placed = placed_meshes(tmp_path / "episode.html")
-        tables = [
-            mesh
-            for color, mesh in placed
-            if np.allclose(np.ptp(mesh, 0)[:2], table_size, atol=1e-3)
-        ]
-        assert len(tables) == 3
-        for world, table in zip((1, 0, 2), tables, strict=True):  # the one that failed first
-            fields = {name: values[world].numpy() for name, values in sim.fields.items()}
-            geom = sim.model.geom("wall").id
-            color = np.round(255.0 * fields["geom_rgba"][geom, :3]).astype(int).tolist()
-            (mesh,) = (mesh for found, mesh in placed if found == color)
-            corners = np.array(list(product((-1.0, 1.0), repeat=3))) * fields["geom_size"][geom]
-            body = sim.model.body("wall").id
-            turn = quat_to_matrix(torch.from_numpy(fields["body_quat"][body])).numpy()
-            expected = corners @ turn.T + fields["body_pos"][body]
-            offset = table.mean(0)[:2] - stage.cfg.scene.table_center[:2]
-            expected[:, :2] += offset
-            gaps = np.linalg.norm(mesh[:, None] - expected, axis=2)
-            assert gaps.min(1).max() < 1e-3
-            assert gaps.min(0).max() < 1e-3
-            (xpos,) = mesh.mean(0)[None] - [*offset, 0.0]
-            assert np.allclose(xpos, sim.xpos[world, body], atol=1e-3)
+    save_episode(tmp_path / "episode.html", visual, worlds, 0.04)
+    placed = placed_meshes(tmp_path / "episode.html")
+    tables = [
+        mesh for color, mesh in placed if np.allclose(np.ptp(mesh, 0)[:2], table_size, atol=1e-3)
+    ]
+    assert len(tables) == 3
+    for world, table in zip(order, tables, strict=True):
+        fields = {name: values[world].numpy() for name, values in sim.fields.items()}
+        geom = sim.model.geom("wall").id
+        color = np.round(255.0 * fields["geom_rgba"][geom, :3]).astype(int).tolist()
+        (mesh,) = (mesh for found, mesh in placed if found == color)
+        corners = np.array(list(product((-1.0, 1.0), repeat=3))) * fields["geom_size"][geom]
+        body = sim.model.body("wall").id
+        turn = quat_to_matrix(torch.from_numpy(fields["body_quat"][body])).numpy()
+        expected = corners @ turn.T + fields["body_pos"][body]
+        offset = table.mean(0)[:2] - stage.cfg.scene.table_center[:2]
+        expected[:, :2] += offset
+        gaps = np.linalg.norm(mesh[:, None] - expected, axis=2)
+        assert gaps.min(1).max() < 1e-3
+        assert gaps.min(0).max() < 1e-3
+        (xpos,) = mesh.mean(0)[None] - [*offset, 0.0]
+        assert np.allclose(xpos, sim.xpos[world, body], atol=1e-3)
     sim.close()
 
 
@@ -267,7 +263,9 @@ def test_one_looks_at_the_first_failing_world(get_stage: GetStage, tmp_path: Pat
     model = get_stage("so101").assets.visual_model
     looks = []
     for failing in ((), (4,), (4, 7)):
-        worlds = [replace(w, failed=int(w.label) in failing) for w in motion(get_stage, 9, 2)]
+        worlds = [
+            replace(w, rules=["LOST"] * (int(w.label) in failing)) for w in motion(get_stage, 9, 2)
+        ]
         save_episode(tmp_path / "e.html", model, worlds, 0.04)
         sent = [message for _, message in messages(tmp_path / "e.html")]
         (look,) = [m for m in sent if m["type"] == "SetCameraLookAtMessage"]
@@ -304,9 +302,9 @@ def test_drawn_places_are_in_every_file(tmp_path: Path) -> None:
     args += ["task.check.window=5", "task.success.params.steps=5", "gate.success.cell_episodes=1"]
     out = tmp_path / "out"
     assert run([*args, f"hydra.run.dir={out}"]) == 1
-    goals = np.load(out / "starts_seed0.npz")["goal_xy"]
+    goals = np.load(out / "success_starts_seed0.npz")["goal_xy"]
     assert np.ptp(goals, 0).min() > 1e-4
-    with (out / "failing_worlds.csv").open() as file:
+    with (out / "success_failing.csv").open() as file:
         rows = list(csv.DictReader(file))
     cells = [[float(row["goal_x_m"]), float(row["goal_y_m"])] for row in rows]
     assert np.allclose(cells, goals, atol=1e-5)
@@ -333,7 +331,7 @@ def motion(get_stage: GetStage, worlds: int, frames: int) -> list[World]:
     at = get_stage("so101").index.object_qpos[0]
     qpos[:, at + 2] += np.linspace(0.0, 0.2, frames)
     qpos[:, get_stage("so101").index.robot_qpos[0]] += np.linspace(0.0, 1.0, frames)
-    return [World(label=str(w), qpos=qpos.copy(), failed=w == 0) for w in range(worlds)]
+    return [World(label=str(w), qpos=qpos.copy(), rules=["LOST"] * (w == 0)) for w in range(worlds)]
 
 
 def test_a_page_holds_every_frame(get_stage: GetStage, tmp_path: Path) -> None:
@@ -429,26 +427,29 @@ def test_without_viser_a_run_says_how_to_have_the_page(
     assert "mjstack[web]" in (out / "report.html").read_text()
 
 
-def labels_of(path: Path) -> list[str]:
-    """Texts of the worlds of a page."""
-    return [m["props"]["text"] for _, m in messages(path) if m["type"] == "LabelMessage"]
+def labels_of(path: Path, rule: str = "") -> list[str]:
+    """Texts of the worlds of a page, or of those of a rule."""
+    return [m["props"]["text"] for _, m in messages(path, rule) if m["type"] == "LabelMessage"]
 
 
-@pytest.mark.full
-def test_a_resumed_run_shows_the_worlds_that_it_reads_back(tmp_path: Path) -> None:
-    """Baseline plays anew, and the page still has the batch, poses and all."""
-    args = ["sim=native", "gates=[baseline,batch]", "nworld=3", *one_second_episode()]
-    page = tmp_path / "run" / "episode.html"
-    assert run([*args, f"hydra.run.dir={page.parent}"]) == 1
-    played = messages(page)
-    page.unlink()
-    assert run([*args, "gate.batch.seeds=2", f"resume={page.parent}"]) == 1
-    assert len(labels_of(page)) == 4
-    for (_, ours), (_, theirs) in zip(played, messages(page), strict=True):
-        assert ours.keys() == theirs.keys()
-        for name in ("batched_positions", "batched_wxyzs", "text"):
-            held = [one.get("props", one.get("updates", {})).get(name) for one in (ours, theirs)]
-            assert np.array_equal(*held), name
+RED, AMBER = (219, 89, 82), (217, 154, 43)
+
+
+def test_a_page_filters_and_colours_by_rule(get_stage: GetStage, tmp_path: Path) -> None:
+    path = tmp_path / "episode.html"
+    broken = (["A"], ["B", "A"], [], ["B"])
+    moving = zip(motion(get_stage, 4, 3), broken, strict=True)
+    worlds = [replace(world, rules=rules) for world, rules in moving]
+    save_episode(path, get_stage("so101").assets.visual_model, worlds, 0.04)
+    assert labels_of(path) == ["0: A", "1: B A", "2", "3: B"]
+    assert labels_of(path, "A") == ["0: A", "1: B A"]
+    assert labels_of(path, "B") == ["1: B A", "3: B"]
+    for rule, first, second in (("", RED, AMBER), ("A", RED, AMBER), ("B", AMBER, AMBER)):
+        sent = [m["props"] for _, m in messages(path, rule) if "props" in m]
+        colors = np.concatenate([p["batched_colors"] for p in sent if "batched_colors" in p])
+        tables = {tuple(color) for color in colors.reshape(-1, 3).tolist()}
+        assert {first, second} <= tables
+    assert max(time for time, _ in messages(path, "A")) == max(t for t, _ in messages(path))
 
 
 @pytest.fixture(scope="module")
@@ -467,9 +468,7 @@ def test_failing_worlds_come_first(failing: Path) -> None:
     lost = int(gate["metrics"]["episodes"] - gate["metrics"]["succeeded"])
     assert 0 < lost < 6
     labels = labels_of(failing / "episode.html")
-    assert [label.endswith(": not stacked") for label in labels[:-1]] == [
-        w < lost for w in range(6)
-    ]
+    assert [label.endswith(": STACKED") for label in labels[:-1]] == [w < lost for w in range(6)]
     assert labels[-1] == "baseline, native"
     report = (failing / "report.html").read_text()
     assert "href='episode.html'" in report
@@ -519,6 +518,7 @@ def test_a_browser_plays_the_episode(get_stage: GetStage, tmp_path: Path, tab: T
     tab.wait("document.querySelector('canvas') !== null")
     clock = "parseFloat([...document.querySelectorAll('input')].map(i => i.value)[0])"
     tab.wait(f"{clock} > 0.5")  # it plays
+    tab.wait("document.querySelector('#rules').options.length === 2")
     seen = colored(tab)
     assert seen["arm"] > 500
     assert seen["red"] > 40

@@ -464,7 +464,7 @@ def test_worlds_move_as_without_it(tmp_path: Path, port: int) -> None:
         out = tmp_path / view
         args = ["gates=[batch]", "nworld=3", "sim=native", f"view={view}", f"web.port={port}"]
         assert run([*args, f"hydra.run.dir={out}"]) == 0
-        with np.load(out / "worlds_seed0.npz") as held:
+        with np.load(out / "batch_seed0.npz") as held:
             ends.append(held["qpos"])
     assert np.array_equal(*ends)
 

@@ -507,7 +507,7 @@ def test_a_replay_names_a_policy_that_was_written_anew(
     write_policy(policy, configure(), seed=9)
     run(["job=replay", f"run={out}", "world=batch:3", f"hydra.run.dir={tmp_path}/again"])
     assert any(
-        "written anew" in line for line in report(tmp_path / "again")["replay_native"]["details"]
+        "the policy was " in line for line in report(tmp_path / "again")["replay_native"]["details"]
     )
 
 

@@ -7,7 +7,6 @@ import csv
 import logging
 import os
 import re
-import shlex
 import shutil
 import signal
 import socket
@@ -21,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from compositions import load_config, refusal
+from compositions import load_config
 from dataset_checker import check_dataset
 from environments import Patch, one_second_episode, report_of
 from policies import run_as_torchrun
@@ -33,12 +32,11 @@ from mjstack.datasets import read_dataset
 from mjstack.distributed import Ranks, current_ranks, see_one_gpu
 from mjstack.episodes.batches import BatchPlan, play_batches
 from mjstack.episodes.record import EpisodeRecord
-from mjstack.episodes.seeds import _record as record_of
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ArgumentError, ConfigError, MjstackError
 from mjstack.gates import runner
 from mjstack.gates.runner import log_error
-from mjstack.jobs import check_job, check_ranks, count_devices
+from mjstack.jobs import check_ranks, count_devices
 
 SHORT = ["sim=native", "gates=[batch]", *one_second_episode()]
 PLAIN = [*SHORT, "web.episode=false"]
@@ -135,7 +133,7 @@ def test_ranks_play_what_one_plays(tmp_path: Path) -> None:
     assert run([*args, f"hydra.run.dir={tmp_path}/one"]) == 1  # the episodes are too short
     text = play(0, [*args, "devices=2", f"hydra.run.dir={tmp_path}/two"], tmp_path, 1)
     assert_same_episodes(tmp_path / "one", tmp_path / "two")
-    with np.load(tmp_path / "two/starts_seed0.npz") as starts:
+    with np.load(tmp_path / "two/success_starts_seed0.npz") as starts:
         assert {len(array) for array in starts.values()} == {5}
 
     assert text.count("status: fail") == 1  # one process prints
@@ -159,7 +157,7 @@ def test_shares_played_apart_join_to_the_whole(finished: Path, size: int) -> Non
     for rank in range(size):
         own = stage.with_config(stage.cfg, ranks=Ranks(rank, size))
         for batch in play_batches(own, [BatchPlan(1, own.worlds)]):
-            parts.append(record_of(own, batch, None))
+            parts.append(EpisodeRecord.from_batch(own.ranks, batch))
     joined = EpisodeRecord.join(parts)
     whole = EpisodeRecord.read(finished, 1)
     assert whole is not None
@@ -211,20 +209,17 @@ def test_a_rank_that_breaks(
     (gate,) = report_of(folder)["gates"]
     assert gate["status"] == "fail"
     assert re.match(r"rank 1 of 2 \(.*\).*" + why, gate["reason"])
-    line = gate["reason"].partition("To go on after the last finished seed: ")[2]
-    program, *words = shlex.split(line)
-    assert (program, words[-1]) == ("mjstack", f"resume={folder}")
     assert f"mjstack: {gate['reason'].split('.')[0]}" in text
-    before = {path: path.stat().st_mtime_ns for path in folder.glob("*_seed*.npz")}
-    assert {path.name for path in before} == {"worlds_seed0.npz", "worlds_seed1.npz"}
-    assert run(words) == 1
-    assert_same_episodes(untrapped, folder)
-    assert {path: path.stat().st_mtime_ns for path in before} == before  # read back
-    report = report_of(folder)
-    (gate,) = report["gates"]
-    assert gate["metrics"]["episodes"] == 20
-    assert "an earlier call has played 2 of 4 seeds (0, 1)" in gate["details"]
-    assert len(report["provenance"]["earlier_calls"]) == 1
+    # The finished seeds are there to be read.
+    assert {path.name for path in folder.glob("*_seed*.npz")} == {
+        "batch_seed0.npz",
+        "batch_seed1.npz",
+    }
+    for seed in (0, 1):
+        ours, theirs = (EpisodeRecord.read(one, seed) for one in (untrapped, folder))
+        assert ours is not None
+        assert theirs is not None
+        np.testing.assert_array_equal(ours.qpos, theirs.qpos)
 
 
 @pytest.mark.parametrize(
@@ -282,8 +277,7 @@ def test_a_killed_first_rank_is_named(script: bool, trap: list[str], tmp_path: P
     assert "mjstack: rank 2" not in text
     assert ("mjstack: rank 0 of 2 was killed (SIGKILL, process " in text) == (not script)
     assert report_of(folder)["status"] == "interrupted"
-    assert run([*trap, f"resume={folder}"]) == 1
-    assert report_of(folder)["gates"][0]["metrics"]["episodes"] == 20
+    assert EpisodeRecord.read(folder, 1) is not None
 
 
 def rank_process(parent: int, rank: int) -> int:
@@ -323,7 +317,7 @@ def test_ctrl_c_stops_all_ranks(tmp_path: Path) -> None:
     args = [*PLAIN, "nworld=4", "gate.batch.seeds=10000", f"hydra.run.dir={folder}", "devices=2"]
     process = start(0, args, tmp_path)
     until = time.monotonic() + 120.0
-    while not (folder / "worlds_seed1.npz").exists() and time.monotonic() < until:
+    while not (folder / "batch_seed1.npz").exists() and time.monotonic() < until:
         time.sleep(0.1)
     process.send_signal(signal.SIGINT)
     began = time.monotonic()
@@ -335,7 +329,7 @@ def test_ctrl_c_stops_all_ranks(tmp_path: Path) -> None:
     assert report_of(folder)["status"] == "interrupted"
 
 
-# Gates that resume
+# Records
 
 
 @pytest.fixture(scope="module")
@@ -347,44 +341,12 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.full
-def test_finished_seeds_are_read_back(finished: Path) -> None:
-    """Every figure of a read record is that of the played one; more seeds may be asked for."""
-    played = report_of(finished)
-    args = [*SHORT, "gates=[batch,success]", "nworld=3", f"resume={finished}"]
-    written = (finished / "worlds_seed1.npz").stat().st_mtime_ns
-    assert run([*args, "gate.batch.seeds=2"]) == 1
-    again = report_of(finished)
-    for ours, theirs in zip(played["gates"], again["gates"], strict=True):
-        assert ours["metrics"] == theirs["metrics"]
-        assert ours["reason"] == theirs["reason"]
-        assert ours["tables"] == theirs["tables"]
-    assert (finished / "worlds_seed1.npz").stat().st_mtime_ns == written
-    assert run([*args, "gate.batch.seeds=3"]) == 1
-    assert report_of(finished)["gates"][0]["metrics"]["episodes"] == 9
-    page = (finished / "report.html").read_text()
-    assert ("Play it in 3-D" in page) == (finished / "episode.html").exists()
-
-
-@pytest.mark.parametrize(
-    ("overrides", "says"),
-    [
-        (["nworld=4"], "nworld=3, expected 4"),
-        (["nworld=3", "seed=1"], "seed=0, expected 1"),
-        (["nworld=3", "job=collect"], "resume="),
-    ],
-)
-def test_another_configuration_is_refused(overrides: list[str], says: str, finished: Path) -> None:
-    args = [*SHORT, "gates=[batch,success]", *overrides, f"resume={finished}"]
-    refusal(lambda: check_job(load_config(args), args), says)
-
-
 def test_a_record_of_an_older_version_is_refused(finished: Path, tmp_path: Path) -> None:
     """It lacks what a result needs."""
-    with np.load(finished / "worlds_seed0.npz") as held:
+    with np.load(finished / "batch_seed0.npz") as held:
         rest = {key: held[key] for key in held.files if not key.startswith("measured.")}
         del rest["steps"]
-    np.savez(tmp_path / "worlds_seed0.npz", **rest)
+    np.savez(tmp_path / "batch_seed0.npz", **rest)
     with pytest.raises(MjstackError, match="cannot be read"):
         EpisodeRecord.read(tmp_path, 0)
 
@@ -513,7 +475,7 @@ def test_all_failing_worlds_are_replayed(finished: Path, tmp_path: Path) -> None
     rows = list(csv.DictReader((folder / "replayed_worlds.csv").open()))
     assert gate["metrics"]["worlds"] == gate["metrics"]["by_the_same_rules"] == len(rows) > 1
     assert all(row["recorded"] == row["native"] for row in rows)
-    failing = list(csv.DictReader((finished / "failing_worlds.csv").open()))
+    failing = list(csv.DictReader((finished / "batch_failing.csv").open()))
     assert [(row["seed"], row["world"], row["recorded"]) for row in rows] == [
         (row["seed"], row["world"], row["rules"]) for row in failing
     ]

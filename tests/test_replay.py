@@ -7,6 +7,7 @@ import json
 import math
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -31,9 +32,8 @@ from mjstack.cli import run
 from mjstack.config.check import validate
 from mjstack.config.load import load_saved
 from mjstack.config.schema import Backend, TermCfg
-from mjstack.episodes.earlier_run import COPY, archive_starts, played_starts
+from mjstack.episodes.earlier_run import archive_starts
 from mjstack.episodes.record import EpisodeRecord, record_name
-from mjstack.episodes.replay import simulate_alone
 from mjstack.episodes.rollout import snapshot
 from mjstack.files import write_npz
 from mjstack.jobs import check_job
@@ -183,7 +183,7 @@ def test_another_verdict_is_said(earlier: Path, tmp_path: Path) -> None:
     (gate,) = report["gates"]
     assert gate["reason"].endswith(f"{differs}and not all is as it was in that run")
     assert any("mujoco was 3.9.9 in that run" in line for line in gate["details"])
-    assert any("not the same as in that run" in line for line in gate["details"])
+    assert any("the compiled model was 000" in line for line in gate["details"])
     assert (status, gate["status"]) == (0, "pass")
 
 
@@ -336,16 +336,23 @@ def test_the_copy_of_a_starts_file(tmp_path: Path) -> None:
     found = archive_starts(cfg, folder)
     assert [path.read_bytes() for path in folder.iterdir()] == [b"any"]
     read = [term.params["path"] for term in found.reset.values()]
-    assert read == [str(folder / COPY)] * 2
+    assert read == [str(folder / "starts_played.npz")] * 2
     assert found.reset["again"].params["pose"] == "home"
     assert cfg.reset["starts"].params["path"] == str(own)  # as saved and shown
 
     plain = load_config(["gates=[batch]"])
     assert archive_starts(plain, folder) == plain
     plain.gate.success.reset = dict(cfg.reset)
-    assert played_starts(plain) is None  # of a gate that does not run
+    (folder / "starts_played.npz").unlink()
+    archive_starts(plain, folder)
+    assert not list(folder.iterdir())  # of a gate that does not run
     plain.gates = ["success"]
-    assert played_starts(plain) == str(own)
+    plain.reset = {"other": replace(cfg.reset["starts"], params={"path": str(tmp_path / "b.npz")})}
+    (tmp_path / "b.npz").write_bytes(b"other")
+    plain.gate.success.reset = dict(cfg.reset)
+    both = archive_starts(plain, folder)
+    for reset, content in ((both.reset, b"other"), (both.gate.success.reset, b"any")):
+        assert {Path(term.params["path"]).read_bytes() for term in reset.values()} == {content}
 
 
 @pytest.mark.full
@@ -408,7 +415,7 @@ def test_a_world_alone_has_its_room(
     stage = new_run("sim=mjwarp", "sim.device=cpu", f"nworld={nworld}", *sizes).stage
     made = []
     monkeypatch.setattr(stage, "simulation", lambda *args, sizes: made.append(sizes))
-    simulate_alone(stage, *stage.backend)
+    stage.simulate_alone(*stage.backend)
     assert made == [BatchSizes(nconmax=nconmax, njmax=100)]
 
 
@@ -463,6 +470,11 @@ DAMAGE: dict[str, tuple[str, str | tuple[str, str] | None, str]] = {
     "empty": (CONFIG, "", "is missing, expected every key of this version"),
     "another tool's": (CONFIG, "model: resnet\n", "config.yaml: cannot be read"),
     "a key too many": (CONFIG, ("nworld: 5\n", "nworld: 5\ncolour: red\n"), "colour"),
+    "another version": (
+        CONFIG,
+        ("    rate: 1.0\n", "    failed_worlds: 0\n"),
+        "run of another version",
+    ),
     "a value out of range": (CONFIG, ("nworld: 5", "nworld: 0"), "nworld=0"),
     "a key too few": (CONFIG, ("nworld: 5\n", ""), "nworld is missing"),
     "another nworld": (
@@ -476,8 +488,8 @@ DAMAGE: dict[str, tuple[str, str | tuple[str, str] | None, str]] = {
         ("name: gates", "name: train\n  trainer: null"),
         "is a run of job=train, expected one of job=gates",
     ),
-    "no record": ("worlds_seed0.npz", None, "gate batch has left no record of seed 0"),
-    "record": ("worlds_seed0.npz", "PK", "worlds_seed0.npz: cannot be read"),
+    "no record": ("batch_seed0.npz", None, "gate batch has left no record of seed 0"),
+    "record": ("batch_seed0.npz", "PK", "batch_seed0.npz: cannot be read"),
 }
 
 

@@ -254,7 +254,7 @@ def test_a_byte_order_mark_hides_nothing(end: str, tmp_path: Path, capsys: Captu
         "experiment/marked.yaml": f"{glob}|defaults:|  - override /task: leaning|nworld: 7|",
         "task/leaning.yaml": f"{glob}|# It leans|defaults:|  - stack|task:|  name: leaning|",
         "robot/ours.yaml": "defaults:|  - so101|title: Ours|",
-        "gate/upright.yaml": "# @package gate.upright|func: mjstack.gates.batch.run_batch|",
+        "gate/upright.yaml": "# @package gate.upright|func: mjstack.gates.episodes.judge_episodes|",
         "task/plain.yaml": "# It has no header|name: plain|",
     }
     for name, text in files.items():

@@ -3,6 +3,7 @@ both backends.
 """
 
 import csv
+import shutil
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
@@ -15,14 +16,17 @@ import torch
 from check_cases import rules_of
 from compositions import load_config
 from environments import (
+    Capture,
     NewRun,
     Patch,
     Refused,
     at_double_speed,
     configure,
     gate_of,
+    judge,
     on_cuda,
     one_second_episode,
+    report_of,
 )
 
 from mjstack.cli import run
@@ -30,20 +34,11 @@ from mjstack.config.schema import Config
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.failures import FailureMonitor, Sign
-from mjstack.episodes.record import FAILING
 from mjstack.episodes.rollout import Hook, reset_worlds, rollout
 from mjstack.episodes.run import Run
-from mjstack.episodes.stage import Progress, Stage
-from mjstack.gates.success import (
-    Goal,
-    describe_region,
-    find_doubts,
-    find_regions,
-    radial_yaw_deg,
-    regions_table,
-    run_success,
-    success_config,
-)
+from mjstack.episodes.stage import Stage
+from mjstack.gates.episodes import Goal, find_doubts, gate_config
+from mjstack.gates.regions import describe_region, find_regions, radial_yaw_deg, regions_table
 from mjstack.jobs.gates import check_machine
 from mjstack.math import wilson_interval
 from mjstack.report.record import GateResult, Status
@@ -52,6 +47,7 @@ from mjstack.sim import Simulation
 from mjstack.tasks.check import make_check
 
 RULES = rules_of("stack")
+FAILING = "success_failing.csv"
 
 PHASES = list(configure().controller.phases)
 
@@ -80,8 +76,7 @@ def rows_of(path: Path) -> list[dict[str, str]]:
 
 def play(run: Run, folder: Path | None = None) -> GateResult:
     run.folder = folder
-    (result,) = run_success(run)
-    return result
+    return judge(run, "success")
 
 
 def test_small_region_passes(passed: Path) -> None:
@@ -93,8 +88,8 @@ def test_small_region_passes(passed: Path) -> None:
     assert (metrics["success_rate_low95"], metrics["success_rate_high95"]) == wilson_interval(6, 6)
     assert gate["thresholds"]["success_rate_min"] == 0.99
     assert "objects within 0.03 x 0.03 m" in gate["notes"]["starts"]
-    files = """.hydra episode.html motion_success.npz report.html report.json report.md run.log
-        starts_seed0.npz success_regions.csv success_seed0.npz"""
+    files = """.hydra episode.html report.html report.json report.md run.log
+        success_regions.csv success_seed0.npz success_starts_seed0.npz"""
     assert sorted(path.name for path in passed.iterdir()) == files.split()
     assert "no region of at least 2 episodes had a failure" in gate["details"]
     assert not [table for table in gate["tables"] if "region" in table["title"]]
@@ -155,15 +150,11 @@ def hasty() -> NewRun:
 def test_seeds_add_up_and_the_rate_decides(hasty: NewRun, tmp_path: Path) -> None:
     """The threshold is on the rate itself; what fails is named all the same."""
     run = hasty("gates=[batch,success]", "gate.success.seeds=2", "gate.success.cell_episodes=2")
-    lines: list[str] = []
-    run.stage.progress = Progress(lines.append)
     result = play(run, tmp_path)
     assert result.status is Status.failed
-    assert "0 of 4 episodes succeeded" in result.reason
     assert "4 of 4 episodes (0:0, 0:1, 1:0, 1:1) failed: " in result.reason
     assert result.reason.endswith(f"job=replay run={tmp_path} world=success:0:0")
     assert result.metrics["distinct_starts"] == 4
-    assert [line.split(":")[0] for line in lines] == ["success, seed 0", "success, seed 1"]
     seeds = next(table for table in result.tables if table.title == "Seeds")
     assert [row[:3] for row in seeds.rows] == [["0", "2", "0"], ["1", "2", "0"]]
     title = "Worst regions of at least 2 episodes"
@@ -173,10 +164,6 @@ def test_seeds_add_up_and_the_rate_decides(hasty: NewRun, tmp_path: Path) -> Non
     (signs,) = [table for table in result.tables if "first sign" in table.header[0]]
     # Every failed episode is in one line, with a sign or without
     assert sum(int(row[1]) for row in signs.rows) == 4
-    rows = rows_of(tmp_path / "success_failing_worlds.csv")
-    assert [row["seed"] + row["world"] for row in rows] == ["00", "01", "10", "11"]
-    assert not (tmp_path / FAILING).exists()  # that is the batch gate's
-
     result = play(hasty("gate.success.rate=0"))
     assert result.status is Status.passed
     assert "2 of 2 episodes (0, 1) failed: " in result.reason
@@ -193,7 +180,48 @@ def test_replay_plays_the_gates_world(passed: Path, tmp_path: Path) -> None:
     assert gate["details"][-1] == "first sign of failure: none; grasps tried again: 0"
 
 
-FILE = "reset=starts_file starts={run}/starts_seed0.npz"
+SITE = """\
+# The starts of one file
+defaults:
+  - /reset@reset: starts_file
+  - _self_
+
+func: mjstack.gates.episodes.judge_episodes
+rate: 0.9
+reset: {starts: {params: {path: layouts.npz}}}
+"""
+
+
+@pytest.mark.full
+def test_a_gate_of_ones_own_is_a_file(
+    passed: Path, tmp_path: Path, monkeypatch: Patch, capsys: Capture
+) -> None:
+    """It starts worlds from a file, and reports, keeps and replays them as *success* does."""
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "conf" / "gate" / "site.yaml"
+    path.parent.mkdir(parents=True)
+    path.write_text(SITE)
+    shutil.copy(passed / "success_starts_seed0.npz", "layouts.npz")
+    conf = ["--config-dir", "conf", "sim=native"]
+    args = [*conf, *at_double_speed(), "nworld=3", "gates=[batch,site]", "gate.batch.rate=0"]
+    assert run([*args, "hydra.run.dir=run"]) == 0
+    _, site = report_of(Path("run"))["gates"]
+    assert (site["name"], site["metrics"]["succeeded"]) == ("site", 3)
+    assert site["thresholds"]["success_rate_min"] == 0.9
+    with np.load("run/site_seed0.npz") as ours, np.load(passed / "success_seed0.npz") as theirs:
+        assert np.allclose(ours["start_places"], theirs["start_places"][:3], atol=1e-6)
+    with np.load("run/batch_seed0.npz") as held:  # which starts as ever
+        assert "sign" not in held
+    Path("layouts.npz").unlink()
+    assert run([*conf[:2], "job=replay", "run=run", "world=site:2", "hydra.run.dir=again"]) == 0
+    assert "bit for bit where it did" in gate_of(Path("again"))["reason"]
+    assert run([*conf, "gates=[site]", "gate.site.rate=2"]) == 2
+    assert "gate.site.rate=2.0: expected a number from 0 to 1" in capsys.readouterr().err
+    assert run([*conf[:2], "--help", "gate.site.cell_episodes"]) == 0
+    assert "gate.site.cell_episodes=20" in capsys.readouterr().out
+
+
+FILE = "reset=starts_file starts={run}/success_starts_seed0.npz"
 NO_REGION = "null, because no reset term of the success gate has a region"
 BAD = [
     ("gate.success.region=[0.5,0.02]", "expected a region with a free position for every object"),
@@ -223,9 +251,9 @@ def test_region_is_the_gates_alone() -> None:
     """Without the gate, its region is not tried; with it, no other start changes."""
     check_machine(load_config(["sim=native", "gates=[batch]", "gate.success.region=[0.1,0.1]"]))
     cfg = load_config(["gate.success.region=[0.01,0.02]"])
-    assert success_config(cfg).reset["cubes"].params["xy"] == [0.01, 0.02]
+    assert gate_config(cfg, "success").reset["cubes"].params["xy"] == [0.01, 0.02]
     assert cfg.gate.success.reset["cubes"].params["xy"] == [0.05, 0.05]
-    assert success_config(cfg).controller.name == "closed_loop"
+    assert gate_config(cfg, "success").controller.name == "closed_loop"
     assert cfg.controller.name == "open_loop"
 
 
@@ -320,7 +348,7 @@ def test_signs_in_real_episodes(new_run: NewRun) -> None:
     undisturbed.
     """
     base = new_run("sim=native", "nworld=6")
-    run = base.on(base.stage.with_config(success_config(base.cfg)))
+    run = base.on(base.stage.with_config(gate_config(base.cfg, "success")))
     red, _ = run.stage.index.object_qpos
     at = {name: run.stage.phase(name).start for name in PHASES}
     done = at["done"] + 5
@@ -403,9 +431,8 @@ def test_worst_regions_of_made_up_episodes() -> None:
     corner = (places[:, 0, 0] >= 0.34) & (places[:, 0, 0] < 0.36) & (places[:, 0, 1] < -0.12)
     turned = (radial_yaw_deg(places[:, 1]) >= 30.0) & (radial_yaw_deg(places[:, 1]) < 45.0)
     succeeded = ~(corner & (rng.random(n) < 0.9)) & ~(turned & (rng.random(n) < 0.5))
-    cfg = load_config(["gate.success.worst_regions=2"]).gate.success
-    assert (cfg.cell, cfg.yaw_cell_deg, cfg.cell_episodes) == (0.02, 15.0, 20)
-    regions = find_regions(cfg, places, succeeded, ("red", "blue"), (0.0, 0.0))
+    assert load_config().gate.success.cell_episodes == 20
+    regions = find_regions(20, places, succeeded, ("red", "blue"), (0.0, 0.0))
     assert [region["rate"] for region in regions] == sorted(region["rate"] for region in regions)
     assert all(region["episodes"] >= 20 for region in regions)
     assert not any(region["object"] == "red" and region.get("x_min_m") == 0.4 for region in regions)
@@ -428,7 +455,7 @@ def test_worst_regions_of_made_up_episodes() -> None:
     assert len({str(region) for region in regions}) == len(regions)
     # A region without a failure has no place among the worst
     flawless = worst | {"object": "blue", "succeeded": worst["episodes"]}
-    (table,) = regions_table(cfg, [worst, flawless])
+    (table,) = regions_table(20, [worst, flawless])
     assert table.title == "Worst regions of at least 20 episodes (1 of 1 with a failure)"
     assert [row[0] for row in table.rows] == [text]
 
@@ -438,7 +465,7 @@ def test_worst_regions_of_made_up_episodes() -> None:
 def test_steps_with_the_tracker_are_one_graph(robot: str, new_run: NewRun, tmp_path: Path) -> None:
     device = ("sim=mjwarp", "sim.device=cuda:0", "nworld=64")
     base = new_run(*device, "graph=require", robot=robot)
-    run = base.on(base.stage.with_config(success_config(base.cfg)))
+    run = base.on(base.stage.with_config(gate_config(base.cfg, "success")))
     sim = run.stage.batch_simulation(64)
     watch = FailureMonitor()
     episode = run.stage.play(sim, run.cfg.reset, [watch])

@@ -162,10 +162,10 @@ def test_equal_runs_have_equal_verdicts(tmp_path: Path) -> None:
     subprocess.run([*command, "--compare", *files], check=True)
     before, after = (json.loads(file.read_text()) for file in files)
     records = after["runs"]["so101_reach"]
-    assert {"worlds_seed0.npz", "success_seed0.npz"} == set(records)
-    records["worlds_seed0.npz"]["arrays"]["qpos"] = "other"
+    assert {"batch_seed0.npz", "success_seed0.npz"} == set(records)
+    records["batch_seed0.npz"]["arrays"]["qpos"] = "other"
     (line,) = verdicts.compare(before, after)
-    assert line.startswith("so101_reach/worlds_seed0.npz: qpos differs")
+    assert line.startswith("so101_reach/batch_seed0.npz: qpos differs")
 
 
 @on_cuda

@@ -338,9 +338,9 @@ def test_only_regular_files_are_read(kind: str, stranger: Path) -> None:
     folder = write_policy(stranger.parent / "policy", load_config(["sim=native"]))
     swap(next(folder.glob("weights-*")))
     assert "it is no regular file" in refused(lambda: load_policy(folder))
-    for name in ("worlds_seed0.npz", ".hydra/hydra.yaml"):
+    for name in ("batch_seed0.npz", ".hydra/hydra.yaml"):
         swap(stranger / name)
-        if name == "worlds_seed0.npz":
+        if name == "batch_seed0.npz":
             assert "it is no regular file" in refused(lambda: replay(stranger))
         else:
             edit(stranger, "task.check.func", "os.system")
@@ -381,7 +381,7 @@ def test_a_policy_cannot_claim_more_than_it_is(tmp_path: Path) -> None:
 def test_arrays_are_not_unpacked_without_end(stranger: Path, monkeypatch: Patch) -> None:
     """A few bytes of an npz file may stand for gigabytes."""
     monkeypatch.setitem(files._MOST, ".npz", 2**22)
-    for name in ("worlds_seed0.npz", "starts.npz"):
+    for name in ("batch_seed0.npz", "starts.npz"):
         np.savez_compressed(stranger / name, zeros=np.zeros(2**20))
         assert (stranger / name).stat().st_size < 2**14
     assert "its arrays have 8388736 bytes, more than 4194304" in refused(lambda: replay(stranger))
@@ -399,7 +399,7 @@ def put_array(
         header = io.BytesIO()
         claim = {"descr": dtype, "fortran_order": False, "shape": shape}
         np.lib.format.write_array_header_1_0(header, claim)
-        with zipfile.ZipFile(folder / "worlds_seed0.npz", "a", zipfile.ZIP_DEFLATED) as file:
+        with zipfile.ZipFile(folder / "batch_seed0.npz", "a", zipfile.ZIP_DEFLATED) as file:
             for number in range(times):
                 again = f"{number}" * (times > 1)
                 file.writestr(f"{name}{again}.npy", header.getvalue() + data)
@@ -615,7 +615,7 @@ def test_no_training_goes_on_from_numbers_that_are_not_finite(tmp_path: Path) ->
 
 def damage_record(**changes: Any) -> Callable[[Path], object]:
     def apply(folder: Path) -> None:
-        path = folder / "worlds_seed0.npz"
+        path = folder / "batch_seed0.npz"
         with np.load(path) as held:
             arrays = dict(held)
         arrays.update({k: f(arrays[k]) if callable(f) else f for k, f in changes.items()})
@@ -624,7 +624,7 @@ def damage_record(**changes: Any) -> Callable[[Path], object]:
     return apply
 
 
-RECORD = "worlds_seed0.npz: cannot be read"
+RECORD = "batch_seed0.npz: cannot be read"
 
 
 def write(name: str, content: bytes) -> Callable[[Path], object]:

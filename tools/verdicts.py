@@ -5,7 +5,7 @@
 
 Gates *batch* and *success* play both robots, tasks stack, box and reach, and the examples, with the
 three experts, on native MuJoCo and on MJWarp's CPU device, with fixed seeds. The file has a SHA-256
-of every array of each record of episodes (``worlds_seed*.npz``, ``success_seed*.npz``) but times
+of every array of each record of episodes (``batch_seed*.npz``, ``success_seed*.npz``) but times
 and places, and the number of worlds that succeeded. On one machine equal code gives equal files.
 ``--compare`` lists the differences, and their sizes where both folders are still there. All runs
 together take some ten minutes on one core, less where Warp's kernels are cached; ``--only`` takes a
@@ -26,7 +26,7 @@ import numpy as np
 
 _IGNORED = ("seconds", "rank_")
 """Beginnings of the names of arrays that differ from run to run."""
-_STEMS = ("worlds", "success")
+_STEMS = ("batch", "success")
 _BOTH = "gates=[batch,success]"
 _BATCH = "gates=[batch]"
 _WARP = "sim=mjwarp sim.device=cpu"

@@ -9,13 +9,13 @@ from typing import Any
 
 from mjstack.config.fields import check_fields
 from mjstack.config.functions import offered
-from mjstack.config.schema import OUTPUTS, SHAPES, Config, SceneCfg, TermCfg
+from mjstack.config.schema import OUTPUTS, SHAPES, Config, GateCfg, SceneCfg, TermCfg
 from mjstack.errors import ConfigError, require_names
 from mjstack.files import MESHES
 
 _DEVICE = re.compile(r"auto|cpu|cuda:\d+")
 _DEVICES = re.compile(r"all|[1-9]\d*")
-_WORLD = re.compile(r"((batch|success):)?((\d+:)?\d+|failing)")
+_WORLD = re.compile(r"([A-Za-z_]\w*:)?((\d+:)?\d+|failing)")
 
 Checks = Iterator[tuple[str, bool, str]]  # a key, whether its value is wrong, and what is expected
 
@@ -34,6 +34,13 @@ def reads_starts_file(reset: Mapping[str, TermCfg]) -> bool:
     return any(
         "path" in term.params and offered(term.func, "reads_file") for term in reset.values()
     )
+
+
+def gate_reset(cfg: Config, gate: str) -> dict[str, TermCfg]:
+    """Reset terms under which a gate of episodes plays."""
+    reset = cfg.gate[gate].reset
+    from_file = reads_starts_file(cfg.reset) and not reads_starts_file(reset)
+    return cfg.reset if from_file or not reset else reset
 
 
 def places_objects(term: TermCfg) -> bool:
@@ -61,7 +68,7 @@ def starts_midway(term: TermCfg) -> bool:
 def _value(cfg: Config, key: str) -> Any:
     value: Any = cfg
     for name in key.split("."):
-        value = value[name] if isinstance(value, dict) else getattr(value, name)
+        value = value[name] if isinstance(value, dict | GateCfg) else getattr(value, name)
     return list(value) if isinstance(value, dict) else value
 
 
@@ -84,16 +91,14 @@ def _run(cfg: Config) -> Checks:
     for key in ("run", "world"):
         wrong = getattr(cfg, key) is not None and cfg.job.name != "replay"
         yield key, wrong, "null, because it is for job=replay alone. Add job=replay"
-    wrong = cfg.resume is not None and cfg.job.name != "gates"
-    expected = "null, because it is for job=gates. Other jobs that can go on do so by themselves"
-    yield "resume", wrong, expected
     wrong = cfg.devices is not None and not _DEVICES.fullmatch(cfg.devices)
     yield "devices", wrong, "all, or a number of GPUs of at least 1"
     expected = "null, because no policy drives the worlds. Add controller=policy"
     played = cfg.job.name in ("play", "export")
     wrong = cfg.policy is not None and not (played or offered(cfg.controller.func, "plays_policy"))
     yield "policy", wrong, expected
-    wrong = cfg.starts is not None and not reads_starts_file(cfg.reset)
+    resets = (cfg.reset, *(t.reset for t in cfg.gate.episodes().values()))
+    wrong = cfg.starts is not None and not any(map(reads_starts_file, resets))
     yield "starts", wrong, "null, because no reset term reads it. Add reset=starts_file"
 
 
@@ -236,7 +241,8 @@ def _phases(cfg: Config) -> Checks:
             require_names(f"{key}.{role}: object or place", [source], known)
             wrong = not phase.observe and source not in observed
             # Looks at the driver, which loads torch, only where it may be wrong.
-            wrong = wrong and ("success" in cfg.gates or offered(controller.func, "measures"))
+            feedback = any(cfg.gate[gate].reset for gate in cfg.episode_gates)
+            wrong = wrong and (feedback or offered(controller.func, "measures"))
             expected = f"true here or before, as closed_loop does not know yet where {source} is"
             yield f"{key}.observe", wrong, expected
             observed.add(source)
@@ -265,12 +271,13 @@ def _gates(cfg: Config) -> Checks:
     wrong = gate.parity.images is not None and not cfg.scene.cameras
     expected = "null, because there are no cameras. Set cameras to those of that run"
     yield "gate.parity.images", wrong, expected
-    from_file = reads_starts_file(cfg.reset)
-    expected = "1, because with reset=starts_file worlds start alike under every seed"
-    yield "gate.success.seeds", from_file and gate.success.seeds > 1, expected
-    # Looks at functions, which load torch, only where there is a region.
-    wrong = gate.success.region is not None and (
-        from_file or not any(map(places_objects, gate.success.reset.values()))
-    )
-    expected = "null, because no reset term of the success gate has a region"
-    yield "gate.success.region", wrong, expected
+    for name, t in gate.episodes().items():
+        from_file = bool(t.reset) and reads_starts_file(gate_reset(cfg, name))
+        expected = "1, because with reset=starts_file worlds start alike under every seed"
+        yield f"gate.{name}.seeds", from_file and t.seeds > 1, expected
+        # Looks at functions, which load torch, only where there is a region.
+        wrong = t.region is not None and (
+            from_file or not any(map(places_objects, t.reset.values()))
+        )
+        expected = f"null, because no reset term of the {name} gate has a region"
+        yield f"gate.{name}.region", wrong, expected

@@ -21,7 +21,6 @@ _TERMS = {
     "controller.action": schema.TermCfg,
     "reset": schema.TermCfg,
     "gate.baseline.reset": schema.TermCfg,
-    "gate.success.reset": schema.TermCfg,
     "termination": schema.TerminationTermCfg,
     "reward": schema.RewardTermCfg,
     "observation": schema.ObservationGroupCfg,
@@ -39,8 +38,14 @@ def complete(cfg: schema.Config) -> None:
     value has the wrong type; or if there is no such MJCF file.
     """
     cfg.view = cfg.view.lower()  # YAML's false and true
-    for name in vars(cfg.gate).keys() - {field.name for field in fields(cfg.gate)}:
-        cfg.gate.added[name] = vars(cfg.gate).pop(name)
+    known = {field.name for field in fields(cfg.gate)}
+    for name in [name for name in vars(cfg.gate) if name not in known]:
+        node = vars(cfg.gate).pop(name)
+        if isinstance(node, dict) and node.get("func") == schema.EPISODES:
+            node = typed(f"gate.{name}", node, schema.EpisodesGateCfg)
+        cfg.gate.added[name] = node
+    for name, gate in cfg.gate.episodes().items():
+        gate.reset = _typed_all(f"gate.{name}.reset", gate.reset, schema.TermCfg)
     for key, kind in _TERMS.items():
         *path, last = key.split(".")
         parent = reduce(getattr, path, cfg)

@@ -16,7 +16,7 @@ from mjstack.errors import ConfigError
 from mjstack.files import check_regular
 
 CONTENT = "sha256:"  # in front of what stands for a file
-_OF_THE_CALL = ("resume", "devices", "sweep", "web", "unused_terms")  # they change no result
+_OF_THE_CALL = ("devices", "sweep", "web", "unused_terms")  # they change no result
 # Changing one of these changes no dataset and no training.
 WITHOUT_EFFECT = ("batch", "gates", "gate", "graph", "view", "video", "run", "world")
 POLICY_FILE = "policy.json"  # of a policy's folder; it names the weights by their SHA-256

@@ -126,10 +126,14 @@ def key_help(cfg: Config, prefix: str, width: int) -> str:
     """Keys of a configuration at and below a dotted one, with unit, range and meaning; an
     UnknownName if there are none.
     """
-    nodes = {f"gate.{name}": (node, "config") for name, node in cfg.gate.added.items()}
+    added = {f"gate.{name}": node for name, node in cfg.gate.added.items()}
+    nodes = {key: (node, "config") for key, node in added.items() if isinstance(node, dict)}
     if cfg.task.check:
         nodes["task.check"] = (cfg.task.check, "Thresholds")
-    keys = [key for key in list_keys(cfg) if key.name not in ("gate.added", *nodes)]
+    keys = [key for key in list_keys(cfg) if key.name not in nodes]
+    keys = [key for key in keys if not key.name.startswith("gate.added")]
+    for name in added.keys() - nodes.keys():
+        keys += list_keys(added[name], name)
     for name, (node, attribute) in nodes.items():
         keys += _declared_keys(name, node, attribute)
     matching = [key for key in keys if f"{key.name}.".startswith(f"{prefix}.")]

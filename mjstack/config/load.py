@@ -54,11 +54,10 @@ def _by_device(cuda: Any, cpu: Any, *, _root_: DictConfig) -> Any:
 
 # The functions that a replay calls: where a run's configuration names them, and of which kind.
 _REPLAYED = {
-    "controller.func": "driver",
-    "controller.action.": "action term",
-    "gate.success.reset.": "reset term",
-    "reset.": "reset term",
-    "task.check.": "check",
+    r"controller\.func": "driver",
+    r"controller\.action\.": "action term",
+    r"(gate\.\w+\.)?reset\.": "reset term",
+    r"task\.check\.": "check",
 }
 
 # Overrides by the key where a choice of a group goes, such as gate.success.reset=jitter
@@ -274,7 +273,7 @@ def load_saved(path: Path) -> Config:
             raise MjstackError(f"{missing[0]} is missing, expected every key of this version.")
         for key, name in session.list_items(merged):
             for place, kind in _REPLAYED.items():
-                if key.startswith(place) and key.endswith(".func"):
+                if re.match(place, key) and key.endswith(".func"):
                     session.check_term(key.removesuffix(".func"), str(name), kind, path)
         _locate_saved(merged, path)
         try:

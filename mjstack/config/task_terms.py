@@ -10,13 +10,12 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from mjstack.config.schema import CloneJobCfg
+from mjstack.config.schema import EPISODES, CloneJobCfg
 from mjstack.config.session import CONFIG_FOLDER, TASK_SEEN
 
 Terms = dict[str, Any]
 
 _JUDGED = "gate.success.reset"
-_COPIES = ("gate.baseline.reset", _JUDGED)
 # Groups that a job leaves out, and what stands in their place
 _LEFT_OUT = {
     "action": "drivers command controller.action, policies their own action",
@@ -37,14 +36,17 @@ def complete_terms(cfg: DictConfig, overrides: Sequence[str]) -> None:
         if cfg.job.name == "train" and not chosen:  # judged from starts as training has them
             terms = {name: f"${{reset.{name}}}" for name in cfg.reset}
             cfg.gate.success.reset = terms | _written(cfg, _JUDGED)
-        lines = [line for key in _COPIES for line in _complete_copy(cfg, key)]
+        gates = [name for name, gate in cfg.gate.items() if gate.get("reset")]
+        lines = [line for name in gates for line in _complete_copy(cfg, name)]
         cfg.unused_terms = [*lines, *_left_out(cfg), *_unseen(cfg)]
 
 
-def _complete_copy(cfg: DictConfig, key: str) -> Iterator[str]:
-    """Put the terms that are written over ``reset`` into a copy of it, and yield a line for each
-    that does not act in gate *success*, if that runs.
+def _complete_copy(cfg: DictConfig, gate: str) -> Iterator[str]:
+    """Put the terms that are written over ``reset`` into a gate's copy of it, and yield a line for
+    each that does not act there, if the gate plays episodes and runs.
     """
+    key = f"gate.{gate}.reset"
+    judged = gate in cfg.gates and cfg.gate[gate].func == EPISODES
     shipped = _shipped(cfg, "reset")
     copy = _terms(cfg, key)
     explicit = {*_written(cfg, key), *(name for name, term in copy.items() if term is None)}
@@ -54,9 +56,9 @@ def _complete_copy(cfg: DictConfig, key: str) -> Iterator[str]:
         added = func != _func(shipped.get(name)) and not (there and func.startswith("mjstack."))
         if name not in explicit and (term is None or func == there or added):
             OmegaConf.select(cfg, key)[name] = None if term is None else f"${{reset.{name}}}"
-        elif key == _JUDGED and "success" in cfg.gates:
+        elif judged:
             place = f"{key}.{name} takes its place" if there else f"{key} has no {name}"
-            yield f"reset.{name} does not act in gate success: {place}"
+            yield f"reset.{name} does not act in gate {gate}: {place}"
 
 
 def _left_out(cfg: DictConfig) -> Iterator[str]:

@@ -4,11 +4,12 @@ recorded, and what they keep of each batch.
 
 from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
 
-from mjstack.config.schema import Config
+from mjstack.config.schema import Backend, Config
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.recorder import Channels, Recorder
@@ -74,7 +75,7 @@ def play_batches(
     channels: Sequence[Channels] = (),
     *,
     cfg: Config | None = None,
-    simulate: Callable[[int], Simulation] | None = None,
+    alone: tuple[Backend, str] | None = None,
     driver: Callable[[BatchPlan, Env], Driver] | None = None,
     observers: Callable[[BatchPlan], Sequence[Observer]] = lambda plan: (),
     label: str = "steps",
@@ -87,8 +88,7 @@ def play_batches(
         plans: The batches.
         channels: What is recorded.
         cfg: Configuration of the environment, if not that of a driven episode.
-        simulate: Makes so many worlds, if not those of the stage's batch; they are closed at the
-            end.
+        alone: Backend and device on which the worlds play without the rest of their batch.
         driver: Makes the driver of worlds that have started, if not the configured one.
         observers: More observers of a batch.
         label: Name of the steps in the progress, before the seed.
@@ -100,14 +100,20 @@ def play_batches(
             if sim is None or sim.nworld != len(plan.worlds):
                 if sim is not None:
                     sim.close()
-                sim = (simulate or stage.batch_simulation)(len(plan.worlds))
+                make = (
+                    stage.batch_simulation
+                    if alone is None
+                    else partial(stage.simulate_alone, *alone)
+                )
+                sim = make(len(plan.worlds))
             env = Env(sim, stage.index, cfg, check_faults=False)  # the check names lost worlds
             reset_worlds(env, plan.seed, plan.worlds)
             recorder = Recorder(*channels)
             episode = play_episode(
                 env,
                 driver(plan, env) if driver else stage.driver(env),
-                [recorder, *observers(plan), *stage.observers],
+                # Once each: the live view may be both
+                [*dict.fromkeys((recorder, *observers(plan), *stage.observers))],
                 advance=stage.progress.advance,
                 label=f"{label}, seed {plan.seed}",
             )

@@ -1,23 +1,22 @@
 """The folder of an earlier run: its configuration, report and records, and its starts file."""
 
-from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from copy import deepcopy
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mjstack.config.check import reads_starts_file
+from mjstack.config.check import gate_reset, reads_starts_file
 from mjstack.config.load import load_saved
-from mjstack.config.schema import Config, TermCfg
+from mjstack.config.schema import Config
 from mjstack.config.session import read_yaml
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.errors import FolderError, MjstackError
 from mjstack.files import made_by, read_json, reading, write_atomic
 
 REPORT = "report.json"
-COPY = "starts_played.npz"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,8 +34,8 @@ class EarlierRun:
     provenance: dict[str, Any]
 
     @classmethod
-    def read(cls, name: str, key: str = "run") -> "EarlierRun":
-        """Read a run's folder, which a configuration key names.
+    def read(cls, name: str) -> "EarlierRun":
+        """Read a run's folder.
 
         Raises:
             FolderError: There is no such run; the message says what is missing.
@@ -47,7 +46,7 @@ class EarlierRun:
         for path in (saved, report):
             if not path.is_file():
                 raise FolderError(
-                    f"{key}={name}: has no {path.relative_to(folder)}, expected the folder of a"
+                    f"run={name}: has no {path.relative_to(folder)}, expected the folder of a"
                     " run, such as outputs/2026-11-21/04-02-05 (of a sweep: one of its jobs'). Name"
                     " another folder."
                 )
@@ -55,12 +54,14 @@ class EarlierRun:
         with suppress(Exception):  # `load_saved` says what is wrong with it
             job = str(read_yaml(saved)["job"]["name"]).partition("\n")[0]
         if job != "gates":  # before the rest, which has keys of that job alone
-            problem = f"{key}={name}: is a run of job={job}, expected one of job=gates"
+            problem = f"run={name}: is a run of job={job}, expected one of job=gates"
             raise FolderError(problem, "Name that run's folder")
         try:
             cfg = load_saved(saved)
         except MjstackError as error:
-            raise FolderError(f"{key}={name}{made_by(folder)}: {error}") from error
+            keys = "ConfigKeyError" in str(error) or " is missing" in str(error)
+            fix = "A run of another version is replayed by that version" if keys else ""
+            raise FolderError(f"run={name}{made_by(folder)}: {error}", fix) from error
         with reading(report, "Name another folder"):
             provenance = dict(read_json(report, "provenance"))
             provenance["versions"] = dict(provenance["versions"])
@@ -101,48 +102,44 @@ class EarlierRun:
 
 
 def archive_starts(cfg: Config, folder: Path) -> Config:
-    """Copy the starts file that worlds start from into a run's folder, byte for byte, for the run
-    and its replays, and return the configuration with the copy as the file of its terms.
+    """Copy the starts files that worlds of gates start from into a run's folder, byte for byte, for
+    the run and its replays, and return the configuration with the copies as the files of its terms.
 
     Raises:
-        OSError: The file cannot be read, or the copy cannot be written.
+        OSError: A file cannot be read, or a copy cannot be written.
     """
-    if path := played_starts(cfg):
-        write_atomic(folder / COPY, Path(path).read_bytes())
+    for path, copy in _copies(cfg, folder).items():
+        write_atomic(copy, Path(path).read_bytes())
     return archived_starts(cfg, folder)
 
 
 def archived_starts(cfg: Config, folder: Path) -> Config:
-    """A run's configuration, with the copy in its folder as the file of its terms.
+    """A run's configuration, with the copies in its folder as the files of its terms.
 
     Raises:
-        FolderError: The copy is missing.
+        FolderError: A copy is missing.
     """
-    path = played_starts(cfg)
-    if path is None:
-        return cfg
-    copy = folder.resolve() / COPY
-    if not copy.is_file():
-        raise FolderError(
-            f"run={folder}: has no {COPY}, expected a copy of the starts file that it started from,"
-            f" {path}. Put one there, unchanged."
-        )
+    copies = _copies(cfg, folder)
+    for path, copy in copies.items():
+        if not copy.is_file():
+            raise FolderError(
+                f"run={folder}: has no {copy.name}, expected a copy of the starts file that it"
+                f" started from, {path}. Put one there, unchanged."
+            )
 
-    def swap(reset: Mapping[str, TermCfg]) -> dict[str, TermCfg]:
-        terms = dict(reset)
-        for key, term in reset.items():
-            if term.params.get("path") == path:
-                terms[key] = replace(term, params=term.params | {"path": str(copy)})
-        return terms
-
-    success = replace(cfg.gate.success, reset=swap(cfg.gate.success.reset))
-    return replace(cfg, reset=swap(cfg.reset), gate=replace(cfg.gate, success=success))
+    cfg = deepcopy(cfg)
+    for reset in (cfg.reset, *(gate.reset for gate in cfg.gate.episodes().values())):
+        for term in reset.values():
+            if term.params.get("path") in copies:
+                term.params["path"] = str(copies[term.params["path"]])
+    return cfg
 
 
-def played_starts(cfg: Config) -> str | None:
-    """The file that worlds of a gate start from; None if they start from none."""
-    reset = cfg.reset
-    if "success" in cfg.gates and not reads_starts_file(reset):
-        reset = cfg.gate.success.reset
-    paths = (term.params.get("path") for term in reset.values() if reads_starts_file({"": term}))
-    return next(filter(None, paths), None)
+def _copies(cfg: Config, folder: Path) -> dict[str, Path]:
+    """Copies of the starts files from which gates play, by the path of each file."""
+    resets = [cfg.reset, *(gate_reset(cfg, gate) for gate in cfg.episode_gates)]
+    terms = [term for reset in resets for term in reset.values() if reads_starts_file({"": term})]
+    paths = dict.fromkeys(path for term in terms if (path := term.params["path"]))
+    numbers = ["", *(f"_{number}" for number in range(2, len(paths) + 1))]
+    names = [f"starts_played{number}.npz" for number in numbers]
+    return {path: folder.resolve() / name for path, name in zip(paths, names, strict=False)}

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -12,14 +11,12 @@ from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.recorder import Channels, Read, Recorder
 from mjstack.episodes.stage import Stage
-from mjstack.files import read_npz, reading, write_npz
 from mjstack.mdp.geometry import place_xy
 from mjstack.report.geometry import Fields, is_visible, match_geoms
 from mjstack.report.page import World, frame_stride
 from mjstack.sim import Simulation
 
 _BYTES = 64 * 2**20  # of one recording
-_PARTS = ("label", "failed", "qpos")  # of a world, in the file
 
 
 def motion_recorder(step_dt: float) -> Recorder:
@@ -102,50 +99,29 @@ def draw_seen(
 
 
 def moving_worlds(
-    stage: Stage, env: Env, qpos: Tensor, failed: np.ndarray, names: Mapping[int, str], seen: int
+    stage: Stage,
+    env: Env,
+    qpos: Tensor,
+    failed: np.ndarray,
+    labels: Mapping[int, str],
+    seen: int = 0,
 ) -> list[World]:
     """Worlds of a batch in motion, as an episode on the stage has left them: positions that
-    `motion_recorder` has recorded, bits of the task's rules, shape ``(nworld,)``, and the names of
-    the worlds that are shown, by their rows; the rules that they broke follow. So many as ``seen``
-    show what their driver saw.
+    `motion_recorder` has recorded, bits of the task's rules, shape ``(nworld,)``, and the labels of
+    the worlds that are shown, by their rows. So many as ``seen`` show what their driver saw.
     """
-    rules = stage.check.rules
     stride = frame_stride(stage.cfg.timing.step_dt)
-    motions = qpos[:, [*names]].float().swapaxes(0, 1).cpu().numpy()
-    fields = world_fields(stage, env, [*names])
-    moving: list[World] = []
-    for (row, name), motion, values in zip(names.items(), motions, fields, strict=True):
-        problem = rules.describe(failed[row])
-        label = f"{name} {problem}".rstrip(" :")
-        images = draw_seen(stage, motion, env.sim, row, stride) if len(moving) < seen else {}
-        moving.append(
-            World(label=label, qpos=motion, failed=bool(problem), images=images, fields=values)
+    motions = qpos[:, [*labels]].float().swapaxes(0, 1).cpu().numpy()
+    fields = world_fields(stage, env, [*labels])
+    return [
+        World(
+            label=label,
+            qpos=motion,
+            rules=stage.check.rules.broken(failed[row]),
+            images=draw_seen(stage, motion, env.sim, row, stride) if number < seen else {},
+            fields=values,
         )
-    return moving
-
-
-def save_worlds(path: Path, worlds: Sequence[World]) -> None:
-    """Write worlds in motion, without images, for a resumed run."""
-    arrays = {name: [getattr(world, name) for world in worlds] for name in _PARTS}
-    arrays |= {name: [world.fields[name] for world in worlds] for name in worlds[0].fields}
-    write_npz(path, arrays)
-
-
-def load_worlds(path: Path) -> list[World]:
-    """The worlds that `save_worlds` has written.
-
-    Raises:
-        FolderError: The file cannot be read.
-    """
-    with reading(path, "Remove it"):
-        arrays = read_npz(path)
-        parts = zip(*(arrays.pop(name) for name in _PARTS), strict=True)
-        return [
-            World(
-                label=str(label),
-                failed=bool(failed),
-                qpos=qpos,
-                fields={name: rows[n] for name, rows in arrays.items() if is_visible(name)},
-            )
-            for n, (label, failed, qpos) in enumerate(parts)
-        ]
+        for number, ((row, label), motion, values) in enumerate(
+            zip(labels.items(), motions, fields, strict=True)
+        )
+    ]

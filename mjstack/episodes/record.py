@@ -1,9 +1,8 @@
-"""The record of all episodes of one seed: arrays for programs, and rows of the failing ones for
-people.
-"""
+"""The record of all episodes of one seed, as arrays."""
 
 import re
-from collections.abc import Mapping, Sequence
+import socket
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -11,29 +10,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from mjstack.distributed import Ranks
+from mjstack.episodes.batches import Batch
 from mjstack.episodes.failures import FailureMonitor, Sign
-from mjstack.episodes.rollout import Episode
 from mjstack.files import read_npz, reading
-from mjstack.tasks.check import Rules
 
-STEMS = {"batch": "worlds", "success": "success"}
-"""The beginning of the files of each gate."""
-FAILING = "failing_worlds.csv"
-SUCCESS_FAILING = "success_failing_worlds.csv"  # where the batch gate has the other one
-REGIONS = "success_regions.csv"
 _FACTS = ("seed", "backend", "device", "seconds", "steps")
 _NAMES = ("object_names", "phase_names")
-
-
-def circumstances(episode: Episode, monitor: FailureMonitor) -> dict[str, np.ndarray]:
-    """Where the episodes that a monitor has watched went wrong; arrays as of `EpisodeRecord`."""
-    signs = torch.stack((monitor.sign, monitor.phase, monitor.step)).cpu().numpy()
-    return {
-        "retries": episode.retries,
-        # NaN is not reached.
-        "unreachable": ~(episode.ik_error <= monitor.env.cfg.controller.ik_tolerance),
-        **dict(zip(("sign", "sign_phase", "sign_step"), signs, strict=True)),
-    }
 
 
 @dataclass(eq=False, kw_only=True, slots=True)
@@ -92,6 +75,43 @@ class EpisodeRecord:
         return {name.removeprefix("value."): self.worlds[name] for name in names}
 
     @classmethod
+    def from_batch(
+        cls, ranks: Ranks, batch: Batch, monitor: FailureMonitor | None = None
+    ) -> "EpisodeRecord":
+        """The record of a batch that a rank has played, perhaps watched by a monitor."""
+        sim = batch.env.sim
+        episode = batch.episode
+        worlds = {
+            "failed": episode.failed,
+            "qpos": sim.qpos.cpu().numpy().copy(),
+            "start_qpos": episode.start,
+            **{f"value.{name}": values for name, values in episode.values.items()},
+            "measured.ik_error_m": episode.ik_error,
+            "measured.peak_contacts": sim.peak_contacts.cpu().numpy().copy(),
+            "measured.peak_constraint_rows": sim.peak_constraints.cpu().numpy().copy(),
+        }
+        if episode.places:
+            worlds["start_places"] = np.stack([*episode.places.values()], 1)
+        if monitor is not None:
+            worlds["retries"] = episode.retries
+            # NaN is not reached.
+            worlds["unreachable"] = ~(episode.ik_error <= batch.env.cfg.controller.ik_tolerance)
+            signs = torch.stack((monitor.sign, monitor.phase, monitor.step)).cpu().numpy()
+            worlds |= zip(("sign", "sign_phase", "sign_step"), signs, strict=True)
+        where = f"rank {ranks.rank}: {socket.gethostname()}, {sim.device}"
+        return cls(
+            seed=batch.plan.seed,
+            backend=sim.backend,
+            device=str(sim.device),
+            worlds=worlds,
+            object_names=list(episode.places),
+            phase_names=[phase.name for phase in monitor.driver.phases] if monitor else [],
+            seconds=episode.timing.seconds,
+            steps=int(sim.step_count.sum()),
+            ranks={batch.plan.worlds[0]: where} if ranks.size > 1 else {},
+        )
+
+    @classmethod
     def join(cls, parts: Sequence["EpisodeRecord"]) -> "EpisodeRecord":
         """The record of all worlds, from those of ranks, in the order of their worlds."""
         first = parts[0]
@@ -108,15 +128,14 @@ class EpisodeRecord:
         )
 
     @classmethod
-    def read(cls, folder: Path | None, seed: int, gate: str = "batch") -> "EpisodeRecord | None":
-        """Read the record of a gate's seed in a run's folder; None if the gate did not get there,
-        or there is no folder.
+    def read(cls, folder: Path, seed: int, gate: str = "batch") -> "EpisodeRecord | None":
+        """Read the record of a gate's seed in a run's folder; None if the gate did not get there.
 
         Raises:
             FolderError: The file cannot be read.
         """
-        path = folder and folder / record_name(gate, seed)
-        if path is None or not path.exists():
+        path = folder / record_name(gate, seed)
+        if not path.exists():
             return None
         with reading(path, "Run the gate again"):
             arrays = read_npz(path)
@@ -155,52 +174,12 @@ class EpisodeRecord:
         ranks = {"rank_first_world": list(self.ranks), "rank_place": list(self.ranks.values())}
         return arrays | ranks
 
-    def failing_rows(
-        self, rules: Rules, places: Mapping[str, np.ndarray]
-    ) -> list[dict[str, object]]:
-        """Cells of every failing episode by column: rules, circumstances, ``places`` at its start
-        as of `start_places`, and all measurements.
-        """
-        return [
-            {
-                "seed": self.seed,
-                "world": world,
-                "rules": " ".join(rules.broken(self.failed[world])),
-                **(self._sign_cells(world) if "sign" in self.worlds else {}),
-                **{
-                    f"{name}_{part}": f"{number:.6g}"
-                    for name, rows in places.items()
-                    for part, number in zip(("x_m", "y_m", "yaw_rad"), rows[world], strict=True)
-                    if not np.isnan(number)
-                },
-                **{name: f"{values[world]:.6g}" for name, values in self.values.items()},
-            }
-            for world in np.flatnonzero(self.failed).tolist()
-        ]
-
-    def _sign_cells(self, world: int) -> dict[str, object]:
-        """A world's circumstances as cells of the table of failing episodes, by column."""
-        row = {name: values[world] for name, values in self.worlds.items()}
-        phase = row["sign_phase"]
-        return {
-            "sign": Sign(row["sign"]).name,
-            "phase": self.phase_names[phase] if 0 <= phase < len(self.phase_names) else "",
-            "step": row["sign_step"] if row["sign_step"] >= 0 else "",
-            "retries": row["retries"],
-            "unreachable": int(row["unreachable"]),
-        }
-
 
 def _items(array: np.ndarray) -> Any:
     """The items of a flat array, in Python's types."""
     return [item.item() for item in array]
 
 
-def starts_name(seed: int | str) -> str:
-    """Name of the file of a seed's starts, for ``reset=starts_file``."""
-    return f"starts_seed{seed}.npz"
-
-
-def record_name(gate: str, seed: int | str) -> str:
+def record_name(gate: str, seed: int) -> str:
     """Name of the file of a seed's record."""
-    return f"{STEMS[gate]}_seed{seed}.npz"
+    return f"{gate}_seed{seed}.npz"

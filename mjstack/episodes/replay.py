@@ -1,33 +1,16 @@
 """One world of a batch played again, alone: its trajectory, and a report on every rule."""
 
-from dataclasses import replace
-
 import numpy as np
 from torch import Tensor
 from typing_extensions import override
 
-from mjstack.config.schema import Backend
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.recorder import Channels, Read, Recorder, read_state
 from mjstack.episodes.rollout import Episode
-from mjstack.episodes.stage import Stage
-from mjstack.sim import Simulation, describe_overflow, resolve_sizes
+from mjstack.sim import describe_overflow
 from mjstack.tasks.check import make_check
 from mjstack.tasks.view import TaskView
-
-_SHARES = 4  # of the contact pool, for a world that is alone
-
-
-def simulate_alone(stage: Stage, backend: Backend, device: str, nworld: int = 1) -> Simulation:
-    """Make the simulation of some worlds of the batch, without the others. In its batch a world
-    could take more than its share of the contact pool, so it gets some more.
-    """
-    sizes = resolve_sizes(stage.cfg)
-    nconmax = min(_SHARES, stage.cfg.nworld) * sizes.nconmax
-    return stage.simulation(
-        nworld, backend, device, sizes=replace(sizes, nconmax=nconmax, nccdmax=None)
-    )
 
 
 def _read_start(env: Env, driver: Driver) -> Read:

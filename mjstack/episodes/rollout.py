@@ -270,7 +270,7 @@ def play_episode(
 
 
 class Judge(Observer):
-    """Judges every world by the task's check.
+    """Judges every world by the task's check; without one, no world fails.
 
     Attributes:
         result: The check's result, at the end.
@@ -281,16 +281,20 @@ class Judge(Observer):
     @override
     def start(self, env: Env, driver: Driver) -> None:
         super().start(env, driver)
-        self._check = make_check(env.cfg)
-        self._check.start(env, driver.steps, driver.phases)
+        self.result = CheckResult(torch.zeros(env.nworld, dtype=torch.int32), {}, {}, False)
+        self._check = make_check(env.cfg) if env.cfg.task.check is not None else None
+        if self._check is not None:
+            self._check.start(env, driver.steps, driver.phases)
 
     @override
     def update(self) -> None:
-        self._check.update(self.driver.phase)
+        if self._check is not None:
+            self._check.update(self.driver.phase)
 
     @override
     def finish(self) -> None:
-        self.result = self._check.result()
+        if self._check is not None:
+            self.result = self._check.result()
 
 
 @dataclass(eq=False)

@@ -77,7 +77,7 @@ class Run:
     Attributes:
         stage: Scene, plan, and all that is made of them.
         folder: Where the run's files go. None for none, such as of ranks that write nothing.
-        overrides: The command line of the run.
+        gate: Name of the gate that is running.
         begin: Gets the name of each part of the run as it begins.
         record: Gets each result as soon as there is one.
         viewers: Look on at the one-world episode that is shown.
@@ -88,7 +88,7 @@ class Run:
 
     stage: Stage
     folder: Path | None = None
-    overrides: Sequence[str] = ()
+    gate: str = ""
     begin: TextHook = lambda name: None
     record: Callable[[GateResult], None] = lambda result: None
     viewers: Sequence[Observer] = ()
@@ -189,7 +189,7 @@ class Run:
         part: str,
         label: str,
         qpos: np.ndarray,
-        status: Status,
+        episode: Episode,
         env: Env,
         title: str = "",
     ) -> None:
@@ -202,8 +202,9 @@ class Run:
             stride = frame_stride(self.cfg.timing.step_dt)
             frames = qpos[::stride]
             seen = draw_seen(self.stage, frames, env.sim, stride=stride)
-            failed = status is Status.failed
-            world = World(label=label, qpos=frames, failed=failed, images=seen, fields=fields)
+            bits = int(episode.failed[0])
+            rules = self.stage.check.rules.broken(bits) if bits else []
+            world = World(label=label, qpos=frames, rules=rules, images=seen, fields=fields)
             self.page.worlds3d[part] = [world]
         if title:
             self.artifacts.pictured = World(label=title, qpos=qpos, fields=fields)

@@ -40,6 +40,7 @@ from mjstack.sim.cameras import with_outputs
 from mjstack.tasks.check import EpisodeCheck, make_check
 
 TextHook = Callable[[str], None]
+_SHARES = 4  # of the contact pool, for a world that is alone
 
 
 @dataclass(frozen=True)
@@ -232,6 +233,15 @@ class Stage:
             fields=required_fields(self.cfg.reset),
             sizes=sizes,
         )
+
+    def simulate_alone(self, backend: Backend, device: str, nworld: int = 1) -> Simulation:
+        """Worlds of the batch without the others. In its batch a world could take more than its
+        share of the contact pool, so it gets some more.
+        """
+        sizes = resolve_sizes(self.cfg)
+        nconmax = min(_SHARES, self.cfg.nworld) * sizes.nconmax
+        sizes = replace(sizes, nconmax=nconmax, nccdmax=None)
+        return self.simulation(nworld, backend, device, sizes=sizes)
 
     @property
     def sizes(self) -> BatchSizes:

@@ -1,20 +1,21 @@
 """Sums over a gate's episodes, and their report."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from mjstack.config.explain import assign, command
-from mjstack.episodes.failures import describe_sign
-from mjstack.episodes.record import FAILING, EpisodeRecord
-from mjstack.episodes.rollout import Episode
+from mjstack.episodes.failures import Sign, describe_sign
+from mjstack.episodes.record import EpisodeRecord
+from mjstack.episodes.stage import Stage
 from mjstack.errors import name_worlds
 from mjstack.files import to_csv
 from mjstack.math import rate_interval, wilson_interval
 from mjstack.report.figure import Figure, figures
+from mjstack.report.page import Map, World, Worlds
 from mjstack.report.record import GateResult, Status
 from mjstack.report.table import Table
 from mjstack.report.text import format_percent
@@ -22,6 +23,7 @@ from mjstack.report.write import safely_write
 from mjstack.tasks.check import EpisodeCheck
 
 _MOST_NAMED = 100  # episodes a line in report.md; the table of failing ones has all
+_MOST_PLOTTED = 20_000  # episodes on the page; of more, the failing ones
 
 
 @dataclass(eq=False, kw_only=True, slots=True)
@@ -30,31 +32,36 @@ class EpisodeTally:
 
     Attributes:
         gate: Whose episodes.
-        noun: The things that are counted, such as ``worlds``.
-        several: Whether there are several seeds; then an episode's name has its seed.
         check: The task's.
-        path: The file of failing episodes; None where nothing is written.
-        replayed: Whether job=replay takes the run.
+        folder: Where its files go; None where nothing is written.
         records: Those of the seeds, without ``qpos``; ``end`` is its hash for each world.
-        first: The first seed's episode, of this rank's worlds; None where the seed was read back.
-        again: Seeds that an earlier call has played.
         notes: Backend and buffer sizes in words.
         problems: Why the gate fails at any rate of success.
         details: Remarks.
     """
 
     gate: str
-    noun: str
-    several: bool
     check: EpisodeCheck
-    path: Path | None
-    replayed: bool
+    folder: Path | None
     records: list[EpisodeRecord] = field(default_factory=list)
-    first: Episode | None = None
-    again: list[int] = field(default_factory=list)
     notes: dict[str, str] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
     details: list[str] = field(default_factory=list)
+
+    @property
+    def several(self) -> bool:
+        """Whether there are several seeds; then an episode's name has its seed."""
+        return self.check.cfg.gate[self.gate].seeds > 1
+
+    def write(
+        self, name: str, save: Callable[..., object], content: object, remark: str = ""
+    ) -> None:
+        """Write a file of the gate, if there is a folder, and add a remark, or the problem: a full
+        disk takes no result back.
+        """
+        if self.folder is not None:
+            problem = safely_write(self.folder / name, save, content, stops=False)
+            self.details += filter(None, [problem or remark])
 
     def add(self, record: EpisodeRecord) -> None:
         """Count one seed. Of a world 200 to 300 bytes are kept, without its final positions."""
@@ -109,17 +116,32 @@ class EpisodeTally:
         return [f"{seeds[seed]}{world}" for seed, world in places]
 
     def write_failing(self) -> None:
-        """Write the table of failing episodes, if any. A full disk takes no result back."""
+        """Write the table of failing episodes, if any: rules, signs, where objects were at the
+        start, and all measurements.
+        """
         rows = []
-        places = self.places
-        for number, record in enumerate(self.records):
-            share = slice(number * len(record.failed), (number + 1) * len(record.failed))
-            starts = {name: values[share] for name, values in places.items()}
-            rows += record.failing_rows(self.check.rules, starts)
-        if rows and self.path is not None:
-            problem = safely_write(self.path, Path.write_text, to_csv(rows), stops=False)
-            has = f"{self.path.name} has every failing episode with what was measured"
-            self.details.append(problem or has)
+        failed = np.flatnonzero(self.array("failed")).tolist() if self.records else []
+        places = self.places if failed else {}
+        for episode in failed:
+            number, world = divmod(episode, len(self.records[0].failed))
+            record = self.records[number]
+            values = {name: array[world] for name, array in record.worlds.items()}
+            row: dict[str, object] = {"seed": record.seed, "world": world}
+            row["rules"] = " ".join(self.check.rules.broken(values["failed"]))
+            if "sign" in values:
+                row["sign"] = Sign(values["sign"]).name
+                row["phase"] = [*record.phase_names, ""][values["sign_phase"]]
+                row["step"] = values["sign_step"] if values["sign_step"] >= 0 else ""
+                row |= {"retries": values["retries"], "unreachable": int(values["unreachable"])}
+            for name, starts in places.items():
+                cells = zip(("x_m", "y_m", "yaw_rad"), starts[episode], strict=True)
+                row |= {f"{name}_{end}": f"{x:.6g}" for end, x in cells if not np.isnan(x)}
+            row |= {name: f"{values[f'value.{name}']:.6g}" for name in record.values}
+            rows.append(row)
+        if rows:
+            name = f"{self.gate}_failing.csv"
+            remark = f"{name} has every failing episode with what was measured"
+            self.write(name, Path.write_text, to_csv(rows), remark)
 
     def figures(self, rate: float) -> list[Figure]:
         """Counts, the success rate with its interval and the least one that is wanted, and the
@@ -153,7 +175,7 @@ class EpisodeTally:
         low, high = wilson_interval(self.successes, self.episodes)
         rate = format_percent(self.successes / self.episodes)
         return (
-            f"{self.successes} of {self.episodes} {self.noun} succeeded ({rate}, 95 % interval"
+            f"{self.successes} of {self.episodes} episodes succeeded ({rate}, 95 % interval"
             f" {format_percent(low, '')} to {format_percent(high)})"
         )
 
@@ -181,10 +203,11 @@ class EpisodeTally:
             counts = "; ".join(f"{texts[n]} in {len(which[n])}{words}" for n, words in why.items())
             reason.append(f"{self._name(failed, 8)} failed: {counts}")
         look = ""
-        if len(failed) and self.path is not None and self.replayed:
-            gate = "" if self.path.name == FAILING else f"{self.gate}:"
+        cfg = self.check.cfg
+        if len(failed) and self.folder is not None and cfg.job.name == "gates":
+            gate = "" if self.gate == cfg.episode_gates[0] else f"{self.gate}:"
             world = f"world={gate}{self.names(failed[:1])[0]}"
-            look = command("job=replay", assign("run", self.path.parent), world)
+            look = command("job=replay", assign("run", self.folder), world)
             look = f". To look at one: {look}"
         if "sign" in self.records[0].worlds and self.array("unreachable").any():
             unreachable = np.flatnonzero(self.array("unreachable"))
@@ -203,7 +226,46 @@ class EpisodeTally:
 
     def _name(self, episodes: Sequence[int] | np.ndarray, limit: int) -> str:
         """How many episodes, and the names of the first ones."""
-        return name_worlds(self.names(episodes), self.episodes, limit, self.noun)
+        return name_worlds(self.names(episodes), self.episodes, limit, "episodes")
+
+    def plot(self, stage: Stage, moving: Sequence[World]) -> Worlds:
+        """The episodes as the run's page plots them, with the ways of objects in some of them."""
+        scene = stage.cfg.scene
+        table = (scene.table_center[:2], scene.table_half[:2])
+        rules = self.check.rules
+        bits = self.array("failed")
+        plotted = np.flatnonzero((bits != 0) | (np.arange(len(bits)) < _MOST_PLOTTED))
+        if len(plotted) < len(bits):
+            self.details.append(
+                f"report.html shows {len(plotted):,} of the {len(bits):,} episodes: the first ones,"
+                " and all that failed"
+            )
+        worlds = Worlds(
+            names=self.names(plotted),
+            broken=[rules.broken(failed) for failed in bits[plotted].tolist()],
+            rules=rules.texts,
+            values=[(self.check.figures[key], v[plotted]) for key, v in self.values.items()],
+        )
+        # What the check judges, and what else differs
+        index = stage.index
+        judged = self.check.objects
+        starts = self.places
+        marks = {name: place.xy for name, place in scene.places.items()}
+        marks |= {name: at for name, at in index.fixed.items() if name in judged}
+        marks = {name: at[:2] for name, at in marks.items() if name not in starts}
+        for name, places in starts.items():
+            if name in index.objects and name not in judged:
+                worlds.unjudged.append(name)
+                continue
+            ways = []
+            if name in index.objects:
+                x, _ = index.objects[name]
+                ways = [(w.caption, bool(w.rules), w.qpos[:, x : x + 2]) for w in moving]
+            xy = places[plotted, :2]
+            worlds.maps.append(
+                Map(title=name, xy=xy, table=table, ways=ways, marks=marks, base=index.base)
+            )
+        return worlds
 
     def tables(self) -> list[Table]:
         """Tables of the report: seeds, and first signs of failure."""

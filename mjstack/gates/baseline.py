@@ -58,7 +58,7 @@ def run_baseline(run: Run) -> list[GateResult]:
     result.reason = result.reason or headline
     world = run.nominal.world
     label = "baseline, native"
-    run.show_world("baseline", label, world.qpos, result.status, world.env, "baseline world")
+    run.show_world("baseline", label, world.qpos, episode, world.env, "baseline world")
     names = scene_names(cfg.scene)
     lines = left_behind(read_robot(cfg.robot, cfg.model), cfg.robot, run.stage.model, names)
     result.details += [f"robot's file: {line}" for line in lines]

@@ -77,7 +77,7 @@ def _compare(run: Run, mjwarp: Simulation) -> GateResult:
         problems += compare_images(run, result)
 
     run.print_line(f"{run.cfg.task.name} check: {headline} ({mjwarp.description})")
-    run.show_world("parity", "parity, MJWarp", world.qpos, judged.status, world.env, "parity world")
+    run.show_world("parity", "parity, MJWarp", world.qpos, episode, world.env, "parity world")
     summary = "; ".join([headline, *ends])
     if "images" in result.notes:
         summary += "; images were not compared"

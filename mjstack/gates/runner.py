@@ -8,11 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from mjstack.config.complete import typed
-from mjstack.config.explain import assign, command
 from mjstack.config.functions import resolve_func
 from mjstack.config.schema import Config
 from mjstack.distributed import Ranks, current_ranks
-from mjstack.episodes.earlier_run import archive_starts, archived_starts
+from mjstack.episodes.earlier_run import archive_starts
 from mjstack.episodes.rollout import lacks_episode
 from mjstack.episodes.run import Run
 from mjstack.errors import MjstackError, RankError, describe_error
@@ -51,9 +50,7 @@ def run_gates(run: Run, folder: Path) -> None:
     """
     stage = run.stage
     cfg = stage.cfg
-    if cfg.resume is not None:
-        cfg = archived_starts(cfg, folder)
-    elif stage.ranks.writes:  # of several ranks, the first makes the copies
+    if stage.ranks.writes:  # of several ranks, the first makes the copies
         cfg = archive_starts(cfg, folder)
     run = replace(run, stage=stage.with_config(cfg, measured=stage.measured))
     for name, gate in find_gates(run.cfg).items():
@@ -74,6 +71,7 @@ def run_guarded(run: Run, name: str, gate: Gate, spread: str = "") -> None:
     spread = spread or getattr(gate, "spread", "")
     over: BaseException | None = None
     try:
+        run.gate = name
         run.begin(name)  # which may load what the gate plays on
         lack = lacks_episode(run.cfg) if getattr(gate, "needs_episode", False) else ""
         if lack:
@@ -91,10 +89,6 @@ def run_guarded(run: Run, name: str, gate: Gate, spread: str = "") -> None:
         results = [GateResult(name=name, status=Status.failed, reason=log_error(cause))]
         gone = isinstance(cause, RankError) and cause.gone
         over = cause if gone or (ranks.size > 1 and spread == "worlds") else None
-        if over is not None and run.cfg.job.name == "gates" and run.folder is not None:
-            rest = [o for o in run.overrides if not o.startswith("resume=")]
-            resuming = command(*rest, assign("resume", run.folder))
-            results[0].reason += f" To go on after the last finished seed: {resuming}"
     seconds = time.perf_counter() - began
     for result in results:
         if result.status is not Status.skipped and not result.seconds:

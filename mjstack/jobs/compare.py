@@ -18,15 +18,14 @@ from mjstack.config.load import load_config
 from mjstack.config.schema import Backend, Config
 from mjstack.episodes.batches import BatchPlan, play_batches
 from mjstack.episodes.motion import motion_recorder, moving_worlds
-from mjstack.episodes.replay import simulate_alone
 from mjstack.episodes.rollout import require_episode
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
 from mjstack.episodes.tally import rate_metrics
 from mjstack.errors import ConfigError, MjstackError
 from mjstack.files import to_csv, write_atomic
+from mjstack.gates.episodes import gate_config
 from mjstack.gates.runner import run_guarded
-from mjstack.gates.success import success_config
 from mjstack.jobs.gates import check_machine
 from mjstack.jobs.runner import CheckedJob, Job
 from mjstack.math import mcnemar_p_value
@@ -38,6 +37,7 @@ from mjstack.report.sweep_picture import Plot, save_sweep
 from mjstack.report.table import Table
 
 NAME = "compare"
+GATE = "success"  # whose episodes are played
 TABLE = "compare.csv"
 _SIDES = ("a", "b")
 _PAGE_WORLDS = 8  # worlds on the page that only one side won, of each side
@@ -67,14 +67,14 @@ def check_compare(cfg: Config, overrides: Sequence[str]) -> CheckedJob:
     for name, side in zip(_SIDES, (cfg, load_config([*unchanged, *against])), strict=True):
         content = config_content(side)
         equal = {key: content[key] for key in ("task", "nworld", "seed")}
-        success = {"success.seeds": side.gate.success.seeds}
-        facts.append(equal | {"robot": side.robot.name, "gate": success})
+        seeds = {f"{GATE}.seeds": side.gate.success.seeds}
+        facts.append(equal | {"robot": side.robot.name, "gate": seeds})
         if changes := differences(facts[-1], facts[0]):
             expected = f"the same robot, task, worlds and seeds ({changes})"
             raise ConfigError("job.against", against, expected)
         require_episode(side)
-        stage = check_machine(replace(side, gates=["success"]))
-        sides[name] = stage.with_config(success_config(stage.cfg))
+        stage = check_machine(replace(side, gates=[GATE]))
+        sides[name] = stage.with_config(gate_config(stage.cfg, GATE))
         driver = (sides[name].cfg.controller.name, content.get("policy", ""))
         notes[name] = " ".join(filter(None, driver))
     first, second = map(_start_of_first_world, sides.values())
@@ -95,7 +95,7 @@ def _key(override: str) -> str:
 
 def _start_of_first_world(stage: Stage) -> dict[str, np.ndarray]:
     """How world 0 of the first seed starts on native MuJoCo, by the arrays of a starts file."""
-    with closing(simulate_alone(stage, Backend.native, "cpu")) as sim:
+    with closing(stage.simulate_alone(Backend.native, "cpu")) as sim:
         return start_arrays(stage.start(sim, stage.cfg.reset, worlds=[0]))
 
 
@@ -110,59 +110,51 @@ def _compare(sides: Sides, notes: Mapping[str, str], folder: Path, run: Run) -> 
 
     # Episodes that only one side won, and the rules that the other one broke there
     rules = run.stage.check.rules
-    episodes = failed_a.size
-    rates: dict[str, dict[str, float]] = {}
-    only: dict[str, int] = {}
-    broken: dict[str, dict[str, int]] = {}
+    m: dict[str, float] = {"episodes": failed_a.size}
+    bars = []
     rows: list[dict[str, Any]] = []
     moving: list[dict[str, Any]] = []
     for name, bits, lost in (("a", failed_a, failed_b), ("b", failed_b, failed_a)):
         alone = (bits == 0) & (lost != 0)
-        rates[name] = rate_metrics(int((bits == 0).sum()), episodes)
-        only[name] = int(alone.sum())
-        first = len(rows)
-        broken[name] = {rule: len(worlds) for rule, worlds in rules.failing(lost[alone]).items()}
-        for seed, world in np.argwhere(alone).tolist():
-            row = {"seed": run.cfg.seed + seed, "world": world, "succeeded": name}
-            rows.append(row | {"rules": " ".join(rules.broken(lost[seed, world]))})
-        moving += rows[first:][:_PAGE_WORLDS]
+        rate = rate_metrics(int((bits == 0).sum()), bits.size)
+        m |= {f"only_{name}": int(alone.sum()), **{f"{name}.{key}": v for key, v in rate.items()}}
+        broken = rules.failing(lost[alone])
+        m |= {f"only_{name}.failed.{rule}": len(worlds) for rule, worlds in broken.items()}
+        bars.append({"side": name, "only": m[f"only_{name}"]} | rate)
+        won = [
+            {"seed": run.cfg.seed + seed, "world": world, "succeeded": name}
+            | {"rules": " ".join(rules.broken(lost[seed, world]))}
+            for seed, world in np.argwhere(alone).tolist()
+        ]
+        rows += won
+        moving += won[:_PAGE_WORLDS]
     write_atomic(folder / TABLE, to_csv(rows, ("seed", "world", "succeeded", "rules")))
     if run.page.motion:
         run.page.worlds3d[NAME] = _replay(sides, moving)
 
     # The result
-    p_value = mcnemar_p_value(only["a"], only["b"])
+    m["both"] = m["a.succeeded"] - m["only_a"]
+    m["neither"] = m["episodes"] - m["a.succeeded"] - m["only_b"]
+    m["p_value"] = p_value = mcnemar_p_value(int(m["only_a"]), int(m["only_b"]))
     verdict = "no difference is shown"
     if p_value < _LEVEL:
-        verdict = f"{'a' if only['a'] > only['b'] else 'b'} is better"
-    bars = []
-    for name, rate in rates.items():
-        bars.append({"side": name, "only": only[name]} | rate)
+        verdict = f"{'a' if m['only_a'] > m['only_b'] else 'b'} is better"
     plot = Plot(title=f"{run.page.title}: {verdict}", over="side", lines=[], panels=_PANELS)
     run.draw(f"{NAME}.png", save_sweep, plot, bars)
+    counts = {rule: [int(m.get(f"only_{s}.failed.{rule}", 0)) for s in _SIDES] for rule in rules}
     table = Table(
         title="Episodes that only one side won, by the rules that the other one broke",
         header=["rule", "meaning", "only a", "only b"],
-        rows=[
-            [rule, rules.texts[rule], *(str(broken[name].get(rule, 0)) for name in _SIDES)]
-            for rule in rules
-            if rule in broken["a"] | broken["b"]
-        ],
+        rows=[[rule, rules.texts[rule], *map(str, n)] for rule, n in counts.items() if any(n)],
     )
     return [
         GateResult(
             name=NAME,
             status=Status.passed,
-            reason=f"{verdict} (McNemar's exact test, p = {p_value:.3g}): of {episodes} episodes a"
-            f" succeeded in {rates['a']['succeeded']} and b in {rates['b']['succeeded']}, only a in"
-            f" {only['a']}, only b in {only['b']}",
-            figures=[
-                *figures(episodes=episodes, both=rates["a"]["succeeded"] - only["a"]),
-                *figures(**{f"only_{name}": count for name, count in only.items()}),
-                *figures(neither=episodes - rates["a"]["succeeded"] - only["b"], p_value=p_value),
-                *(figure for name, rate in rates.items() for figure in figures(name, **rate)),
-                *(f for side in _SIDES for f in figures(f"only_{side}.failed", **broken[side])),
-            ],
+            reason=f"{verdict} (McNemar's exact test, p = {p_value:.3g}): of {m['episodes']}"
+            f" episodes a succeeded in {m['a.succeeded']} and b in {m['b.succeeded']}, only a in"
+            f" {m['only_a']}, only b in {m['only_b']}",
+            figures=figures(**m),
             notes={**notes, "table": TABLE},
             tables=[table] if table.rows else [],
         )
@@ -193,12 +185,10 @@ def _replay(sides: Sides, rows: Sequence[Mapping[str, Any]]) -> list[World]:
     moving: dict[str, list[World]] = {name: [] for name in sides}
     for name, stage in sides.items():
         channels = motion_recorder(stage.cfg.timing.step_dt).channels
-        simulate = partial(simulate_alone, stage, *stage.backend)
-        for batch in play_batches(stage, plans, channels, simulate=simulate):
-            worlds = batch.plan.worlds
-            names = {row: f"{batch.plan.seed}:{world} {name}" for row, world in enumerate(worlds)}
+        for batch in play_batches(stage, plans, channels, alone=stage.backend):
+            labels = [f"{batch.plan.seed}:{world} {name}" for world in batch.plan.worlds]
             failed, qpos = batch.episode.failed, batch.rows["qpos"]
-            moving[name] += moving_worlds(stage, batch.env, qpos, failed, names, 0)
+            moving[name] += moving_worlds(stage, batch.env, qpos, failed, dict(enumerate(labels)))
     return [world for pair in zip(*moving.values(), strict=True) for world in pair]
 
 

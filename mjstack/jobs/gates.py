@@ -1,23 +1,18 @@
 """Job *gates*: a configuration and a folder in, gates run, a report left behind."""
 
 from contextlib import suppress
-from pathlib import Path
-from typing import Any
 
 import torch
 
-from mjstack.config.fingerprint import config_content, differences
 from mjstack.config.schema import Backend, Config
 from mjstack.drivers.driver import check_driver
 from mjstack.envs import driven_config
-from mjstack.episodes.earlier_run import EarlierRun
-from mjstack.episodes.record import STEMS
 from mjstack.episodes.stage import Stage
-from mjstack.errors import ConfigError, FolderError, MjstackError, Unreachable, renamed_keys
+from mjstack.errors import ConfigError, MjstackError, Unreachable, renamed_keys
+from mjstack.gates.episodes import gate_config
 from mjstack.gates.images import load_images
 from mjstack.gates.runner import find_gates, run_gates
-from mjstack.gates.success import success_config
-from mjstack.jobs.runner import VIEWS, CheckedJob, Job, count_devices, run_provenance
+from mjstack.jobs.runner import VIEWS, CheckedJob, Job, count_devices
 from mjstack.jobs.showing import check_showing
 from mjstack.managers.episode import required_fields
 from mjstack.managers.term import blamed
@@ -31,10 +26,6 @@ from mjstack.sim.native import NativeSimulation
 
 # Bytes of a run over those of its native worlds: measured 3.2 to 4.6, for both drivers.
 _SHARE = 4
-_GATES_IN = {  # gates whose worlds a value of view or video shows
-    "true": ["baseline", "parity"],
-    "web": ["baseline", "parity", "batch", "success"],
-}
 
 
 def check_machine(cfg: Config) -> Stage:
@@ -45,15 +36,17 @@ def check_machine(cfg: Config) -> Stage:
     stage = Stage(cfg)
     check_task(stage)
     for key, value in (("view", cfg.view), ("video", str(cfg.video).lower())):
-        if value != "false" and not {*_GATES_IN[value]} & {*cfg.gates}:
-            expected = f"a gate that shows worlds: {', '.join(_GATES_IN[value])}"
+        names = ["baseline", "parity", *(cfg.gate.episodes() if value == "web" else ())]
+        if value != "false" and not {*names} & {*cfg.gates}:
+            expected = f"a gate that shows worlds: {', '.join(names)}"
             raise ConfigError(key, value, expected, "Add one of them to gates")
     check_showing(cfg)
     if "parity" in cfg.gates and cfg.gate.parity.images is not None:
         load_images(cfg)
         require_offscreen(stage.model)
     _check_starts(stage)
-    if stage.backend[0] is Backend.native and {"batch", "success", "throughput"} & set(cfg.gates):
+    batch = cfg.episode_gates or "throughput" in cfg.gates
+    if batch and stage.backend[0] is Backend.native:
         _check_memory(stage)
     return stage
 
@@ -78,9 +71,10 @@ def _check_starts(stage: Stage) -> None:
         with suppress(Unreachable):  # the gate reports it
             driven = driven_config(cfg, cfg.gate.success.reset)
             check_env(stage, driven, reset="gate.success.reset")
-    driven = driven_config(success_config(cfg))
-    if "success" in cfg.gates and driven.reset != cfg.reset:
-        check_env(stage, driven, reset="gate.success.reset")
+    for gate in cfg.episode_gates:
+        driven = driven_config(gate_config(cfg, gate))
+        if driven.reset != cfg.reset:
+            check_env(stage, driven, reset=f"gate.{gate}.reset")
 
 
 def check_task(stage: Stage) -> None:
@@ -108,7 +102,8 @@ def check_task(stage: Stage) -> None:
         if cfg.task.check is not None or not driver.needs_phases:
             env.reset()
             check_driver(env, cfg, stage.assets)
-    if "success" in cfg.gates and driver.planned:  # the closed-loop expert plays
+    feedback = any(cfg.gate[gate].reset for gate in cfg.episode_gates)
+    if feedback and driver.planned:  # the closed-loop expert plays
         from mjstack.kinematics.batched_ik import build_chain  # loads Warp
 
         build_chain(stage.model, cfg.robot)
@@ -162,45 +157,7 @@ def check_env(stage: Stage, cfg: Config, **keys: str) -> None:
 def check_gates(cfg: Config) -> CheckedJob:
     """Raise for what this machine cannot do, before anything is written."""
     title = f"task {cfg.task.name}, {cfg.nworld} worlds, gates {', '.join(cfg.gates)}"
-    stage = check_machine(cfg)
-    earlier: list[str] = []
-    if cfg.resume is not None and stage.ranks.writes:
-        earlier = _check_resumed(stage, cfg.resume)
-    return CheckedJob(
-        stage=stage,
-        title=title,
-        work=run_gates,
-        folder=None if cfg.resume is None else Path(cfg.resume),
-        resumable="gates",
-        earlier=earlier,
-        spreads=True,
-    )
-
-
-def _check_resumed(stage: Stage, name: str) -> list[str]:
-    """The calls that have played a run so far; a FolderError if the folder has none, or one of
-    another configuration or model, of which no episode can be kept.
-    """
-    run = EarlierRun.read(name, "resume")
-    earlier, asked = (_played_config(cfg) for cfg in (run.cfg, stage.cfg))
-    if keys := differences(earlier, asked):
-        problem = f"resume={name}: has a run of another configuration: {keys}"
-        raise FolderError(problem, "Name another folder, or set these keys back")
-    if run.provenance.get("model_sha256") != run_provenance(stage)["model_sha256"]:
-        problem = f"resume={name}: the compiled model is not the same as in that run"
-        raise FolderError(f"{problem}, expected the same physics", "Name another folder")
-    call = ", ".join(str(run.provenance.get(key)) for key in ("date", "git_commit", "device"))
-    return [*run.provenance.get("earlier_calls", []), call]
-
-
-def _played_config(cfg: Config) -> dict[str, Any]:
-    """Everything that the episodes of batch and success depend on; more seeds may be asked for."""
-    config = config_content(cfg, ("gates", "view", "video", "graph"))
-    config["sim"] = {"backend": resolve_backend(cfg)[0], "step": cfg.sim.step}
-    config["gate"] = {name: config["gate"][name] for name in STEMS}
-    for gate in config["gate"].values():
-        del gate["seeds"]
-    return config
+    return CheckedJob(stage=check_machine(cfg), title=title, work=run_gates, spreads=True)
 
 
 JOB = Job(check_gates, views=VIEWS)

@@ -10,10 +10,9 @@ import torch
 
 from mjstack.config.schema import Config, PlayJobCfg
 from mjstack.drivers.driver import find_driver, with_controller
+from mjstack.episodes.batches import BatchPlan, play_batches
 from mjstack.episodes.motion import draw_seen, world_fields
 from mjstack.episodes.recorder import WorldRecorder
-from mjstack.episodes.replay import simulate_alone
-from mjstack.episodes.rollout import play_episode, rollout
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError
@@ -66,45 +65,37 @@ def play_worlds(run: Run) -> list[GateResult]:
     """
     stage = run.stage
     cfg = stage.cfg
-    advance = stage.progress.advance
     job: PlayJobCfg = cfg.job
+    judged = cfg.task.check is not None
+    recorder = WorldRecorder()
     worlds: list[World] = []
     looks = []
-    details = []
+    result = GateResult(name=NAME, status=Status.passed)
     succeeded = 0
-    with closing(simulate_alone(stage, *stage.backend)) as sim:
-        for world in range(cfg.nworld):
-            env = stage.start(sim, cfg.reset, worlds=[world])
-            driver = stage.driver(env)
-            recorder = WorldRecorder()
-            observers = [*run.viewers, recorder]
-            label = f"steps of world {world}"
-            outcome = "not judged: the task has no check"
-            status = Status.passed
-            if cfg.task.check is None:
-                rollout(env, driver, observers, advance=advance, label=label)
-            else:
-                episode = play_episode(env, driver, observers, advance=advance, label=label)
-                judged, headline = run.judge_one(NAME, episode)
-                status = judged.status
-                succeeded += status is Status.passed
-                outcome = judged.reason or f"succeeded, {headline}"
-            qpos = recorder.qpos
-            seen = draw_seen(stage, qpos, sim) if cfg.video and job.camera is None else {}
-            (fields,) = world_fields(stage, env, [0])
-            worlds.append(World(label=str(world), qpos=qpos, images=seen, fields=fields))
-            looks.append({name: value.clone() for name, value in sim.fields.items()})
-            run.show_world(f"{NAME}_{world}", str(world), qpos, status, env)
-            details.append(f"world {world}: {outcome}")
-            run.print_line(details[-1])
-    result = GateResult(
-        name=NAME,
-        status=Status.passed,
-        reason=f"{succeeded} of {cfg.nworld} worlds succeeded" if cfg.task.check else outcome,
-        figures=figures(worlds=cfg.nworld, **({"succeeded": succeeded} if cfg.task.check else {})),
-        notes={"backend": sim.description},
-        details=details,
-    )
+    for batch in play_batches(
+        stage,
+        [BatchPlan(cfg.seed, [world]) for world in range(cfg.nworld)],
+        alone=stage.backend,
+        observers=lambda plan: [recorder, *run.viewers],
+    ):
+        world = batch.plan.worlds[0]
+        sim = batch.env.sim
+        outcome = "not judged: the task has no check"
+        if judged:
+            played, headline = run.judge_one(NAME, batch.episode)
+            succeeded += played.status is Status.passed
+            outcome = played.reason or f"succeeded, {headline}"
+        qpos = recorder.qpos
+        seen = draw_seen(stage, qpos, sim) if cfg.video and job.camera is None else {}
+        (fields,) = world_fields(stage, batch.env, [0])
+        worlds.append(World(label=str(world), qpos=qpos, images=seen, fields=fields))
+        looks.append({name: value.clone() for name, value in sim.fields.items()})
+        run.show_world(f"{NAME}_{world}", str(world), qpos, batch.episode, batch.env)
+        result.details.append(f"world {world}: {outcome}")
+        result.notes["backend"] = sim.description
+        run.print_line(result.details[-1])
+    result.reason = f"{succeeded} of {cfg.nworld} worlds succeeded" if judged else outcome
+    result.figures = figures(worlds=cfg.nworld, **({"succeeded": succeeded} if judged else {}))
     if cfg.video:
         _save(run, worlds, looks, result)
     return [result]

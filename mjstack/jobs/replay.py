@@ -15,16 +15,16 @@ from mjstack.envs import driven_config
 from mjstack.episodes.batches import BatchPlan, play_batches
 from mjstack.episodes.earlier_run import EarlierRun, archived_starts
 from mjstack.episodes.failures import FailureMonitor, describe_sign
-from mjstack.episodes.record import STEMS, EpisodeRecord
-from mjstack.episodes.replay import WorldTrace, simulate_alone
+from mjstack.episodes.record import EpisodeRecord
+from mjstack.episodes.replay import WorldTrace
 from mjstack.episodes.rollout import Episode, require_episode
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
 from mjstack.episodes.tally import rate_cells
 from mjstack.errors import ConfigError, DeviceError, FolderError, shorten
 from mjstack.files import to_csv, write_atomic, write_npz
+from mjstack.gates.episodes import gate_config
 from mjstack.gates.runner import run_guarded
-from mjstack.gates.success import success_config
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import VIEWS, CheckedJob, Job, run_provenance
 from mjstack.jobs.showing import check_showing
@@ -36,8 +36,12 @@ from mjstack.sim import resolve_backend, resolve_device
 
 TABLE = "replayed_worlds.csv"
 _TABLE_ROWS = 100  # worlds in report.md
-# Besides versions, what arithmetic depends on
-_PLACES = {"git_commit": "mjstack's commit", "cpu": "the processor"}
+_FACTS = {  # besides versions, on which a result or its last bits depend
+    "git_commit": "mjstack's commit",
+    "cpu": "the processor",
+    "policy": "the policy",
+    "model_sha256": "the compiled model",
+}
 # [m, rad], and of quaternions: backends differ by rounding, another start by more
 _SAME_START = 1e-6
 _NATIVE = (Backend.native, "cpu")
@@ -48,15 +52,23 @@ class _Plan:
     """One world, or all failing ones, to be played again."""
 
     run: EarlierRun
-    gate: str  # whose worlds they are, ``batch`` or ``success``
+    gate: str  # whose worlds they are
     failing: bool  # whether they are all failing ones
     bits: dict[int, dict[int, int]]  # of the rules that each world broke, by seed and world
-    seed: int  # the first one
-    world: int  # its first one
     record: EpisodeRecord  # of the first seed
     # Backend and device, each played once; the first is the run's unless ``sim`` says otherwise.
     where: list[tuple[Backend, str]]
     stage: Stage  # with the configuration that the gate played under, on the first backend here
+
+    @property
+    def seed(self) -> int:
+        """The first one."""
+        return next(iter(self.bits))
+
+    @property
+    def world(self) -> int:
+        """The first one's first."""
+        return next(iter(self.bits[self.seed]))
 
 
 def _plan_replay(cfg: Config) -> _Plan:
@@ -79,16 +91,15 @@ def _plan_replay(cfg: Config) -> _Plan:
     # The worlds: [gate:][seed:]number or [gate:]failing
     *heads, tail = str(cfg.world).split(":")
     failing = tail == "failing"
-    played_gates = [gate for gate in STEMS if gate in run.cfg.gates]
-    gate = heads.pop(0) if heads and not heads[0].isdigit() else (played_gates or ["batch"])[0]
-    seeds = range(run.cfg.seed, run.cfg.seed + run.cfg.gate[gate].seeds)
-    seed = int(heads[0]) if heads else seeds[0]
+    gates = run.cfg.episode_gates
+    gate = heads.pop(0) if heads and not heads[0].isdigit() else gates[0] if gates else ""
+    seeds = range(run.cfg.seed, run.cfg.seed + (run.cfg.gate[gate].seeds if gate in gates else 0))
+    seed = int(heads[0]) if heads else run.cfg.seed
     bits: dict[int, dict[int, int]] = {}
     expected = ""
-    if gate not in played_gates:
+    if gate not in gates:
         noun = "failing worlds" if failing else "a world"
-        names = " or ".join(played_gates) or "but it had none"
-        expected = f"{noun} of a gate that run had, {names}"
+        expected = f"{noun} of a gate that run had, {' or '.join(gates) or 'but it had none'}"
     elif failing:
         bits, episodes = run.failing(gate)
         if not bits:
@@ -99,16 +110,11 @@ def _plan_replay(cfg: Config) -> _Plan:
         expected = f"a world from 0 to {run.cfg.nworld - 1}, as that run has"
     if expected:
         raise ConfigError("world", cfg.world, expected)
-    if failing:
-        seed = next(iter(bits))
-    record = run.record(seed, gate)
-    if not failing:
-        bits = {seed: {int(tail): int(record.failed[int(tail)])}}
+    record = run.record(next(iter(bits), seed), gate)
+    bits = bits or {seed: {int(tail): int(record.failed[int(tail)])}}
 
     # How they are played here
-    played = archived_starts(run.cfg, run.folder)
-    if gate == "success":
-        played = success_config(played)
+    played = gate_config(archived_starts(run.cfg, run.folder), gate)
     where = _choose(cfg.sim, record)
     backend, device = where[0]
     sim = SimCfg(backend=backend, device=device, step=cfg.sim.step)
@@ -119,8 +125,6 @@ def _plan_replay(cfg: Config) -> _Plan:
         gate=gate,
         failing=failing,
         bits=bits,
-        seed=seed,
-        world=next(iter(bits[seed])),
         record=record,
         where=where,
         stage=Stage(played),
@@ -150,7 +154,7 @@ def _check_start(plan: _Plan) -> None:
     recorded = plan.record.worlds["start_qpos"][plan.world]
     # Native first, which takes less time to load. Rounding may have MJWarp draw otherwise.
     for backend, device in dict.fromkeys([_NATIVE, plan.where[0]]):
-        with closing(simulate_alone(stage, backend, device)) as sim:
+        with closing(stage.simulate_alone(backend, device)) as sim:
             stage.start(sim, stage.cfg.reset, seed=plan.seed, worlds=[plan.world])
             start = sim.qpos[0].cpu().numpy()
             same = start.shape == recorded.shape
@@ -204,19 +208,14 @@ def _replay_all(plan: _Plan, run: Run, folder: Path) -> None:
 def _changes(recorded: dict, current: dict) -> list[str]:
     """Facts that differ from the earlier run's and could change a result, or its last bits."""
     before, now = (
-        facts["versions"] | {name: facts.get(key) for key, name in _PLACES.items()}
+        facts["versions"] | {words: facts.get(key) for key, words in _FACTS.items()}
         for facts in (recorded, current)
     )
-    lines = [
+    return [
         f"{name} was {shorten(str(before[name]), 100)} in that run and is {value} now"
         for name, value in now.items()
         if name in before and before[name] != value
     ]
-    if recorded.get("policy") != current.get("policy"):
-        lines.append("the policy is not the same as in that run: it was written anew")
-    if recorded.get("model_sha256") != current["model_sha256"]:
-        lines.append("the compiled model is not the same as in that run: this is another physics")
-    return lines
 
 
 def _replay(
@@ -227,18 +226,20 @@ def _replay(
     backend, device = plan.where[number]
     stage = run.stage
     check = stage.check
-    monitors = [FailureMonitor()] if plan.gate == "success" else []
+    monitors = [FailureMonitor()] if stage.cfg.gate[plan.gate].reset else []
     trace = WorldTrace()
     observers = [trace, *(run.viewers if first else []), *monitors]
     facts = {"seed": plan.seed, "world": plan.world}
-    with closing(simulate_alone(stage, backend, device)) as sim:
-        episode = stage.play(sim, stage.cfg.reset, observers, seed=plan.seed, worlds=[plan.world])
+    plans = [BatchPlan(plan.seed, [plan.world])]
+    batches = play_batches(stage, plans, alone=(backend, device), observers=lambda _: observers)
+    with closing(batches):
+        episode = next(batches).episode
         lines = trace.explain(episode)
         qpos = trace.arrays["qpos"]
         result, headline = run.judge_one(f"replay_{backend}", episode)
         title = f"world {plan.world} of seed {plan.seed}, replayed ({backend})" if first else ""
         label = f"{plan.world}, {backend}"
-        run.show_world(f"replay_{backend}", label, qpos, result.status, trace.env, title)
+        run.show_world(f"replay_{backend}", label, qpos, episode, trace.env, title)
     agrees, comparison = _compare(plan, number, episode, qpos[-1], changes, run)
     lines += [_first_sign(monitor, episode) for monitor in monitors]
     for line in lines:
@@ -317,7 +318,7 @@ def _play_failing(
     batches = play_batches(
         stage,
         [BatchPlan(seed, list(worlds)) for seed, worlds in share],
-        simulate=partial(simulate_alone, stage, backend, device),
+        alone=(backend, device),
     )
     played: list[tuple[int, int, int]] = []  # seed, world and bits
     for done, batch in enumerate(batches, 1):

@@ -78,8 +78,6 @@ class CheckedJob:
         work: Does it in a folder, and hands each result to the run's ``record``.
         folder: The default folder of a job that resumes; None for a folder of the hour.
         resumes: Its name in report.json, by which it knows any folder that it goes on with.
-        resumable: Its name there if it goes on only where the command line says so.
-        earlier: The calls that the run goes on with, in words.
         spreads: Whether ranks share the work: `work` is called in each of them.
     """
 
@@ -88,8 +86,6 @@ class CheckedJob:
     work: Callable[[Run, Path], None]
     folder: Path | None = None
     resumes: str = ""
-    resumable: str = ""
-    earlier: Sequence[str] = ()
     spreads: bool = False
 
     def assist(self, folder: Path) -> None:
@@ -125,7 +121,7 @@ class CheckedJob:
         report = Report(
             folder=folder,
             overrides=list(overrides),
-            resumes=self.resumes or self.resumable,
+            resumes=self.resumes,
             pictures=page.pictures,
         )
         self._load(warp=self.stage.backend[0] is Backend.mjwarp and cfg.gates != ["baseline"])
@@ -152,8 +148,6 @@ class CheckedJob:
             console.print(line, markup=False)
             log.warning("%s", line)
         report.provenance = run_provenance(self.stage)
-        if self.earlier:
-            report.provenance["earlier_calls"] = list(self.earlier)
         if self.stage.ranks.size > 1:
             places = self.stage.ranks.gather(self._place())
             report.provenance["ranks"] = [f"rank {r}: {p}" for r, p in enumerate(places)]
@@ -179,7 +173,6 @@ class CheckedJob:
             run = Run(
                 self.stage,
                 folder=folder,
-                overrides=report.overrides,
                 begin=begin,
                 record=record,
                 viewers=[live] if live else showing.find_viewers(self.stage),

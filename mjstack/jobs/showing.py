@@ -96,9 +96,9 @@ def save_page(stage: Stage, folder: Path, page: Page) -> None:
         frame_dt = frame_stride(cfg.timing.step_dt) * cfg.timing.step_dt
         model = stage.assets.visual_model
         problem = safely_write(path, web.save_episode, model, worlds, frame_dt)
-        page.notes += [] if problem else web.not_shown(model, worlds)
-    if path.exists():  # perhaps an earlier call's, of seeds that were read back
-        page.episode = web.EPISODE
+        if not problem:
+            page.episode = web.EPISODE
+            page.notes += web.not_shown(model, worlds)
     if problem:
         page.notes.append(problem)
         stage.progress.print_line(problem)

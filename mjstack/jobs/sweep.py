@@ -47,16 +47,13 @@ class SweepJob:
         report = self.report()
         return report if report is not None and report.status in _ENDED else None
 
-    def set_aside(self) -> bool:
+    def set_aside(self) -> None:
         """Make room for a run: move what an earlier one has left into a folder beside this one,
-        unless the job goes on with it. Return whether the job goes on where ``resume`` says so.
+        unless the job goes on with it.
         """
         earlier = self.report()
-        if earlier is None:  # the run refuses other files
-            return False
-        if not earlier.resumes:
+        if earlier is not None and not earlier.resumes:  # the run refuses other files
             move_aside(self.folder)
-        return earlier.resumes == "gates"
 
 
 def number_jobs(folder: Path, jobs: Iterable[Sequence[str]], first: int = 0) -> list[SweepJob]:
@@ -298,8 +295,8 @@ class _Queue:
                     self._slots.append(self._slots.pop(self._slots.index(slot)))
                     return False
                 locks.enter_context(gpu)
-            key = "resume" if job.set_aside() else "hydra.run.dir"
-            args = [*job.overrides, assign(key, job.folder), *search_path_args()]
+            job.set_aside()
+            args = [*job.overrides, assign("hydra.run.dir", job.folder), *search_path_args()]
             logged = log.tell()
             child = Child(args, log, env=slot.env, cores=slot.cores)
             self.running[slot] = _Running(job, child, logged, locks.pop_all())

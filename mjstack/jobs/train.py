@@ -18,8 +18,8 @@ from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Assets, Stage
 from mjstack.errors import ConfigError, FolderError
 from mjstack.files import made_by, reading, to_csv, write_atomic
+from mjstack.gates.episodes import judge_episodes
 from mjstack.gates.runner import run_guarded
-from mjstack.gates.success import run_success
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import CheckedJob, Job
 from mjstack.jobs.showing import check_showing
@@ -93,7 +93,7 @@ def _run(trainer: Trainer, run: Run, folder: Path) -> None:
     run_guarded(run, NAME, partial(_train, trainer, folder), "worlds")
     if run.artifacts.results[NAME].status is Status.passed:
         judged = run.on(judged_stage(run.stage, folder / LAST))
-        run_guarded(judged, "success", run_success)
+        run_guarded(judged, "success", judge_episodes)
         trained = run.artifacts.results[NAME]
         judgement = Figure("judgement", judged.artifacts.results["success"].seconds, "s")
         times = [figure for figure in trained.figures if figure.unit == "s"]

@@ -60,16 +60,21 @@ class World:
     Attributes:
         label: Its text, short.
         qpos: Positions at frames, shape ``(frames, nq)``; NaN where it was not played.
-        failed: Whether it failed, which colours its table.
+        rules: Names of the rules that it broke; the first one colours its table.
         images: What its driver saw, by camera, each ``(frames, height, width, 3)``, uint8.
         fields: Its model fields that pictures show, those of the model with visuals, by name.
     """
 
     label: str
     qpos: np.ndarray
-    failed: bool = False
+    rules: Sequence[str] = ()
     images: Mapping[str, np.ndarray] = field(default_factory=dict)
     fields: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def caption(self) -> str:
+        """Label and broken rules."""
+        return ": ".join(filter(None, (self.label, " ".join(self.rules))))
 
 
 @dataclass(kw_only=True, slots=True)

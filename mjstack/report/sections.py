@@ -74,7 +74,7 @@ class Section:
 def make_sections(report: Report, page: Page) -> list[Section]:
     """The whole run: summary, pictures, then every gate, and the provenance."""
     facts = report.provenance
-    text = f"Play it in 3-D: {page.episode} (red tables: failed worlds)"
+    text = f"Play it in 3-D: {page.episode} (coloured tables: failed worlds, by rule)"
     head: list[Part] = [
         ", ".join(str(facts[name]) for name in ("date", "device") if name in facts),
         page.command,

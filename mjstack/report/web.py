@@ -2,9 +2,11 @@
 view shows. The only module that imports viser.
 """
 
+import base64
 import contextlib
 import errno
 import io
+import json
 import logging
 import math
 import os
@@ -35,7 +37,24 @@ _PORT = re.compile(r":\d+$")
 _MESSAGE = 2**16  # bytes, the largest of a browser
 _MARGIN = 0.12  # m between worlds
 _UNSEEN = ("site_", "cam_", "light_", "mat_")  # beginnings of model fields that it does not show
-_FAILED = np.array([0.86, 0.35, 0.32])
+_COLORS = ("db5952", "d99a2b", "8d63c9", "2f9e8f", "c45a9c", "7a8b3c")  # of broken rules
+_FILTER = """<script>{
+const motions = %s, shown = decodeURIComponent(location.hash.slice(1));
+if (motions[shown]) window.__VISER_EMBED_DATA__ = motions[shown][1];
+addEventListener("hashchange", () => location.reload());
+addEventListener("DOMContentLoaded", () => {
+  const list = document.createElement("select");
+  list.id = "rules";
+  list.style = "position: fixed; top: 1em; left: 1em; z-index: 9";
+  for (const rule of ["", ...Object.keys(motions)]) {
+    const option = new Option(rule || "all worlds", rule, false, rule === shown);
+    if (rule) option.style.color = "#" + motions[rule][0];
+    list.add(option);
+  }
+  list.onchange = () => { location.hash = list.value };
+  document.body.append(list);
+});
+}</script>"""
 _IMAGE = 0.16  # m, height of what a driver saw
 _UPRIGHT = (0.5, -0.5, -0.5, 0.5)  # it faces the viewer
 
@@ -50,11 +69,18 @@ def lacks_viser() -> str:
 class Stage:
     """Worlds side by side in a viser server's scene."""
 
-    def __init__(self, server: Any, model: mujoco.MjModel, worlds: Sequence[World]) -> None:
+    def __init__(
+        self,
+        server: Any,
+        model: mujoco.MjModel,
+        worlds: Sequence[World],
+        rules: Sequence[str] = (),
+    ) -> None:
         """Add the worlds to a ``viser.ViserServer``, in the state of their model with visuals.
 
         Images stand behind the table. In worlds that failed, the table and what stands still in
-        all worlds alike are red.
+        all worlds alike have the colour of the first rule that they broke, by its number in
+        ``rules``.
         """
         self._shapes = shapes = Shapes(model, [world.fields for world in worlds])
         low, high = shapes.box()
@@ -62,10 +88,13 @@ class Stage:
         self._handles: list[tuple[Shape, Any]] = []
         places, turns = self._round(*shapes.poses(shapes.rest))
         self._last = (places, turns)
-        failed = np.array([world.failed for world in worlds])
+        failed = np.array([bool(world.rules) for world in worlds])
+        first = [rules.index(world.rules[0]) if world.rules else 0 for world in worlds]
+        colors = np.array([[*bytes.fromhex(_color(number))] for number in first]) / 255.0
         for number, shape in enumerate(shapes.meshes):
             rgba = shape.rgba.copy()
-            rgba[failed[shape.worlds] & shape.table, :3] = _FAILED
+            marked = failed[shape.worlds] & shape.table
+            rgba[marked, :3] = colors[shape.worlds][marked]
             alpha = rgba[:, 3]
             handle = server.scene.add_batched_meshes_simple(
                 f"/{number}",
@@ -88,7 +117,7 @@ class Stage:
             x, y = self._offsets[number]
             server.scene.add_label(
                 f"/label/{number}",
-                world.label,
+                world.caption,
                 position=(x + high[0], y + 0.5 * (low[1] + high[1]), low[2]),
                 anchor="top-center",
                 font_size_mode="scene",
@@ -185,14 +214,31 @@ def save_episode(
     path: Path, model: mujoco.MjModel, worlds: Sequence[World], frame_dt: float
 ) -> None:
     """Write worlds in motion, side by side, as one HTML file, which plays without a server. A world
-    that ends earlier stays. ``model`` has visuals, ``frame_dt`` is the time between frames [s].
+    that ends earlier stays. A list on the page, or ``#RULE`` behind its address, shows the worlds
+    that broke a rule alone. ``model`` has visuals, ``frame_dt`` is the time between frames [s].
 
     Raises:
         OSError: The file cannot be written.
     """
+    rules = list(dict.fromkeys(rule for world in worlds for rule in world.rules))
+    page = _record(model, worlds, rules, frame_dt).as_html()
+    motions = {}
+    for number, rule in enumerate(rules):
+        broken = [world for world in worlds if rule in world.rules]
+        motion = _record(model, broken, rules, frame_dt).serialize()
+        motions[rule] = [_color(number), base64.b64encode(motion).decode()]
+    script = _FILTER % json.dumps(motions).replace("<", "\\u003c") if rules else ""
+    page = page.replace("<title>Viser</title>", "<title>Episode</title>", 1)
+    path.write_text(page.replace("</head>", f"{script}</head>", 1), encoding="utf-8")
+
+
+def _record(
+    model: mujoco.MjModel, worlds: Sequence[World], rules: Sequence[str], frame_dt: float
+) -> Any:
+    """Viser's recording of worlds in motion; arguments as of `Stage` and `save_episode`."""
     server = start_server("127.0.0.1", 0)
     try:
-        stage = Stage(server, model, worlds)
+        stage = Stage(server, model, worlds, rules)
         qpos = np.stack([_fill(world, worlds) for world in worlds], axis=1)
         stage.update(qpos[0])
         scene = server.get_scene_serializer()
@@ -202,10 +248,14 @@ def save_episode(
                 scene.insert_sleep(frame_dt)
                 stage.update(row, frame)
         scene.insert_sleep(1.0)
-        page = scene.as_html().replace("<title>Viser</title>", "<title>Episode</title>", 1)
-        path.write_text(page, encoding="utf-8")
+        return scene
     finally:
         stop_server(server)
+
+
+def _color(number: int) -> str:
+    """The colour of a rule, by its number, as hexadecimal digits."""
+    return _COLORS[number % len(_COLORS)]
 
 
 def check_address(host: str, port: int) -> None:

@@ -85,8 +85,6 @@ class Config:
     """controller=policy, job=play, job=export: the folder of a trained policy."""
     run: str | None = spec(None)
     """job=replay: the folder of an earlier run."""
-    resume: str | None = spec(None)
-    """job=gates: folder of a run of this configuration, whose seeds of batch and success count."""
     devices: str | None = spec(None)
     """GPUs that share the job's worlds, a process for each: all, or how many. null: as torchrun
     has it, or one."""
@@ -94,6 +92,11 @@ class Config:
     """job=replay: 17; of seed 3, 3:17; success:3:17 where batch ran too; failing: all those."""
     unused_terms: list[str] = spec([])
     """Terms of the task that this job does not use, a line each; mjstack fills it in."""
+
+    @property
+    def episode_gates(self) -> list[str]:
+        """The gates that run and play episodes, in their order."""
+        return [name for name in self.gate.episodes() if name in self.gates]
 
     @property
     def files(self) -> dict[str, str]:

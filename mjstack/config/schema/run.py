@@ -188,18 +188,6 @@ class CapacityCfg(GateFuncCfg):
 
 
 @dataclass(slots=True)
-class BatchGateCfg(GateFuncCfg):
-    """The batch gate plays every world of some seeds and judges them together."""
-
-    seeds: int = spec(unit="seeds", ge=1, le=100_000)
-    """Seeds that are played: the configured one and those after it."""
-    failed_worlds: int = spec(unit="worlds", ge=0, le=MOST_WORLDS)
-    """Worlds that may fail, over all seeds."""
-    distinct_fraction: float = spec(ge=0.0, le=1.0)
-    """Smallest share of distinct starts, or of distinct final states."""
-
-
-@dataclass(slots=True)
 class ThroughputCfg(GateFuncCfg):
     """How throughput is measured."""
 
@@ -231,27 +219,28 @@ class ThroughputCfg(GateFuncCfg):
     """Whether native MuJoCo is measured too on CUDA machines."""
 
 
-@dataclass(slots=True)
-class SuccessGateCfg(GateFuncCfg):
-    """The success gate plays episodes from randomised starts and needs a success rate."""
+EPISODES = "mjstack.gates.episodes.judge_episodes"  # the function of every gate of episodes
 
-    seeds: int = spec(unit="seeds", ge=1, le=100_000)
+
+@dataclass(slots=True)
+class EpisodesGateCfg(GateFuncCfg):
+    """A gate that plays episodes in nworld worlds under some seeds, and needs a success rate."""
+
+    seeds: int = spec(1, unit="seeds", ge=1, le=100_000)
     """Seeds of nworld episodes each: the configured one and those after it."""
-    rate: float = spec(ge=0.0, le=1.0)
+    rate: float = spec(1.0, ge=0.0, le=1.0)
     """Share of the episodes that must succeed."""
+    distinct_fraction: float = spec(0.0, ge=0.0, le=1.0)
+    """Smallest share of distinct starts, or of distinct final states."""
     region: list[float] | None = spec(None, unit="m", length=2, ge=0.0)
     """Half-widths of the objects' region in x and y; null: as ``reset`` has them."""
-    cell: float = spec(unit="m", gt=0.0)
-    """Width of the cells in which start positions are counted, in x and y."""
-    yaw_cell_deg: float = spec(unit="deg", gt=0.0, le=90.0)
-    """Width of the bins of an object's yaw relative to its direction as seen from the base."""
-    cell_episodes: int = spec(unit="episodes", ge=1, le=MOST_COUNT)
-    """Episodes below which a cell has no rate."""
-    worst_regions: int = spec(unit="cells", ge=1, le=MOST_COUNT)
-    """Worst cells in report.md."""
+    cell_episodes: int = spec(20, unit="episodes", ge=1, le=MOST_COUNT)
+    """Episodes below which a cell of start positions has no rate."""
     reset: dict[str, Any] = spec({})
-    """Reset terms, unless ``reset=starts_file`` names a file: what they add to the task's own terms
-    of ``reset``, or replace by name."""
+    """Reset terms of its own: what they add to the task's own terms of ``reset``, or replace by
+    name. ``reset=starts_file`` takes the place of those that read no file. With some, closed_loop
+    plays in place of a plan, and starts, signs of failure and regions are recorded. Empty: those of
+    ``reset``."""
 
 
 @dataclass  # without slots: OmegaConf sets what is no field, see `complete`
@@ -264,11 +253,11 @@ class GateCfg:
     """MJWarp against native MuJoCo."""
     capacity: CapacityCfg = field(default_factory=CapacityCfg)
     """Buffer sizes."""
-    batch: BatchGateCfg = field(default_factory=BatchGateCfg)
+    batch: EpisodesGateCfg = field(default_factory=EpisodesGateCfg)
     """Every world of a batch."""
     throughput: ThroughputCfg = field(default_factory=ThroughputCfg)
     """Speed."""
-    success: SuccessGateCfg = field(default_factory=SuccessGateCfg)
+    success: EpisodesGateCfg = field(default_factory=EpisodesGateCfg)
     """Success rate from randomised starts."""
     added: dict[str, Any] = spec({})
     """Gates of the search path by name; their keys are ``gate.NAME.KEY``."""
@@ -276,6 +265,11 @@ class GateCfg:
     def __getitem__(self, name: str) -> Any:
         """The parameters of a gate."""
         return self.added[name] if name in self.added else getattr(self, name)
+
+    def episodes(self) -> dict[str, EpisodesGateCfg]:
+        """Parameters of every gate of episodes, by the gate's name."""
+        gates = {name: self[name] for name in self.functions()}
+        return {name: gate for name, gate in gates.items() if isinstance(gate, EpisodesGateCfg)}
 
     def functions(self) -> dict[str, str]:
         """Dotted name of every gate's function, by the gate's name."""
