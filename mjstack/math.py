@@ -4,7 +4,7 @@ Quaternions are (w, x, y, z), the last dimension is the vector's own.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 
 import torch
@@ -12,8 +12,21 @@ from torch import Tensor
 
 # The third row of a rotation matrix is 2xz - 2wy, 2yz + 2wx, 1 - 2xx - 2yy: columns of w, x, y, z
 # in the products of both terms; and their signs times 2, and what is added.
-_Z_ROW_COLUMNS = torch.tensor([1, 2, 1, 2, 1, 2, 3, 3, 1, 0, 0, 2])
-_Z_ROW_NUMBERS = torch.tensor([2.0, 2.0, -2.0, -2.0, 2.0, -2.0, 0.0, 0.0, 1.0])
+_Z_ROW_COLUMNS = (1, 2, 1, 2, 1, 2, 3, 3, 1, 0, 0, 2)
+_Z_ROW_SIGNS = (2.0, 2.0, -2.0, -2.0, 2.0, -2.0)
+
+
+def constant(values: Iterable[float], like: Tensor, dtype: torch.dtype | None = None) -> Tensor:
+    """Numbers in the type of a tensor, or another, and on its device, shape ``(n,)``. Copied there
+    once: a captured step may not copy from the host. Not to be written into.
+    """
+    return _constant(tuple(values), like.device, dtype or like.dtype)
+
+
+@cache
+def _constant(values: tuple[float, ...], device: torch.device, dtype: torch.dtype) -> Tensor:
+    with torch.inference_mode(False):
+        return torch.tensor(values, dtype=dtype, device=device)
 
 
 def atan2(y: Tensor, x: Tensor) -> Tensor:
@@ -68,18 +81,9 @@ def quat_angle(a: Tensor, b: Tensor) -> Tensor:
 
 def quat_z_row(quat: Tensor) -> Tensor:
     """Third row of the rotation matrix: world z of the body's axes, shape ``(..., 3)``."""
-    columns, signs, added = _z_row_constants(quat.device, quat.dtype)
-    factors = quat.index_select(-1, columns)
-    terms = factors[..., :6] * factors[..., 6:] * signs
-    return terms[..., :3] + terms[..., 3:] + added
-
-
-@cache
-def _z_row_constants(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, ...]:
-    """The constants of `quat_z_row`, copied once: a captured step may not copy from the host."""
-    with torch.inference_mode(False):
-        numbers = _Z_ROW_NUMBERS.to(device, dtype)
-        return (_Z_ROW_COLUMNS.to(device), *numbers.split((6, 3)))
+    factors = quat.index_select(-1, constant(_Z_ROW_COLUMNS, quat, torch.int64))
+    terms = factors[..., :6] * factors[..., 6:] * constant(_Z_ROW_SIGNS, quat)
+    return terms[..., :3] + terms[..., 3:] + constant((0.0, 0.0, 1.0), quat)
 
 
 def quat_to_matrix(quat: Tensor) -> Tensor:
@@ -109,20 +113,13 @@ def lowest_point(pos: Tensor, quat: Tensor, shape: str, size: Sequence[float]) -
         across = norm(up[..., :2])
         reach = size[0] * across + size[1] * up[..., 2].abs()
     elif shape == "hull":  # of points, their coordinates one after the other
-        reach = -(up[..., None, :] * _constant(size, up.device, up.dtype)).sum(-1).amin(-1)
+        reach = -(up[..., None, :] * constant(size, up).view(-1, 3)).sum(-1).amin(-1)
     elif len(set(size)) == 1:  # a cube
         reach = size[0] * up.abs().sum(-1)
     else:
         x, y, z = up.abs().unbind(-1)
         reach = size[0] * x + size[1] * y + size[2] * z
     return pos[..., 2] - reach
-
-
-@cache
-def _constant(points: tuple[float, ...], device: torch.device, dtype: torch.dtype) -> Tensor:
-    """Points [m], shape ``(n, 3)``, copied once: a captured step may not copy from the host."""
-    with torch.inference_mode(False):
-        return torch.tensor(points, dtype=dtype, device=device).view(-1, 3)
 
 
 def describe_tensor(value: object) -> str:

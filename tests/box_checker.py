@@ -21,9 +21,9 @@ SIGNS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 def check_box_world(rec: Recording, cfg: Config, model: mujoco.MjModel) -> Outcome:
     """Judges one world."""
     rules = make_check(cfg).t
-    box = cfg.scene.box
+    box = cfg.scene.objects["box"]
+    floor = box.parts["floor"]
     out = Outcome(counted(rec, cfg))
-    assert box is not None
     assert rec.support_force is not None
     steps = len(rec.pose)
     top = cfg.scene.table_center[2] + cfg.scene.table_half[2]
@@ -33,10 +33,11 @@ def check_box_world(rec: Recording, cfg: Config, model: mujoco.MjModel) -> Outco
     closed = np.array(cfg.robot.gripper_closed)
     opened = np.array(cfg.robot.gripper_open)
     opening = ((rec.gripper - closed) / (opened - closed)).min(1)
-    x_low = box.center[0] - box.half[0]
-    x_high = box.center[0] + box.half[0]
-    y_low = box.center[1] - box.half[1]
-    y_high = box.center[1] + box.half[1]
+    rim = 2 * box.parts["near"].size[2]
+    x_low = box.xy[0] - floor.size[0]
+    x_high = box.xy[0] + floor.size[0]
+    y_low = box.xy[1] - floor.size[1]
+    y_high = box.xy[1] + floor.size[1]
 
     released_at: dict[str, int] = {}
     for cube, color in enumerate(COLORS):
@@ -52,8 +53,8 @@ def check_box_world(rec: Recording, cfg: Config, model: mujoco.MjModel) -> Outco
                 x - x_high,
                 y_low - y,
                 y - y_high,
-                top + box.floor - z,
-                z - top - box.height,
+                top + 2 * floor.size[2] - z,
+                z - top - rim,
             ]
         ).max(axis=(0, 2))
         over = ((x >= x_low) & (x <= x_high) & (y >= y_low) & (y <= y_high)).all(1)
@@ -62,7 +63,7 @@ def check_box_world(rec: Recording, cfg: Config, model: mujoco.MjModel) -> Outco
         airborne = loaded & (z.min(1) - top >= rules.lift_height) & ~supported[:, cube]
 
         still = detached & (outside <= rules.inside) & (speed < rules.rest_speed)
-        rest = top + box.floor + cfg.scene.objects[color].half_height
+        rest = top + 2 * floor.size[2] + cfg.scene.objects[color].half_height
         high = rec.pose[:, cube, 2] - rest > rules.drop_height
         let_go = np.append(False, loaded[:-1]) & ~loaded
         falls = high & (let_go | ~loaded & ~supported[:, cube])
@@ -94,7 +95,7 @@ def check_box_world(rec: Recording, cfg: Config, model: mujoco.MjModel) -> Outco
     if len(blue_loaded) and blue_loaded[0] < released_at.get("red", steps):
         out.failed.add("ORDER")
 
-    clearance = lowest_geometry(rec, cfg.robot.jaw_bodies, model) - max(top, top + box.height)
+    clearance = lowest_geometry(rec, cfg.robot.jaw_bodies, model) - (top + rim)
     out.values["jaw_clearance_m"] = clearance
     if not clearance >= rules.jaw_clearance:
         out.failed.add("JAW_CLEAR")

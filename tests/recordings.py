@@ -174,7 +174,7 @@ class World:
         return self.sensordata[:, at : at + 3]
 
     def support(self, cube: int, number: int = 0) -> np.ndarray:
-        """A view of the world's force on it, or of the other cube's, shape ``(steps, 3)``."""
+        """A view of the world's force on it, the other cube's or the box's, ``(steps, 3)``."""
         at = self.stage.index.support_force[NAMES[cube]][number]
         return self.sensordata[:, at : at + 3]
 

@@ -50,7 +50,8 @@ def small_env(*overrides: str, robot: str = "so101", nworld: int = 3) -> Env:
 
 def extent(model: mujoco.MjModel, name: str) -> tuple[np.ndarray, np.ndarray]:
     geom = model.geom(name)
-    return geom.pos - geom.size, geom.pos + geom.size
+    pos = geom.pos + model.body(geom.bodyid[0]).pos
+    return pos - geom.size, pos + geom.size
 
 
 def test_the_scene_is_the_protocols(robot: str) -> None:
@@ -77,7 +78,7 @@ def test_the_scene_is_the_protocols(robot: str) -> None:
         assert (high - low)[other] >= (0.33, 0.25)[other] - 1e-9
     for part in PARTS:
         geom = model.geom(f"box_{part}")
-        assert (int(geom.bodyid[0]), int(geom.condim[0])) == (0, 3)
+        assert (model.body(geom.bodyid[0]).name, int(geom.condim[0])) == ("box", 3)
         np.testing.assert_allclose(geom.friction, [0.8, 0.005, 0.0005])
         solref = [-4444.444444, -266.666667] if part == "floor" else [0.01, 1.0]
         np.testing.assert_allclose(geom.solref, solref)
@@ -102,10 +103,9 @@ def test_the_motion_is_the_protocols(robot: str) -> None:
 
 
 @pytest.mark.full
-def test_other_scenes_have_no_box_and_pay_for_no_sensor_of_it(robot: str) -> None:
+def test_other_scenes_pay_for_no_sensor_of_supports(robot: str) -> None:
     cfg = load_config([f"robot={robot}"])
     model = build_model(cfg)
-    assert not any(model.geom(i).name.startswith("box_") for i in range(model.ngeom))
     assert model.nsensor == 4
     assert SceneIndex(model, cfg.robot, cfg.scene).support_force == {}
 
@@ -130,14 +130,14 @@ def test_sensors_tell_supports_from_jaws(robot: str) -> None:
         assert not any(pressed([*index.jaw_force[RED], *index.jaw_force[BLUE]]))
         return [pressed(index.support_force[name]) for name in (RED, BLUE)]
 
-    assert forces() == [[True, False], [True, False]]
+    assert forces() == [[True, False, False], [True, False, False]]  # world, cube, box
     mujoco.mj_resetData(model, data)
     data.qpos[red : red + 3] = [*cfg.scene.places["red_slot"].xy, top + 0.006 + 0.022]
     data.qpos[blue + 2] += 0.3
-    assert forces() == [[True, False], [False, False]]
+    assert forces() == [[False, False, True], [False, False, False]]
     mujoco.mj_resetData(model, data)
     data.qpos[red : red + 3] = np.add(data.qpos[blue : blue + 3], [0.0, 0.0, 0.044])
-    assert forces() == [[False, True], [True, True]]
+    assert forces() == [[False, True, False], [True, True, False]]
 
 
 # The start
@@ -213,15 +213,14 @@ def test_terms_know_the_box(robot: str) -> None:
     put(env, BLUE, places[BLUE], [2])
     put(env, RED, np.add(places[RED], [0.0, 0.0, 0.1]), [3])
     check = make_check(env.cfg)
-    floor = env.cfg.scene.box.floor
     offsets = {
-        name: object_to_place(env, object=name, place=check.slots[name], height=floor)
+        name: object_to_place(env, object=name, place=check.slots[name], height=0.006)
         for name in (RED, BLUE)
     }
     np.testing.assert_allclose(offsets[RED][1:3], 0.0, atol=1e-6)
     wanted = np.subtract(places[BLUE], env.sim.model.body(BLUE).pos)
     np.testing.assert_allclose(offsets[BLUE][0], wanted, atol=1e-6)
-    placed = check.placed(check.view(env).step()).int().tolist()
+    placed = check.placed(env.state).int().tolist()
     assert placed == [[0, 0], [1, 0], [1, 1], [0, 0]]
     progress = Progress(env)
     grasp_point = 0.5 * sum(env.sim.site_xpos[0, s] for s in env.index.grasp_sites)
@@ -341,10 +340,10 @@ def test_lowest_point_of_a_turned_geom(kind: str) -> None:
 @pytest.mark.parametrize(
     ("override", "parts"),
     [
-        ("scene.box.center=[0.305,0.2]", ["scene.box.center", "so that it is on the table"]),
-        ("scene.box.height=0.005", ["scene.box.height=0.005", "0.006 m"]),
-        ("scene.box.wall=-0.006", ["scene.box.wall=-0.006", "above 0"]),
-        ("scene.box.friction=[1,0.005]", ["scene.box.friction", "3 numbers"]),
+        ("task.check.into=red", ["task.check.into=red", "a part floor"]),
+        ("task.check.into=tray", ["tray", "blue, box, red"]),
+        ("scene.objects.box.yaw=0.1", ["task.check.into=box", "not turned"]),
+        ("scene.objects.box.parts.near.solref=[1]", ["near.solref", "2 numbers"]),
         ("scene.places.red_slot.xy=[0.46,0.26]", ["red_slot.xy", "a place in the box"]),
         ("scene.random_xy=[0.1]", ["scene.random_xy", "2 numbers"]),
         ("scene.random_xy=[0.1,-0.1]", ["scene.random_xy", "at least 0"]),
@@ -371,7 +370,6 @@ def test_a_bad_value_is_one_line(override: str, parts: list[str]) -> None:
         ("phases=stack", ["gate.parity.states", "approach_red"]),
         ("~controller.phases.settle_blue", ["task.check", "settle_blue"]),
         ("scene.places.red_slot.xy=null", ["red_slot"]),
-        ("scene.box.heigth=1", ["scene.box.heigth"]),
         ("timing=default timing.decimation=11", ["task.control_hz=50"]),
         ("observation.policy.terms.red_to_slot.params.object=red_cub", ["red_to_slot", "red_cub"]),
         ("reward.progress.params.scale=0", ["reward.progress.params.scale=0", "above 0"]),

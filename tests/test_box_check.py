@@ -172,11 +172,15 @@ def test_mjwarp_fills_the_box(robot: str, controller: str, device: str) -> None:
     for world in worlds:
         carry = world.steps("carry_red")
         steps = [20, carry[len(carry) // 2], -1]  # on the table, red in the air, in the box
-        felt = [
-            [np.linalg.norm(world.support(cube)[step]) > 1e-5 for cube in (RED, BLUE)]
-            for step in steps
-        ]
-        assert felt == [[True, True], [False, True], [True, True]]
+        for number, expected in (
+            (0, [[True, True], [False, True], [False, False]]),  # the world's
+            (2, [[False, False], [False, False], [True, True]]),  # the box's
+        ):
+            felt = [
+                [np.linalg.norm(world.support(cube, number)[step]) > 1e-5 for cube in (RED, BLUE)]
+                for step in steps
+            ]
+            assert felt == expected
     few = worlds[:4]
     result = feed(few, torch.float32)
     for k, world in enumerate(few):
@@ -266,8 +270,8 @@ def _edge(w: World, axis: int, by: float) -> float:
     side.
     """
     scene = w.stage.cfg.scene
-    assert scene.box is not None
-    return scene.box.center[axis] + scene.box.half[axis] - scene.objects["red"].half_height + by
+    box = scene.objects["box"]
+    return box.xy[axis] + box.parts["floor"].size[axis] - scene.objects["red"].half_height + by
 
 
 # Places: the rules that break, when, along which axis the cube is beyond the inside of the box, and
@@ -570,10 +574,9 @@ def test_a_fall_over_the_box_is_a_drop_without_phases() -> None:
         alter, color = name.rsplit("_", 1)
         cube = RED if color == "red" else BLUE
         hold = world.steps(f"hold_{color}")
-        box = world.stage.cfg.scene.box
-        assert box is not None
+        floor = 2.0 * world.stage.cfg.scene.objects["box"].parts["floor"].size[2]
         thing = world.stage.cfg.scene.objects[color]
-        rest = world.stage.cfg.scene.table_top + box.floor + thing.half_height
+        rest = world.stage.cfg.scene.table_top + floor + thing.half_height
         if alter in ("caught", "caught_late", "one_jaw"):
             for jaw in (0, 1)[: 1 if alter == "one_jaw" else 2]:
                 world.jaw(cube, jaw)[hold[: 30 if alter == "caught_late" else 1]] = 0.0

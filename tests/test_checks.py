@@ -32,7 +32,7 @@ from mjstack.tasks.parts import (
     upright,
 )
 from mjstack.tasks.placed import Placed
-from mjstack.tasks.view import Step, TaskView
+from mjstack.tasks.view import Step
 
 
 class PutCheck(EpisodeCheck):
@@ -70,7 +70,7 @@ def test_conditions_see_what_the_check_does_not_judge() -> None:
     model = build_model(cfg)
     sim = make_simulation(model, cfg, 2, backend=Backend.native, device="cpu")
     env = Stage(cfg).start(sim, NOMINAL)
-    step = TaskView(env, ["red"]).step()
+    step = Step(env, ["red"])
     blue = cfg.scene.objects["blue"]
     expected = torch.tensor([*blue.xy, cfg.scene.table_top + blue.half_height])
     torch.testing.assert_close(step.center("blue"), expected.expand(2, 3), rtol=0, atol=1e-6)
@@ -112,7 +112,7 @@ def test_a_check_of_ones_own_judges_native_worlds() -> None:
     broken = [check.rules.broken(int(bits)) for bits in result.failed]
     assert broken == [["GRASP"], ["GRASP", "AT_PLACE"], []]
     assert result.values["grasp_steps"].tolist() == [0.0, 0.0, 5.0]
-    assert check.placed(check.view(env).step())[:, 0].tolist() == [True, False, True]
+    assert check.placed(env.state)[:, 0].tolist() == [True, False, True]
     told = check.report(result)
     assert told["GRASP"] == ("grasp_steps 0", "at least 3")
     assert told["AT_PLACE"] == ("at_place_steps 20", "at least 10")
@@ -159,7 +159,7 @@ def turned_step(*overrides: str, nworld: int = 64) -> tuple[Step, np.ndarray]:
     matrices = np.empty((nworld, 9))
     for matrix, quat in zip(matrices, quats, strict=True):
         mujoco.mju_quat2Mat(matrix, quat)
-    return TaskView(env, ["red"]).step(), matrices.reshape(-1, 3, 3)[:, 2]
+    return Step(env, ["red"]), matrices.reshape(-1, 3, 3)[:, 2]
 
 
 @pytest.mark.parametrize(("number", "axis"), list(enumerate("xyz")))
@@ -199,7 +199,7 @@ def test_a_zone_has_both_ends_in_the_frame_of_its_fixture() -> None:
     """A wall that is turned by 30 degrees; red goes along its x axis, then along its y axis."""
     wall = "{size: [0.05, 0.01, 0.02], fixed: true, xy: [0.4, 0.1], yaw: 0.5235987755982988}"
     step, _ = turned_step(f"+scene.objects.wall={wall}", nworld=8)
-    env = step.view.env
+    env = step.env
     along = np.array([-0.08, 0.019, 0.021, 0.03, 0.039, 0.041, 0.03, 0.03])
     aside = np.array([0.0, 0.0, 0.0, 0.001, 0.0, 0.0, 0.003, -0.003])
     c, s = np.cos(np.pi / 6), np.sin(np.pi / 6)
@@ -208,11 +208,11 @@ def test_a_zone_has_both_ends_in_the_frame_of_its_fixture() -> None:
     env.sim.qpos[:, at : at + 2] = torch.tensor(xy).to(env.sim.qpos)
     zone = in_zone("red", "wall", low=(0.02, -0.002), high=(0.04, 0.002))
     expected = [False, False, True, True, True, False, False, False]
-    assert zone(TaskView(env, ["red"]).step()).tolist() == expected
+    assert zone(Step(env, ["red"])).tolist() == expected
     # Of both conditions, each threshold by its name
     both = zone & released("red", open_fraction=0.0)
     assert both.names == ("along_x", "along_y", "untouched", "open_fraction")
-    assert both(TaskView(env, ["red"]).step()).tolist() == expected
+    assert both(Step(env, ["red"])).tolist() == expected
 
 
 class Drawer(EpisodeCheck):
@@ -230,7 +230,7 @@ class Drawer(EpisodeCheck):
         return [InWindow("OPEN", "not open", self.up, self.t.window), *rests]
 
     def up(self, step: Step) -> torch.Tensor:
-        return step.view.env.sim.qpos[:, 0] >= self.t.least
+        return step.env.sim.qpos[:, 0] >= self.t.least
 
     def placed(self, step: Step) -> torch.Tensor:
         return self.up(step) if self.t.wrong == "shape" else self.up(step)[:, None]

@@ -278,7 +278,9 @@ def test_a_step_is_without_autograd_and_what_it_returns_is_not() -> None:
         obs, reward, *_ = env.step(move)
     env.reset(mask=mask_of(env, 1))
     env.step(zeros(env))
-    assert env.reward_manager._terms["change"].call.before.is_inference()
+    assert env.reward_manager.terms[
+        env.reward_manager.names.index("change")
+    ].call.before.is_inference()
     layer = torch.nn.Linear(obs["policy"].shape[1], 1)
     (layer(obs["policy"]).sum() * reward.sum()).backward()
     assert layer.weight.grad is not None

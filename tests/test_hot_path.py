@@ -16,6 +16,7 @@ CASTS = {"bool", "int", "float"}
 # The code that runs within a step, by file and class, "" for functions; None for all of a file.
 PATHS: dict[str, dict[str, str] | None] = {
     "envs/env.py": {"Env": "advance _step_physics _evaluate _reset_ended _begin _start"},
+    "envs/schedule.py": None,
     "envs/command_delay.py": {"CommandDelay": "late reset"},
     "envs/faults.py": {"FaultLatch": "record record_reward"},
     "envs/outputs.py": {
@@ -32,10 +33,11 @@ PATHS: dict[str, dict[str, str] | None] = {
         "RewardManager": "compute reset",
         "TerminationManager": "compute",
         "_ValueManager ResetManager": "reset",
-        "_ValueManager": "begin _term_values",
+        "_ValueManager": "_term_values",
     },
     "managers/view.py": {"": "random_uniform zero_rows"},
-    "managers/term.py": {"": "pass_value shared branches", "Term": "__call__ reset"},
+    "managers/term.py": {"Term": "__call__ reset"},
+    "managers/state.py": None,
     "mdp/observation.py": None,
     "mdp/reward.py": None,
     "mdp/geometry.py": None,
@@ -59,12 +61,11 @@ PATHS: dict[str, dict[str, str] | None] = {
     "episodes/recorder.py": {"Recorder": "update", "": "_read_world read_commands read_state"},
     "episodes/replay.py": {"": "_read_trace"},
     "mdp/starts/placement.py": {"Placement": "choose"},
-    "tasks/check.py": {"EpisodeCheck": "update placed_of"},
+    "tasks/check.py": {"EpisodeCheck": "update"},
     "tasks/view.py": {
-        "TaskView": "step clear",
         "Step": (
-            "pose pos center quat velocity turn height bounds speed corner_speed pressed tilt "
-            "in_hand untouched narrowest supported judged _judged _of_each _sensed"
+            "clear value pose pos center quat velocity turn height bounds speed corner_speed "
+            "pressed tilt in_hand untouched narrowest supported judged _judged _of_each _sensed"
         ),
         "AllOf": "__call__ apart __and__",
     },
@@ -74,18 +75,18 @@ PATHS: dict[str, dict[str, str] | None] = {
         "Carried InWindow AtRest": "update",
         "AtLeast": "holds unlocked",
     },
-    "tasks/placed.py": {"HeldSuccess": "__call__ _holds reset"},
+    "tasks/placed.py": {"HeldSuccess": "__call__ reset"},
     "tasks/stack.py": {
-        "StackCheck": "placed placed_of on_top goals",
+        "StackCheck": "placed goals",
         "StackSuccess": "_look _replace_oldest __call__",
     },
     "tasks/box.py": {
-        "BoxCheck": "airborne outside over placed goals at_slot",
+        "BoxCheck": "airborne outside over placed goals",
         "_CarriedOver _Release _Settled _Order": "update",
         "_Drop": "update holds",
         "BoxSuccess": "__init__",
     },
-    "tasks/progress.py": {"Progress": "__call__ _placed _measure"},
+    "tasks/progress.py": {"Progress": "__call__ _measure"},
     "tasks/reach.py": {"ReachCheck": "placed trace"},
     "drivers/open_loop.py": {"JointTrajectory": "command"},
     "drivers/driver.py": {"OpenLoopDriver": "command"},

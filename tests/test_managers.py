@@ -4,6 +4,7 @@ import functools
 import itertools
 import re
 import sys
+from collections.abc import Callable
 from contextlib import closing
 from types import FrameType
 from typing import Any
@@ -22,7 +23,8 @@ from mjstack.managers import (
     RewardManager,
     TerminationManager,
 )
-from mjstack.managers.term import Term, in_one_pass, shared
+from mjstack.managers.state import branches, in_one_pass, shared
+from mjstack.managers.term import Term
 from mjstack.mdp import reward as reward_terms
 from mjstack.scene import SceneIndex
 from mjstack.sim.simulation import Columns
@@ -203,19 +205,31 @@ def test_a_part_of_a_view_is_its_memory_where_columns_lie_side_by_side() -> None
     assert sim.part("site_xpos", 1).shape == (3, 3)
 
 
-def test_a_branch_knows_what_came_before_it_and_keeps_the_rest() -> None:
+def test_a_branch_knows_what_came_before_it_and_hands_on_the_rest(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def side_by_side(device: torch.device, *works: Callable[[], None]) -> None:
+        for work in works:
+            work()
+
+    monkeypatch.setattr("mjstack.managers.state.side_by_side", side_by_side)
+
     @shared
     def value(env: object, name: str) -> torch.Tensor:
         return torch.zeros(1)
 
     env = object()
 
+    def look() -> tuple[torch.Tensor, torch.Tensor]:
+        return value(env, "before"), value(env, "within")
+
     def work() -> torch.Tensor:
         before = value(env, "before")
-        assert in_one_pass(lambda: value(env, "before")) is before
         assert value(object(), "before") is not before
-        first, second = (in_one_pass(lambda: value(env, "within")) for _ in range(2))
-        assert first is not second
+        (first, one), (second, other) = branches(torch.device("cuda"), look, look)
+        assert first is second is before
+        assert one is not other  # a branch may not read another's
+        assert value(env, "within") is other
         return before
 
     assert value(env, "before") is not in_one_pass(work)
@@ -273,7 +287,7 @@ def test_terms_with_parameters_are_built_once() -> None:
     limit.reset(mask_of(env, 1))  # no memory, nothing to forget
 
 
-def test_a_term_marked_so_ignores_success() -> None:
+def test_a_term_marked_so_reads_the_state_alone() -> None:
     lift = "{func: mjstack.mdp.reward.lift, params: {object: red, height: 0.04}, weight: 1.0}"
     reach = "{func: mjstack.mdp.reward.reach, params: {object: red, scale: 0.2}, weight: 1.0}"
     rewards = (f"+reward.lift={lift}", f"+reward.reach={reach}")
@@ -282,12 +296,12 @@ def test_a_term_marked_so_ignores_success() -> None:
         for action in actions(env, 3):
             env.step(action)
         managers = (env.reward_manager, env.termination_manager)
-        marked = [t for m in managers for t in m._terms.values() if t.ignores_success]
+        marked = [t for m in managers for t in m.terms if t.reads_state]
         assert {term.label.partition(".")[2] for term in marked} == {
             *("progress", "lift", "reach", "action_rate", "joint_vel"),
             *("time_out", "object_off_table", "joint_limit", "non_finite", "overflow"),
         }
-        assert env.observation_manager.ignores_success
+        assert env.observation_manager.reads_state
         for term in [*marked, *(part.term for part in env.observation_manager._parts)]:
             values = []
             for success in (False, True):
@@ -308,7 +322,7 @@ def test_an_observation_may_read_the_success_of_its_step() -> None:
     success = f"task.success={{func: {__name__}.every_other_step}}"
     term = f"+observation.policy.terms.succeeded={{func: {__name__}.succeeded}}"
     with closing(make_env(["task=stack", "sim=native", success, term], nworld=4)) as env:
-        assert not env.observation_manager.ignores_success
+        assert not env.observation_manager.reads_state
         env.reset(seed=0)
         for number, action in enumerate(actions(env, 4)):
             _, _, terminated, _, extras = env.step(action)
@@ -333,4 +347,4 @@ def test_what_is_made_of_a_marked_term_is_not_marked() -> None:
     with closing(make_env(["task=stack", "sim=native"], nworld=2)) as env:
         for name, params in (("PaysOnce", {}), ("bonus", {"object": "red", "height": 0.04})):
             cfg = TermCfg(func=f"{__name__}.{name}", params=params)
-            assert not Term("reward.mine", cfg, env).ignores_success
+            assert not Term("reward.mine", cfg, env).reads_state

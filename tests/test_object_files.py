@@ -18,7 +18,7 @@ from mjstack.mdp.observation import fixture_pos, fixture_vel
 from mjstack.mdp.starts.starts_file import write_starts
 from mjstack.robots.guest import object_left_behind
 from mjstack.scene import build_model
-from mjstack.tasks.view import TaskView
+from mjstack.tasks.view import Step
 
 NATIVE = ("sim=native", "reset=nominal")
 BOX = [(-1, 3, 4, 2), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4)]
@@ -247,7 +247,7 @@ def test_joints_of_a_fixture(tmp_path: Path) -> None:
     env.sim.qvel[:, dof] = -0.2
     assert fixture_pos(env, joint="thing_hinge").tolist() == [0.4]
     assert fixture_vel(env, joint="thing_hinge").tolist() == [-0.2]
-    assert TaskView(env, ["red"]).step().joint("thing_hinge").tolist() == [[pytest.approx(0.4)]]
+    assert Step(env, ["red"]).joint("thing_hinge").tolist() == [[pytest.approx(0.4)]]
     refusal(lambda: fixture_pos(env, joint="hinge"), "Did you mean 'thing_hinge'")
     env.close()
 

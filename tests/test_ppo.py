@@ -26,7 +26,6 @@ from mjstack.cli import run
 from mjstack.envs import Env
 from mjstack.errors import MjstackError
 from mjstack.policy import load_policy
-from mjstack.tasks.check import make_check
 from mjstack.train.ppo import PpoLearner
 
 TINY = (
@@ -219,13 +218,13 @@ def test_the_expert_plays_at_the_beginning(tmp_path: Path) -> None:
     keys = [f"reset.expert.params.{name}={value}" for name, value in params.items()]
     env = on_new_sim("native", 16, configure("reset=expert_states", "action=ee_tilt", *keys))
     env.reset(seed=0)
-    view = make_check(env.cfg).view(env)
+    view = env.state
     for step in range(50):
         env.step(torch.zeros((16, 6)))
         if step == 0:
-            held = view.step().in_hand[:, 0].clone()
+            held = view.in_hand[:, 0].clone()
     assert 2 < held.sum() < 14
-    assert view.step().in_hand[held, 0].all()
+    assert view.in_hand[held, 0].all()
 
     written = (out / "expert_states.npz").stat().st_mtime_ns
     assert run([*command, f"job.folder={out}"]) == 0

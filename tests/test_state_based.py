@@ -153,7 +153,7 @@ def test_a_push_goes_on_from_wherever_the_arm_is(folder: Callable[[str], Path]) 
         if 45 <= step < 55:
             command[:, 1] -= 0.05
         env.step(command)
-    puck = stage.check.view(env).step()
+    puck = env.state
     assert stage.check.placed(puck).all()
     assert puck.untouched.all()
     env.close()

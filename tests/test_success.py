@@ -6,7 +6,6 @@ import csv
 import shutil
 from contextlib import closing
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -303,15 +302,15 @@ def monitor(
     n = phase.shape[1]
     counts = torch.zeros(n, dtype=torch.int32)
     sim = SimpleNamespace(qpos=torch.zeros(n, 3), qvel=torch.zeros(n, 3), overflow=counts)
-    env = SimpleNamespace(nworld=n, device=torch.device("cpu"), sim=sim, index=None, cfg=cfg)
     driver = SimpleNamespace(phase=torch.zeros(n, dtype=torch.int64), phases=build_phases(cfg))
-    view = SimpleNamespace()
-    check = SimpleNamespace(objects=make_check(cfg).objects, view=lambda _: view)
-    monkeypatch.setattr("mjstack.episodes.failures.make_check", lambda _: check)
+    state = SimpleNamespace(value=lambda condition: condition(state))
+    check = SimpleNamespace(objects=make_check(cfg).objects)
+    views = {"sim": sim, "index": None, "cfg": cfg, "check": check, "state": state}
+    env = SimpleNamespace(nworld=n, device=torch.device("cpu"), **views)
     watch = FailureMonitor()
     watch.start(env, driver)
     for step in range(len(phase)):
-        view.step = partial(SimpleNamespace, in_hand=torch.from_numpy(in_hand[step]))
+        state.in_hand = torch.from_numpy(in_hand[step])
         check.placed = lambda _, step=step: torch.from_numpy(placed[step])
         for tensor, values in ((driver.phase, phase), (sim.qpos, qpos), (sim.overflow, overflow)):
             tensor.copy_(torch.from_numpy(values[step]))

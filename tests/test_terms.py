@@ -24,6 +24,7 @@ from mjstack.mdp import termination as termination_terms
 from mjstack.mdp.geometry import source_xy
 from mjstack.tasks.check import make_check
 from mjstack.tasks.stack import StackSuccess
+from mjstack.tasks.view import Step
 
 CUBES = ("red", "blue")
 OBJECT = {"object": "red"}
@@ -430,9 +431,10 @@ def rested(rec: SimpleNamespace, *views: torch.Tensor, since: np.ndarray) -> np.
 
 
 def env_of(rec: SimpleNamespace, nworld: int) -> SimpleNamespace:
-    return SimpleNamespace(
-        nworld=nworld, device=torch.device("cpu"), cfg=rec.cfg, index=rec.index, sim=StubViews()
-    )
+    views = {"cfg": rec.cfg, "index": rec.index, "sim": StubViews(), "check": make_check(rec.cfg)}
+    env = SimpleNamespace(nworld=nworld, device=torch.device("cpu"), **views)
+    env.state = Step(env, env.check.objects)
+    return env
 
 
 FROM = 115  # where trajectories are altered: the world has been successful for a while

@@ -70,13 +70,13 @@ class DrawerCheck(EpisodeCheck):
         whole = self.cfg.task.episode_steps
 
         def still(step: Step) -> torch.Tensor:
-            return fixture_vel(step.view.env, joint=JOINT)[:, None].abs() <= t.speed
+            return fixture_vel(step.env, joint=JOINT)[:, None].abs() <= t.speed
 
         def on_rail(step: Step) -> torch.Tensor:
             return step.joint(JOINT) <= t.stop
 
         def alone(step: Step) -> torch.Tensor:
-            return (force(step.view.env, "cabinet") == 0.0)[:, None]
+            return (force(step.env, "cabinet") == 0.0)[:, None]
 
         opening = [Figure("open", unit="m", low=t.open)]
         rule = ("OPEN", "drawer not open", self.is_open, t.window)
@@ -95,13 +95,13 @@ class DrawerCheck(EpisodeCheck):
 
     def let_go(self, step: Step) -> torch.Tensor:
         """Whether nothing touches the handle, shape ``(nworld, 1)``."""
-        return (force(step.view.env, "handle") == 0.0)[:, None]
+        return (force(step.env, "handle") == 0.0)[:, None]
 
     def inside(self, step: Step) -> torch.Tensor:
         """Whether the cube is between the drawer's walls, shape ``(nworld, 3)``."""
-        env = step.view.env
+        env = step.env
         middle = env.sim.site_xpos[:, env.sim.model.site("cabinet_inside").id]
-        half = step.view.constant(*env.sim.model.site("cabinet_inside").size)
+        half = step.constant(*env.sim.model.site("cabinet_inside").size)
         return (step.center("cube") - middle).abs() <= half
 
     def placed(self, step: Step) -> torch.Tensor:

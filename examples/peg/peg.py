@@ -52,5 +52,5 @@ class PegCheck(EpisodeCheck):
 
     def trace(self, step: Step) -> dict[str, torch.Tensor]:
         """Values for a replay."""
-        away = object_to_object(step.view.env, a="peg", b="hole")
+        away = object_to_object(step.env, a="peg", b="hole")
         return {"off_m": away[:, :2].abs().amax(1), "tilt_deg": step.tilt("peg")}

@@ -129,7 +129,7 @@ def _robot(cfg: Config) -> Checks:
 
 
 def _scene(cfg: Config) -> Checks:
-    """Objects, places and the box are on the table; `scene.build` sees what they touch."""
+    """Objects and places are on the table; `scene.build` sees what they touch."""
     scene = cfg.scene
     needs_free = cfg.task.check is not None or any(map(places_objects, cfg.reset.values()))
     expected = "at least one object that is not fixed, for the check and for random starts"
@@ -172,13 +172,6 @@ def _scene(cfg: Config) -> Checks:
     for name, place in scene.places.items():
         yield "scene.places", name in scene.objects, "names that no object has"
         yield from _on_table(scene, f"scene.places.{name}.xy", place.xy, place.random_xy)
-    box = scene.box
-    if box is None:
-        return
-    expected = f"more than the floor's thickness, {box.floor:g} m"
-    yield "scene.box.height", box.height <= box.floor, expected
-    outer = [half + box.wall for half in box.half]
-    yield from _on_table(scene, "scene.box.center", box.center, outer)
 
 
 def _on_table(scene: SceneCfg, key: str, xy: list[float], edge: Sequence[float]) -> Checks:

@@ -136,8 +136,6 @@ def _complete_scene(scene: schema.SceneCfg) -> None:
             raise ConfigError(f"{key}.xy", thing.xy, expected)
     for place in scene.places.values():
         place.xy = in_world(place.xy)
-    if scene.box is not None:
-        scene.box.center = in_world(scene.box.center)
 
 
 def _find_file(key: str, file: str | None) -> str | None:

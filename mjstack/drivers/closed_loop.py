@@ -14,7 +14,6 @@ from mjstack.envs import Env
 from mjstack.managers.view import EnvView, offers
 from mjstack.math import atan2, norm
 from mjstack.mdp.geometry import jaw_forces, objects_in_hand, robot
-from mjstack.tasks.check import make_check
 
 _QUARTER = 0.5 * math.pi
 _ROLL_STEP = 0.05  # rad per step
@@ -220,7 +219,7 @@ class ClosedLoopDriver(FeedbackDriver):
         self._until_within = column(s.until_within or -1.0 for s in specs)
         self._handled = column(max(phase.grasped, phase.carried, 0) for phase in phases)
         self._numbers = torch.arange(len(objects), device=self.phase.device)
-        window = 0 if cfg.task.check is None else make_check(cfg).settle_steps
+        window = 0 if cfg.task.check is None else self._env.check.settle_steps
         self._rest = window + math.ceil(cfg.controller.rest_seconds / cfg.timing.step_dt)
 
 

@@ -15,7 +15,6 @@ from mjstack.drivers.roles import Role, find_roles
 from mjstack.managers.view import EnvView, offers
 from mjstack.math import atan2, norm, quat_to_matrix
 from mjstack.mdp.geometry import pose_w, robot
-from mjstack.tasks.check import make_check
 
 # How fast
 _SPEED = 0.5  # m/s, of the grasp point
@@ -110,8 +109,7 @@ class StateBasedDriver(FeedbackDriver):
         self.due = torch.zeros_like(self.phase)
 
         # The task: objects, the phases that move each, and its column of `EpisodeCheck.placed`
-        self._check = make_check(cfg)
-        self._view = self._check.view(env)
+        self._check = env.check
         moved = find_roles(cfg, plan)
         things = list(cfg.scene.objects)
         judged = self._check.objects
@@ -245,7 +243,7 @@ class StateBasedDriver(FeedbackDriver):
             near = norm(miss) <= _BESIDE
             between[:, k] = near & (off[:, 2] <= _BESIDE)
             grasped[:, k] = between[:, k] & (state.opening <= _SHUT)
-        placed = self._check.placed(self._view.step())
+        placed = self._env.state.value(self._check.placed)
         unknown = torch.zeros_like(placed[:, :1])  # of an object that the check does not judge
         placed = torch.cat((unknown, placed), dim=1).index_select(1, self._judged)
         places = [self._point(state, row[Role.place].expand(len(pos))) for row in self._roles]

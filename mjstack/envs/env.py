@@ -1,7 +1,7 @@
 """The environment: one step order over any simulation."""
 
 from collections.abc import Callable
-from functools import partial
+from functools import cached_property, partial
 
 import torch
 from torch import Tensor
@@ -11,17 +11,20 @@ from mjstack.envs.camera_schedule import CameraSchedule
 from mjstack.envs.command_delay import CommandDelay
 from mjstack.envs.faults import FaultLatch
 from mjstack.envs.outputs import EpisodeStatistics, Outputs, ResetResult, StepResult
+from mjstack.envs.schedule import run, step_order
 from mjstack.envs.threads import few_threads
 from mjstack.errors import ArgumentError
 from mjstack.managers.action import ActionManager
 from mjstack.managers.episode import ResetManager, RewardManager, TerminationManager
 from mjstack.managers.observation import ObservationManager
-from mjstack.managers.term import Term, branches, current_term, first_value, in_one_pass
-from mjstack.mdp.geometry import lost_state
+from mjstack.managers.state import in_one_pass, lost_state
+from mjstack.managers.term import Term, current_term, first_value
 from mjstack.rng import check_seed
 from mjstack.scene import SceneIndex
 from mjstack.sim import Simulation
-from mjstack.sim.graph import StepGraph, side_by_side, where_any
+from mjstack.sim.graph import StepGraph, where_any
+from mjstack.tasks.check import EpisodeCheck, make_check
+from mjstack.tasks.view import Step
 
 
 class Env:
@@ -67,7 +70,10 @@ class Env:
         cameras: What draws them, with the names in their segmentation; None without cameras.
     """
 
+    termination_manager: TerminationManager
+    reward_manager: RewardManager
     observation_manager: ObservationManager
+    faults: FaultLatch
 
     def __init__(
         self,
@@ -136,6 +142,16 @@ class Env:
         self._outputs = Outputs(self)
         self.faults = FaultLatch(self, check=check_faults)
         self.graph = self.captured(self.advance, "env.step")
+
+    @cached_property
+    def check(self) -> EpisodeCheck:
+        """The task's check, which terms, drivers and observers of this environment share."""
+        return make_check(self.cfg)
+
+    @cached_property
+    def state(self) -> Step:
+        """The state of the check's objects, without phases, which they share too."""
+        return Step(self, self.check.objects, force=self.check.force)
 
     @property
     def max_episode_steps(self) -> int:
@@ -288,56 +304,21 @@ class Env:
         """
         self.episode_step += 1 if ended is None else ~ended
 
-        def look() -> tuple[Tensor, Tensor | None]:
-            ends = self.termination_manager
-            rewards = self.reward_manager
-            observations = self.observation_manager
-            # A held step is seen by what remembers it alone.
-            observe = (observations.compute,) if last or observations.remembers else ()
-            early = observe if observations.ignores_success else ()
+        def evaluate() -> bool:
+            run(self.device, step_order(self, self._outputs, ended, last))
+            current_term.label = ""
+            self.faults.look()
+            return lost_state(self) is not self.sim.no_worlds
 
-            def begin_ends() -> Tensor:
-                lost = lost_state(self)
-                ends.begin()
-                return lost
-
-            succeed = partial(self.success_term or (lambda _: self.sim.no_worlds), self)
-            begun = [partial(rewards.begin, name) for name in rewards.early]
-            achieved, lost, *_ = branches(self.device, succeed, begin_ends, *begun, *early)
-            # None where the host can see that there are none
-            none_lost = lost is self.sim.no_worlds or not (lost.is_cuda or bool(lost.any()))
-            broken = None if none_lost else lost
-            if ended is not None:  # their success stays
-                achieved = torch.where(ended, self.success, achieved)
-            torch.gt(achieved, lost, out=self.success)  # achieved and not lost
-
-            def reward() -> None:
-                ends.compute(ended)
-                rewards.compute(void=broken, ended=ended)
-                if lost.is_cuda:  # elsewhere the host looks
-                    self.faults.record_reward()
-
-            def keep() -> None:
-                for compute in () if early else observe:
-                    compute()
-                if last:
-                    record = [partial(self.faults.record, lost)] if lost.is_cuda else []
-                    side_by_side(self.device, partial(self._outputs.write_final, broken), *record)
-
-            branches(self.device, reward, keep)
-            return lost, broken
-
-        lost, broken = in_one_pass(look)
-        current_term.label = ""
-        self.faults.look(lost, broken)
+        maybe_lost = in_one_pass(evaluate)
         done = self.termination_manager.done
         if last:
-            self._reset_ended(done, broken)
+            self._reset_ended(done, maybe_lost)
         return None if last else done.clone()
 
-    def _reset_ended(self, done: Tensor, broken: Tensor | None) -> None:
+    def _reset_ended(self, done: Tensor, maybe_lost: bool) -> None:
         """Terminal images, statistics, the reset of the worlds that are ``done``, and what is
-        observed then. Of ``broken`` worlds the state is not finite; None if there are none.
+        observed then. The host sees where it cannot be that a state is not finite.
         """
         # On CUDA the host cannot look, because that would stop the device: the graph does.
         ending = self.termination_manager.values.shape[1] > 0 and (done.is_cuda or bool(done.any()))
@@ -349,7 +330,7 @@ class Env:
         self._draws.draw_ended(done)
         if ending:
             where_any(done, restart)
-        elif broken is not None:
+        elif maybe_lost:
             self._outputs.restore_observations()
 
     def _begin(self, mask: Tensor) -> None:

@@ -4,10 +4,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from mjstack.config.functions import offered
 from mjstack.errors import FaultError, name_worlds
+from mjstack.managers.state import lost_state
 from mjstack.math import all_finite, not_finite
 from mjstack.sim import LOST_PHYSICS, BatchSizes, Overflow, Simulation, describe_overflow
 
@@ -50,18 +50,17 @@ class FaultLatch:
         self._lost = POOL if "overflow" in ends_on else LOST_PHYSICS
         self._state_ends = "non_finite" in ends_on
 
-    def look(self, lost: Tensor, broken: Tensor | None) -> None:
+    def look(self) -> None:
         """Record the faults of a step and raise the first, on the CPU; a short look at all numbers
-        shows that there are none. Takes worlds whose state is not finite, shape ``(nworld,)``,
-        bool; ``broken`` is None if there are none.
+        shows that there are none.
         """
-        if lost.is_cuda or not self._check:
+        if self._reward.is_cuda or not self._check:
             return
         env = self._env
         numbers = (env.reward_manager.reward, *env.observation_manager.groups.values())
-        fine = broken is None and not self._any and all_finite(*numbers)
+        fine = not self._any and lost_state(env) is self._none and all_finite(*numbers)
         if not fine or bool(env.sim.overflow.any()):
-            self.record(lost)
+            self.record()
             self.record_reward()
             self.raise_first()
 
@@ -71,10 +70,8 @@ class FaultLatch:
         if self._check and self._faults.is_cuda and self._steps % FAULT_WINDOW == 0:
             self.raise_first()
 
-    def record(self, broken: Tensor) -> None:
-        """Add the faults of a step except for its reward's, before a reset can erase them, with the
-        worlds whose state is not finite, shape ``(nworld,)``, bool.
-        """
+    def record(self) -> None:
+        """Add the faults of a step except for its reward's, before a reset can erase them."""
         if not self._check:
             return
         env = self._env
@@ -82,9 +79,10 @@ class FaultLatch:
         self._overflow |= env.sim.overflow & self._lost
         groups = env.observation_manager.groups.values()
         seen = not_finite(*groups) if groups else self._none
-        state = self._none if self._state_ends else broken
+        lost = lost_state(env)
+        state = self._none if self._state_ends else lost
         # In a world that is broken the observation adds nothing: True is more than False
-        faults = (env.action_manager.not_finite(), state, self._none, seen > broken)
+        faults = (env.action_manager.not_finite(), state, self._none, seen > lost)
         self._faults |= torch.stack(faults, dim=1)
 
     def record_reward(self) -> None:

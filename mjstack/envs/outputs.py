@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from mjstack.managers.state import lost_state
+
 if TYPE_CHECKING:
     from mjstack.envs.env import Env
 
@@ -26,19 +28,20 @@ class Outputs:
         self._final = {name: torch.zeros_like(group) for name, group in self._groups.items()}
         self._final_success = torch.zeros_like(env.success)
 
-    def write_final(self, broken: Tensor | None) -> None:
+    def write_final(self) -> None:
         """Keep success and the observations of this step, before a reset changes them. Those of
-        ``broken`` worlds, whose state is not finite, shape ``(nworld,)``, bool, or None, are 0
-        where they are NaN, which a value times 0 would hand on.
+        worlds whose state is not finite are 0 where they are NaN, which a value times 0 would hand
+        on.
         """
+        lost = lost_state(self._env)
         self._final_success.copy_(self._env.success)
         for name, final in self._final.items():
             group = self._groups[name]
-            if broken is None:
+            if lost is self._env.sim.no_worlds:
                 final.copy_(group)
             else:
                 finite = group.nan_to_num(0.0, 0.0, 0.0)
-                torch.where(broken[:, None], finite, group, out=final)
+                torch.where(lost[:, None], finite, group, out=final)
 
     def restore_observations(self) -> None:
         """Make the final observations the current ones, where no world is reset."""

@@ -10,7 +10,6 @@ from mjstack.envs import Env
 from mjstack.episodes.rollout import Observer
 from mjstack.math import not_finite
 from mjstack.sim.simulation import LOST_PHYSICS
-from mjstack.tasks.check import make_check
 
 GONE_STEPS = 3  # in a row without load on both jaws: less may be a touch in passing
 
@@ -71,8 +70,7 @@ class FailureMonitor(Observer):
         """Read what belongs where, and allocate for the environment's worlds."""
         super().start(env, driver)
         device = env.device
-        self._check = make_check(env.cfg)
-        self._view = self._check.view(env)
+        self._check = env.check
         # Numbers of objects are the check's. Without phases there is one, which moves nothing.
         names = list(env.cfg.scene.objects)
         column = {names.index(name): place for place, name in enumerate(self._check.objects)}
@@ -97,9 +95,8 @@ class FailureMonitor(Observer):
         """Process the end of a step. Fixed shapes, no host read."""
         sim = self.env.sim
         phase = self.driver.phase
-        step = self._view.step()
-        loaded = step.in_hand
-        placed = self._check.placed(step)
+        loaded = self.env.state.in_hand
+        placed = self.env.state.value(self._check.placed)
 
         lost = not_finite(sim.qpos, sim.qvel) | ((sim.overflow & LOST_PHYSICS) != 0)
         entered = phase > self._at

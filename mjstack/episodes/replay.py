@@ -9,8 +9,7 @@ from mjstack.envs import Env
 from mjstack.episodes.recorder import Channels, Read, Recorder, read_state
 from mjstack.episodes.rollout import Episode
 from mjstack.sim import describe_overflow
-from mjstack.tasks.check import make_check
-from mjstack.tasks.view import TaskView
+from mjstack.tasks.view import Step
 
 
 def _read_start(env: Env, driver: Driver) -> Read:
@@ -22,18 +21,16 @@ def _read_start(env: Env, driver: Driver) -> Read:
 def _read_trace(env: Env, driver: Driver) -> Read:
     """State, objects and the check's values, by name in the file."""
     state = read_state(env, driver)
-    check = make_check(env.cfg)
-    task = check.view(env)
-    free = TaskView(env, list(env.cfg.scene.free))
+    check = env.check
+    objects = Step(env, list(env.cfg.scene.free))
 
     def read() -> dict[str, Tensor]:
-        objects = free.step()
         return {
             **state(),
             "object_pos_m": objects.pos,
             "object_speed_m_per_s": objects.speed,
             "object_height_m": objects.height,
-            **check.trace(task.step()),
+            **check.trace(env.state),
             "phase": driver.phase,
         }
 
@@ -62,7 +59,7 @@ class WorldTrace(Recorder):
     def explain(self, episode: Episode) -> list[str]:
         """A line for each rule. Whether it held is the check's result; the numbers say why."""
         sim = self.env.sim
-        check = make_check(self.env.cfg)
+        check = self.env.check
         bits = int(episode.failed[0])
         finite = np.isfinite(np.hstack((self.arrays["qpos"], self.arrays["qvel"]))).all(1)
         lost = int(finite.argmin())  # the first step, if any

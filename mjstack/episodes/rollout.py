@@ -14,11 +14,12 @@ from mjstack.drivers.driver import Driver, find_driver
 from mjstack.envs import Env
 from mjstack.envs.buffers import Advance
 from mjstack.errors import ConfigError
+from mjstack.managers.state import in_one_pass
 from mjstack.managers.term import current_term
 from mjstack.mdp.geometry import place_xy, pose_w
 from mjstack.sim import Simulation
 from mjstack.sim.graph import StepGraph
-from mjstack.tasks.check import CheckResult, make_check
+from mjstack.tasks.check import CheckResult
 
 Reset = dict[str, TermCfg]
 
@@ -96,12 +97,15 @@ def rollout(
         observer.start(env, driver)
 
     # A step, and its graph
-    def work() -> None:
-        current_term.label = "controller"
-        env.action_manager.process(driver.command())
-        env.advance()
+    def updates() -> None:
         for observer in observers:
             observer.update()
+
+    def work() -> None:
+        current_term.label = "controller"
+        env.action_manager.process(in_one_pass(driver.command))
+        env.advance()
+        in_one_pass(updates)
 
     play = env.captured(work, "a step of the episode")
     # On Warp's CPU device physics alone is captured, once for all episodes.
@@ -281,20 +285,19 @@ class Judge(Observer):
     @override
     def start(self, env: Env, driver: Driver) -> None:
         super().start(env, driver)
-        self.result = CheckResult(torch.zeros(env.nworld, dtype=torch.int32), {}, {}, False)
-        self._check = make_check(env.cfg) if env.cfg.task.check is not None else None
-        if self._check is not None:
-            self._check.start(env, driver.steps, driver.phases)
+        self.result = CheckResult(torch.zeros(env.nworld, dtype=torch.int32), {}, False)
+        if env.check is not None:
+            env.check.start(env, driver.steps, driver.phases)
 
     @override
     def update(self) -> None:
-        if self._check is not None:
-            self._check.update(self.driver.phase)
+        if self.env.check is not None:
+            self.env.check.update(self.driver.phase)
 
     @override
     def finish(self) -> None:
-        if self._check is not None:
-            self.result = self._check.result()
+        if self.env.check is not None:
+            self.result = self.env.check.result()
 
 
 @dataclass(eq=False)

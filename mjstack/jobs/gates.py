@@ -116,7 +116,7 @@ def _try_check(stage: Stage) -> None:
         check.start(env, 1)
         check.update()
         check.result()
-        placed = check.placed(check.view(env).step())
+        placed = check.placed(env.state)
         expected = describe_tensor(torch.zeros((env.nworld, len(check.objects) or 1)) > 0)
         if (actual := describe_tensor(placed)) != expected:
             raise MjstackError(f"placed: {actual}, expected {expected}, of two worlds")

@@ -14,7 +14,6 @@ from mjstack.managers.observation import ObservationManager
 from mjstack.managers.view import (
     EnvView,
     episode_draw,
-    ignores_success,
     offers,
     random_uniform,
     uses_fields,
@@ -29,7 +28,6 @@ __all__ = [
     "RewardManager",
     "TerminationManager",
     "episode_draw",
-    "ignores_success",
     "offers",
     "random_uniform",
     "required_fields",

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from mjstack.config.functions import offered
 from mjstack.config.schema import RewardTermCfg, TermCfg, TerminationTermCfg
+from mjstack.managers.state import lost_state
 from mjstack.managers.term import Term, blamed, first_value, render_table
 from mjstack.managers.view import EnvView, zero_rows
 
@@ -48,37 +49,28 @@ def required_fields(*resets: Mapping[str, TermCfg]) -> tuple[str, ...]:
 
 
 class _ValueManager:
-    """Terms that give every world a value at every step, by name; ``early`` are those that do not
-    read the task's success.
+    """Terms that give every world a value at every step; ``early`` are those that read the state
+    alone.
     """
 
     def __init__(
         self, kind: str, env: EnvView, cfg: Mapping[str, TermCfg], dtype: torch.dtype
     ) -> None:
         self._env = env
-        self._terms = {name: Term(f"{kind}.{name}", term, env) for name, term in cfg.items()}
-        for term in self._terms.values():
+        self.terms = [Term(f"{kind}.{name}", term, env) for name, term in cfg.items()]
+        for term in self.terms:
             first_value(term, env, boolean=dtype is torch.bool)
-        self.names = list(self._terms)
-        self.early = [name for name, term in self._terms.items() if term.ignores_success]
-        self._early: dict[str, Tensor] = {}
+        self.early = [term for term in self.terms if term.reads_state]
+        self.names = list(cfg)
         self.values = torch.zeros((env.nworld, len(cfg)), dtype=dtype, device=env.device)
 
-    def begin(self, *names: str) -> None:
-        """Compute terms of `early`, by default all, beside the task's success or each other."""
-        for name in names or self.early:
-            self._early[name] = self._terms[name](self._env)
-
     def _term_values(self) -> list[Tensor]:
-        """The value of every term, in order. `begin` has computed some of them."""
-        early, self._early = self._early, {}
-        return [
-            early[name] if name in early else term(self._env) for name, term in self._terms.items()
-        ]
+        """The value of every term, in order."""
+        return [term(self._env) for term in self.terms]
 
     def reset(self, mask: Tensor) -> None:
         """Clear what the terms keep of the masked worlds."""
-        for term in self._terms.values():
+        for term in self.terms:
             term.reset(mask)
 
 
@@ -109,22 +101,21 @@ class RewardManager(_ValueManager):
         self.reward = self.values.sum(1)
         self.episode_sums = torch.zeros_like(self.values)
 
-    def compute(self, void: Tensor | None = None, ended: Tensor | None = None) -> Tensor:
-        """Write `values` and `reward`, and return `reward`.
+    def compute(self, ended: Tensor | None = None) -> Tensor:
+        """Write `values` and `reward`, and return `reward`. A world whose state is not finite gets
+        none for this step.
 
         Args:
-            void: Worlds whose state is not finite, shape ``(nworld,)``, bool: they get no reward
-                for this step.
             ended: Within a decision that holds its action for several control steps: worlds whose
                 episode ended in an earlier one, which get no reward, shape ``(nworld,)``, bool. The
                 rewards of the others are added to those before.
         """
         before = None if ended is None else self.values.clone()
-        if self._terms:
+        if self.terms:
             torch.stack(self._term_values(), dim=1, out=self.values)
             self.values *= self.weights
-        for worthless in (void, ended):
-            if worthless is not None:
+        for worthless in (lost_state(self._env), ended):
+            if worthless is not None and worthless is not self._env.sim.no_worlds:
                 self.values.masked_fill_(worthless[:, None], 0.0)
         self.episode_sums += self.values
         if before is not None:
@@ -173,17 +164,17 @@ class TerminationManager(_ValueManager):
             ended: Worlds whose episode ended in an earlier control step of the same decision, shape
                 ``(nworld,)``, bool: they stay ended as they were.
         """
-        if not self._terms:
+        if not self.terms:
             return
         values = self._term_values()
         if ended is not None:
             earlier = self.values.unbind(1)
             values = [torch.where(ended, *pair) for pair in zip(earlier, values, strict=True)]
         torch.stack(values, dim=1, out=self.values)
+        # ``terminated`` by any term that counts as such, ``done`` by any term at all; in one call
         torch.any(self.values & self._counts, dim=2, out=self._ended)
-        # Where both hold, the state itself ended the episode: there is nothing left to bootstrap
-        # from.
-        torch.bitwise_xor(self.done, self.terminated, out=self.truncated)
+        # A world that both ended is terminated: there is nothing left to bootstrap from.
+        torch.gt(self.done, self.terminated, out=self.truncated)
 
     def __str__(self) -> str:
         rows = [

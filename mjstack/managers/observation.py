@@ -145,7 +145,7 @@ class ObservationManager:
             columns.
         groups: The tensors, by group. They are written anew at every step.
         remembers: Whether a term has a history, which needs every control step.
-        ignores_success: Whether all terms are marked as such.
+        reads_state: Whether all terms are marked as reading the state alone, see `offers`.
     """
 
     def __init__(self, env: EnvView, cfg: Mapping[str, ObservationGroupCfg]) -> None:
@@ -168,7 +168,7 @@ class ObservationManager:
         empty = torch.full((env.nworld, 1), math.nan, dtype=torch.float32, device=env.device)
         self.groups = {name: empty.repeat(1, dim) for name, dim in self.group_dims.items()}
         self._parts = [p for group in self._groups.values() for p in group.parts.values()]
-        self.ignores_success = all(part.term.ignores_success for part in self._parts)
+        self.reads_state = all(part.term.reads_state for part in self._parts)
         self._clips = any(part.cfg.clip for part in self._parts)
         self._scales = any(part.cfg.scale != 1.0 for part in self._parts)
         # Limits and scale of each column of one step

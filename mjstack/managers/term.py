@@ -4,10 +4,9 @@ import inspect
 import io
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from contextvars import ContextVar, copy_context
-from functools import partial, wraps
+from functools import partial
 from types import SimpleNamespace, UnionType
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import torch
 from rich.console import Console
@@ -18,11 +17,9 @@ from mjstack.config.fields import Range, check_fields
 from mjstack.config.functions import resolve_func
 from mjstack.config.schema import TermCfg
 from mjstack.errors import ConfigError, MjstackError, ParameterError, TermError, first_line, suggest
+from mjstack.managers.state import once
 from mjstack.managers.view import EnvView
 from mjstack.math import describe_tensor
-from mjstack.sim.graph import side_by_side
-
-Result = TypeVar("Result")
 
 _WORDS = {float: "a number", int: "an integer", bool: "true or false", str: "a name"}
 _WORDS |= {type(None): "null"}
@@ -110,64 +107,6 @@ def blamed(label: str) -> Iterator[None]:
 # Dotted configuration key of the term that was called last: the one to name if a capture fails
 current_term = SimpleNamespace(label="")
 
-# Values computed from the state that a pass looks at, by function and environment; None outside.
-_pass_values: ContextVar[dict[Any, Any] | None] = ContextVar("_pass_values", default=None)
-
-
-def in_one_pass(work: Callable[[], Result]) -> Result:
-    """The result of work that does not change the state: a value that several terms need is
-    computed once.
-
-    A nested pass starts with the outer cache and does not write back: it may run as a parallel
-    branch of a CUDA graph. The values belong to a context, which Python leaves however the work
-    ends: a ``finally`` clause that Ctrl-C cuts short would leave old values to later steps.
-    """
-    context = copy_context()
-    context.run(_pass_values.set, dict(_pass_values.get() or {}))
-    return context.run(work)
-
-
-def branches(device: torch.device, *works: Callable[[], Any]) -> list[Any]:
-    """Results of independent works of one pass. Later ones know the values that earlier ones have
-    computed, except on CUDA, where they are branches of a graph.
-    """
-    if device.type != "cuda":
-        return [work() for work in works]
-    results: list[Any] = [None] * len(works)
-
-    def keep(number: int, work: Callable[[], Any]) -> None:
-        results[number] = in_one_pass(work)
-
-    side_by_side(device, *(partial(keep, *pair) for pair in enumerate(works)))
-    return results
-
-
-def known_values() -> dict[Any, Any]:
-    """Values that the current pass has computed, to read and add to; outside a pass a new dict."""
-    values = _pass_values.get()
-    return {} if values is None else values
-
-
-def pass_value(key: Any, compute: Callable[..., Any], /, *args: Any, **named: Any) -> Any:
-    """The value of this key in the current pass, computed where it is asked for first."""
-    values = known_values()
-    if key not in values:
-        values[key] = compute(*args, **named)
-    return values[key]
-
-
-def shared(compute: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """Make a function of an environment, and perhaps of names, compute a value once in a pass. No
-    term may write into it.
-    """
-
-    @wraps(compute)
-    def value(env: EnvView, *names: str, **named: str) -> Tensor:
-        key = (id(env), compute, *names, *named.items())
-        return pass_value(key, compute, env, *names, **named)
-
-    return value
-
 
 class Term:
     """A term ready to be called: a function with its parameters, or an instance of a class built
@@ -197,7 +136,7 @@ class Term:
         is_class = inspect.isclass(func)
         check_params(label, func, self.params, 1 if is_class or not masked else 2)
         self.model_fields: Sequence[str] = getattr(func, "model_fields", ())  # that it writes
-        self.ignores_success = getattr(func, "ignores_success", None) is func
+        self.reads_state = getattr(func, "reads", None) == ("state", func)
         self.call: Any = partial(func, **self.params)
         if is_class:
             with blamed(label):
@@ -205,15 +144,13 @@ class Term:
             if hasattr(func, "label"):
                 self.call.label = label
         self.has_memory = hasattr(self.call, "reset")  # from step to step
-        # Two groups may need the same: a function of the state gives both the same value, while
-        # others may keep something.
-        key = (id(env), func, repr(sorted(self.params.items())))
-        self._key = None if is_class or masked else key
+        # Two groups may need the same function of the state.
+        self._key = self if is_class else (func, repr(sorted(self.params.items())))
 
     def __call__(self, *args: Any) -> Any:
-        """Call the term with the environment, and a mask if it takes one."""
+        """Call the term with the environment, and a mask if it takes one; once in a pass."""
         current_term.label = self.label
-        return self.call(*args) if self._key is None else pass_value(self._key, self.call, *args)
+        return once((self._key, *args), self.call, *args)
 
     def reset(self, mask: Tensor) -> None:
         """Let a term with a memory forget the masked worlds."""

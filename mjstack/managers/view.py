@@ -50,6 +50,14 @@ class EnvView(Protocol):
     success: Tensor
     given_places: dict[str, Tensor]
 
+    @property
+    def check(self) -> Any:
+        """The task's check, an `EpisodeCheck`, made where it is asked for first."""
+
+    @property
+    def state(self) -> Any:
+        """The state of the check's objects, a `Step`."""
+
 
 def offers(kind: str = "", /, **attributes: Any) -> Callable[[Any], Any]:
     """Mark a term with its kind, and with what others may ask of it.
@@ -63,7 +71,9 @@ def offers(kind: str = "", /, **attributes: Any) -> Callable[[Any], Any]:
     where it ends such worlds; of a reset term ``reads_file``, where its parameter ``path`` names a
     file of starts, ``places_objects``, where its parameter ``xy`` is a region, ``joint_noise``,
     where its parameter ``arm`` moves the arm's joints; ``starts_midway``, where worlds start in the
-    middle of an episode.
+    middle of an episode; ``reads="state"`` of a reward, termination or observation that reads
+    neither ``env.success`` nor what another term or manager writes: CUDA may compute it beside
+    them. A subclass, or a function that wraps it, has to say so again.
 
     Example:
         >>> @offers("observation term", unit="m")
@@ -74,19 +84,10 @@ def offers(kind: str = "", /, **attributes: Any) -> Callable[[Any], Any]:
 
     def mark(term: Any) -> Any:
         for name, value in attributes.items():
-            setattr(term, name, value)
+            setattr(term, name, (value, term) if name == "reads" else value)
         return term
 
     return mark
-
-
-def ignores_success(term: Any) -> Any:
-    """Mark a reward, termination or observation term that reads neither ``env.success`` nor what
-    another term or manager writes: CUDA may compute it beside them. A subclass, or a function that
-    wraps it, is not marked.
-    """
-    term.ignores_success = term
-    return term
 
 
 def uses_fields(*names: str) -> Callable[[Any], Any]:

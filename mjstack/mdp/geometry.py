@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from mjstack.errors import require_names
-from mjstack.managers.term import shared
+from mjstack.managers.state import shared
 from mjstack.managers.view import EnvView, episode_draw
-from mjstack.math import all_finite, lowest_point, norm, not_finite
+from mjstack.math import constant, lowest_point, norm
 from mjstack.scene.index import RobotTensors, SceneIndex
 from mjstack.sim.simulation import Simulation
 
@@ -57,21 +57,11 @@ def pose_w(env: EnvView, name: str) -> Tensor:
     """
     if name not in env.index.fixed:
         return env.sim.part("qpos", env.index.object_columns(name)[0])
-    pose = env.index.constant(env.index.fixed[name], env.sim.qpos).expand(env.nworld, -1)
+    pose = constant(env.index.fixed[name], env.sim.qpos).expand(env.nworld, -1)
     body = env.index.bodies[name]
     parts = {"body_pos": pose[:, :3], "body_quat": pose[:, 3:]}
     moved = [env.sim.fields[f][:, body] if f in env.sim.fields else parts[f] for f in parts]
     return pose if parts.keys().isdisjoint(env.sim.fields) else torch.cat(moved, dim=1)
-
-
-@shared
-def lost_state(env: EnvView) -> Tensor:
-    """Whether a state is not finite, shape ``(nworld,)``, bool; ``sim.no_worlds`` where the host
-    can see that none is. Do not write into it.
-    """
-    sim = env.sim
-    fine = all_finite(sim.qpos, sim.qvel)
-    return sim.no_worlds if fine else not_finite(sim.qpos, sim.qvel)
 
 
 @shared
@@ -97,9 +87,8 @@ def place_xy(env: EnvView, name: str) -> Tensor:
         return env.given_places[name].index_select(0, env.world)
     place = places[name]
     if not any(place.random_xy):
-        return env.index.constant(place.xy, env.sim.qpos).expand(env.nworld, -1)
+        return constant(place.xy, env.sim.qpos).expand(env.nworld, -1)
     draw = episode_draw(env, name, 2)
-    constant = env.index.constant
     return constant(place.xy, draw) + constant(place.random_xy, draw) * draw
 
 

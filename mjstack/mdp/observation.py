@@ -1,24 +1,19 @@
 """Observation terms: functions of the environment that return ``(nworld,)`` or ``(nworld, d)``."""
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from mjstack.errors import require_names
-from mjstack.managers.term import shared
-from mjstack.managers.view import EnvView, ignores_success, offers
+from mjstack.managers.state import shared
+from mjstack.managers.view import EnvView, offers
+from mjstack.math import constant
 from mjstack.mdp.geometry import jaw_forces, place_xy, pose_w, robot
 
-
-def _in(unit: str | Sequence[str]) -> Callable[[Any], Any]:
-    """Mark an observation of the state alone with its unit."""
-    return lambda term: ignores_success(offers("observation term", unit=unit)(term))
-
-
-_in_metres = _in("m")
-_by_joint = _in("joint")
+_in = partial(offers, "observation term", reads="state")
+_in_metres = _in(unit="m")
+_by_joint = _in(unit="joint")
 
 
 @_by_joint
@@ -33,7 +28,7 @@ def joint_pos_relative(env: EnvView) -> Tensor:
     return joint_pos(env) - robot(env).home
 
 
-@_in("joint/s")
+@_in(unit="joint/s")
 def joint_vel(env: EnvView) -> Tensor:
     """Joint velocities [rad/s, m/s], shape ``(nworld, n)``."""
     return env.sim.part("qvel", robot(env).qvel)
@@ -83,7 +78,7 @@ def object_to_place(env: EnvView, *, object: str, place: str, height: float = 0.
     return torch.cat((place_xy(env, place) - at[:, :2], height - at[:, 2:]), dim=1)
 
 
-@_in(("m",) * 3 + ("1",) * 4)
+@_in(unit=("m",) * 3 + ("1",) * 4)
 def object_pose(env: EnvView, *, object: str) -> Tensor:
     """Position [m] and quaternion (wxyz), world frame, shape ``(nworld, 7)``."""
     return pose_w(env, object)
@@ -110,7 +105,7 @@ def goals(env: EnvView) -> Tensor:
     return torch.cat([env.sim.qpos[:, :0], *places], dim=1)
 
 
-@_in("1")
+@_in(unit="1")
 def headings(env: EnvView) -> Tensor:
     """How the boxes that can move are turned about z: cosine and sine of four times the yaw of
     each, which are the same after a quarter turn, shape ``(nworld, 2 * boxes)``.
@@ -129,31 +124,29 @@ def headings(env: EnvView) -> Tensor:
     return torch.stack((cos, sin), dim=2).flatten(1)
 
 
-@_in(("m/s",) * 3 + ("rad/s",) * 3)
+@_in(unit=("m/s",) * 3 + ("rad/s",) * 3)
 def object_velocity(env: EnvView, *, object: str) -> Tensor:
     """Linear [m/s, world frame] and angular [rad/s, body frame] velocity, shape ``(nworld, 6)``."""
     if object in env.index.fixed:
-        return env.index.constant([0.0] * 6, env.sim.qvel).expand(env.nworld, -1)
+        return constant([0.0] * 6, env.sim.qvel).expand(env.nworld, -1)
     return env.sim.part("qvel", env.index.object_columns(object)[1])
 
 
-@ignores_success
-@offers("observation term")
+@_in()
 def fixture_pos(env: EnvView, *, joint: str) -> Tensor:
     """Position of a fixture's joint [rad, m], shape ``(nworld,)``. Not to be written into."""
     require_names("joint of a fixture", [joint], env.index.joints)
     return env.sim.part("qpos", env.index.joints[joint][0])
 
 
-@ignores_success
-@offers("observation term")
+@_in()
 def fixture_vel(env: EnvView, *, joint: str) -> Tensor:
     """Velocity of a fixture's joint [rad/s, m/s], shape ``(nworld,)``. Not to be written into."""
     require_names("joint of a fixture", [joint], env.index.joints)
     return env.sim.part("qvel", env.index.joints[joint][1])
 
 
-@_in("N")
+@_in(unit="N")
 def jaw_force(env: EnvView, *, object: str) -> Tensor:
     """Size of each jaw's contact force on an object [N], shape ``(nworld, 2)``."""
     return jaw_forces(env.index, env.sim, object)

@@ -4,13 +4,13 @@ import torch
 from torch import Tensor
 
 from mjstack.config.fields import Positive
-from mjstack.managers.view import EnvView, ignores_success
+from mjstack.managers.view import EnvView, offers
 from mjstack.math import norm
 from mjstack.mdp import observation
 from mjstack.mdp.geometry import above_table
 
 
-@ignores_success
+@offers(reads="state")
 def reach(env: EnvView, *, object: str, scale: Positive, height: float = 0.0) -> Tensor:
     """Nearness of the grasp point to a point above an object: ``1 - tanh(distance / scale)``.
 
@@ -24,7 +24,7 @@ def reach(env: EnvView, *, object: str, scale: Positive, height: float = 0.0) ->
     return 1.0 - torch.tanh(norm(offset) / scale)
 
 
-@ignores_success
+@offers(reads="state")
 def lift(env: EnvView, *, object: str, height: Positive) -> Tensor:
     """Height of an object's lowest point above the table as a fraction of ``height`` [m], from 0 to
     1.
@@ -37,13 +37,13 @@ def success(env: EnvView) -> Tensor:
     return env.success.to(torch.float32)
 
 
-@ignores_success
+@offers(reads="state")
 def action_rate(env: EnvView) -> Tensor:
     """Squared change of the action since the last step, summed."""
     return (env.action - env.previous_action).square().sum(1)
 
 
-@ignores_success
+@offers(reads="state")
 def joint_vel(env: EnvView) -> Tensor:
     """Squared joint velocities [rad^2/s^2], summed."""
     return observation.joint_vel(env).square().sum(1)

@@ -6,14 +6,16 @@ import torch
 from torch import Tensor
 
 from mjstack.config.fields import Count, NotNegative
-from mjstack.managers.view import EnvView, ignores_success, offers
-from mjstack.mdp.geometry import lost_state, robot
+from mjstack.managers.state import lost_state
+from mjstack.managers.view import EnvView, offers
+from mjstack.math import constant
+from mjstack.mdp.geometry import robot
 from mjstack.mdp.observation import joint_pos
 from mjstack.sim import LOST_PHYSICS
 from mjstack.sim.simulation import Columns
 
 
-@ignores_success
+@offers(reads="state")
 def time_out(env: EnvView, *, steps: Count) -> Tensor:
     """After this many steps."""
     return env.episode_step >= steps
@@ -32,7 +34,7 @@ def _outside(values: Tensor, low: Tensor, high: Tensor) -> Tensor:
     return ((values < low) | (values > high)).any(1)
 
 
-@ignores_success
+@offers(reads="state")
 class ObjectOffTable:
     """When an object's centre is beside the table or below its top."""
 
@@ -40,7 +42,7 @@ class ObjectOffTable:
         scene = env.cfg.scene
         x, y, _ = scene.table_half
         triples = ([*scene.table_center[:2], 0.0], [-x, -y, scene.table_top], [x, y, math.inf])
-        numbers = [env.index.constant(three * len(scene.free), env.sim.qpos) for three in triples]
+        numbers = [constant(three * len(scene.free), env.sim.qpos) for three in triples]
         self._center, self._low, self._high = numbers
         columns = [first + axis for first in env.index.object_qpos for axis in range(3)]
         self._columns = Columns(columns, env.device)
@@ -51,7 +53,7 @@ class ObjectOffTable:
         return _outside(at - self._center, self._low, self._high)
 
 
-@ignores_success
+@offers(reads="state")
 class JointLimit:
     """When a joint of the robot is outside its range by more than a part of it: MuJoCo's limits are
     soft.
@@ -74,15 +76,13 @@ class JointLimit:
         return _outside(joint_pos(env), self._low, self._high)
 
 
-@ignores_success
-@offers(ends_on="non_finite")
+@offers(ends_on="non_finite", reads="state")
 def non_finite(env: EnvView) -> Tensor:
     """When a position or velocity is NaN or infinite: such a world cannot go on."""
     return lost_state(env).clone()  # which is not to be written into
 
 
-@ignores_success
-@offers(ends_on="overflow")
+@offers(ends_on="overflow", reads="state")
 def overflow(env: EnvView) -> Tensor:
     """When a buffer of the world was too small, so that physics was lost."""
     return (env.sim.overflow & LOST_PHYSICS) != 0

@@ -1,11 +1,10 @@
-"""Builds a scene around a robot: floor, table, objects and perhaps a box, timestep and solver, all
-set before compilation.
+"""Builds a scene around a robot: floor, table, objects, timestep and solver, all set before
+compilation.
 """
 
 import itertools
 import math
 from collections.abc import Mapping
-from functools import partial
 from typing import Any
 
 import mujoco
@@ -21,7 +20,7 @@ from mjstack.config.mjcf import (
     read_object,
     set_range,
 )
-from mjstack.config.schema import BoxCfg, CameraCfg, Config, ObjectCfg, SceneCfg
+from mjstack.config.schema import CameraCfg, Config, ObjectCfg, SceneCfg
 from mjstack.errors import ConfigError, MjstackError, UnknownName, require_names
 from mjstack.robots import robot_spec
 from mjstack.robots.guest import WORLD, compile_robot_scene, mujoco_errors
@@ -59,8 +58,8 @@ def build_model(cfg: Config, *, visuals: bool = False) -> mujoco.MjModel:
 
 def scene_names(scene: SceneCfg) -> set[str]:
     """Names of the scene's own geoms, bodies and cameras."""
-    walls = (f"box_{name}" for name in ("floor", "near", "far", "right", "left"))
-    return {"floor", TABLE, *scene.objects, *scene.cameras, *walls}
+    geoms = (name + suffix for name, thing in scene.objects.items() for suffix in thing.pieces)
+    return {"floor", TABLE, *scene.objects, *scene.cameras, *geoms}
 
 
 def build_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> mujoco.MjModel:
@@ -80,7 +79,7 @@ def add_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> Non
 
     Args:
         spec: The robot; it is changed in place.
-        cfg: Table, objects and perhaps a box, the physics timestep, the solver's settings (``None``
+        cfg: Table, objects, the physics timestep, the solver's settings (``None``
             keeps the robot file's own), and the jaws, whose force on each object a sensor measures.
         visuals: Keep geoms that only pictures need, and add a disc for each place.
     """
@@ -109,8 +108,6 @@ def add_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> Non
     table = _add_geom(world, TABLE, "box", pos=scene.table_center, size=scene.table_half)
     table.friction = scene.table_friction
     table.rgba = [0.72, 0.66, 0.58, 1]
-    if scene.box is not None:
-        _add_box(spec, scene.box, scene.table_top)
     for name, thing in scene.objects.items():
         _add_object(spec, name, thing, scene.table_top)
 
@@ -197,6 +194,8 @@ def _add_object(spec: mujoco.MjSpec, name: str, thing: ObjectCfg, top: float) ->
         size = [*piece.size, 0.0, 0.0][:3]
         geom = _add_geom(body, name + suffix, piece.shape, size=size, pos=piece.pos, **surface)
         geom.quat = piece.turned
+        if piece.solref is not None:
+            geom.solref[:] = piece.solref
         if piece.shape == "capsule":
             mujoco.mju_mulQuat(geom.quat, piece.turned, CAPSULE_TURN)
 
@@ -253,8 +252,6 @@ def _require_clear(model: mujoco.MjModel, scene: SceneCfg) -> None:
     mujoco.mj_kinematics(model, data)
     root = model.body_rootid[model.geom_bodyid]
     geoms = {name: np.flatnonzero(root == model.body(name).id) for name in scene.objects}
-    walls = [model.geom(geom).name.startswith("box_") for geom in range(model.ngeom)]
-    geoms["the box"] = np.flatnonzero(walls)
     for name, thing in scene.free.items():
         for obstacle in [label for label in geoms if label != name]:
             pairs = itertools.product(geoms[name], geoms[obstacle])
@@ -284,20 +281,3 @@ def _add_camera(spec: mujoco.MjSpec, name: str, camera: CameraCfg, scene: SceneC
     quat = np.zeros(4)
     mujoco.mju_mat2Quat(quat, axes.T.ravel())
     body.add_camera(name=name, pos=np.add(origin, pose.pos), quat=quat, fovy=camera.fovy)
-
-
-def _add_box(spec: mujoco.MjSpec, box: BoxCfg, top: float) -> None:
-    """Add a box on a surface at height top [m]; names of its geoms begin with ``box_``."""
-    x, y = box.center
-    half_x, half_y = box.half
-    thick = 0.5 * box.wall
-    up = 0.5 * box.height
-    color = [0.50, 0.55, 0.52, 1]
-    add = partial(_add_geom, spec.worldbody, shape="box", friction=box.friction, rgba=color)
-    floor = [*box.half, 0.5 * box.floor]
-    add("box_floor", pos=[x, y, top + floor[2]], size=floor, solref=box.floor_solref)
-    for name, i, j in (("near", -1, 0), ("far", 1, 0), ("right", 0, -1), ("left", 0, 1)):
-        pos = [x + i * half_x + i * thick, y + j * half_y + j * thick, top + up]
-        # The walls across x close the corners.
-        size = [thick, half_y + box.wall, up] if i else [half_x, thick, up]
-        add(f"box_{name}", pos=pos, size=size, solref=box.wall_solref)

@@ -139,7 +139,6 @@ class SceneIndex:
             model.joint(n).name: (int(model.jnt_qposadr[n]), int(model.jnt_dofadr[n]))
             for n in np.flatnonzero(hung & (model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE)))
         }
-        self._constants: dict[tuple, Tensor] = {}
         host = torch.device("cpu")  # side by side, so that no device has anything of them
         self._columns = {
             name: (Columns(range(qpos, qpos + 7), host), Columns(range(qvel, qvel + 6), host))
@@ -181,15 +180,6 @@ class SceneIndex:
             self.posture.follow(numbers[2])  # which moves its tables there
             self._tensors[key] = RobotTensors(*columns, *numbers)  # type: ignore[arg-type]
         return self._tensors[key]
-
-    def constant(self, values: Sequence[float], like: Tensor) -> Tensor:
-        """Numbers in the type and on the device of a tensor, shape ``(n,)``. Copied there once: a
-        captured step may not copy from the host.
-        """
-        key = (tuple(values), like.device, like.dtype)
-        if key not in self._constants:
-            self._constants[key] = torch.tensor(values, dtype=like.dtype, device=like.device)
-        return self._constants[key]
 
     def object_columns(self, name: str) -> tuple[Columns, Columns]:
         """Columns of qpos (7 numbers) and of qvel (6) of an object that moves; any other name is

@@ -11,6 +11,7 @@ from typing_extensions import override
 from mjstack.config.fields import spec
 from mjstack.config.schema import RobotCfg
 from mjstack.errors import ConfigError, require_names
+from mjstack.managers.state import shared
 from mjstack.managers.view import EnvView
 from mjstack.mdp.geometry import place_xy
 from mjstack.report.figure import Figure
@@ -19,7 +20,7 @@ from mjstack.scene.index import lowest_height
 from mjstack.tasks import parts
 from mjstack.tasks.check import EpisodeCheck, Judgement, Rule
 from mjstack.tasks.placed import HeldSuccess
-from mjstack.tasks.view import AllOf, PhaseNames, Step, TaskView, once_per_step
+from mjstack.tasks.view import AllOf, PhaseNames, Step
 
 
 class BoxCheck(EpisodeCheck):
@@ -49,6 +50,8 @@ class BoxCheck(EpisodeCheck):
         """The objects, in the order in which they go into the box."""
         places: list[str] = spec()
         """The place of each in the box."""
+        into: str = spec()
+        """The box: a fixed object along the world's axes, with a part ``floor`` between others."""
         force: float = spec(unit="N", gt=0.0)
         """A jaw, or a support, that presses with more than this touches."""
         grasp_steps: int = spec(unit="steps", ge=1, le=1_000_000)
@@ -161,12 +164,19 @@ class BoxCheck(EpisodeCheck):
         """Read the scene's box, and raise unless every object fits into it at its place."""
         t = self.t
         scene = self.cfg.scene
-        box = scene.box
-        if box is None:
-            raise ConfigError("scene", scene.name, "a scene with a box", "Set scene=box")
-        top = scene.table_top
-        self._low = [*(box.center[i] - box.half[i] for i in (0, 1)), top + box.floor]
-        self._high = [*(box.center[i] + box.half[i] for i in (0, 1)), top + box.height]
+        require_names("task.check.into: object", [t.into], scene.objects)
+        box = scene.objects[t.into]
+        floor = box.parts.get("floor")
+        if floor is None or box.yaw or box.quat or box.pos:
+            expected = "a fixed object on the table, not turned, with a part floor"
+            raise ConfigError("task.check.into", t.into, expected, "Set scene=box")
+        center = [box.xy[i] + floor.pos[i] for i in (0, 1)]
+        bottom, rim = (
+            scene.table_top + max(part.pos[2] + part.size[2] for part in parts)
+            for parts in ([floor], box.parts.values())
+        )
+        self._low = [*(center[i] - floor.size[i] for i in (0, 1)), bottom]
+        self._high = [*(center[i] + floor.size[i] for i in (0, 1)), rim]
         if len(t.places) != len(t.objects):
             raise ConfigError("task.check.places", t.places, "a place for each object")
         self.slots = dict(zip(t.objects, t.places, strict=True))
@@ -176,28 +186,28 @@ class BoxCheck(EpisodeCheck):
                 continue  # the base class reports it
             xy = scene.places[slot].xy
             half = scene.objects[name].half
-            if not all(abs(xy[i] - box.center[i]) <= box.half[i] - half[i] for i in (0, 1)):
+            if not all(abs(xy[i] - center[i]) <= floor.size[i] - half[i] for i in (0, 1)):
                 raise ConfigError(f"scene.places.{slot}.xy", xy, f"a place in the box for {name}")
 
-    @once_per_step
+    @shared
     def airborne(self, step: Step) -> Tensor:
         """Whether each object is held in the air, shape ``(nworld, objects)``, bool."""
-        up = step.bounds[0][..., 2] - step.view.top >= self.t.lift_height
+        up = step.bounds[0][..., 2] - step.top >= self.t.lift_height
         return step.in_hand & up & ~step.supported
 
-    @once_per_step
+    @shared
     def outside(self, step: Step) -> Tensor:
         """How far the outermost corner is beyond the inside of the box along each axis [m],
         negative inside, shape ``(nworld, objects, 3)``.
         """
         low, high = step.bounds
-        constant = step.view.constant
+        constant = step.constant
         return torch.maximum(constant(*self._low) - low, high - constant(*self._high))
 
     def high(self, step: Step) -> Tensor:
         """Whether each object is too high to be let go of, ``(nworld, objects)``, bool."""
-        heights = [self._low[2] + thing.half_height for thing in step.view.things]
-        return step.pos[..., 2] - step.view.constant(*heights) > self.t.drop_height
+        heights = [self._low[2] + thing.half_height for thing in step.things]
+        return step.pos[..., 2] - step.constant(*heights) > self.t.drop_height
 
     def over(self, step: Step) -> Tensor:
         """Whether each object is over the box or in it."""
@@ -209,13 +219,12 @@ class BoxCheck(EpisodeCheck):
 
     @override
     def goals(self, step: Step) -> dict[str, Tensor]:
-        return {name: self.at_slot(step.view.env, name).float() for name in self.objects}
-
-    def at_slot(self, env: EnvView, name: str) -> Tensor:
-        """Centre of an object that rests at its place in the box [m], shape ``(nworld, 3)``."""
-        xy = place_xy(env, self.slots[name])
-        height = self._low[2] + self.cfg.scene.objects[name].half_height
-        return torch.cat((xy, torch.full_like(xy[:, :1], height)), dim=1)
+        goals = {}
+        for name, slot in self.slots.items():
+            xy = place_xy(step.env, slot).float()
+            height = self._low[2] + self.cfg.scene.objects[name].half_height
+            goals[name] = torch.cat((xy, torch.full_like(xy[:, :1], height)), dim=1)
+        return goals
 
     @override
     def trace(self, step: Step) -> dict[str, Tensor]:
@@ -243,14 +252,14 @@ class _CarriedOver(parts.Carried):
     def counts(self) -> list[Figure]:
         return [*super().counts(), Figure("over_box{}")]
 
-    def start(self, view: TaskView) -> None:
-        super().start(view)
-        self._hold = view.during(self.hold)
-        self.over = view.counter(len(self.objects))  # in the last step of the hold, or of any load
+    def start(self, step: Step) -> None:
+        super().start(step)
+        self._hold = step.during(self.hold)
+        self.over = step.counter(len(self.objects))  # in the last step of the hold, or of any load
 
     def update(self, step: Step) -> None:
         super().update(step)
-        hold = step.judged(self._hold) if step.view.phased else step.in_hand
+        hold = step.judged(self._hold) if step.phased else step.in_hand
         self.over.copy_(torch.where(hold, self.inside(step), self.over))
 
     def judge(self, end: Step) -> Judgement:
@@ -270,12 +279,12 @@ class _Drop(parts.AtLeast):
     def counts(self) -> list[Figure]:
         return [Figure(self.value, low=0.0, high=0.0)]
 
-    def start(self, view: TaskView) -> None:
-        super().start(view)
-        self._loaded = view.zeros(len(self.objects))  # in the step before
+    def start(self, step: Step) -> None:
+        super().start(step)
+        self._loaded = step.zeros(len(self.objects))  # in the step before
 
     def update(self, step: Step) -> None:
-        if step.view.phased:
+        if step.phased:
             # A grasp that slips while the jaws still close is made anew; the last one counts.
             grasped = self.grasp.length == self.grasp.least
             self.best.masked_fill_(step.judged(self.grasp.key) & grasped, 0.0)
@@ -295,7 +304,7 @@ class _Release(parts.AtLeast):
     """RELEASE: out of the jaws, the gripper open."""
 
     def update(self, step: Step) -> None:
-        opens = step.judged(self.key) if step.view.phased else self.unlocked()
+        opens = step.judged(self.key) if step.phased else self.unlocked()
         wide = torch.where(opens & self.condition(step), step.narrowest, 0.0)
         torch.maximum(self.best, wide, out=self.best)
 
@@ -303,13 +312,13 @@ class _Release(parts.AtLeast):
 class _Settled(parts.AtLeast):
     """SETTLED: at rest in the box after the release."""
 
-    def start(self, view: TaskView) -> None:
-        super().start(view)
-        self._rest = view.zeros(len(self.objects))  # steps at rest in a row
+    def start(self, step: Step) -> None:
+        super().start(step)
+        self._rest = step.zeros(len(self.objects))  # steps at rest in a row
 
     def update(self, step: Step) -> None:
         self._rest.add_(1.0).mul_(self.condition(step))
-        if step.view.phased:  # as of the settling's last step, or else the most
+        if step.phased:  # as of the settling's last step, or else the most
             settled = torch.where(step.judged(self.key), self._rest, self.best)
         else:
             settled = torch.maximum(self.best, self._rest * self.unlocked())
@@ -326,8 +335,8 @@ class _Order(Rule):
         super().__init__("ORDER", text or "never broken", figures=figures)
         self._release = release
 
-    def start(self, view: TaskView) -> None:
-        self._early = view.zeros()
+    def start(self, step: Step) -> None:
+        self._early = step.zeros()
 
     def update(self, step: Step) -> None:
         early = step.in_hand[:, 1:] & ~self._release.holds()[:, :-1]
@@ -350,7 +359,7 @@ class _JawClear(Rule):
         self._least = least
 
     def judge(self, end: Step) -> Judgement:
-        sim = end.view.env.sim
+        sim = end.env.sim
         sim.kinematics()
         jaws = [body for jaw in jaw_bodies(sim.model, self._robot.jaw_bodies) for body in jaw]
         clearance = lowest_height(sim.model, jaws, sim.xpos, sim.xquat) - self._rim
@@ -368,6 +377,6 @@ class BoxSuccess(HeldSuccess):
         Raises:
             MjstackError: The task has another check.
         """
-        check = BoxCheck(env.cfg)
+        check = BoxCheck.from_env(env)
         let_go = parts.released(*check.objects, open_fraction=check.t.open_fraction)
-        super().__init__(env, check.view(env), [check.resting, let_go], check.settle_steps)
+        super().__init__(env, [check.resting, let_go], check.settle_steps)

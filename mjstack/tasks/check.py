@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import chain
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 import torch
@@ -15,13 +15,13 @@ from mjstack.config.fields import field_range
 from mjstack.config.functions import resolve_func
 from mjstack.config.schema import Config
 from mjstack.errors import ConfigError, TermError, require_names
+from mjstack.managers.state import lost_state
 from mjstack.managers.view import EnvView
-from mjstack.math import not_finite
 from mjstack.mdp.geometry import LOADED
 from mjstack.report.figure import Figure, suffix
 from mjstack.scene.phases import Phase
-from mjstack.sim.simulation import LOST_PHYSICS, Columns
-from mjstack.tasks.view import PhaseNames, Step, TaskView
+from mjstack.sim.simulation import LOST_PHYSICS
+from mjstack.tasks.view import PhaseNames, Step
 
 _EVERY_TASK = {
     "FINITE": "state not finite",
@@ -120,8 +120,8 @@ class Rule(ABC):
         }
         self.figures = [[replace(f, name=f.name.format(s)) for f in figures] for s in suffixes]
 
-    def start(self, view: TaskView) -> None:  # noqa: B027
-        """Allocate for the worlds of a view."""
+    def start(self, step: Step) -> None:  # noqa: B027
+        """Allocate for the worlds of an environment, at their start."""
 
     def update(self, step: Step) -> None:  # noqa: B027
         """Process the state at the end of a step. Fixed shapes, no host read."""
@@ -159,7 +159,6 @@ class EpisodeCheck(ABC):
     Attributes:
         cfg: The configuration.
         t: The thresholds.
-        key: That of every check of its class with these thresholds; see `once_per_step`.
         rules: Names, bits and words of the rules.
         objects: The objects that the task is about, which the rules read; perhaps none.
         figures: What the rules measure, without values, by key.
@@ -178,13 +177,9 @@ class EpisodeCheck(ABC):
             MjstackError: A threshold is missing, unknown, of the wrong type or out of range.
         """
         node = dict(cfg.task.check or {})
-        name = node.pop("func", None)
-        if not issubclass(check_class(cfg) or object, type(self)):
-            expected = f"{type(self).__module__}.{type(self).__name__}, whose rules a term needs"
-            raise ConfigError("task.check.func", name or "null", expected)
+        node.pop("func", None)
         self.cfg = cfg
         self.t: Any = typed("task.check", node, self.Thresholds)
-        self.key = f"{type(self).__module__}.{type(self).__qualname__} {self.t}"
         phases = cfg.controller.phases
         steps = sum(round(phase.seconds / cfg.timing.step_dt) for phase in phases.values())
         steps = steps or cfg.task.episode_steps
@@ -200,19 +195,27 @@ class EpisodeCheck(ABC):
         self.rules = Rules(dict(chain(*(rule.texts.items() for rule in self._rules))))
         self.figures = {f.key: f for rule in self._rules for f in rule.declared()}
 
+    @classmethod
+    def from_env(cls, env: EnvView) -> Self:
+        """The check of an environment, a ConfigError if it is of another class."""
+        if not isinstance(check := env.check, cls):
+            name, expected = (f"{c.__module__}.{c.__name__}" for c in (type(check), cls))
+            raise ConfigError("task.check.func", name, f"{expected}, whose rules a term needs")
+        return check
+
     @abstractmethod
     def build(self) -> list[Rule]:
         """The task's rules, in the order of their bits."""
 
     @property
+    def force(self) -> float:
+        """A jaw or a support that presses with more than this touches an object [N]."""
+        return getattr(self.t, "force", LOADED)
+
+    @property
     def settle_steps(self) -> int:
         """Length of the window at the episode's end in which everything has to be at rest."""
         return getattr(self.t, "window", 0)
-
-    def view(self, env: EnvView, phases: Sequence[Phase] = (), stop: int = 0) -> TaskView:
-        """The task's objects in the worlds of an environment; arguments as of `TaskView`."""
-        force = getattr(self.t, "force", LOADED)
-        return TaskView(env, self.objects, phases, stop=stop, force=force)
 
     def start(self, env: EnvView, steps: int, phases: Sequence[Phase] = ()) -> None:
         """Allocate for an episode.
@@ -224,9 +227,10 @@ class EpisodeCheck(ABC):
         """
         self._steps = steps
         # Without phases, rules count before the settled window.
-        self._view = self.view(env, phases, steps if phases else steps - self.settle_steps)
+        stop = steps if phases else steps - self.settle_steps
+        self._step = Step(env, self.objects, phases, stop=stop, force=self.force)
         for rule in self._rules:
-            rule.start(self._view)
+            rule.start(self._step)
         self._finite = torch.ones(env.nworld, dtype=torch.bool, device=env.device)
 
     def update(self, phase: Tensor | None = None) -> None:
@@ -236,17 +240,18 @@ class EpisodeCheck(ABC):
             phase: Number of the phase that each world's command belonged to, shape ``(nworld,)``,
                 int64; None without phases.
         """
-        sim = self._view.env.sim
-        self._finite &= ~not_finite(sim.qpos, sim.qvel)
-        step = self._view.step(phase)
+        self._finite &= ~lost_state(self._step.env)
+        self._step.phase = phase
         for rule in self._rules:
-            rule.update(step)
-        self._view.count += 1
+            rule.update(self._step)
+        self._step.count += 1
 
     def result(self) -> CheckResult:
         """Judge the episode; every rule that was not shown to hold has failed."""
-        sim = self._view.env.sim
-        complete = int(self._view.count) == self._steps
+        end = self._step
+        end.phase = None
+        sim = end.env.sim
+        complete = int(end.count) == self._steps
         physics_steps = self._steps * self.cfg.timing.decimation
         passed = {
             "FINITE": self._finite,
@@ -254,7 +259,6 @@ class EpisodeCheck(ABC):
             "OVERFLOW": (sim.overflow & LOST_PHYSICS) == 0,
         }
         values: dict[str, Tensor] = {}
-        end = self._view.step()
         for rule in self._rules:
             holds, measured = rule.judge(end)
             if rule.at_end:
@@ -263,7 +267,7 @@ class EpisodeCheck(ABC):
             values |= zip((figure.key for figure in rule.declared()), measured, strict=True)
         bits = [bit * (~passed[name]).int() for name, bit in self.rules.items()]
         failed = torch.stack(bits).sum(0, dtype=torch.int32)
-        return CheckResult(failed, values, self._view.phased)
+        return CheckResult(failed, values, end.phased)
 
     def why(
         self, failed: np.ndarray, values: Mapping[str, np.ndarray]
@@ -298,12 +302,6 @@ class EpisodeCheck(ABC):
         objects)``, bool; of a check without objects, whether all is done, shape ``(nworld, 1)``. No
         host read.
         """
-
-    def placed_of(self, step: Step, carried: Columns) -> Tensor:
-        """Whether each object of `goals` is where it belongs: those columns of `placed`, shape
-        ``(nworld, goals)``, bool. No host read.
-        """
-        return carried.read(self.placed(step))
 
     def goals(self, step: Step) -> dict[str, Tensor]:
         """Where the centre of each object that is carried belongs [m], each ``(nworld, 3)``, by
@@ -345,29 +343,18 @@ class EpisodeCheck(ABC):
         return ", ".join(f"{name} {value:.4g}" for name, value in named.items())
 
 
-def check_class(cfg: Config) -> type[EpisodeCheck] | None:
-    """The class of the task's check; None for a task that can be trained, not verified.
-
-    Raises:
-        TermError: ``task.check.func`` names none, or one that lacks a method.
-    """
-    if cfg.task.check is None:
-        return None
-    name = str(cfg.task.check.get("func"))
-    check = cast(type[EpisodeCheck], resolve_func("task.check", name, base=EpisodeCheck))
-    for method in sorted(check.__abstractmethods__):
-        raise TermError("task.check.func", f"{name}: method '{method}' is missing")
-    return check
-
-
 def make_check(cfg: Config) -> EpisodeCheck:
     """The task's check, its thresholds checked.
 
     Raises:
-        MjstackError: The task has none, or a threshold cannot be used.
+        MjstackError: The task has none, ``task.check.func`` names none or one that lacks a method,
+            or a threshold cannot be used.
     """
-    check = check_class(cfg)
-    if check is None:
+    if cfg.task.check is None:
         expected = f"a check of task {cfg.task.name}: without one it can be trained, not verified"
         raise ConfigError("task.check", "null", expected, "Train it: mjstack.make_env")
+    name = str(cfg.task.check.get("func"))
+    check = cast(type[EpisodeCheck], resolve_func("task.check", name, base=EpisodeCheck))
+    for method in sorted(check.__abstractmethods__):
+        raise TermError("task.check.func", f"{name}: method '{method}' is missing")
     return check(cfg)

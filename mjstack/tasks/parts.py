@@ -16,7 +16,7 @@ from mjstack.math import norm, quat_angle, quat_to_matrix
 from mjstack.mdp.geometry import place_xy, pose_w
 from mjstack.report.figure import Figure
 from mjstack.tasks.check import Judgement, Rule
-from mjstack.tasks.view import AllOf, PhaseNames, Step, TaskView
+from mjstack.tasks.view import AllOf, PhaseNames, Step
 
 Condition = Callable[[Step], Tensor]
 
@@ -30,16 +30,16 @@ def airborne(*objects: str, height: float) -> Condition:
     """
 
     def condition(step: Step) -> Tensor:
-        columns = step.view.columns(objects)
+        columns = step.columns(objects)
         up = columns.read(step.height) > height
-        return up if step.view.phased else up & columns.read(step.in_hand)
+        return up if step.phased else up & columns.read(step.in_hand)
 
     return condition
 
 
 def in_hand(*objects: str) -> Condition:
     """Objects on which all jaws press."""
-    return lambda step: step.view.columns(objects).read(step.in_hand)
+    return lambda step: step.columns(objects).read(step.in_hand)
 
 
 def released(*objects: str, open_fraction: float) -> AllOf:
@@ -50,7 +50,7 @@ def released(*objects: str, open_fraction: float) -> AllOf:
 
     def parts(step: Step) -> tuple[Tensor, ...]:
         wide = step.narrowest >= least
-        return step.view.columns(objects).read(step.untouched) if objects else wide, wide
+        return step.columns(objects).read(step.untouched) if objects else wide, wide
 
     return AllOf(("untouched", "open_fraction"), parts)
 
@@ -77,9 +77,9 @@ def offset(step: Step, object: str, onto: str) -> tuple[Tensor, Tensor]:
 
 def on_top_of(step: Step, onto: str, object: str) -> Tensor:
     """Centre of an object that stands on the middle of another one [m], shape ``(nworld, 3)``."""
-    objects = step.view.env.cfg.scene.objects
+    objects = step.env.cfg.scene.objects
     height = objects[onto].half_height + objects[object].half_height
-    return step.center(onto) + step.view.constant(0.0, 0.0, height)
+    return step.center(onto) + step.constant(0.0, 0.0, height)
 
 
 def at_place(object: str, place: str, *, distance: float) -> AllOf:
@@ -89,7 +89,7 @@ def at_place(object: str, place: str, *, distance: float) -> AllOf:
 
 def away(step: Step, object: str, place: str) -> Tensor:
     """Horizontal distance of an object's centre from a place [m], shape ``(nworld,)``."""
-    apart = step.center(object)[:, :2] - place_xy(step.view.env, place).float()
+    apart = step.center(object)[:, :2] - place_xy(step.env, place).float()
     return norm(apart)
 
 
@@ -99,11 +99,11 @@ def on_table(object: str, *, gap: float) -> AllOf:
     """
 
     def parts(step: Step) -> Tensor:
-        scene = step.view.env.cfg.scene
+        scene = step.env.cfg.scene
         half = scene.objects[object].half
-        room = step.view.constant(*(scene.table_half[i] - half[i] for i in (0, 1)), gap)
-        center = step.view.constant(*scene.table_center[:2], 0.0)
-        height = step.height[:, step.view.number(object), None]
+        room = step.constant(*(scene.table_half[i] - half[i] for i in (0, 1)), gap)
+        center = step.constant(*scene.table_center[:2], 0.0)
+        height = step.height[:, step.number(object), None]
         at = torch.cat((step.center(object)[:, :2], height), dim=1)
         return (at - center).abs() <= room
 
@@ -132,10 +132,10 @@ def in_zone(object: str, frame: str, *, low: Sequence[float], high: Sequence[flo
     """
 
     def parts(step: Step) -> Tensor:
-        pose = pose_w(step.view.env, frame).float()
+        pose = pose_w(step.env, frame).float()
         apart = step.center(object) - pose[:, :3]
         at = (quat_to_matrix(pose[:, 3:]) * apart[..., None]).sum(-2)[:, : len(low)]
-        constant = step.view.constant
+        constant = step.constant
         return at.clamp(constant(*low), constant(*high)) == at
 
     return AllOf(("along_x", "along_y", "along_z")[: len(low)], parts)
@@ -180,9 +180,9 @@ class AtLeast(Rule):
         return [Figure(self.value or f"{self.name.lower()}_steps{{}}", low=self.least)]
 
     @override
-    def start(self, view: TaskView) -> None:
-        self.key = view.during(self.phases)
-        self.best = view.counter(len(self.objects))
+    def start(self, step: Step) -> None:
+        self.key = step.during(self.phases)
+        self.best = step.counter(len(self.objects))
 
     def holds(self) -> Tensor:
         """Whether it has held so far, shape ``(nworld, objects)``, bool."""
@@ -209,21 +209,21 @@ class Streak(AtLeast):
     anew: PhaseNames = field(default=(), kw_only=True)
 
     @override
-    def start(self, view: TaskView) -> None:
-        super().start(view)
-        self.length = view.counter(len(self.objects))
-        self._clears = view.during(self.anew)
+    def start(self, step: Step) -> None:
+        super().start(step)
+        self.length = step.counter(len(self.objects))
+        self._clears = step.during(self.anew)
 
     @override
     def update(self, step: Step) -> None:
-        if self.anew and step.view.phased:
-            step.view.clear(step.judged(self._clears))
+        if self.anew and step.phased:
+            step.clear(step.judged(self._clears))
         self.length.add_(1.0).mul_(self._counts(step))
         torch.maximum(self.best, self.length, out=self.best)
 
     def _counts(self, step: Step) -> Tensor:
         counts = self.condition(step) & step.judged(self.key)
-        return counts if step.view.phased else counts & self.unlocked()
+        return counts if step.phased else counts & self.unlocked()
 
 
 @dataclass(eq=False)
@@ -245,17 +245,17 @@ class Carried(Streak):
         ]
 
     @override
-    def start(self, view: TaskView) -> None:
-        super().start(view)
+    def start(self, step: Step) -> None:
+        super().start(step)
         size = len(self.objects)
-        self._from = view.zeros(size, 2)  # where the streak began
-        self._far = view.counter(size)  # farthest from there
-        self._longest = view.counter(size)
+        self._from = step.zeros(size, 2)  # where the streak began
+        self._far = step.counter(size)  # farthest from there
+        self._longest = step.counter(size)
 
     @override
     def update(self, step: Step) -> None:
         counts = self._counts(step)
-        xy = step.view.columns(self.objects).read(step.pos)[..., :2]
+        xy = step.columns(self.objects).read(step.pos)[..., :2]
         begins = counts & (self.length == 0.0)
         self._from.copy_(torch.where(begins[..., None], xy, self._from))
         self.length.add_(1.0).mul_(counts)
@@ -302,8 +302,8 @@ class InWindow(Rule):
         super().__init__(self.name, self.text, figures=counts)
 
     @override
-    def start(self, view: TaskView) -> None:
-        self.length = view.zeros(len(self._rule.names))  # of the streaks that last to the end
+    def start(self, step: Step) -> None:
+        self.length = step.zeros(len(self._rule.names))  # of the streaks that last to the end
 
     @override
     def update(self, step: Step) -> None:
@@ -349,15 +349,15 @@ class AtRest(Rule):
         self.measured = [Figure("peak_speed", unit="m/s")]
 
     @override
-    def start(self, view: TaskView) -> None:
-        size = len(view.objects)
+    def start(self, step: Step) -> None:
+        size = len(step.objects)
         # The last steps. A ring that is not filled fails: NaN compares false with everything.
-        self._poses = view.zeros(self.window, size, 7, fill=math.nan)
-        self._speeds = view.zeros(self.window, size, fill=math.nan)
+        self._poses = step.zeros(self.window, size, 7, fill=math.nan)
+        self._speeds = step.zeros(self.window, size, fill=math.nan)
 
     @override
     def update(self, step: Step) -> None:
-        slot = step.view.count.remainder(self.window)  # of the oldest step
+        slot = step.count.remainder(self.window)  # of the oldest step
         self._poses.index_copy_(1, slot, step.pose[:, None])
         self._speeds.index_copy_(1, slot, step.speed[:, None])
 

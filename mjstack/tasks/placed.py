@@ -9,48 +9,35 @@ import torch
 from torch import Tensor
 
 from mjstack.config.fields import Count, Fraction
-from mjstack.managers.term import branches
+from mjstack.managers.state import branches
 from mjstack.managers.view import EnvView
-from mjstack.tasks.check import make_check
 from mjstack.tasks.parts import Condition, released
-from mjstack.tasks.view import TaskView
 
 
 class HeldSuccess:
     """Achieved while conditions have held for some steps in a row."""
 
-    def __init__(
-        self, env: EnvView, view: TaskView, conditions: Sequence[Condition], steps: int
-    ) -> None:
+    def __init__(self, env: EnvView, conditions: Sequence[Condition], steps: int) -> None:
         """Allocate the streaks.
 
         Args:
             env: The environment.
-            view: Of the task's objects.
             conditions: All have to hold, each shape ``(nworld, n)``, bool.
             steps: How many steps in a row.
         """
-        self._view = view
-        self._conditions = conditions
+        self._conditions = [partial(env.state.value, condition) for condition in conditions]
         self._steps = steps
         self._length = torch.zeros(env.nworld, dtype=torch.int32, device=env.device)
-        self.none_hold = False  # in the last step, as far as the host could see
 
     def __call__(self, env: EnvView) -> Tensor:
         """Process a step; shape ``(nworld,)``, bool."""
-        works = [partial(self._holds, condition) for condition in self._conditions]
         # Mostly the host can see that nothing holds, whatever the other conditions say
-        self.none_hold = not self._length.is_cuda and not bool(works[0]().all(1).any())
-        if self.none_hold:
+        if not self._length.is_cuda and not bool(self._conditions[0]().all(1).any()):
             self._length.zero_()
             return torch.zeros_like(self._length, dtype=torch.bool)
-        holds = torch.cat(branches(env.device, *works), dim=1)
+        holds = torch.cat(branches(env.device, *self._conditions), dim=1)
         self._length.add_(1).mul_(holds.all(1))
         return self._length >= self._steps
-
-    def _holds(self, condition: Condition) -> Tensor:
-        # A step for each condition, because a branch may share no value
-        return condition(self._view.step())
 
     def reset(self, mask: Tensor) -> None:
         """Forget the masked worlds."""
@@ -76,8 +63,7 @@ class Placed(HeldSuccess):
         Raises:
             MjstackError: The task has no check, or the number is out of range.
         """
-        check = make_check(env.cfg)
-        conditions: list[Condition] = [check.placed]
+        conditions: list[Condition] = [env.check.placed]
         if open_fraction is not None:
-            conditions.append(released(*check.objects, open_fraction=open_fraction))
-        super().__init__(env, check.view(env), conditions, steps)
+            conditions.append(released(*env.check.objects, open_fraction=open_fraction))
+        super().__init__(env, conditions, steps)

@@ -1,5 +1,6 @@
 """Reward in stages for tasks in which objects are carried to their goals."""
 
+from functools import partial
 from math import inf
 
 import torch
@@ -7,17 +8,16 @@ from torch import Tensor
 
 from mjstack.config.fields import Fraction, Positive
 from mjstack.errors import ConfigError
-from mjstack.managers.term import branches
-from mjstack.managers.view import EnvView, ignores_success
+from mjstack.managers.state import branches
+from mjstack.managers.view import EnvView, offers
 from mjstack.math import norm
 from mjstack.mdp.observation import grasp_point_pos
-from mjstack.tasks.check import make_check
 
 STAGES = ("reach", "lift", "carry", "place", "release")
 BELOW = 0.005  # m below its goal that an object over it may be: contacts are soft
 
 
-@ignores_success
+@offers(reads="state")
 class Progress:
     """Progress of a task whose check has `EpisodeCheck.goals`, from 0 to 1.
 
@@ -62,18 +62,17 @@ class Progress:
         Raises:
             MjstackError: The task has no check, or one without goals.
         """
-        self._check = make_check(env.cfg)
-        self._view = self._check.view(env)
-        names = list(self._check.goals(self._view.step()))
+        self._check = env.check
+        self._state = env.state
+        names = list(self._check.goals(self._state))
         if not names:
             expected = "a check with goals, which this reward follows"
             raise ConfigError("task.check.func", type(self._check).__name__, expected)
-        self._columns = self._view.columns(names)
-        self._scale, self._near = scale, near
+        self._columns = self._state.columns(names)
         # Of away, across, above, low and opening, see `_measure`: the range over which each counts
         # (an open_fraction of 0 takes any opening), the number of the stage that it measures, and
         # from where to where it unlocks stages.
-        constant = self._view.constant
+        constant = self._state.constant
         self._ranges = constant(scale, scale, scale, height, max(open_fraction, 1e-6))
         self._nearest = constant(1.0)
         self._number = constant(0.0, 2.0, 3.0, 1.0, 4.0)
@@ -87,33 +86,9 @@ class Progress:
 
     def __call__(self, env: EnvView) -> Tensor:
         """The reward, shape ``(nworld,)``."""
-        (distances, heights, in_hand), placed = branches(env.device, self._measure, self._placed)
-        if self._beyond_reach(distances, in_hand, placed):
-            value = self._stages(distances + (heights or self._heights()), in_hand, placed)
-        else:
-            value = torch.sub(1.0, (distances[0] / self._scale).tanh_()) / len(STAGES)
-        if value.shape[1] == 1:
-            return value[:, 0]
-
-        # One object after the other
-        finished = (placed & ~in_hand)[:, :-1]
-        value[:, :-1].masked_fill_(finished, 1.0)
-        value[:, 1:].mul_(finished.cumprod(1))
-        return value.mean(1)
-
-    def _beyond_reach(self, distances: list[Tensor], in_hand: Tensor, placed: Tensor) -> bool:
-        """Whether an object may have got beyond the first stage: mostly the host sees that none
-        has. Always true on CUDA, where it cannot look.
-        """
-        if in_hand.is_cuda:
-            return True
-        _, across, above = distances
-        over = (across <= self._near) & (above >= -BELOW)
-        return bool(over.logical_or_(in_hand).logical_or_(placed).any())
-
-    def _stages(self, parts: list[Tensor], in_hand: Tensor, placed: Tensor) -> Tensor:
-        """How far each object has got, shape ``(nworld, objects)``."""
-        measured = torch.stack(parts, dim=-1)
+        works = (self._measure, partial(self._state.value, self._check.placed))
+        (measured, in_hand), placed = branches(env.device, *works)
+        placed = self._columns.read(placed)
 
         # Which stages each object has got to
         within = measured.clamp(self._least, self._most) == measured
@@ -124,27 +99,28 @@ class Progress:
         worth = measured / self._ranges
         nearness = worth[..., :3]
         torch.sub(self._nearest, nearness.abs_().tanh_(), out=nearness)
-        return worth.clamp_(0.0, 1.0).add_(self._number).mul_(reached).amax(-1) / len(STAGES)
+        worth.clamp_(0.0, 1.0).add_(self._number).mul_(reached)
+        value = worth.amax(-1) / len(STAGES)
+        if value.shape[1] == 1:
+            return value[:, 0]
 
-    def _placed(self) -> Tensor:
-        return self._check.placed_of(self._view.step(), self._columns)
+        # One object after the other
+        finished = (placed & ~in_hand)[:, :-1]
+        value[:, :-1].masked_fill_(finished, 1.0)
+        value[:, 1:].mul_(finished.cumprod(1))
+        return value.mean(1)
 
-    def _measure(self) -> tuple[list[Tensor], list[Tensor], Tensor]:
-        """Of each object: its distance from the grasp point, and from its goal horizontally and
-        upwards [m]; on CUDA, where the host cannot look first, `_heights`; and whether it is in the
-        hand; each ``(nworld, objects)``.
+    def _measure(self) -> tuple[Tensor, Tensor]:
+        """Of each object its distance from the grasp point, that from its goal horizontally and
+        upwards, the height of its lowest point [m], and the gripper's opening, shape ``(nworld,
+        objects, 5)``; and whether it is in the hand, shape ``(nworld, objects)``.
         """
-        step = self._view.step()
+        step = self._state
         pos = self._columns.read(step.pos)
         goals = list(self._check.goals(step).values())
         offset = pos - (torch.stack(goals, dim=1) if len(goals) > 1 else goals[0][:, None])
-        away = norm(pos - grasp_point_pos(step.view.env).float()[:, None])
-        distances = [away, norm(offset[..., :2]), offset[..., 2]]
-        heights = self._heights() if away.is_cuda else []
-        return distances, heights, self._columns.read(step.in_hand)
-
-    def _heights(self) -> list[Tensor]:
-        """The height of each object's lowest point [m], and the gripper's opening."""
-        step = self._view.step()
+        away = norm(pos - grasp_point_pos(step.env).float()[:, None])
         low = self._columns.read(step.height)
-        return [low, step.narrowest.expand_as(low)]
+        opening = step.narrowest.expand_as(low)
+        parts = (away, norm(offset[..., :2]), offset[..., 2], low, opening)
+        return torch.stack(parts, dim=-1), self._columns.read(step.in_hand)

@@ -49,7 +49,7 @@ class ReachCheck(EpisodeCheck):
     @override
     def trace(self, step: Step) -> dict[str, Tensor]:
         t = self.t
-        offset = grasp_point_to_object(step.view.env, object=t.object, height=t.height)
+        offset = grasp_point_to_object(step.env, object=t.object, height=t.height)
         return {"distance_m": norm(offset)}
 
     def headline(self, values: Mapping[str, float]) -> str:

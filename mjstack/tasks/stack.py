@@ -10,15 +10,14 @@ from torch import Tensor
 from typing_extensions import override
 
 from mjstack.config.fields import spec
-from mjstack.managers.term import branches
+from mjstack.managers.state import branches
 from mjstack.managers.view import EnvView
 from mjstack.report.figure import Figure
 from mjstack.sim.graph import where_any
-from mjstack.sim.simulation import Columns
 from mjstack.tasks import parts
 from mjstack.tasks.check import EpisodeCheck, Rule
 from mjstack.tasks.placed import HeldSuccess
-from mjstack.tasks.view import Step, once_per_step
+from mjstack.tasks.view import Step
 
 
 class StackCheck(EpisodeCheck):
@@ -117,17 +116,7 @@ class StackCheck(EpisodeCheck):
     @override
     def placed(self, step: Step) -> Tensor:
         """Whether the object is on the other one, and that one on the table."""
-        return torch.cat((self.on_top(step), self.supported(step)[:, None]), dim=1)
-
-    @once_per_step
-    def on_top(self, step: Step) -> Tensor:
-        """Whether the object is on the other one, shape ``(nworld, 1)``, bool."""
-        return self.stacked(step)[:, None]
-
-    @override
-    def placed_of(self, step: Step, carried: Columns) -> Tensor:
-        """As `placed`: a subclass that changes the one changes the other."""
-        return self.on_top(step)
+        return torch.stack((self.stacked(step), self.supported(step)), dim=1)
 
     @override
     def goals(self, step: Step) -> dict[str, Tensor]:
@@ -158,28 +147,25 @@ class StackSuccess(HeldSuccess):
         Raises:
             MjstackError: The task has another check.
         """
-        check = StackCheck(env.cfg)
-        view = check.view(env)
-        # The host can mostly tell by the first. On CUDA a branch of a graph shares no value.
-        apart = [check.on_top, check.supported.apart]
-        placed = [check.placed] if env.device.type == "cuda" else apart
-        super().__init__(env, view, [*placed, check.released], check.t.window)
-        ring = (check.t.window, len(view.objects))
+        check = StackCheck.from_env(env)
+        super().__init__(env, [check.placed, check.released], check.t.window)
+        self._state = state = env.state
+        ring = (check.t.window, len(state.objects))
         # Where the oldest step is, in every world.
         self._slot = torch.zeros(1, dtype=torch.int64, device=env.device)
-        self._pose = view.zeros(*ring, 7)
-        self._energy = view.zeros(*ring)  # squared speed
+        self._pose = state.zeros(*ring, 7)
+        self._energy = state.zeros(*ring)  # squared speed
         # Squared distance to later steps, and 1 - |cosine of half the angle| to them
-        self._apart = view.zeros(*ring, 2)
+        self._apart = state.zeros(*ring, 2)
         t = check.t
         rotation = 1.0 - math.cos(0.5 * math.radians(t.rest_rotation_deg))
-        speeds = [t.rest_speed**2] * len(view.objects)
-        self._limits = view.constant(*speeds, t.rest_position**2, rotation)
+        speeds = [t.rest_speed**2] * len(state.objects)
+        self._limits = state.constant(*speeds, t.rest_position**2, rotation)
 
     def __call__(self, env: EnvView) -> Tensor:
         """Process a step; shape ``(nworld,)``, bool."""
         achieved, _ = branches(env.device, partial(super().__call__, env), self._look)
-        if achieved.is_cuda or (not self.none_hold and bool(achieved.any())):
+        if achieved.is_cuda or bool(achieved.any()):
             largest = torch.cat((self._energy.mean(1), self._apart.amax((1, 2))), dim=1)
             achieved &= (largest <= self._limits).all(1)
         return achieved
@@ -190,11 +176,10 @@ class StackSuccess(HeldSuccess):
         """
         self._slot.add_(1).remainder_(self._steps)
         # No window that holds a step without a standing object can pass: its slot is never judged.
-        if not self.none_hold:
-            where_any(self._length, self._replace_oldest)
+        where_any(self._length, self._replace_oldest)
 
     def _replace_oldest(self) -> None:
-        step = self._view.step()
+        step = self._state
         self._pose.index_copy_(1, self._slot, step.pose[:, None])
         self._energy.index_copy_(1, self._slot, step.speed.square()[:, None])
         self._apart.index_fill_(1, self._slot, 0.0)

@@ -5,7 +5,7 @@ alone, which are never stale.
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, reduce, wraps
+from functools import reduce
 from operator import and_
 from typing import Any
 
@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from mjstack.errors import ConfigError, MjstackError, require_names
-from mjstack.managers.term import known_values
+from mjstack.managers.state import shared
 from mjstack.managers.view import EnvView
-from mjstack.math import atan2, lowest_point, norm, quat_to_matrix
+from mjstack.math import atan2, constant, lowest_point, norm, quat_to_matrix
 from mjstack.mdp.geometry import LOADED, gripper_opening, pose_w
 from mjstack.mdp.observation import fixture_pos, object_velocity
 from mjstack.scene.phases import Phase
@@ -25,42 +25,32 @@ PhaseNames = Sequence[Sequence[str]]
 """For each object, names of phases."""
 
 
-def once_per_step(compute: Callable[..., Any]) -> Callable[..., Any]:
-    """Make a function of a step compute a value once per step, for all conditions and terms that
-    share it. It is not to be written into.
-
-    The function's last argument is the step. Another one, such as the check of a method, has a
-    ``key``: those of equal keys share the value.
-    """
-
-    @wraps(compute)
-    def cached(*args: Any) -> Any:
-        *checks, step = args
-        key = (compute, step.view.key, *(check.key for check in checks))
-        if key not in step.known:
-            step.known[key] = compute(*args)
-        return step.known[key]
-
-    return cached
+def _value(compute: Callable[[Any], Any]) -> Any:
+    """Make a method of `Step` a property that is computed once in a pass."""
+    return property(shared(compute))
 
 
-def step_value(compute: Callable[[Any], Any]) -> Any:
-    """Make a method of `Step` a property that is computed once per step."""
-    return property(once_per_step(compute))
+class Step:
+    """The state of a task's objects in every world of an environment, as it is now. Within a pass
+    each value is computed once.
 
-
-class TaskView:
-    """Where the state of a task's objects is read, in every world of an environment.
+    A dimension over objects has the order of ``objects``. Forces are those of the last physics
+    step. A sensor gives the net force of a jaw on an object; that is the sum of the normal forces
+    up to a factor of 1.6, because friction adds at most 1.2 times the normal force across it and
+    the normals of one jaw on a convex object do not cancel. The threshold is ten million times
+    smaller than a grasp's force: it tells contact from none.
 
     Attributes:
         env: The environment.
         objects: Names of the objects, the order of every dimension over objects.
         phased: Whether the driver has phases.
+        phase: Number of the phase of every world, shape ``(nworld,)``, int64; perhaps None.
         count: Steps so far, shape ``(1,)``, int64.
         stop: Steps from this one on count for no rule that names phases.
         table: Whether a phase counts for a column of a key, shape ``(phases, n)``, bool.
-        key: Equal to that of another view, if both see the same of the same environment.
     """
+
+    phase: Tensor | None = None
 
     def __init__(
         self,
@@ -78,7 +68,6 @@ class TaskView:
         self.objects = list(objects)
         self.phased = bool(phases)
         self.force = force
-        self.key = f"{id(env)} {force} {' '.join(objects)}"
         self.count = torch.zeros(1, dtype=torch.int64, device=env.device)
         self._phases = [phase.name for phase in phases]
         self.stop = stop
@@ -99,10 +88,6 @@ class TaskView:
 
         self.jaws = columns(index.jaw_force)
         self.supports = columns(index.support_force)
-
-    def step(self, phase: Tensor | None = None) -> "Step":
-        """The state now, computed where it is asked for, once."""
-        return Step(self, phase)
 
     def columns(self, names: Sequence[str]) -> Columns:
         """Columns of some objects, made once: a captured step may not copy from the host."""
@@ -128,7 +113,7 @@ class TaskView:
 
     def constant(self, *values: float) -> Tensor:
         """Numbers on the device, copied there once, shape ``(n,)``, float32."""
-        return self.env.index.constant(values, self.half)
+        return constant(values, self.half)
 
     def zeros(self, *shape: int, fill: float = 0.0) -> Tensor:
         """A buffer, shape ``(nworld, *shape)``, float32."""
@@ -147,156 +132,140 @@ class TaskView:
                 # Not by a product: an earlier attempt may have left NaN.
                 counter.masked_fill_(mask, 0.0)
 
-
-class Step:
-    """The state of a task's objects in one step, each part computed when it is first asked for.
-
-    A dimension over objects has the order of ``view.objects``. Forces are those of the last physics
-    step. A sensor gives the net force of a jaw on an object; that is the sum of the normal forces
-    up to a factor of 1.6, because friction adds at most 1.2 times the normal force across it and
-    the normals of one jaw on a convex object do not cancel. The threshold is ten million times
-    smaller than a grasp's force: it tells contact from none.
-    """
-
-    def __init__(self, view: TaskView, phase: Tensor | None) -> None:
-        """Take the view, and the phase of every world."""
-        self.view = view
-        # What is known of this state, see `once_per_step`; terms of one pass share it.
-        self.known = known_values()
-        self._phase = phase
-
-    @step_value
+    @_value
     def pose(self) -> Tensor:
         """Position [m] and quaternion (wxyz), shape ``(nworld, objects, 7)``."""
-        return self._of_each([pose_w(self.view.env, name) for name in self.view.objects])
+        return self._of_each([pose_w(self.env, name) for name in self.objects])
 
-    @step_value
+    @_value
     def pos(self) -> Tensor:
         """Position [m], shape ``(nworld, objects, 3)``."""
         return self.pose[..., :3]
 
-    @step_value
+    @_value
     def quat(self) -> Tensor:
         """Orientation (wxyz), shape ``(nworld, objects, 4)``."""
         return self.pose[..., 3:]
 
-    @step_value
+    @_value
     def velocity(self) -> Tensor:
         """Velocity as MuJoCo has it: linear [m/s] in the world, angular [rad/s] in the object's
         frame, shape ``(nworld, objects, 6)``.
         """
-        env = self.view.env
-        return self._of_each([object_velocity(env, object=name) for name in self.view.objects])
+        env = self.env
+        return self._of_each([object_velocity(env, object=name) for name in self.objects])
 
-    @step_value
+    @_value
     def turn(self) -> Tensor:
         """Rotation matrices, shape ``(nworld, objects, 3, 3)``."""
         return quat_to_matrix(self.quat)
 
-    @step_value
+    @_value
     def height(self) -> Tensor:
         """Height of the lowest point above the table [m], shape ``(nworld, objects)``."""
-        forms = [thing.form for thing in self.view.things]
+        forms = [thing.form for thing in self.things]
         if forms[1:] == forms[:-1]:  # all alike
-            return lowest_point(self.pos, self.quat, *forms[0]) - self.view.top
+            return lowest_point(self.pos, self.quat, *forms[0]) - self.top
         poses = zip(self.pos.unbind(1), self.quat.unbind(1), forms, strict=True)
         lowest = [lowest_point(pos, quat, *form) for pos, quat, form in poses]
-        return torch.stack(lowest, dim=1) - self.view.top
+        return torch.stack(lowest, dim=1) - self.top
 
-    @step_value
+    @_value
     def bounds(self) -> tuple[Tensor, Tensor]:
         """Least and largest coordinates [m] of the corners, or of those of the box around another
         shape, each ``(nworld, objects, 3)``.
         """
-        reach = (self.turn.abs() * self.view.half[:, None]).sum(-1)
+        reach = (self.turn.abs() * self.half[:, None]).sum(-1)
         return self.pos - reach, self.pos + reach
 
-    @step_value
+    @_value
     def speed(self) -> Tensor:
         """Fastest that any point can be [m/s], shape ``(nworld, objects)``."""
         parts = norm(self.velocity.unflatten(-1, (2, 3)))
         linear, angular = parts.unbind(-1)
-        return linear + self.view.radius * angular
+        return linear + self.radius * angular
 
-    @step_value
+    @_value
     def corner_speed(self) -> Tensor:
         """Speed of the fastest corner [m/s], shape ``(nworld, objects)``."""
-        view = self.view
-        signs = view.constant(*itertools.chain(*itertools.product((-1.0, 1.0), repeat=3)))
-        arms = view.half[:, None] * signs.view(8, 3)
+        signs = self.constant(*itertools.chain(*itertools.product((-1.0, 1.0), repeat=3)))
+        arms = self.half[:, None] * signs.view(8, 3)
         # A free joint's linear velocity is the world's, the angular one the body's, as all here.
         linear = (self.turn * self.velocity[..., :3, None]).sum(-2)
         spin = self.velocity[..., None, 3:].expand(-1, -1, 8, -1)
         swept = torch.linalg.cross(spin, arms.expand_as(spin))
         return norm(linear[..., None, :] + swept).amax(-1)
 
-    @step_value
+    @_value
     def pressed(self) -> Tensor:
         """Whether each jaw presses on each object, shape ``(nworld, objects, jaws)``, bool."""
-        return self._sensed(self.view.jaws)
+        return self._sensed(self.jaws)
 
     def center(self, name: str) -> Tensor:
         """Position of an object of the scene [m], shape ``(nworld, 3)``."""
-        view = self.view
-        if name not in view.objects:  # such as a fixture
-            return pose_w(view.env, name)[:, :3].float()
-        return self.pos[:, view.objects.index(name)]
+        if name not in self.objects:  # such as a fixture
+            return pose_w(self.env, name)[:, :3].float()
+        return self.pos[:, self.objects.index(name)]
 
     def joint(self, name: str) -> Tensor:
         """Position of a fixture's joint [rad, m], shape ``(nworld, 1)``."""
-        return fixture_pos(self.view.env, joint=name).float()[:, None]
+        return fixture_pos(self.env, joint=name).float()[:, None]
 
     def tilt(self, name: str, axis: str = "z", *, either_end: bool = True) -> Tensor:
         """Angle of an object's axis from the vertical, at most 90 unless ``either_end`` is false
         [deg], shape ``(nworld,)``. Axis ``face``: of the face that a box or a cylinder lies on.
         """
-        shape = self.view.env.cfg.scene.objects[name].shape
+        shape = self.env.cfg.scene.objects[name].shape
         faces = {"box": "xyz", "cylinder": "z"}
         require_names(f"axis of {shape} {name}", [axis], [*"xyz", *["face"] * (shape in faces)])
         axis = faces[shape] if axis == "face" else axis
-        cosines = self.turn[:, self.view.number(name), 2]  # of each axis
+        cosines = self.turn[:, self.number(name), 2]  # of each axis
         cosines = cosines.abs() if either_end or axis == "xyz" else cosines
         ordered = cosines.sort(-1).values if axis == "xyz" else cosines.roll("zyx".index(axis), -1)
         return atan2(norm(ordered[:, :2]), ordered[:, 2]).rad2deg()
 
-    @step_value
+    @_value
     def in_hand(self) -> Tensor:
         """Whether all jaws press on each object, shape ``(nworld, objects)``, bool."""
         return self.pressed.all(-1)
 
-    @step_value
+    @_value
     def untouched(self) -> Tensor:
         """Whether no jaw presses on each object, shape ``(nworld, objects)``, bool."""
         return ~self.pressed.any(-1)
 
-    @step_value
+    @_value
     def narrowest(self) -> Tensor:
         """Opening of the least open gripper joint as measured, 0 to 1, shape ``(nworld, 1)``."""
-        opening = gripper_opening(self.view.env).float()
+        opening = gripper_opening(self.env).float()
         return opening if opening.shape[1] == 1 else opening.amin(1, keepdim=True)
 
-    @step_value
+    @_value
     def supported(self) -> Tensor:
         """Whether anything but a jaw presses on each object, shape ``(nworld, objects)``, bool;
         needs ``scene.support_sensors``.
         """
-        if not self.view.env.cfg.scene.support_sensors:
+        if not self.env.cfg.scene.support_sensors:
             expected = "true: the check asks what an object rests on"
             raise ConfigError("scene.support_sensors", False, expected)
-        return self._sensed(self.view.supports).any(-1)
+        return self._sensed(self.supports).any(-1)
 
     def judged(self, key: slice) -> Tensor:
         """Whether the step counts for a rule, shape ``(nworld, columns)`` or ``(1, 1)``, bool."""
-        return self._judged[:, key] if self.view.phased else self._judged
+        return self._judged[:, key] if self.phased else self._judged
 
-    @cached_property
+    @_value
     def _judged(self) -> Tensor:
         """Every column of every key, ``(nworld, n)``; without phases ``(1, 1)``."""
-        view = self.view
-        going = (view.count < view.stop)[:, None]
-        if self._phase is None or not view.phased:
+        going = (self.count < self.stop)[:, None]
+        if self.phase is None or not self.phased:
             return going
-        return view.table.index_select(0, self._phase) & going
+        return self.table.index_select(0, self.phase) & going
+
+    @shared
+    def value(self, condition: Callable[["Step"], Tensor]) -> Tensor:
+        """The value of a condition."""
+        return condition(self)
 
     def _of_each(self, values: list[Tensor]) -> Tensor:
         if not values:
@@ -306,10 +275,10 @@ class Step:
         return torch.stack(values, dim=1).float()
 
     def _sensed(self, columns: Columns) -> Tensor:
-        count = len(self.view.objects)
+        count = len(self.objects)
         shape = (count, len(columns.indices) // (3 * count or 1), 3)
-        forces = self.view.env.sim.part("sensordata", columns, *shape)
-        return norm(forces) > self.view.force
+        forces = self.env.sim.part("sensordata", columns, *shape)
+        return norm(forces) > self.force
 
 
 @dataclass(frozen=True, slots=True)

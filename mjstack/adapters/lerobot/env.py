@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from mjstack.envs import Env, driven_config
 from mjstack.episodes.rollout import reset_worlds
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ArgumentError, ConfigError
+from mjstack.managers.state import in_one_pass
 from mjstack.policy import load_policy
 from mjstack.policy.lerobot import IMAGES, SEEN, STATE
 from mjstack.rng import check_seed
@@ -24,7 +26,6 @@ from mjstack.robots.units import LEROBOT
 from mjstack.sim import StateRenderer
 from mjstack.sim.cameras import with_outputs
 from mjstack.sim.sizes import resolve_sizes
-from mjstack.tasks.check import make_check
 
 Info = dict[str, Any]
 TIMINGS = {30: "hz30", 50: "default"}  # by control rate [Hz]
@@ -127,7 +128,6 @@ class LerobotVectorEnv(VectorEnv):
             observation={GROUP: replace(cfg.observation[GROUP], noise=False)},
             scene=replace(cfg.scene, cameras=with_outputs(cfg.scene.cameras, ["rgb"], cameras)),
         )
-        self._check = make_check(played)
         sim = stage.simulation(nworld, *stage.backend, sizes=resolve_sizes(cfg, driven=False))
         self.inner = env = Env(sim, stage.index, played, check_faults=False)
         self.words = LerobotWords(env, env.observation_manager.groups, env.images, units)
@@ -159,7 +159,7 @@ class LerobotVectorEnv(VectorEnv):
                 raise ArgumentError("seed", f"{len(seed)} numbers", expected)
         reset_worlds(env, None if seed is None else env.cfg.seed, seed)
         self._left = self._max_episode_steps
-        self._check.start(env, self._left, [])
+        self.inner.check.start(env, self._left, [])
         return self._observe(), {}
 
     def step(self, actions: np.ndarray) -> tuple[Info, np.ndarray, np.ndarray, np.ndarray, Info]:
@@ -170,10 +170,10 @@ class LerobotVectorEnv(VectorEnv):
         success = np.zeros(self.num_envs, bool)
         if self._left:
             self.inner.step(targets)
-            self._check.update(self._phase)
+            in_one_pass(partial(self.inner.check.update, self._phase))
             self._left -= 1
             if not self._left:
-                success = (self._check.result().failed == 0).cpu().numpy()
+                success = (self.inner.check.result().failed == 0).cpu().numpy()
         ended = np.full(self.num_envs, not self._left)
         reward = success.astype(np.float32)
         return self._observe(), reward, np.zeros_like(ended), ended, {"is_success": success}

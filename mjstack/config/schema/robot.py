@@ -31,8 +31,6 @@ class PlacementsCfg:
     """x and y of each place."""
     random_xy: list[float] = spec(unit="m", length=2, ge=0.0)
     """How far ``reset=randomized`` moves each object, plus or minus."""
-    box_center: list[float] | None = spec(None, unit="m", length=2)
-    """Centre of the box."""
     grasp_offset: float = spec(0.0, unit="m")
     """How far above an object's centre it is held."""
     home: list[float] | None = spec(None, unit="rad, m")

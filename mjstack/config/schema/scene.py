@@ -1,4 +1,4 @@
-"""The scene: table, objects, places, cameras and perhaps a box."""
+"""The scene: table, objects, places and cameras."""
 
 import itertools
 import math
@@ -16,29 +16,6 @@ SHAPES = {  # and the sizes of each
     "sphere": (1, "the radius"),
     "capsule": _ROUND,
 }
-
-
-@dataclass(slots=True)
-class BoxCfg:
-    """A receiving box on the table: a floor and four walls around it, fixed to the world."""
-
-    center: list[float] = spec(unit="m", length=2)
-    """x and y of the centre of its inside."""
-    half: list[float] = spec(unit="m", length=2, gt=0.0)
-    """Half sizes of its inside in x and y."""
-    floor: float = spec(unit="m", gt=0.0)
-    """Thickness of the floor."""
-    wall: float = spec(unit="m", gt=0.0)
-    """Thickness of the walls."""
-    height: float = spec(unit="m", gt=0.0)
-    """Height of the rim above the table."""
-    friction: list[float] = spec(length=3, gt=0.0)
-    """Sliding, torsional and rolling coefficient."""
-    floor_solref: list[float] = spec(length=2)
-    """Contact parameters of the floor: time constant [s] and damping ratio, or, negative,
-    stiffness and damping."""
-    wall_solref: list[float] = spec(length=2)
-    """Contact parameters of the walls."""
 
 
 @dataclass(slots=True)
@@ -115,6 +92,9 @@ class PartCfg(ShapeCfg):
 
     pos: list[float] = spec([0.0, 0.0, 0.0], unit="m", length=3)
     """Its centre in the object's frame, whose origin stands on the table."""
+    solref: list[float] | None = spec(None, length=2)
+    """Contact parameters: time constant [s] and damping ratio, or, negative, stiffness and
+    damping. null: MuJoCo's."""
 
 
 @dataclass(slots=True)
@@ -269,7 +249,7 @@ class CameraCfg:
 
 @dataclass(slots=True)
 class SceneCfg:
-    """A table, objects and places on it, and perhaps a box."""
+    """A table, and objects and places on it."""
 
     name: str = spec()
     """Its name, which selects the robot's ``placements``."""
@@ -290,8 +270,6 @@ class SceneCfg:
     """Named spots on the table."""
     support_sensors: bool = False
     """Whether sensors measure what presses on each object beside the jaws."""
-    box: BoxCfg | None = None
-    """A receiving box."""
     cameras: dict[str, CameraCfg] = spec({})
     """Cameras by name. Without any, the model has nothing that only pictures need."""
     grasp_offset: float = spec(0.0, unit="m")
