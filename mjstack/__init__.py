@@ -18,7 +18,6 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
-from mjstack.adapters.ids import Registrar
 from mjstack.version import __version__ as __version__
 
 if TYPE_CHECKING:
@@ -53,6 +52,3 @@ if not TYPE_CHECKING:  # a type checker would take any name for one of these
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
-
-
-Registrar().install()

@@ -25,9 +25,9 @@ from mjstack.cli import run
 from mjstack.config.check import validate
 from mjstack.config.fingerprint import config_hash, differences
 from mjstack.config.schema import Backend, Config
-from mjstack.datasets import DatasetSpec, DatasetWriter, Feature
 from mjstack.datasets.part import PartWriter
-from mjstack.datasets.spec import INDICES
+from mjstack.datasets.spec import INDICES, DatasetSpec, Feature
+from mjstack.datasets.writer import DatasetWriter
 from mjstack.envs import Env, build_env, demonstration_config
 from mjstack.episodes.batches import Batch, BatchPlan
 from mjstack.episodes.recorder import Channels, Recorder, read_commands
@@ -332,6 +332,10 @@ def folder(tmp_path: Path, monkeypatch: Patch) -> Path:
         (["task=reach", "task.check=null"], "task=reach"),
         ([f"+observation.state={{terms: {{q: {JOINT_POS}}}}}"], "observation.state=a group"),
         (["job.folder=taken"], "taken cannot be written"),
+        (
+            ["cameras=[front]", "scene.cameras.front.size=[33,32]"],
+            "scene.cameras.front.size=[33, 32]: expected even numbers",
+        ),
     ],
 )
 def test_bad_input_is_one_line(args: list[str], words: str, folder: Path, refused: Refused) -> None:
@@ -543,7 +547,7 @@ def test_finished_batches_are_kept(
     write = PartWriter.write
 
     def broken(self: PartWriter, episode: Any, *args: Any) -> None:
-        if episode.seed == 1 and len(self.part.rows) == 1:
+        if episode.row["seed"] == 1 and len(self.part.rows) == 1:
             raise error
         write(self, episode, *args)
 
@@ -592,16 +596,10 @@ def test_damaged_notes_are_one_line(
 ) -> None:
     play_nothing()
     assert collect("nworld=2", "job.episodes=1") == 0
-    (batch,) = json.loads((folder / BATCHES).read_text())
-    batch["kept"] = batch.pop("episodes")
-    for text, says in [
-        ("[{]", f"{BATCHES}: cannot be read (JSONDecodeError: "),
-        (json.dumps([batch]), "has a dataset of version 0.1, expected one of this version"),
-    ]:
-        (folder / BATCHES).write_text(text)
-        capsys.readouterr()
-        assert run([*COMMAND, "nworld=2", "job.episodes=2"]) == 2
-        assert says in capsys.readouterr().err
+    (folder / BATCHES).write_text("[{]")
+    capsys.readouterr()
+    assert run([*COMMAND, "nworld=2", "job.episodes=2"]) == 2
+    assert f"{BATCHES}: cannot be read (JSONDecodeError: " in capsys.readouterr().err
 
 
 @pytest.mark.full
@@ -629,10 +627,12 @@ def test_steps_come_to_the_host_in_chunks(monkeypatch: Patch) -> None:
     for size in (1, 2 * (6 * 3 + 5) * 4, 10**6):  # one world, two and all at once
         monkeypatch.setattr("mjstack.jobs.collect_episodes._CHUNK_BYTES", size)
         episodes = list(source.episodes(batch, [6, 0, 3]))
-        assert [episode.world for episode in episodes] == [6, 0, 3]
+        assert [episode.row["world"] for episode in episodes] == [6, 0, 3]
         for episode in episodes:
             for name, values in rows.items():
-                assert np.array_equal(episode.arrays[name], values[:5, episode.world].numpy())
+                assert np.array_equal(
+                    episode.arrays[name], values[:5, episode.row["world"]].numpy()
+                )
 
 
 @pytest.mark.full

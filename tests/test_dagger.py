@@ -152,10 +152,10 @@ def test_two_ranks_give_one_policy_and_go_on_bit_for_bit(tmp_path: Path) -> None
 
 def test_a_round_of_another_number_of_ranks_is_refused(tmp_path: Path) -> None:
     stage = Stage(load_config([*TINY, "nworld=2", "job.episodes=2"]))
-    rounds.make_round(stage, tmp_path, None, 0)
+    rounds.make_round(stage, tmp_path, None, 0, None)
     other = stage.with_config(stage.cfg, ranks=Alone(0, 2))
     with pytest.raises(FolderError, match=r"'processes': 1\}, and this one has .*'processes': 2\}"):
-        rounds.make_round(other, tmp_path, None, 0)
+        rounds.make_round(other, tmp_path, None, 0, None)
     with pytest.raises(ConfigError, match="episodes=2: expected at least 4, because one of each"):
         check_clone(other)
 
@@ -170,9 +170,9 @@ class Alone(Ranks):
 def test_gradients_are_cut_and_the_learning_rate_rises(tmp_path: Path, monkeypatch: Patch) -> None:
     """A round begins with the small moments of the one before, so a full rate would leap."""
     stage = Stage(load_config([*TINY, "job.warm_up=0.5", "job.max_grad_norm=0.001"]))
-    played = rounds.make_round(stage, tmp_path, None, 0)
+    played = rounds.make_round(stage, tmp_path, None, 0, None)
     rates, lengths = [], []
-    with closing(CloneLearner(stage, played, tmp_path)) as learner:
+    with closing(CloneLearner(stage, played, tmp_path, None)) as learner:
         cut = learner._optimizer.step
 
         def step() -> None:

@@ -316,6 +316,13 @@ def test_names_come_back_as_they_are(here: Path) -> None:
         assert robot.file == str(file)
 
 
+def test_a_joint_without_a_name_has_its_number(here: Path) -> None:
+    """As the scene names it, with a servo, which the file cannot name it for."""
+    robot = guess(gantry().replace('name="z"', ""))
+    assert robot["arm_joints"] == ["x", "y", "unnamed_2", "roll"]
+    assert [*robot["servos"]] == ["unnamed_2"]
+
+
 ROLL_ALONE = gantry().split('<body name="left jaw">')[0] + 4 * "</body>" + "</worldbody></mujoco>"
 REFUSED = {
     "interpolation": (gantry(["x${oc.env:HOME}", *PLAIN[1:]]), "'x${oc.env:HOME}' in it means"),
@@ -326,7 +333,6 @@ REFUSED = {
         "no body has fingers, or one jaw, at the end of joints",
     ),
     "no gripper": (ROLL_ALONE, "its fingers open by 0 mm only"),
-    "no name": (gantry().replace('name="z"', ""), "the joint of body unnamed_3 has no name"),
     "sideways": (
         gantry().replace('pos="0 0 0.5"', 'pos="0 0 0.5" quat="1 1 0 0"'),
         "the hand of hand cannot point down over a table within the arm's reach",

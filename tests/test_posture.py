@@ -20,7 +20,6 @@ from mjstack.config.schema import Config
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError
 from mjstack.kinematics.mink_ik import GraspIk
-from mjstack.kinematics.reach import PointReach
 from mjstack.robots import read_robot
 from mjstack.robots.guest import left_behind
 from mjstack.robots.jaws import Jaws
@@ -150,7 +149,7 @@ def coupled_arm(tmp_path: Path, kind: str) -> Config:
 
 @pytest.mark.parametrize("kind", COUPLINGS)
 def test_inverse_kinematics_takes_what_follows_along(kind: str, tmp_path: Path) -> None:
-    """mink, the batched solver and the reach agree with MuJoCo's grasp point, and reach it."""
+    """mink and the batched solver agree with MuJoCo's grasp point, and reach it."""
     cfg = coupled_arm(tmp_path, kind)
     ik = GraspIk(cfg.robot, cfg.model, tolerance=1e-4)
     places = Posture(ik.model, cfg.robot.joints)
@@ -167,10 +166,6 @@ def test_inverse_kinematics_takes_what_follows_along(kind: str, tmp_path: Path) 
     for k, point in enumerate(points):
         assert np.linalg.norm(ik.grasp_point(command[k].double().numpy()) - point) < 1e-5
         assert ik.solve(point, ik.home)[1] < 1e-4
-    reach = PointReach(ik.model, cfg.robot, cfg.robot.home[4:])
-    q, left = reach.solve(points)
-    assert left.max() < 1e-5
-    np.testing.assert_allclose(reach.forward(q)[1], points, atol=1e-5)
 
 
 def test_a_joint_that_follows_two_is_refused(tmp_path: Path) -> None:
@@ -359,12 +354,9 @@ def test_an_idle_joint_follows_none(where: str, tmp_path: Path) -> None:
     ik = GraspIk(cfg.robot, cfg.model, tolerance=1e-4)
     assert Posture(ik.model, cfg.robot.joints).leader.max(initial=-1) <= 4  # the fingers' alone
     assert not ik._frozen.along
-    reach = PointReach(ik.model, cfg.robot, cfg.robot.home[4:])
-    assert reach._native is None
     goals = np.tile(ik.home, (4, 1))
     goals[:, :3] += np.random.default_rng(1).uniform(-0.15, 0.15, (4, 3)) * [1.0, 1.0, 0.2]
     points = np.array([ik.grasp_point(goal) for goal in goals])
-    np.testing.assert_allclose(reach.forward(goals[:, :3])[1], points, atol=1e-9)
     solver = Arm(ik.model, cfg.robot).solver(4, iterations=40)
     np.testing.assert_allclose(solver.forward(torch.from_numpy(goals))[0], points, atol=1e-6)
 

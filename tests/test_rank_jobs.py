@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from dataset_checker import images_of
 from environments import SHORT_REACH, at_double_speed, one_second_episode, report_of
 from test_ranks import PLAIN, SCRIPT, play, start_python
 
@@ -109,7 +110,9 @@ def test_ranks_collect_images(tmp_path: Path) -> None:
     np.testing.assert_array_equal(shared.frames("action"), alone.frames("action"))
     key = "observation.images.front"
     for episode in range(3):
-        first, second = (stored.images(key, episode).astype(float) for stored in (alone, shared))
+        first, second = (
+            images_of(stored, key, episode).astype(float) for stored in (alone, shared)
+        )
         assert first.shape == second.shape
         assert abs(first - second).mean() < 1.0  # the encoder sees other neighbours
         assert second.std() > 10.0

@@ -1,4 +1,4 @@
-"""What the arm reaches: against MuJoCo and mink, regions that are refused, obstacles, and the map
+"""Reach of the arm: against MuJoCo and mink, regions that are refused, obstacles, and the map
 of the tool.
 """
 
@@ -16,13 +16,13 @@ import pytest
 import reachability
 import torch
 from compositions import load_config, make_env
-from environments import Capture, GetStage, Patch, configure, on_shared_sim
+from environments import Capture, GetStage, Patch, configure
+from ik_arm import Arm, results
 
-import mjstack
 from mjstack.config.schema import Config
 from mjstack.errors import ConfigError, ParameterError
+from mjstack.kinematics.batched_ik import find_reach
 from mjstack.kinematics.mink_ik import GraspIk
-from mjstack.kinematics.reach import PointReach
 from mjstack.mdp.starts.placement import Placement
 from mjstack.scene import SceneIndex, build_model
 
@@ -37,89 +37,47 @@ def points_over(cfg: Config, n: int, seed: int = 0) -> np.ndarray:
     return np.column_stack((xy, lowest + rng.uniform(0.0, 0.15, n)))
 
 
-def grasp_point(ik: GraspIk, cfg: Config, q: np.ndarray, gripper: list[float]) -> np.ndarray:
-    """Where mink's model has the grasp point at a solution."""
-    command = ik.home.copy()
-    command[-len(gripper) :] = gripper
-    joints = sorted(cfg.robot.ik_joints, key=cfg.robot.arm_joints.index)
-    command[[cfg.robot.arm_joints.index(name) for name in joints]] = q
-    return ik.grasp_point(command)
-
-
 @pytest.mark.parametrize("grip", ["open", "closed"])
-def test_solutions_are_where_mujoco_says(get_stage: GetStage, robot: str, grip: str) -> None:
+def test_what_mink_reaches_is_reached(get_stage: GetStage, robot: str, grip: str) -> None:
     cfg = get_stage(robot).cfg
-    gripper = cfg.robot.gripper_open if grip == "open" else cfg.robot.gripper_closed
+    gripper = getattr(cfg.robot, f"gripper_{grip}")
     ik = GraspIk(cfg.robot, cfg.model, tolerance=5e-4)
-    start = np.array([*ik.home[: len(cfg.robot.arm_joints)], *gripper])
     points = points_over(cfg, 20)
-    found, distances = PointReach(get_stage(robot).model, cfg.robot, gripper).solve(points)
-    assert distances.max() < 5e-4
-    for point, q, distance in zip(points, found, distances, strict=True):
-        at = grasp_point(ik, cfg, q, gripper)
-        assert np.linalg.norm(at - point) == pytest.approx(distance, abs=1e-9)
-        assert ik.solve(point, start)[1] < 5e-4  # mink gets there too
-
-
-def open_reach(get_stage: GetStage, robot: str) -> tuple[Config, mujoco.MjModel, PointReach]:
-    """A robot's configuration, its scene, and its reach with open jaws."""
-    stage = get_stage(robot)
-    cfg = stage.cfg
-    return cfg, stage.model, PointReach(stage.model, cfg.robot, cfg.robot.gripper_open)
+    solutions, distances = find_reach(get_stage(robot).model, cfg.robot, points, gripper)
+    assert distances.shape == (3, 20)
+    assert float(distances.amin(0).max()) < 5e-4
+    for k, point in enumerate(points):
+        q = solutions[distances[:, k].argmin(), k].double().numpy()
+        np.testing.assert_allclose(q[-len(gripper) :], gripper, atol=1e-6)
+        assert np.linalg.norm(ik.grasp_point(q) - point) < 5e-4
+        assert ik.solve(point, np.array([*ik.home[: -len(gripper)], *gripper]))[1] < 5e-4
 
 
 @pytest.mark.full
-def test_the_tilt_is_that_of_the_gripper_and_the_smallest(get_stage: GetStage, robot: str) -> None:
-    cfg, model, _ = open_reach(get_stage, robot)
-    reach = reachability.Upright(model, cfg, "open")
+def test_other_starts_reach_what_home_does_not(get_stage: GetStage) -> None:
+    cfg = get_stage("so101").cfg
+    points = np.random.default_rng(0).uniform([-0.1, -0.4, 0.0], [0.6, 0.4, 0.4], (2000, 3))
+    _, distances = find_reach(get_stage("so101").model, cfg.robot, points, cfg.robot.gripper_open)
+    reached = distances < 5e-4
+    assert float(reached.any(0).double().mean()) > float(reached[0].double().mean()) + 0.01
+
+
+@pytest.mark.full
+def test_the_tilt_is_the_smallest(get_stage: GetStage, robot: str) -> None:
+    cfg = get_stage(robot).cfg
+    model = get_stage(robot).model
     points = points_over(cfg, 4)
-    q_upright, distances, tilts = reach.solve_upright(points)
+    distances, tilts = reachability.solve_upright(model, cfg, "open", points)
     assert distances.max() < 5e-4
-    data = mujoco.MjData(model)
-    last = model.joint(cfg.robot.arm_joints[-1])
-    joints = sorted(cfg.robot.ik_joints, key=cfg.robot.arm_joints.index)
-    for point, q, tilt in zip(points, q_upright, tilts, strict=True):
-        home = zip(cfg.robot.joints, cfg.robot.home, strict=True)
-        solution = zip(joints, q, strict=True)
-        for name, value in (dict(home) | cfg.robot.locked | dict(solution)).items():
-            data.qpos[model.joint(name).qposadr[0]] = value
-        mujoco.mj_kinematics(model, data)
-        axis = data.xaxis[last.id] * np.sign(data.xaxis[last.id] @ (point - data.xanchor[last.id]))
-        assert math.degrees(math.acos(-axis[2])) == pytest.approx(tilt, abs=1e-4)
-    # Nothing better is found from many other postures.
-    rng = np.random.default_rng(3)
-    for point, tilt in zip(points, tilts, strict=True):
-        start = rng.uniform(reach._low, reach._high, (300, len(reach._low)))
-        many = np.tile(point, (300, 1))
-        goals = np.column_stack((many, np.tile([0.0, 0.0, -reachability.POINTING], (300, 1))))
-        found = reach.point.descend(reach.descend(start, goals), many)
-        distance = np.linalg.norm(reach.point.forward(found)[1] - many, axis=1)
-        assert reach.tilt(found)[distance < 5e-4].min() > tilt - 0.5
-
-
-@pytest.mark.full
-def test_out_of_reach_is_as_far_as_it_is(get_stage: GetStage, robot: str) -> None:
-    _, _, reach = open_reach(get_stage, robot)
-    far = np.array([[1.5, 0.0, 0.2], [1.6, 0.0, 0.2]])
-    distance = reach.solve(far)[1]
-    # Stretched towards it: nothing of the range of 200,000 postures is nearer.
-    q = np.random.default_rng(0).uniform(reach._low, reach._high, (200_000, len(reach._low)))
-    nearest = np.linalg.norm(reach.forward(q)[1] - far[:1], axis=1).min()
-    assert 0.0 < distance[0] <= nearest
-    assert distance[1] - distance[0] == pytest.approx(0.1, abs=1e-3)
-
-
-@pytest.mark.full
-def test_joints_stay_within_both_ranges(get_stage: GetStage, robot: str) -> None:
-    cfg, model, reach = open_reach(get_stage, robot)
-    upright = reachability.Upright(model, cfg, "open")
-    points = np.random.default_rng(1).uniform([-0.3, -0.6, 0.0], [0.8, 0.6, 0.6], (200, 3))
-    joints = sorted(cfg.robot.ik_joints, key=cfg.robot.arm_joints.index)
-    for q in (reach.solve(points)[0], upright.solve_upright(points)[0]):
-        for name, values in zip(joints, q.T, strict=True):
-            for low, high in (model.joint(name).range, model.actuator(name).ctrlrange):
-                assert values.min() >= low - 1e-12
-                assert values.max() <= high + 1e-12
+    # Nothing better is found from many other postures, by the kinematics of MuJoCo
+    arm = Arm(model, cfg.robot)
+    solver = arm.solver(300, iterations=40, approach_gain=0.5)
+    for k, (point, tilt) in enumerate(zip(points, tilts, strict=True)):
+        q, targets = arm.anywhere(300, k), np.tile(point, (300, 1))
+        for _ in range(reachability.SOLVES):
+            q, distance = results(solver, q, targets)
+        down = -arm.directions(q[distance < 5e-4])[1][:, 2]
+        assert tilt == pytest.approx(np.degrees(np.arccos(down.max())), abs=0.5)
 
 
 REGIONS = [
@@ -419,22 +377,15 @@ def test_the_tool_maps_the_table(tmp_path: Path, capsys: Capture, monkeypatch: P
     levels = {"grasp": (pytest.approx(0.022), "open"), "approach": (approach, "open")}
     assert reachability.find_levels(cfg) == levels | {"carry": (carry, "open")}
 
-    # Points are as PointReach has them
+    # Points are as solved one by one
     with (tmp_path / "reachability.csv").open() as file:
         rows = list(csv.DictReader(file))
-    reach = PointReach(build_model(cfg), cfg.robot, cfg.robot.gripper_open)
+    model = build_model(cfg)
     for row in rows[:: len(rows) // 7]:
         z = cfg.scene.table_top + cfg.scene.objects["red"].half_height
         point = np.array([[float(row["x_m"]), float(row["y_m"]), z]])
-        distance = float(reach.solve(point)[1][0])
+        distance = float(find_reach(model, cfg.robot, point, cfg.robot.gripper_open)[1].min())
         assert (row["grasp_reached"] == "1") is (distance <= 5e-4)
         assert float(row["grasp_residual_m"]) == pytest.approx(distance, rel=0.01, abs=2e-6)
         assert (row["grasp_tilt_deg"] != "nan") is (row["grasp_reached"] == "1")
-    assert {row["grasp_reached"] for row in rows} >= {"1"}
-
-
-def test_a_native_environment_checks_reach_without_warp() -> None:
-    env = on_shared_sim("native", 3, configure("reset=randomized"))
-    assert env.reset_manager is not None
-    source = Path(mjstack.__file__).parent / "kinematics" / "reach.py"
-    assert "import warp" not in source.read_text()
+    assert {row["grasp_reached"] for row in rows} == {"0", "1"}

@@ -23,7 +23,7 @@ from mjstack.config.schema import Config
 from mjstack.config.session import search_path
 from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.errors import ConfigError, MjstackError, UnknownName
-from mjstack.kinematics.reach import PointReach
+from mjstack.kinematics.batched_ik import find_reach
 from mjstack.robots import robot_spec
 from mjstack.scene import build_model
 
@@ -280,17 +280,16 @@ def test_reach_of_an_arm_with_a_slide_is_mujocos() -> None:
     cfg = scara()
     model = build_model(cfg)
     arm = Arm(model, cfg.robot)
-    reach = PointReach(model, cfg.robot, cfg.robot.gripper_open)
     points = scara_points(30)
-    solutions, distances = reach.solve(points)
-    assert distances.max() < 1e-6
-    commands = arm.at_home(30)
-    commands[:, arm.moved] = solutions
-    assert np.linalg.norm(arm.grasp_point(commands) - points, axis=1).max() < 1e-6
+    commands, distances = find_reach(model, cfg.robot, points, cfg.robot.gripper_open)
+    assert distances.max() < 1e-5
+    for start in commands.double().numpy():
+        assert np.linalg.norm(arm.grasp_point(start) - points, axis=1).max() < 1e-5
     # Above the slide's range the point is as far away as it is above.
-    q, distances = reach.solve(np.array([[0.4, 0.0, 0.28 + 0.1]]))
-    assert distances[0] == pytest.approx(0.1, abs=1e-4)
-    assert q[0, 2] == pytest.approx(0.25, abs=1e-9)
+    point = np.array([[0.4, 0.0, 0.28 + 0.1]])
+    q, distances = find_reach(model, cfg.robot, point, cfg.robot.gripper_open)
+    assert distances.min() == pytest.approx(0.1, abs=1e-4)
+    assert q[distances[:, 0].argmin(), 0, 2] == pytest.approx(0.25, abs=1e-6)
 
 
 def test_mink_plans_an_arm_with_a_slide() -> None:

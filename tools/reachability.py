@@ -14,63 +14,38 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+import torch
 from common import make_parser, run
 
 from mjstack.config.schema import Config
 from mjstack.envs.buffers import Advance
 from mjstack.errors import ConfigError
-from mjstack.kinematics.reach import STARTS, PointReach
+from mjstack.kinematics.batched_ik import BatchedIk, find_reach
 from mjstack.report.picture import figure, outline
 from mjstack.report.table import Table
 from mjstack.scene import build_model
-from mjstack.scene.index import approach_body, locked_home
 from mjstack.scene.phases import object_targets
 
-SHARE = 500  # points between two lines of progress
 FINE = 0.001  # [m] to which regions are given
-POINTING = 0.02  # [m/rad] weight of the approach axis against the position
+SOLVES = 16  # that turn the gripper upright, one after the other
 
 
-class Upright(PointReach):
-    """Reach of the grasp point with the gripper as upright as it goes."""
-
-    def __init__(self, model: mujoco.MjModel, cfg: Config, gripper: str) -> None:
-        arguments = (model, cfg.robot, getattr(cfg.robot, f"gripper_{gripper}"))
-        super().__init__(*arguments)
-        self.point = PointReach(*arguments)
-        self.ahead = PointReach(*arguments)  # of a point 1 m along the approach axis
-        data = mujoco.MjData(model)
-        joints = [model.joint(name).qposadr[0] for name in cfg.robot.joints]
-        data.qpos[joints] = locked_home(cfg.robot)
-        mujoco.mj_kinematics(model, data)
-        turned = data.xmat[approach_body(model, cfg.robot)].reshape(3, 3)
-        self.ahead.tip = self.ahead.tip + turned @ cfg.robot.approach_axis
-        self.tolerance = cfg.controller.ik_tolerance
-
-    def forward(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Jacobian and pose of the grasp point and of the approach axis, weighted."""
-        (jacobian, tip), (turns, ahead) = (reach.forward(q) for reach in (self.point, self.ahead))
-        rows = np.concatenate((jacobian, POINTING * (turns - jacobian)), axis=1)
-        return rows, np.column_stack((tip, POINTING * (ahead - tip)))
-
-    def solve_upright(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Joint positions, distances that are left [m], and the smallest tilts [deg], NaN where the
-        distance is not within tolerance.
-        """
-        best, distance = self.point.solve(points)
-        tilt = np.where(distance <= self.tolerance, self.tilt(best), np.nan)
-        goals = np.column_stack((points, np.tile([0.0, 0.0, -POINTING], (len(points), 1))))
-        for start in [best.copy(), *(self.start(points, off) for off in STARTS)]:
-            q = self.point.descend(self.descend(start, goals), points)
-            left = np.linalg.norm(points - self.point.forward(q)[1], axis=1)
-            better = (left <= self.tolerance) & (self.tilt(q) < tilt)
-            for values, new in ((best, q), (distance, left), (tilt, self.tilt(q))):
-                values[better] = new[better]
-        return best, distance, tilt
-
-    def tilt(self, q: np.ndarray) -> np.ndarray:
-        """Angle of the approach axis to straight down [deg]."""
-        return np.degrees(np.arccos(np.clip(-self.forward(q)[1][:, 5] / POINTING, -1.0, 1.0)))
+def solve_upright(
+    model: mujoco.MjModel, cfg: Config, gripper: str, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Distances that are left to points of shape ``(n, 3)`` [m], and the smallest tilts of the
+    gripper [deg], NaN where the distance is not within tolerance.
+    """
+    command = getattr(cfg.robot, f"gripper_{gripper}")
+    q, distance = find_reach(model, cfg.robot, points, command)
+    q, targets = q.flatten(0, 1), torch.from_numpy(np.tile(points, (len(q), 1)))
+    ik = BatchedIk(model, cfg.robot, len(q), "cpu", iterations=40, approach_gain=0.5)
+    for _ in range(SOLVES):
+        q = ik.solve(q, targets)[0].clone()
+    down = -ik.forward(q)[2][:, 2].view(distance.shape)
+    reached = distance <= cfg.controller.ik_tolerance
+    tilt = down.clamp(-1.0, 1.0).arccos().rad2deg().where(reached, torch.inf).amin(0)
+    return distance.amin(0).numpy(), tilt.where(reached.any(0), torch.nan).numpy()
 
 
 def find_levels(cfg: Config) -> dict[str, tuple[float, str]]:
@@ -151,13 +126,9 @@ def draw_map(args: argparse.Namespace, cfg: Config, advance: Advance) -> Iterato
     columns = {"x_m": points[:, 0], "y_m": points[:, 1]}
     tilts = {}
     for name, (height, gripper) in find_levels(cfg).items():
-        reach = Upright(model, cfg, gripper)
         places = np.insert(points, 2, scene.table_top + height, axis=1)
-        parts = []
-        for first in range(0, len(places), SHARE):
-            parts.append(reach.solve_upright(places[first : first + SHARE])[1:])
-            advance(f"{name}: points", first, len(places))
-        distance, tilt = np.concatenate(parts, axis=1)
+        distance, tilt = solve_upright(model, cfg, gripper, places)
+        advance(f"{name}: points", len(places), len(places))
         columns |= {f"{name}_reached": np.isfinite(tilt), f"{name}_residual_m": distance}
         columns[f"{name}_tilt_deg"] = tilts[f"{name}: {height:.3f} m above, {gripper}"] = tilt
     args.folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,6 @@
-"""Gymnasium's interfaces with NumPy arrays: worlds as a `VectorEnv`, or one as an `Env`."""
+"""Gymnasium's interfaces with NumPy arrays: worlds as a `VectorEnv`, or one as an `Env`. Importing
+this registers the ids of the tasks, such as ``mjstack/stack-so101-v0``.
+"""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -9,11 +11,11 @@ import numpy as np
 import torch
 from numpy import ndarray
 
-from mjstack.adapters.ids import register_env
 from mjstack.config import load_config
 from mjstack.config.schema import CameraCfg
 from mjstack.envs import Env, build_env
 from mjstack.errors import ArgumentError, ConfigError, MissingExtra, require_names
+from mjstack.files import CONFIG_FOLDER
 from mjstack.managers import offers
 from mjstack.report.picture import Window, opens_windows
 from mjstack.rng import check_seed
@@ -24,6 +26,7 @@ from mjstack.sim.cameras import with_outputs
 try:
     import gymnasium
     from gymnasium import spaces
+    from gymnasium.envs.registration import register
     from gymnasium.vector import AutoresetMode, VectorEnv
     from gymnasium.vector.utils import batch_space
 except ImportError as error:
@@ -33,6 +36,7 @@ __all__ = ["GymnasiumEnv", "GymnasiumVectorEnv", "make", "register_env"]
 Observation = ndarray | dict[str, ndarray]
 Info = dict[str, Any]
 _MODES = ("rgb_array", "human")  # of rendering
+_MAKER = "mjstack.adapters.gymnasium:make"
 
 
 class GymnasiumVectorEnv(VectorEnv):
@@ -315,6 +319,22 @@ def make(
     return made
 
 
+def register_env(
+    id: str, overrides: Sequence[str] = (), *, config_dir: str | os.PathLike | None = None
+) -> None:
+    """Register a task of your own for ``gymnasium.make`` and ``make_vec``.
+
+    Args:
+        id: Such as ``mine/push-v0``.
+        overrides: Of every environment of this id, such as ``["task=push", "robot=so101"]``.
+        config_dir: A folder with more choices, as of `mjstack.make_env`.
+    """
+    kwargs: dict[str, Any] = {"choices": list(overrides)}
+    if config_dir is not None:  # relative to the folder of this call
+        kwargs["config_dir"] = os.path.abspath(config_dir)
+    register(id, entry_point=_MAKER, vector_entry_point=_MAKER, kwargs=kwargs)
+
+
 def _numpy(obs: dict[str, torch.Tensor], group: str | None) -> Observation:
     # Copies, because images are the environment's own memory.
     arrays = {name: value.to("cpu", copy=True).numpy() for name, value in obs.items()}
@@ -342,3 +362,8 @@ def _array(action: Any, space: spaces.Space) -> ndarray:
     if array.shape != space.shape:
         raise ArgumentError("action", f"shape {array.shape}", expected)
     return array
+
+
+for _task in sorted(path.stem for path in CONFIG_FOLDER.glob("task/*.yaml")):
+    for _robot in sorted(path.stem for path in CONFIG_FOLDER.glob("robot/*.yaml")):
+        register_env(f"mjstack/{_task}-{_robot}-v0", [f"task={_task}", f"robot={_robot}"])

@@ -14,13 +14,13 @@ changed once they count.
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mjstack.datasets.spec import DTYPES, INDICES, DatasetSpec, Video
+from mjstack.datasets.spec import INDICES, DatasetSpec
 from mjstack.errors import MissingExtra
 
 VERSION = "v3.0"
@@ -68,11 +68,6 @@ def shard_indices(shard: int) -> dict[str, int]:
     return {"chunk_index": shard // CHUNK, "file_index": shard % CHUNK}
 
 
-def shard_of(row: Mapping[str, Any]) -> int:
-    """The shard of an episode, by its row."""
-    return row["data/chunk_index"] * CHUNK + row["data/file_index"]
-
-
 def shard_path(folder: Path, files: str, shard: int, video: str = "") -> Path:
     """Where a shard's frames (`DATA`), episodes (`EPISODES`) or images (`VIDEO`) are."""
     return folder / files.format(**shard_indices(shard), video_key=video)
@@ -86,11 +81,10 @@ def columns_of(spec: DatasetSpec) -> dict[str, tuple[str, int]]:
 
 def make_info(
     spec: DatasetSpec,
-    *,
     provenance: Sequence[Mapping[str, Any]] = (),
+    *,
     episodes: int = 0,
     frames: int = 0,
-    tasks: int = 0,
     shards: int = 0,
 ) -> dict[str, Any]:
     """The content of info.json. LeRobot does not read the block ``mjstack``.
@@ -119,7 +113,7 @@ def make_info(
         "fps": spec.fps,
         "total_episodes": episodes,
         "total_frames": frames,
-        "total_tasks": tasks,
+        "total_tasks": min(1, episodes),
         "chunks_size": CHUNK,
         "data_files_size_in_mb": DATA_MB,
         "video_files_size_in_mb": VIDEO_MB,  # LeRobot wants a number without videos too
@@ -138,7 +132,7 @@ def make_info(
 
 
 def episode_columns(
-    videos: Iterable[str], fps: float, shard: int, number: int, first: int, start: int, end: int
+    spec: DatasetSpec, shard: int, number: int, first: int, start: int, end: int
 ) -> dict[str, Any]:
     """Columns of the row of an episode that say where it is: in a shard whose first frame is
     ``first``, from frame ``start`` to before ``end``.
@@ -149,11 +143,13 @@ def episode_columns(
         "dataset_from_index": start,
         "dataset_to_index": end,
     }
-    folders = [f"videos/{name}" for name in videos]
+    folders = [f"videos/{name}" for name in spec.videos]
     for name, value in shard_indices(shard).items():
         columns |= {f"{files}/{name}": value for files in ("data", "meta/episodes", *folders)}
-    times = {"from_timestamp": (start - first) / fps, "to_timestamp": (end - first) / fps}
-    return columns | {f"{files}/{name}": time for files in folders for name, time in times.items()}
+    times = {"from_timestamp": start - first, "to_timestamp": end - first}
+    return columns | {
+        f"{files}/{name}": time / spec.fps for files in folders for name, time in times.items()
+    }
 
 
 def is_foreign(info: Mapping[str, Any]) -> bool:
@@ -162,40 +158,24 @@ def is_foreign(info: Mapping[str, Any]) -> bool:
 
 
 def check_info(info: Any) -> None:
-    """Raise an error of any kind where info.json is not what `make_info` makes; of a foreign
-    dataset, where its features and counts are not.
-    """
-    empty = make_info(DatasetSpec(robot_type="", fps=1, features={}, config_sha256=""))
-    foreign = is_foreign(info)
-    used = ("codebase_version", "fps", "features", "total_episodes", "total_frames")
-    blocks = [(info, {name: empty[name] for name in used} if foreign else empty)]
-    if not foreign:
-        blocks.append((info["mjstack"], empty["mjstack"]))
-    for block, model in blocks:
-        for name, value in model.items():
-            kinds = {"video_path": str | None, "fps": int | float}.get(name, type(value))
-            number = block[name] if isinstance(block[name], int | float) else 0
-            right = isinstance(block[name], kinds) and not isinstance(block[name], bool)
-            if not right or not 0 <= number < math.inf or (name == "fps" and not number):
-                raise ValueError(f"{name} is {block[name]!r:.60}")
+    """Raise an error of any kind where counts and features of info.json cannot be used."""
+    counts = {name: info[name] for name in ("fps", "total_episodes", "total_frames")}
+    if not is_foreign(info):
+        counts["shards"] = info["mjstack"]["shards"]
+    for name, value in counts.items():
+        if (type(value) is not int and name != "fps") or not 0 <= value < math.inf:
+            raise ValueError(f"{name} is {value!r:.60}")
+    if not info["fps"]:
+        raise ValueError("fps is 0")
     for name, feature in info["features"].items():
         if not all(type(number) is int and number > 0 for number in feature["shape"]):
             raise ValueError(f"the shape of {name} is {feature['shape']!r:.60}")
-        if not foreign and feature["dtype"] not in (*DTYPES, "video"):
-            raise ValueError(f"the dtype of {name} is {feature['dtype']!r:.60}")
-    for entry in () if foreign else info["mjstack"]["provenance"]:
-        if not 0 <= entry["from_episode"] <= info["total_episodes"]:
-            raise ValueError(f"from_episode is {entry['from_episode']}")
-    videos_of(info)
+    video_columns(info)
 
 
-def videos_of(info: Mapping[str, Any]) -> dict[str, Video]:
+def video_columns(info: Mapping[str, Any]) -> list[str]:
     """The videos of info.json."""
-    return {
-        name: Video(height=feature["shape"][0], width=feature["shape"][1])
-        for name, feature in info["features"].items()
-        if feature["dtype"] == "video"
-    }
+    return [name for name, feature in info["features"].items() if feature["dtype"] == "video"]
 
 
 def numeric_columns(info: Mapping[str, Any]) -> list[str]:
@@ -233,8 +213,8 @@ def frames_table(schema: Any, columns: Mapping[str, np.ndarray]) -> Any:
     return pa.Table.from_arrays(arrays, schema=schema)
 
 
-def tasks_table(tasks: Sequence[str]) -> Any:
+def tasks_table(task: str) -> Any:
     """Task texts as a pandas data frame whose index is the text: so LeRobot reads them."""
     pa, _ = require_pyarrow()
-    table = pa.table({"task_index": range(len(tasks)), "task": list(tasks)})
+    table = pa.table({"task_index": [0], "task": [task]})
     return table.replace_schema_metadata({"pandas": _PANDAS})

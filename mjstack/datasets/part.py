@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mjstack.datasets import lerobot
-from mjstack.datasets.spec import INDICES, DatasetSpec, EpisodeData, typed_episode
+from mjstack.datasets.spec import INDICES, DatasetSpec, EpisodeData
 from mjstack.datasets.statistics import (
     by_name,
     count_pixels,
@@ -18,8 +18,6 @@ from mjstack.datasets.statistics import (
     sampled_frames,
 )
 from mjstack.datasets.video import VideoEncoder
-
-IMAGES_GIB = 1.0  # images that may wait for being encoded
 
 
 @dataclass(kw_only=True, slots=True)
@@ -47,9 +45,7 @@ class PartWriter:
         part: What is written so far.
     """
 
-    def __init__(
-        self, folder: Path, spec: DatasetSpec, name: str, *, images_gib: float = IMAGES_GIB
-    ) -> None:
+    def __init__(self, folder: Path, spec: DatasetSpec, name: str, images_gib: float) -> None:
         """Begin files of a dataset with columns and videos as of ``spec``. ``name`` tells those of
         processes apart; ``images_gib`` is the most that images may take which wait for being
         encoded. An OSError if they cannot be written.
@@ -81,12 +77,15 @@ class PartWriter:
         share = max(data, self._videos.megabytes() / lerobot.VIDEO_MB, rows / lerobot.MOST_ROWS)
         return share * (1.0 + 1.0 / rows) > 1.0
 
-    def write(self, episode: EpisodeData, task: int, number: int, start: int) -> None:
+    def write(self, episode: EpisodeData, number: int, start: int) -> None:
         """Write an episode as a row group, so that it can be read without the others: its number,
-        that of its first frame (``start``) and of its task are those in the dataset. A FolderError
-        if it does not fit the spec, an OSError if it cannot be written.
+        that of its first frame (``start``) and of its task are those in the dataset. An OSError if
+        it cannot be written.
         """
-        row, columns = typed_episode(self._spec, episode)
+        columns = {
+            name: np.asarray(episode.arrays[name], feature.dtype).reshape(-1, feature.dim)
+            for name, feature in self._spec.features.items()
+        }
         length = len(next(iter(columns.values())))
         frame = np.arange(length)
         indices: dict[str, np.ndarray] = {
@@ -94,15 +93,16 @@ class PartWriter:
             "frame_index": frame,
             "episode_index": np.full(length, number),
             "index": start + frame,
-            "task_index": np.full(length, task),
+            "task_index": np.zeros(length, int),
         }
-        columns = columns | {name: values[:, None] for name, values in indices.items()}
+        columns |= {name: values[:, None] for name, values in indices.items()}
         table = lerobot.frames_table(self._writer.schema, columns)
         self._writer.write_table(table, row_group_size=length)
         self._videos.add(episode.images)
         statistics = {
             name: by_name(frame_statistics(columns[name]), length) for name in table.column_names
         }
+        row: dict[str, Any] = {"length": length, "tasks": [self._spec.task], **episode.row}
         sampled = sampled_frames(length)
         for name in self._spec.videos:
             pixels = count_pixels(episode.images[name][sampled])
@@ -110,7 +110,7 @@ class PartWriter:
             row[f"{lerobot.PIXELS}/{name}"] = pixels.ravel()
         for name, kinds in statistics.items():
             row |= {f"stats/{name}/{kind}": values for kind, values in kinds.items()}
-        self.part.rows.append({"length": length, "tasks": [episode.task], **row})
+        self.part.rows.append(row)
 
     def complete(self) -> Part:
         """Close the files; they are on the disk then."""

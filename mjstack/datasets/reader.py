@@ -1,7 +1,10 @@
-"""Opening a dataset: to read it, or to go on with it."""
+"""Opening a dataset: to read it, or to go on with it. Each file is read and checked by itself."""
 
+import json
 import math
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,15 +12,15 @@ from typing import Any
 import numpy as np
 
 from mjstack.config.fingerprint import differences
-from mjstack.datasets import lerobot, parquet, tables
-from mjstack.datasets.lerobot import STATISTICS, is_foreign, numeric_columns, videos_of
+from mjstack.datasets import lerobot
+from mjstack.datasets.lerobot import is_foreign, numeric_columns, video_columns
 from mjstack.datasets.spec import INDICES, DatasetSpec
-from mjstack.datasets.video import decode
 from mjstack.errors import FolderError, require_names
-from mjstack.files import refuse_links
+from mjstack.files import reading, refuse_links
 
 _FIX = "Restore its files, or give another folder"
 _SLACK = 1e-4  # s: LeRobot lets no timestamp be off further
+_WHOLE = {"length", "seed", "world"}  # columns of an episode's row
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,37 +31,13 @@ class StoredDataset:
         folder: The dataset.
         info: The content of info.json.
         tasks: Texts of the tasks, by index.
-        episodes: A row per episode: its columns but for the statistics. Of a dataset that mjstack
-            has not written: its length, and its seed if there is one.
+        episodes: A row per episode: its columns but for the statistics.
     """
 
     folder: Path
     info: dict[str, Any]
     tasks: list[str]
     episodes: list[dict[str, Any]]
-
-    def images(self, name: str, episode: int) -> np.ndarray:
-        """Decode an episode's images.
-
-        Args:
-            name: Such as ``observation.images.front``.
-            episode: Its number.
-
-        Returns:
-            Shape ``(frames, height, width, 3)``, uint8.
-
-        Raises:
-            UnknownName: There are no such images.
-            IndexError: There is no such episode.
-            FolderError: A file is missing or damaged.
-        """
-        videos = videos_of(self.info)
-        require_names("video", [name], videos)
-        row = self.episodes[episode]
-        path = lerobot.shard_path(self.folder, lerobot.VIDEO, lerobot.shard_of(row), name)
-        start = row[f"videos/{name}/from_timestamp"]
-        with tables.readable(path):
-            return decode(path, videos[name], start, row["length"], self.info["fps"])
 
     def frames(self, name: str) -> np.ndarray:
         """Every frame of a column. Those of an episode are the slice from its
@@ -78,9 +57,9 @@ class StoredDataset:
         require_names("feature", [name], numeric_columns(self.info))
         shape = features[name]["shape"]
         columns = [np.empty((0, math.prod(shape)), features[name]["dtype"])]
-        for path in tables.data_files(self.folder, self.info):
-            with tables.readable(path):
-                columns.append(tables.read_columns(path, self.info, [name])[name])
+        for path in data_files(self.folder, self.info):
+            with readable(path):
+                columns.append(read_columns(path, self.info, [name])[name])
         return np.concatenate(columns).reshape(-1, *shape)
 
 
@@ -94,15 +73,15 @@ def read_dataset(folder: Path | str, used: Iterable[str] = ()) -> StoredDataset:
             looked at.
 
     Raises:
-        FolderError: There is none, or a file is missing, damaged or too large for what it holds.
+        FolderError: There is none, or a file is missing or damaged.
     """
     folder = Path(folder)
-    info = tables.read_info(folder)
+    info = read_info(folder)
     columns = [*INDICES, *used] if is_foreign(info) else numeric_columns(info)
     require_names("feature", columns, info["features"])
-    _check_sizes(folder, info, columns)
-    tasks = tables.read_tasks(folder, info)
-    rows = (tables.read_lengths if is_foreign(info) else tables.read_rows)(folder, info)
+    _check_counts(folder, info)
+    tasks = read_tasks(folder, info)
+    rows = read_rows(folder, info)
     stored = StoredDataset(folder=folder, info=info, tasks=tasks, episodes=rows)
     _check_frames(stored, columns)
     return stored
@@ -113,57 +92,44 @@ def read_begun(folder: Path, spec: DatasetSpec) -> StoredDataset | None:
 
     Raises:
         FolderError: It is damaged, as of `read_dataset`, or of another configuration; or there are
-            other files, or links where files are written, or a folder in place of a file.
+            other files, or links.
     """
-    names = ["data", "meta/episodes", *(f"videos/{name}" for name in spec.videos)]
-    chunks = [chunk for name in names for chunk in (folder / name).glob("chunk-*")]
-    folders = [*(folder / name for name in ("meta", "videos", *names)), *chunks]
-    files = [folder / name for name in (lerobot.INFO, lerobot.STATS, lerobot.TASKS)]
-    files += [*folder.glob("meta/.*"), *(file for chunk in chunks for file in chunk.glob("*"))]
-    refuse_links(folders + files, "Write into another folder")
-    for path in [*(path for path in folders if not path.is_dir()), *files]:
-        if path.exists() and (path in folders or not path.is_file()):
-            kind = "folder" if path in folders else "regular file"
-            raise FolderError(f"{path} is no {kind}, expected one. {_FIX}")
-    if not files[0].exists():
-        begun = f".{files[0].name}."
+    refuse_links(folder.rglob("*"), "Write into another folder")
+    if not (folder / lerobot.INFO).exists():
+        begun = f".{Path(lerobot.INFO).name}."
         for file in folder.rglob("*"):
             if file.is_file() and not file.name.startswith(begun):
                 name = file.relative_to(folder)
                 expected = "expected a dataset or an empty folder. Give another"
                 raise FolderError(f"{folder} has {name} and no {lerobot.INFO}, {expected}")
         return None
-    info = tables.read_info(folder)
+    info = read_info(folder)
     if is_foreign(info):
         raise FolderError(f"{folder} was not written by mjstack", "Give another folder")
-    if changes := differences(_identity(info), _identity(lerobot.make_info(spec))):
-        fix = "Give another folder, or what it was begun with"
-        raise FolderError(f"{folder} has {changes}", fix)
+    with readable(folder / lerobot.INFO):
+        stored = _identity(info)
+    if changes := differences(stored, _identity(lerobot.make_info(spec, [spec.provenance]))):
+        fix = "Set job.folder to another folder, or these keys back"
+        raise FolderError(f"{folder} has episodes of another configuration: {changes}", fix)
     return read_dataset(folder)
 
 
 def _identity(info: dict[str, Any]) -> dict[str, Any]:
-    """Everything of info.json that stays while a dataset grows."""
-    block = {key: info["mjstack"][key] for key in ("config_sha256", "units", "values")}
+    """Everything that stays while a dataset grows, the configuration first."""
+    block = info["mjstack"]
+    digest = {"config_sha256": block["config_sha256"]}
+    config = [{}, *block["provenance"]][-1].get("config", digest)
     keys = ("codebase_version", "robot_type", "fps", "chunks_size", "features")
-    return block | {key: info[key] for key in keys}
+    same = {"units": block["units"], "values": block["values"]}
+    return {**config, **same, **{key: info[key] for key in keys}}
 
 
-def _check_sizes(folder: Path, info: dict[str, Any], columns: Iterable[str]) -> None:
-    """Check how many rows the files have and what they unpack to, before any is unpacked."""
-    width = sum(math.prod(info["features"][name]["shape"]) for name in columns)
+def _check_counts(folder: Path, info: dict[str, Any]) -> None:
+    """Check how many rows the files have, before any is read."""
     counts = []
-    for files, numbers in (
-        (lerobot.EPISODES, 2 if is_foreign(info) else width * len(STATISTICS)),
-        (lerobot.DATA, width),
-    ):
-        rows = disk = 0
-        for path in tables.data_files(folder, info, files):
-            with tables.readable(path):
-                rows += parquet.count_rows(path)
-                disk += path.stat().st_size
-                parquet.check_size(rows * numbers, disk)
-        counts.append(rows)
+    for files in (lerobot.EPISODES, lerobot.DATA):
+        paths = data_files(folder, info, files)
+        counts.append(sum(count_rows(path) for path in paths))
     total = [info["total_episodes"], info["total_frames"]]
     if counts != total:
         raise FolderError(
@@ -181,7 +147,7 @@ def _check_frames(stored: StoredDataset, names: Iterable[str]) -> None:
     info, tasks = stored.info, stored.tasks
     lengths = [row["length"] for row in stored.episodes]
     frames = info["total_frames"]
-    if min(lengths, default=1) < 1 or sum(lengths) != frames:
+    if sum(lengths) != frames:
         problem = f"{stored.folder} has episodes of {sum(lengths)} frames, expected {frames}"
         raise FolderError(f"{problem} as {lerobot.INFO} says. {_FIX}")
     frame = np.arange(frames) - np.repeat(np.cumsum([0, *lengths])[:-1], lengths)
@@ -191,14 +157,10 @@ def _check_frames(stored: StoredDataset, names: Iterable[str]) -> None:
         "index": np.arange(frames),
         "timestamp": (frame / info["fps"]).astype(np.float32),
     }
-    if not is_foreign(info):
-        numbers = {task: number for number, task in enumerate(tasks)}
-        task_numbers = [numbers.get(row["tasks"][0], -1) for row in stored.episodes]
-        expected["task_index"] = np.repeat(task_numbers, lengths)
     start = 0
-    for path in tables.data_files(stored.folder, info):
-        with tables.readable(path):
-            columns = tables.read_columns(path, info, names)
+    for path in data_files(stored.folder, info):
+        with readable(path):
+            columns = read_columns(path, info, names)
             stop = start + len(columns["index"])
             for name, values in expected.items():
                 column, values = columns[name][:, 0], values[start:stop]
@@ -218,13 +180,131 @@ def _check_frames(stored: StoredDataset, names: Iterable[str]) -> None:
 def uncommitted(folder: Path, shards: int) -> list[Path]:
     """Files that an interrupted writer left: shards from this number on, and hidden ones."""
     counted = {lerobot.FILE.format(**lerobot.shard_indices(shard)) for shard in range(shards)}
-    places = {"data": "parquet", "meta/episodes": "parquet", "videos/*": "mp4"}
-    patterns = [
-        f"{place}/chunk-*/{name}"
-        for place, ending in places.items()
-        for name in (f"file-*.{ending}", f".file-*.{ending}*")
-    ]
-    totals = (lerobot.INFO, lerobot.STATS, lerobot.TASKS)
-    patterns += [f"meta/.{Path(name).name}.*" for name in totals]
-    paths = [path for pattern in patterns for path in folder.glob(pattern)]
+    patterns = ("chunk-*/file-*", "chunk-*/.file-*", "meta/.*.*.*")
+    paths = [path for pattern in patterns for path in folder.rglob(pattern)]
     return [path for path in paths if f"{path.parent.name}/{path.stem}" not in counted]
+
+
+def readable(path: Path) -> AbstractContextManager[None]:
+    """Raise a `FolderError` for whatever goes wrong with a file inside."""
+    return reading(path, "Restore it, or give another folder")
+
+
+def data_files(folder: Path, info: dict[str, Any], files: str = lerobot.DATA) -> list[Path]:
+    """The data files that count, or those of episodes (`lerobot.EPISODES`), in order. If some are
+    missing, the first of them is among these.
+    """
+    paths = sorted(folder.glob(re.sub(r"{.*?}", "*", files)))
+    if is_foreign(info):
+        return paths
+    shards = min(info["mjstack"]["shards"], len(paths) + 1)
+    return [lerobot.shard_path(folder, files, shard) for shard in range(shards)]
+
+
+def read_info(folder: Path) -> dict[str, Any]:
+    """The content of info.json.
+
+    Raises:
+        FolderError: It is missing, damaged, or of another version of LeRobot's.
+    """
+    lerobot.require_pyarrow()
+    path = folder / lerobot.INFO
+    if not path.is_file():
+        problem = f"{folder} has no {lerobot.INFO}, expected a LeRobotDataset v3"
+        raise FolderError(problem, "Give the folder dataset of job=collect")
+    with readable(path):
+        info = json.loads(path.read_text(encoding="utf-8"))
+        version = str(info["codebase_version"])
+        if not version.startswith("v3"):
+            problem = f"{folder} is a LeRobotDataset {version:.20}, expected v3.0"
+            raise FolderError(problem, "Convert it with LeRobot")
+        lerobot.check_info(info)
+    return info
+
+
+def open_file(path: Path) -> Any:
+    """A `ParquetFile`, whose footer is read; an exception if it is none."""
+    return lerobot.require_pyarrow()[1].ParquetFile(path)
+
+
+def count_rows(path: Path) -> int:
+    """Rows of a file, as its footer has them; a FolderError if it cannot be read."""
+    with readable(path):
+        return open_file(path).metadata.num_rows
+
+
+def read_numbers(path: Path, widths: Mapping[str, int]) -> dict[str, np.ndarray]:
+    """Columns of numbers, each shape ``(rows, width)``, in the file's types. Raises if it cannot be
+    read, or a row has not as many numbers as ``widths`` says.
+    """
+    table = open_file(path).read(columns=list(widths))
+    columns = {}
+    for name, width in widths.items():
+        column = table[name].combine_chunks()
+        even = True
+        while even and hasattr(column, "flatten"):
+            even = len(column.value_lengths().unique()) < 2  # a null has none
+            column = column.flatten()
+        if not even or len(column) != len(table) * width or column.null_count:
+            raise ValueError(f"rows of {name} without {width} numbers")
+        values = column.to_numpy(zero_copy_only=False)
+        if values.dtype.kind not in "biuf":
+            raise ValueError(f"{name} has other values than numbers")
+        columns[name] = values.reshape(len(table), width)
+    return columns
+
+
+def read_columns(path: Path, info: dict[str, Any], names: Iterable[str]) -> dict[str, np.ndarray]:
+    """Columns of a data file, each shape ``(frames, numbers)``.
+
+    Raises:
+        Exception: It cannot be read; a number is missing or not finite; or mjstack wrote it and the
+            type is another than info.json says.
+    """
+    features = info["features"]
+    columns = read_numbers(path, {n: math.prod(features[n]["shape"]) for n in names})
+    for name, values in columns.items():
+        if not is_foreign(info) and values.dtype != features[name]["dtype"]:
+            raise ValueError(f"{name} is {values.dtype}, expected {features[name]['dtype']}")
+        if not np.isfinite(values).all():
+            raise ValueError(f"{name} has numbers that are not finite")
+    return columns
+
+
+def read_tasks(folder: Path, info: dict[str, Any]) -> list[str]:
+    """Texts of the tasks that count, by index."""
+    path = folder / lerobot.TASKS
+    if not info.get("total_tasks", 1):
+        return []
+    with readable(path):
+        table = open_file(path).read()
+        names = table.column_names
+        text = "task" if "task" in names else next(n for n in names if n != "task_index")
+        count = len(table) if is_foreign(info) else info["total_tasks"]
+        columns = (table[name].to_pylist() for name in ("task_index", text))
+        tasks = sorted(zip(*columns, strict=True))[:count]
+        if [number for number, _ in tasks] != list(range(count)):
+            raise ValueError(f"task_index does not count from 0 to {count - 1}")
+        if not all(isinstance(task, str) for _, task in tasks):
+            raise ValueError("a task is no text")
+    return [task for _, task in tasks]
+
+
+def read_rows(folder: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
+    """Rows of every episode, without what is counted of their numbers."""
+    rows: list[dict[str, Any]] = []
+    for path in data_files(folder, info, lerobot.EPISODES):
+        with readable(path):
+            file = open_file(path)
+            counts = ("stats/", f"{lerobot.PIXELS}/")
+            names = [name for name in file.schema_arrow.names if not name.startswith(counts)]
+            for row in file.read(columns=names).to_pylist():
+                for name in _WHOLE & row.keys() | {"length"}:
+                    if type(row[name]) is not int or row[name] < (name == "length"):
+                        raise ValueError(f"row {len(rows)}: {name} is {row[name]!r:.60}")
+                rows.append(row)
+    for video in video_columns(info) if not is_foreign(info) else ():
+        for path in data_files(folder, info, lerobot.VIDEO.replace("{video_key}", video)):
+            with readable(path):
+                pass  # it is there
+    return rows

@@ -6,7 +6,6 @@ frame is complete in itself.
 
 import errno
 import os
-import struct
 import subprocess
 import time
 from collections import deque
@@ -29,9 +28,9 @@ _PIXELS = ["-f", "rawvideo", "-pix_fmt", "rgb24"]
 
 
 def encode(images: np.ndarray, fps: int, codec: str, path: Path | None = None) -> None:
-    """Write images, shape ``(frames, height, width, 3)``, uint8, ``fps`` a second, as an mp4 with
-    one of `CODECS`; without a path the result is not kept. An OSError if the encoder fails, such as
-    on a full disk.
+    """Write images, shape ``(frames, height, width, 3)``, uint8, ``fps`` a second, as an mp4 in
+    ``h264`` or ``av1``; without a path the result is not kept. An OSError if the encoder fails,
+    such as on a full disk.
     """
     height, width = images.shape[1:3]
     size = ["-s", f"{width}x{height}", "-r", str(fps)]
@@ -53,33 +52,6 @@ def join(paths: Sequence[Path], path: Path) -> None:
     listed.unlink()
 
 
-def decode(path: Path, video: Video, start: float, frames: int, fps: int) -> np.ndarray:
-    """Read so many images of a video, ``fps`` a second from ``start`` [s] on, shape ``(frames,
-    height, width, 3)``, uint8. An OSError if the file cannot be read.
-    """
-    seek = ["-ss", f"{max(0.0, start - 0.5 / fps):.6f}"]
-    content = _ffmpeg([*seek, "-i", str(path), "-frames:v", str(frames), *_PIXELS, "-"])
-    shape = (frames, video.height, video.width, 3)
-    if len(content) != np.prod(shape):
-        raise OSError(errno.EIO, f"{len(content)} bytes of images, expected {np.prod(shape)}")
-    return np.frombuffer(content, np.uint8).reshape(shape)
-
-
-def check_video(path: Path) -> None:
-    """Raise an error of any kind for an mp4 that is cut or has no index of its frames."""
-    with open(path, "rb") as file:
-        end = path.stat().st_size
-        kinds: list[bytes] = []
-        while file.tell() < end and len(kinds) < 64:  # ffmpeg's has four boxes
-            start = file.tell()
-            size, kind = struct.unpack(">I4s", file.read(8))
-            (size,) = struct.unpack(">Q", file.read(8)) if size == 1 else (size,)
-            kinds.append(kind)
-            file.seek(start + max(size, 8))
-        if file.tell() != end or b"moov" not in kinds:
-            raise ValueError("the video is cut")
-
-
 def check_encoder(videos: Mapping[str, Video], fps: int) -> None:
     """Encode a few images as those of each video will be, and keep nothing.
 
@@ -99,8 +71,8 @@ def check_encoder(videos: Mapping[str, Video], fps: int) -> None:
             ) from error
 
 
-def _ffmpeg(arguments: Sequence[str], content: memoryview | None = None) -> bytes:
-    """The output of ffmpeg. Ctrl-C does not reach ffmpeg, so a video once begun is completed."""
+def _ffmpeg(arguments: Sequence[str], content: memoryview | None = None) -> None:
+    """Run ffmpeg. Ctrl-C does not reach ffmpeg, so a video once begun is completed."""
     try:
         import imageio_ffmpeg
 
@@ -120,7 +92,6 @@ def _ffmpeg(arguments: Sequence[str], content: memoryview | None = None) -> byte
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         line = text.splitlines()[0] if text else f"status {done.returncode}"
         raise OSError(errno.EIO, f"ffmpeg: {line}")
-    return done.stdout
 
 
 class VideoEncoder:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mjstack.drivers.feedback import STAY, FeedbackDriver, measure_planar
+from mjstack.drivers.feedback import STAY, FeedbackDriver
 from mjstack.drivers.open_loop import OpenLoopPlanner, smoothstep
 from mjstack.envs import Env
 from mjstack.managers.view import EnvView, offers
@@ -74,8 +74,7 @@ class ClosedLoopDriver(FeedbackDriver):
         over = smoothstep((2.0 * u - 1.0).clamp(min=0.0))
         share = torch.where(self._again[:, None], torch.stack((over, over, up), dim=1), s)
         target = torch.lerp(self._from[:, :3], self._to[:, :3], share)
-        posture = self._nominal[self.phase]
-        start = torch.where(fresh[:, None], posture, self._command)
+        start = torch.where(fresh[:, None], self._nominal[self.phase], self._command)
         start[:, self._n_arm :] = torch.lerp(self._from[:, 3:], self._to[:, 3:], s)
         self._at.copy_(torch.cat((target, start[:, self._n_arm :]), dim=1))
         if self._aligns:
@@ -84,9 +83,7 @@ class ClosedLoopDriver(FeedbackDriver):
         if self._tilt is not None:
             there = self._aim(self._tilt.place[self.phase])
             approach = self._tilt.desired_approach(start, self.phase, there, fresh)
-        command, distance = self._ik.solve(
-            start, target, posture if self._cfg.controller.posture_gain > 0.0 else None, approach
-        )
+        command, distance = self._solve(start, target, self.phase, approach)
         self._keep_finite(command)
         _put(self.error, self._time >= length - _DONE, torch.maximum(self.error, distance))
         return self._command
@@ -185,8 +182,7 @@ class ClosedLoopDriver(FeedbackDriver):
 
     def _carried_pose(self) -> Tensor:
         """x, y [m] and yaw [rad] of the carried object, shape ``(nworld, 3)``."""
-        poses = [measure_planar(self._env, name) for name in self._cfg.scene.objects]
-        return torch.stack(poses, dim=1)[self._worlds, self._carried[self.phase]]
+        return self._planar()[self._worlds, self._carried[self.phase]]
 
     def _build_timetable(self) -> None:
         """Make tensors of when and how the phases follow each other, a row per phase."""

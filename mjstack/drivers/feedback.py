@@ -199,6 +199,7 @@ class FeedbackDriver(Driver):
         objects = cfg.scene.objects
         self._long = [name for name, thing in objects.items() if thing.oblong and name in grasped]
         self._oblong = self._tensor(name in self._long for name in objects)
+        self._has_faces = self._tensor(thing.has_faces for thing in objects.values())
         self._aligns = c.yaw_alignment > 0.0 or bool(self._long and cfg.robot.roll_joint)
         self._roll_column, self._roll_sign = self._find_roll() if self._aligns else (0, 1.0)
         rolls = robot(env).ctrl_range[self._roll_column].float()
@@ -214,12 +215,15 @@ class FeedbackDriver(Driver):
 
     def _observe(self, due: Tensor) -> None:
         """Measure objects where due, shape ``(nworld, objects)``, bool; and all places."""
-        objects = self._cfg.scene.objects
-        for number, name in enumerate(objects):
-            last = self._seen[:, number]
-            last.copy_(torch.where(due[:, number, None], measure_planar(self._env, name), last))
-        for number, name in enumerate(self._cfg.scene.places, start=len(objects)):
+        last = self._seen[:, : due.shape[1]]
+        last.copy_(torch.where(due[..., None], self._planar(), last))
+        for number, name in enumerate(self._cfg.scene.places, start=due.shape[1]):
             self._seen[:, number, :2] = place_xy(self._env, name).float()
+
+    def _planar(self) -> Tensor:
+        """x, y [m] and yaw [rad] of every object now, shape ``(nworld, objects, 3)``."""
+        objects = self._cfg.scene.objects
+        return torch.stack([measure_planar(self._env, name) for name in objects], dim=1)
 
     def _aim(self, phase: Tensor) -> Tensor:
         """Target of each world's phase, from its anchor as last seen [m], ``(nworld, 3)``."""
@@ -257,6 +261,13 @@ class FeedbackDriver(Driver):
     def _detour(self, rolls: Tensor, roll: Tensor) -> Tensor:
         """Cost of rolls that lead back over the nominal one, lest they go to and fro."""
         return _BACK * (rolls * roll < -0.01)
+
+    def _solve(
+        self, start: Tensor, target: Tensor, phase: Tensor, approach: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Inverse kinematics near the posture of each world's phase; as of `BatchedIk.solve`."""
+        posture = self._nominal[phase] if self._cfg.controller.posture_gain > 0.0 else None
+        return self._ik.solve(start, target, posture, approach)
 
     def _keep_finite(self, command: Tensor) -> Tensor:
         """Keep the command for the next step. A world whose state is not finite keeps its last one,

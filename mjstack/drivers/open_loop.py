@@ -1,7 +1,7 @@
 """Planning before the episode: targets of the grasp point and joint trajectories of every world."""
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
@@ -213,20 +213,15 @@ class OpenLoopPlanner:
         ends[:, 0, 3:] = robot.home[len(robot.arm_joints) :]
         return ends
 
-    def _progress(self) -> Iterator[tuple[int, float]]:
-        """Number of the phase, and the smoothstep parameter at the end, of every step."""
-        for number, phase in enumerate(self.phases):
-            steps = phase.stop - phase.start
-            for step in range(steps):
-                yield number, smoothstep((step + 1) / steps)
-
     def _step_weights(self) -> tuple[Tensor, Tensor]:
         """Barycentric weights of the Chebyshev points, and their numbers, for every step."""
         n = len(self._nodes)
         bary = (-1.0) ** np.arange(n)
         bary[[0, -1]] *= 0.5
-        phase, s = (np.array(part)[:, None] for part in zip(*self._progress(), strict=True))
-        gap = s - self._nodes
+        lengths = [phase.stop - phase.start for phase in self.phases]
+        phase = np.repeat(np.arange(len(lengths)), lengths)[:, None]
+        s = smoothstep(np.concatenate([np.arange(1, steps + 1) / steps for steps in lengths]))
+        gap = s[:, None] - self._nodes
         hit = np.abs(gap) < 1e-12
         share = bary / np.where(hit, 1.0, gap)
         rows = np.where(hit.any(1, keepdims=True), hit, share / share.sum(1, keepdims=True))

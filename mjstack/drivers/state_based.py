@@ -127,7 +127,6 @@ class StateBasedDriver(FeedbackDriver):
         size = tensor(max(cfg.scene.objects[r.name].half) + _REACH for r in moved)
         beside = norm(self._target[self._roles[:, Role.down], :2])
         self._reach = size + beside * self._pushes
-        self._has_faces = tensor(thing.has_faces for thing in cfg.scene.objects.values())
 
         # Heights of targets: over an object that is not carried, wherever it is, or over the table
         self._above = tensor(target.above for _, target in self._aimed)
@@ -151,7 +150,6 @@ class StateBasedDriver(FeedbackDriver):
 
     @override
     def command(self) -> Tensor:
-        cfg = self._cfg.controller
         self._observe(self._always)
         state = self._measure()
         due = self._decide(state)
@@ -167,14 +165,13 @@ class StateBasedDriver(FeedbackDriver):
             rolls = (due.role == Role.down) | due.pushes
             start[:, self._roll_column] += due.turn.clamp(-_ROLL, _ROLL) * rolls
         approach = None if self._tilt is None else self._tilted(state, due, phase)
-        posture = self._nominal[phase] if cfg.posture_gain > 0.0 else None
         if approach is not None:
             # From a gripper that points elsewhere, the shortest way may end at a joint's limit.
             flipped = (state.approach * approach).sum(1, keepdim=True) < _FLIPPED
             roll = start[:, self._roll_column].clone()
             start = torch.where(flipped, self._nominal[phase], start)
             start[:, self._roll_column] = roll
-        change = self._ik.solve(start, target, posture, approach)[0] - q
+        change = self._solve(start, target, phase, approach)[0] - q
         largest = change.abs().amax(1, keepdim=True)
         command = q + change * (_JOINT / largest.clamp(min=1e-6)).clamp(max=1.0)
 

@@ -286,8 +286,9 @@ class Judge(Observer):
     def start(self, env: Env, driver: Driver) -> None:
         super().start(env, driver)
         self.result = CheckResult(torch.zeros(env.nworld, dtype=torch.int32), {}, False)
-        if env.check is not None:
-            env.check.start(env, driver.steps, driver.phases)
+        self._check = env.check if env.cfg.task.check is not None else None
+        if self._check is not None:
+            self._check.start(env, driver.steps, driver.phases)
 
     @override
     def update(self) -> None:
@@ -296,8 +297,8 @@ class Judge(Observer):
 
     @override
     def finish(self) -> None:
-        if self.env.check is not None:
-            self.result = self.env.check.result()
+        if self._check is not None:
+            self.result = self._check.result()
 
 
 @dataclass(eq=False)

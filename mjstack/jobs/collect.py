@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from mjstack.config.schema import CollectJobCfg, Config
-from mjstack.datasets import DatasetWriter, lerobot
+from mjstack.datasets import lerobot
 from mjstack.datasets.part import Part
+from mjstack.datasets.writer import DatasetWriter
 from mjstack.envs import demonstration_config
 from mjstack.episodes.batches import Batch, BatchPlan, play_batches
 from mjstack.episodes.rollout import require_episode
@@ -202,12 +203,11 @@ class Collection:
 
     def _choose(
         self, seed: int, parts: Sequence[tuple[np.ndarray, np.ndarray, int]]
-    ) -> tuple[list[int], int, int, int]:
+    ) -> tuple[list[int], int, int]:
         """Record a batch, and choose the worlds whose episodes are kept.
 
         Returns:
-            These worlds, and the numbers of the next episode and of the next frame of the dataset,
-            and of the task.
+            These worlds, and the numbers of the next episode and of the next frame of the dataset.
         """
         failed = np.concatenate([bits for bits, _, _ in parts])
         finite = np.concatenate([flags for _, flags, _ in parts])
@@ -229,13 +229,11 @@ class Collection:
         self.batches.append(record)
         records = [asdict(batch) for batch in self.batches]
         write_atomic(self._record_path, json.dumps(records, indent=1) + "\n")
-        task = self._stage.cfg.task
-        number = self.writer.number_task(task.instruction or task.name)
-        return chosen, self.committed, self.writer.frames, number
+        return chosen, self.committed, self.writer.frames
 
     def _commit(self, files: Sequence[Part]) -> None:
         """Commit the files of all ranks, and print what the batch has brought."""
-        self.writer.flush(files)
+        self.writer.commit(files)
         batch = self.batches[-1]
         self._stage.progress.print_line(
             f"collect, seed {batch.seed}: {batch.succeeded} of {batch.worlds} worlds succeeded,"

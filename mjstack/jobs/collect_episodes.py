@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from mjstack.datasets import DatasetSpec, EpisodeData
 from mjstack.datasets.part import Part, PartWriter
+from mjstack.datasets.spec import DatasetSpec, EpisodeData
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
 from mjstack.episodes.batches import Batch
@@ -85,13 +85,10 @@ class EpisodeSource:
         if self._renderer is not None:
             self._renderer.close()
 
-    def write(
-        self, batch: Batch, chosen: Sequence[int], episode: int, frame: int, task: int
-    ) -> list[Part]:
+    def write(self, batch: Batch, chosen: Sequence[int], episode: int, frame: int) -> list[Part]:
         """Write this rank's part of a batch into hidden files: of the worlds of all ranks those
-        that are ``chosen``. ``episode``, ``frame`` and ``task`` are numbers in the dataset: of the
-        first of these episodes, of its first frame, and of the task. A FolderError if an episode
-        does not fit the spec, an OSError if a file cannot be written.
+        that are ``chosen``. ``episode`` and ``frame`` are numbers in the dataset: of the first of
+        these episodes, and of its first frame. An OSError if a file cannot be written.
         """
         worlds = batch.plan.worlds
         order = {world: number for number, world in enumerate(chosen) if world in worlds}
@@ -103,9 +100,9 @@ class EpisodeSource:
             for count, (number, data) in enumerate(zip(order.values(), episodes, strict=True), 1):
                 if writer is None:
                     name = f"rank{self._stage.ranks.rank:04d}-{len(files)}"
-                    writer = PartWriter(self._folder, self._spec, name, images_gib=images_gib)
+                    writer = PartWriter(self._folder, self._spec, name, images_gib)
                 first_frame = frame + number * len(data.arrays[STATE])
-                writer.write(data, task, episode + number, first_frame)
+                writer.write(data, episode + number, first_frame)
                 if writer.is_full() or count == len(order):
                     files.append(writer.complete())
                     writer = None
@@ -156,18 +153,16 @@ class EpisodeSource:
         """A world's steps and its result. `next.success` is true in the last step of a successful
         episode alone.
         """
-        task = self._stage.cfg.task
         broken = self._stage.check.rules.describe(int(batch.episode.failed[row]))
         last = np.arange(len(arrays[STATE])) == len(arrays[STATE]) - 1
         arrays |= {"next.done": last, "next.success": last & (not broken)}
         return EpisodeData(
             arrays={name: arrays[name] for name in self._spec.features},
             images=images,
-            task=task.instruction or task.name,
-            success=not broken,
-            seed=batch.plan.seed,
-            world=batch.plan.worlds[row],
-            values={
+            row={
+                "success": not broken,
+                "seed": batch.plan.seed,
+                "world": batch.plan.worlds[row],
                 "retries": int(batch.episode.retries[row]),
                 "failed_rules": broken,
                 "config_sha256": self._spec.config_sha256,

@@ -2,7 +2,6 @@
 of the batches that were played.
 """
 
-import dataclasses
 import json
 import os
 from collections.abc import Mapping, Sequence
@@ -13,18 +12,15 @@ from typing import Any
 import mujoco
 import torch
 
-from mjstack.config.fingerprint import WITHOUT_EFFECT, config_content, config_hash, differences
+from mjstack.config.fingerprint import WITHOUT_EFFECT, config_content, config_hash
 from mjstack.config.functions import offered
 from mjstack.config.schema import CollectJobCfg, Config, ObservationTermCfg
-from mjstack.datasets import DatasetSpec, Feature, Video
-from mjstack.datasets.lerobot import INFO
 from mjstack.datasets.reader import read_begun
-from mjstack.datasets.spec import term_columns
-from mjstack.datasets.tables import read_info, readable
+from mjstack.datasets.spec import DatasetSpec, Feature, Video, term_columns
 from mjstack.datasets.video import check_encoder
 from mjstack.envs import Env, demonstration_config
 from mjstack.episodes.stage import Stage
-from mjstack.errors import ConfigError, FolderError
+from mjstack.errors import ConfigError
 from mjstack.files import lock_folder, reading
 from mjstack.jobs.runner import run_provenance
 from mjstack.mdp.starts.placement import SCHEMA
@@ -105,6 +101,9 @@ def plan_collection(stage: Stage) -> CollectPlan:
         if "rgb" not in camera.outputs:
             expected = "rgb among them, which a dataset keeps"
             raise ConfigError(f"scene.cameras.{name}.outputs", list(camera.outputs), expected)
+        if any(side % 2 for side in camera.size):
+            expected = "even numbers of pixels, because a video halves the resolution of colour"
+            raise ConfigError(f"scene.cameras.{name}.size", list(camera.size), expected)
     if plan.spec.videos:
         check_encoder(plan.spec.videos, plan.spec.fps)
     return plan
@@ -131,21 +130,10 @@ def check_folder(dataset: Path, spec: DatasetSpec) -> None:
     Raises:
         FolderError: It is of another configuration or damaged, or another process is writing it.
     """
-    if not os.path.lexists(dataset):
-        return
-    if not dataset.is_dir():
-        raise FolderError(f"{dataset} is no folder, expected one", "Set job.folder to another")
-    os.close(lock_folder(dataset))
-    if (dataset / INFO).is_file():
-        info = read_info(dataset)
-        with readable(dataset / INFO):
-            recorded = [{}, *info.get("mjstack", {"provenance": []})["provenance"]][-1]
-            changes = differences(recorded.get("config", {}), spec.provenance["config"])
-        if recorded and changes:
-            problem = f"{dataset} has episodes of another configuration: {changes}"
-            raise FolderError(problem, "Set job.folder to another folder, or these keys back")
-    read_begun(dataset, spec)
-    read_batches(dataset.parent / BATCHES)
+    if dataset.is_dir():
+        os.close(lock_folder(dataset))
+        read_begun(dataset, spec)
+        read_batches(dataset.parent / BATCHES)
 
 
 @dataclass(kw_only=True, slots=True)
@@ -174,21 +162,12 @@ def read_batches(path: Path) -> list[BatchRecord]:
     """The batches of earlier calls.
 
     Raises:
-        FolderError: The file cannot be read, or is of version 0.1.
+        FolderError: The file cannot be read.
     """
     if not path.exists():
         return []
     with reading(path, f"Remove {BATCHES}: the expert's success rate is counted anew"):
-        batches = json.loads(path.read_text())
-        if any("kept" in batch for batch in batches):
-            reason = f"{path.parent} has a dataset of version 0.1, expected one of this version"
-            raise FolderError(reason, "Set job.folder to another folder")
-        records = [BatchRecord(**batch) for batch in batches]
-        for record in records:
-            *counts, broken = dataclasses.astuple(record)
-            if not all(type(count) is int and count >= 0 for count in (*counts, *broken.values())):
-                raise ValueError(f"a record is {record!r:.60}")
-        return records
+        return [BatchRecord(**batch) for batch in json.loads(path.read_text())]
 
 
 def episode_config(cfg: Config) -> dict[str, Any]:
@@ -225,11 +204,15 @@ def make_spec(env: Env, cfg: Config, provenance: Mapping[str, Any]) -> DatasetSp
         names=tuple(f"{name}.pos" for name in cfg.robot.joints),
         units=lerobot if job.units == LEROBOT else units,
     )
+    videos = {
+        f"{IMAGES}.{name}": Video(height=camera.size[0], width=camera.size[1], codec=job.codec)
+        for name, camera in cfg.scene.cameras.items()
+    }
     features = {STATE: positions}
     for group in cfg.observation:
         name = f"observation.{group}"
-        if name in features:
-            expected = f"another name, because {name} are the measured joints"
+        if name in features or name in videos or "/" in name:
+            expected = "a name without / that is neither state nor a camera's"
             raise ConfigError(f"observation.{group}", "a group", expected)
         features[name] = group_feature(env, group)
     features |= {
@@ -240,13 +223,10 @@ def make_spec(env: Env, cfg: Config, provenance: Mapping[str, Any]) -> DatasetSp
     }
     if job.units == LEROBOT:  # a recording of the real arm has no others
         features = {STATE: positions, ACTION: positions}
-    videos = {
-        f"{IMAGES}.{name}": Video(height=camera.size[0], width=camera.size[1], codec=job.codec)
-        for name, camera in cfg.scene.cameras.items()
-    }
     return DatasetSpec(
         robot_type=(job.units == LEROBOT and cfg.robot.lerobot_type) or cfg.robot.name,
         fps=round(cfg.task.control_hz),
+        task=cfg.task.instruction or cfg.task.name,
         features=features,
         videos=videos,
         config_sha256=config_hash(config),

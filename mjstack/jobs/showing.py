@@ -21,7 +21,7 @@ from mjstack.report.geometry import geom_colors, with_fields, write_fields
 from mjstack.report.page import Page, World, frame_stride
 from mjstack.report.table import Console
 from mjstack.report.write import safely_write
-from mjstack.scene.index import geom_corners
+from mjstack.robots.bodies import forward_kinematics, geom_corners
 from mjstack.sim import Simulation
 
 _STILL = 1e-3  # m
@@ -58,15 +58,16 @@ def draw_episode(
     qpos = pictured.qpos
     model = with_fields(stage.assets.visual_model, pictured.fields)
     colors = geom_colors(model)
+    data = forward_kinematics(model)
     objects = {}
     for name in stage.index.objects:
         geoms = np.flatnonzero(model.geom_bodyid == model.body(name).id)
-        objects[name] = (0.5 * np.ptp(geom_corners(model, geoms), (0, 1)), colors[geoms[0]])
+        objects[name] = (0.5 * np.ptp(geom_corners(data, geoms), (0, 1)), colors[geoms[0]])
     title = f"{cfg.robot.title}, {cfg.task.name}: {pictured.label}"
     draw("scene.png", picture.save_scene, model, qpos[-1])
     bodies = [stage.index.bodies[name] for name in stage.index.fixed]
     geoms = np.flatnonzero(np.isin(model.body_rootid[model.geom_bodyid], bodies))
-    fixed = geom_corners(model, geoms)
+    fixed = geom_corners(data, geoms)
     places = {
         name: (model.geom(f"place/{name}").pos[:2], place.xy, place.random_xy)
         for name, place in cfg.scene.places.items()

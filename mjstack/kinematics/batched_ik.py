@@ -9,11 +9,13 @@ import numpy as np
 import torch
 import warp as wp
 from numpy import ndarray
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from mjstack.config.schema import RobotCfg
 from mjstack.errors import ArgumentError, ConfigError, MjstackError
-from mjstack.kinematics.ik_kernels import HINGE, SLIDE, Chain, Shape, forward_kernel, solve_kernel
+from mjstack.kinematics.ik_kernels import HINGE, SLIDE, Chain, forward_kernel, solve_kernel
+from mjstack.robots.bodies import ancestors, forward_kinematics
 from mjstack.robots.posture import posture
 from mjstack.scene.index import approach_body, joint_limits, locked_home
 from mjstack.sim.warp_setup import torch_stream_scope
@@ -25,15 +27,16 @@ _DAMPING = 0.005
 # CUDA threads per block. Few, because a world is one thread, and many processors share the worlds.
 _BLOCK_DIM = 32
 _MAX_STEP = 0.3  # [rad, m] largest change of any joint per iteration
-_NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
+# [rad, m] off home, of each ik joint: every start has its own branch of solutions
+_STARTS = (0.0, -0.6, 0.6)
+_DIGITS = 12  # of a chain's numbers: the rest is rounding
 
-_Pose = tuple[ndarray, ndarray]  # position and quaternion (wxyz)
-_Link = tuple[_Pose, ndarray, int, int, int]  # frame, axis, kind, column and row as in `Chain`
 
-
-def build_chain(model: mujoco.MjModel, robot: RobotCfg) -> tuple[Chain, Shape]:
+def build_chain(
+    model: mujoco.MjModel, robot: RobotCfg
+) -> tuple[Chain, tuple[int, ...], tuple[int, ...]]:
     """Read the bodies of a compiled model from the world to each site: the chain, in Warp arrays on
-    the current device, and its shape.
+    the current device, and kinds and movers of its links, see `solve_kernel`.
     """
     # Columns of the joint targets: the joint of each, those that move, and their limits
     columns = {model.joint(name).id: (column, -1) for column, name in enumerate(robot.joints)}
@@ -45,55 +48,72 @@ def build_chain(model: mujoco.MjModel, robot: RobotCfg) -> tuple[Chain, Shape]:
             columns[joint] = (int(leader), row)
     moved = [column for column in moved if column not in coupling.coupled]
     limits = np.tile(np.array([[-np.inf], [np.inf]], dtype=np.float32), len(robot.joints))
-    ranges = joint_limits(model, robot, moved)
-    for side, values in enumerate(ranges):
-        limits[side, moved] = _round_inwards(values, 1.0 - 2.0 * side)
+    for side, values in enumerate(joint_limits(model, robot)):
+        limits[side, moved] = _round_inwards(values[moved], 1.0 - 2.0 * side)
 
-    # Links from the world to the jaws, and from there to each site
-    first, second = (model.site(name).id for name in robot.grasp_sites)
-    first_path = _path(model, model.site_bodyid[first])
-    second_path = _path(model, model.site_bodyid[second])
-    shared = len({*first_path} & {*second_path})
-    chain = Chain()
-    links: list[_Link] = []
-    turned: dict[int, ndarray] = {}  # quaternions of the bodies on the last link, seen from it
-
-    def extend(bodies: list[int], start: _Pose) -> _Pose:
-        """Append the bodies' links; return the frame after them, seen from the last joint."""
-        pose = start
-        for body in bodies:
-            pose = _compose(pose, (model.body_pos[body], model.body_quat[body]))
-            first_joint = model.body_jntadr[body]
-            for joint in range(first_joint, first_joint + model.body_jntnum[body]):
-                if joint in columns:
-                    pose = _compose(pose, (model.jnt_pos[joint], _NO_TURN))
-                    links.append((*_read_link(model, joint, pose), *columns[joint]))
-                    pose = (-model.jnt_pos[joint], _NO_TURN)
-                    turned.clear()
-            turned[body] = pose[1]
-        return pose
-
-    trunk = extend(first_path[:shared], (np.zeros(3), _NO_TURN))
-    chain.trunk = len(links)
+    # Joints from the world to the jaws, and from there to each site
+    sites = [model.site(name).id for name in robot.grasp_sites]
+    first, second = ({*ancestors(model, model.site_bodyid[site])} for site in sites)
+    shared = sorted(first & second)
+    trunk, *forks = (
+        [joint for joint in sorted(columns) if model.jnt_bodyid[joint] in bodies]
+        for bodies in (shared, first - second, second - first)
+    )
+    joints = [*trunk, *forks[0], *forks[1]]
+    kinds = tuple(model.jnt_type[joints].tolist())
+    for joint, kind in zip(joints, kinds, strict=True):
+        if kind not in (HINGE, SLIDE):
+            type_ = mujoco.mjtJoint(kind).name.removeprefix("mjJNT_").lower()
+            problem = f"joint '{model.joint(joint).name}' is of type {type_}"
+            raise MjstackError(f"{problem}, expected hinge or slide", "Name no other joints")
+    rigid = [body for body in shared if not trunk or body >= model.jnt_bodyid[trunk[-1]]]
     body = approach_body(model, robot)
-    if body not in turned:
-        names = ", ".join(model.body(b).name for b in turned) or "none"
+    if body not in rigid:
+        names = ", ".join(model.body(b).name for b in rigid) or "none"
         expected = (
             f"a body that carries both grasp sites and that every joint before them moves: {names}"
         )
         raise ConfigError("robot.approach_body", model.body(body).name, expected)
-    axis = np.empty(3)
-    mujoco.mju_rotVecQuat(axis, np.array(robot.approach_axis, dtype=float), turned[body])
-    chain.approach = wp.vec3(*(axis / np.linalg.norm(axis)))
-    end = extend(first_path[shared:], trunk)
-    chain.first_site = wp.vec3(*_compose(end, (model.site_pos[first], _NO_TURN))[0])
-    chain.fork = len(links)
-    end = extend(second_path[shared:], trunk)
-    chain.second_site = wp.vec3(*_compose(end, (model.site_pos[second], _NO_TURN))[0])
-    chain.end = len(links)
-    frames, axes, kinds, column, rows = (list(values) for values in zip(*links, strict=True))
-    poses = [[*pos, *quat[1:], quat[0]] for pos, quat in frames]  # Warp: xyzw
+    column, rows = ([columns[joint][k] for joint in joints] for k in (0, 1))
+    link = {c: k for k, (c, row) in enumerate(zip(column, rows, strict=True)) if row < 0}
+    mover = tuple(link.get(c, -1) if c in moved else -1 for c in column)
+    if max(mover, default=-1) < 0 or {*moved} & {*column[len(trunk) :]}:
+        expected = f"joints that move both grasp sites, {' and '.join(robot.grasp_sites)}"
+        raise ConfigError("robot.ik_joints", robot.ik_joints, expected)
+
+    # Frames with these joints at 0, at their anchors, turned as their bodies; the last: the world
+    qpos = model.qpos0.copy()
+    qpos[model.jnt_qposadr[joints]] = 0.0
+    data = forward_kinematics(model, qpos)
+    back = (model.jnt_type == SLIDE) * model.qpos0[model.jnt_qposadr]
+    anchors = np.vstack((data.xanchor - back[:, None] * data.xaxis, np.zeros(3)))
+    quats = data.xquat[[*model.jnt_bodyid, 0]]
+    turns = data.xmat[model.jnt_bodyid].reshape(-1, 3, 3)
+
+    def seen(joint: int, pos: ndarray, quat: ndarray) -> list[float]:
+        """A pose in the world seen from a joint's frame, quaternion as Warp has it."""
+        at, turn, x, q = (np.empty(n) for n in (3, 4, 3, 4))
+        mujoco.mju_negPose(at, turn, anchors[joint], quats[joint])
+        mujoco.mju_mulPose(x, q, at, turn, pos, quat)
+        return [*x.round(_DIGITS), *np.roll(q, -1).round(_DIGITS)]
+
+    before = [-1, *trunk[:-1], *(j for fork in forks for j in [trunk[-1], *fork][: len(fork)])]
+    poses = [seen(b, anchors[j], quats[j]) for b, j in zip(before, joints, strict=True)]
+    ends = (
+        seen([*trunk, *fork][-1], data.site_xpos[site], quats[-1])[:3]
+        for fork, site in zip(forks, sites, strict=True)
+    )
+    approach = turns[trunk[-1]].T @ data.xmat[body].reshape(3, 3) @ robot.approach_axis
+
+    # The chain
+    chain = Chain()
+    chain.trunk = len(trunk)
+    chain.fork = len(trunk) + len(forks[0])
+    chain.end = len(joints)
+    chain.first_site, chain.second_site = (wp.vec3(*end) for end in ends)
+    chain.approach = wp.vec3(*(approach / np.linalg.norm(approach)).round(_DIGITS))
     chain.frame = wp.array(poses, dtype=wp.transform)
+    axes = np.einsum("nji,nj->ni", turns[joints], data.xaxis[joints]).round(_DIGITS)
     chain.axis = wp.array(axes, dtype=wp.vec3)
     chain.kind = wp.array(kinds, dtype=int)
     chain.column = wp.array([max(c, 0) for c in column], dtype=int)
@@ -103,48 +123,7 @@ def build_chain(model: mujoco.MjModel, robot: RobotCfg) -> tuple[Chain, Shape]:
     chain.table_low = wp.array(coupling.low, dtype=float)
     chain.table_step = wp.array(coupling.step, dtype=float)
     chain.table_value = wp.array2d(coupling.value, dtype=float)
-    moving = [c in moved for c in column]  # or goes along
-    ik_links = tuple(c in moved and row < 0 for c, row in zip(column, rows, strict=True))
-    link = {c: k for k, c in enumerate(column) if ik_links[k]}
-    leaders = tuple(-1 if row < 0 else link.get(c, -1) for c, row in zip(column, rows, strict=True))
-    if not any(ik_links) or any(moving[chain.trunk :]):
-        expected = f"joints that move both grasp sites, {' and '.join(robot.grasp_sites)}"
-        raise ConfigError("robot.ik_joints", robot.ik_joints, expected)
-    return chain, Shape(tuple(kinds), ik_links, leaders, chain.trunk, chain.fork, chain.end)
-
-
-def _read_link(model: mujoco.MjModel, joint: int, pose: _Pose) -> tuple[_Pose, ndarray, int]:
-    """Read a joint whose frame at qpos0 is ``pose``; its frame at 0 is turned, or shifted, back by
-    qpos0.
-    """
-    kind = int(model.jnt_type[joint])
-    axis = model.jnt_axis[joint].copy()
-    if kind not in (HINGE, SLIDE):
-        name = model.joint(joint).name
-        type_ = mujoco.mjtJoint(kind).name.removeprefix("mjJNT_").lower()
-        raise MjstackError(
-            f"joint '{name}' is of type {type_}, expected hinge or slide. Name no other joints."
-        )
-    zero = float(model.qpos0[model.jnt_qposadr[joint]])
-    turn = _NO_TURN.copy()
-    if kind == HINGE:
-        mujoco.mju_axisAngle2Quat(turn, axis, -zero)
-        back = (np.zeros(3), turn)
-    else:
-        back = (-zero * axis, turn)
-    return _compose(pose, back), axis, kind
-
-
-def _path(model: mujoco.MjModel, body: int) -> list[int]:
-    """Bodies from the world, which is left out, to the given one."""
-    return [*_path(model, model.body_parentid[body]), int(body)] if body else []
-
-
-def _compose(a: _Pose, b: _Pose) -> _Pose:
-    pos = np.empty(3)
-    quat = np.empty(4)
-    mujoco.mju_mulPose(pos, quat, a[0], a[1], b[0], b[1])
-    return pos, quat
+    return chain, kinds, mover
 
 
 def _round_inwards(limits: ndarray, sign: float) -> ndarray:
@@ -224,7 +203,7 @@ class BatchedIk:
 
         # The chain and all buffers, each a Warp array and a torch view of it
         with torch_stream_scope(self._device):
-            self._chain, shape = build_chain(model, robot)
+            self._chain, *links = build_chain(model, robot)
             self._array = {
                 "home": wp.array(np.tile(locked_home(robot), (nworld, 1)), dtype=float),
                 "down": wp.full(nworld, wp.vec3(0.0, 0.0, -1.0), dtype=wp.vec3),
@@ -239,7 +218,7 @@ class BatchedIk:
         wp.synchronize_device(self._device)
 
         # Kernels are compiled and loaded here: a capture may do neither.
-        self._kernel = solve_kernel(shape)
+        self._kernel = solve_kernel(*links)
         self.forward(self._view["q"])
         self.solve(self._view["q"], self._view["target"])
         wp.synchronize_device(self._device)
@@ -283,15 +262,11 @@ class BatchedIk:
         Raises:
             ArgumentError: A shape is wrong.
         """
-        self._copy_in("q", q)
-        self._copy_in("target", target)
-        names = ["q", "target", "home", "down"]
-        if posture is not None:
-            self._copy_in("posture", posture)
-            names[2] = "posture"
-        if approach is not None:
-            self._copy_in("approach", approach)
-            names[3] = "approach"
+        bend = "home" if posture is None else "posture"
+        names = ["q", "target", bend, "down" if approach is None else "approach"]
+        for name, values in zip(names, (q, target, posture, approach), strict=True):
+            if values is not None:
+                self._copy_in(name, values)
         self._launch(self._kernel, names, self._settings, ["solution", "distance"])
         self._coupling.project(self._view["solution"], self._moving)
         return self._view["solution"], self._view["distance"]
@@ -312,3 +287,21 @@ class BatchedIk:
             shapes = (f"shape {tuple(shape)}" for shape in (values.shape, buffer.shape))
             raise ArgumentError(name, *shapes)
         buffer.copy_(values)
+
+
+def find_reach(
+    model: mujoco.MjModel, robot: RobotCfg, points: ndarray, gripper: ArrayLike
+) -> tuple[Tensor, Tensor]:
+    """Bring the grasp point as near to points [m], shape ``(n, 3)``, as possible, from home and
+    from both sides of it, without collisions. The gripper's joints are at positions [rad, m] of
+    shape ``(n_gripper,)`` or ``(n, n_gripper)``. Returns joint positions, shape ``(3, n, nu)``, and
+    the distances that are left [m], shape ``(3, n)``.
+    """
+    q = np.tile(locked_home(robot), (len(_STARTS), len(points), 1))
+    q[..., len(robot.arm_joints) :] = gripper
+    moving = [robot.joints.index(name) for name in robot.ik_joints]
+    q[..., moving] += np.reshape(_STARTS, (-1, 1, 1))
+    targets = torch.from_numpy(np.tile(points, (len(_STARTS), 1)))
+    ik = BatchedIk(model, robot, len(targets), "cpu", iterations=40)
+    solution, distance = ik.solve(torch.from_numpy(q).flatten(0, 1), targets)
+    return solution.view(q.shape), distance.view(q.shape[:2])

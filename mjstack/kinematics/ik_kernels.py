@@ -1,7 +1,6 @@
 """Warp kernels for the grasp point: forward and inverse kinematics, one thread per world."""
 
 # No `from __future__ import annotations` here: Warp reads the annotations as objects.
-from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -48,20 +47,6 @@ class Chain:
     table_low: wp.array[float]  # tables of joints that follow, see `Posture`
     table_step: wp.array[float]
     table_value: wp.array2d[float]
-
-
-@dataclass(frozen=True)
-class Shape:
-    """The chain that a solve kernel is compiled for, so that its loops unroll and its working
-    memory is registers.
-    """
-
-    kinds: tuple[int, ...]  # HINGE or SLIDE, of each link
-    moved: tuple[bool, ...]  # whether inverse kinematics moves it; of the trunk alone
-    leader: tuple[int, ...]  # number of the moved link that it follows, or -1
-    trunk: int
-    fork: int
-    end: int
 
 
 @wp.func
@@ -141,13 +126,19 @@ def within(value: float, low: float, high: float) -> float:
 
 
 @cache
-def solve_kernel(shape: Shape) -> wp.Kernel:
-    """Compile the kernel that moves every world's grasp point towards its target.
+def solve_kernel(kinds: tuple[int, ...], mover: tuple[int, ...]) -> wp.Kernel:
+    """Compile the kernel that moves every world's grasp point towards its target, for one chain: so
+    its loops unroll, and its working memory is registers.
 
     Joints behind the last moved one, such as the wrist's roll and the fingers, are followed once
     per solve. An iteration then follows the END links up to it.
+
+    Args:
+        kinds: HINGE or SLIDE, of each link.
+        mover: Link of the trunk whose joint moves each link, by inverse kinematics: itself, or the
+            one that it follows; -1 where it stands.
     """
-    END = max(i + 1 for i, moved in enumerate(shape.moved) if moved or shape.leader[i] >= 0)
+    END = max(i + 1 for i, link in enumerate(mover) if link >= 0)
     Values = wp.types.vector(length=END, dtype=float)
     Rows = wp.types.matrix(shape=(END, 3), dtype=float)  # a vector per link
 
@@ -226,15 +217,15 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
             high[i] = chain.high[i]
             q[i] = within(start[w, j], low[i], high[i])
             home[i] = posture[w, j]
-            if wp.static(shape.moved[i]):
+            if wp.static(mover[i] == i):
                 solution[w, j] = q[i]
         if not finite:
             distance[w] = NAN
             return
         # Links behind the moved ones
-        rest = follow(chain, start, w, END, wp.static(shape.trunk), wp.transform_identity())
-        first_end = follow(chain, start, w, wp.static(shape.trunk), wp.static(shape.fork), rest)
-        second_end = follow(chain, start, w, wp.static(shape.fork), wp.static(shape.end), rest)
+        rest = follow(chain, start, w, END, chain.trunk, wp.transform_identity())
+        first_end = follow(chain, start, w, chain.trunk, chain.fork, rest)
+        second_end = follow(chain, start, w, chain.fork, chain.end, rest)
         first_site = wp.transform_point(first_end, chain.first_site)
         second_site = wp.transform_point(second_end, chain.second_site)
         approach = wp.transform_vector(rest, chain.approach)
@@ -247,8 +238,9 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
             axes = Rows()
             slopes = Values()
             for i in range(END):
-                if wp.static(shape.leader[i] >= 0):
-                    pair = position(chain, i, q[wp.static(shape.leader[i])])
+                slopes[i] = 1.0
+                if wp.static(mover[i] >= 0 and mover[i] != i):
+                    pair = position(chain, i, q[wp.static(mover[i])])
                     q[i] = pair[0]
                     slopes[i] = pair[1]
             link = wp.transform(wp.vec3(), wp.quat_identity())
@@ -256,7 +248,7 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
                 pose = wp.transform_multiply(link, chain.frame[i])
                 anchors[i] = wp.transform_get_translation(pose)
                 axes[i] = wp.transform_vector(pose, chain.axis[i])
-                link = turn(pose, chain.axis[i], wp.static(shape.kinds[i]), q[i])
+                link = turn(pose, chain.axis[i], wp.static(kinds[i]), q[i])
             first = wp.transform_point(link, first_site)
             second = wp.transform_point(link, second_site)
             midpoint = wp.lerp(first, second, 0.5)
@@ -269,30 +261,21 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
                 # Jacobian of the midpoint
                 jacobian = Rows()
                 for i in range(END):
-                    if wp.static(shape.moved[i]):
+                    if wp.static(mover[i] >= 0):
                         direction = axes[i]
-                        if wp.static(shape.kinds[i] == HINGE):
+                        if wp.static(kinds[i] == HINGE):
                             direction = wp.cross(direction, midpoint - anchors[i])
-                        jacobian[i] = direction
-                for i in range(END):
-                    if wp.static(shape.leader[i] >= 0):
-                        direction = axes[i]
-                        if wp.static(shape.kinds[i] == HINGE):
-                            direction = wp.cross(direction, midpoint - anchors[i])
-                        jacobian[wp.static(shape.leader[i])] += slopes[i] * direction
+                        jacobian[wp.static(mover[i])] += slopes[i] * direction
                 # Null-space motion, and the step
                 guide = Values()
                 if iteration < guided:
                     lever = wp.cross(wp.transform_vector(link, approach), desired[w])
                     for i in range(END):
-                        if wp.static(shape.moved[i]):
-                            guide[i] = posture_gain * (home[i] - q[i])
-                            if wp.static(shape.kinds[i] == HINGE):
-                                guide[i] += approach_gain * wp.dot(axes[i], lever)
-                    for i in range(END):
-                        if wp.static(shape.leader[i] >= 0 and shape.kinds[i] == HINGE):
+                        if wp.static(mover[i] == i):
+                            guide[i] += posture_gain * (home[i] - q[i])
+                        if wp.static(mover[i] >= 0 and kinds[i] == HINGE):
                             turned = slopes[i] * wp.dot(axes[i], lever)
-                            guide[wp.static(shape.leader[i])] += approach_gain * turned
+                            guide[wp.static(mover[i])] += approach_gain * turned
                 step = find_step(jacobian, q, guide, low, high, error, damping)
                 largest = wp.float32(0.0)
                 for i in range(END):
@@ -301,7 +284,7 @@ def solve_kernel(shape: Shape) -> wp.Kernel:
                 for i in range(END):
                     q[i] = wp.clamp(q[i] + scale * step[i], low[i], high[i])
         for i in range(END):
-            if wp.static(shape.moved[i]):
+            if wp.static(mover[i] == i):
                 solution[w, chain.column[i]] = best[i]
         distance[w] = nearest
 

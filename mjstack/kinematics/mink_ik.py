@@ -91,7 +91,7 @@ class GraspIk:
         limited.jnt_limited[np.setdiff1d(np.arange(self.model.njnt), joints)] = False
         limited.jnt_range[joints] = self._coupling.limits
         self._limits = [mink.ConfigurationLimit(limited, gain=1.0)]
-        self._posture.set_target(self._to_qpos(self.home))
+        self._posture.set_target(self._coupling.qpos(self.home))
 
     def solve(self, target: ndarray, start: ndarray) -> tuple[ndarray, float]:
         """Find joint positions [rad, m], shape ``(nu,)``, arm joints first, for a target of the
@@ -100,7 +100,7 @@ class GraspIk:
         """
         self._task.target[:] = target
         configuration = self._configuration
-        configuration.update(self._to_qpos(start))
+        configuration.update(self._coupling.qpos(start))
         nearest = configuration.q[self._qpos].copy()
         distance = math.inf
         for _ in range(_ITERATIONS):
@@ -120,7 +120,7 @@ class GraspIk:
             configuration.integrate_inplace(step * min(1.0, _MAX_STEP / max(largest, 1e-12)), 1.0)
             if self._frozen.along:
                 command = self._coupling.agree(configuration.q[self._qpos])
-                configuration.update(self._to_qpos(command))
+                configuration.update(self._coupling.qpos(command))
             left = float(np.linalg.norm(self._task.compute_error(configuration)))
             # The pull towards home can end in oscillations, farther from the target.
             if left < distance:
@@ -134,8 +134,5 @@ class GraspIk:
 
     def grasp_point(self, q: ndarray) -> ndarray:
         """Grasp point [m] at joint positions of shape ``(nu,)``, shape ``(3,)``."""
-        self._configuration.update(self._to_qpos(q))
+        self._configuration.update(self._coupling.qpos(q))
         return self._task.compute_error(self._configuration) + self._task.target
-
-    def _to_qpos(self, q: ndarray) -> ndarray:
-        return self._coupling.qpos(q)

@@ -13,6 +13,7 @@ from mjstack.config.mjcf import (
     compile_scene,
     describe,
     fix_masses,
+    mujoco_lines,
     option_names,
     read_object,
     scenery,
@@ -24,20 +25,22 @@ from mjstack.robots.posture import REST
 WORLD = "world"  # MuJoCo's name of the body that never moves
 
 # Figures of the solver that the group `solver` leaves to the robot's file where they are null
-_SOLVER = ("iterations", "ls_iterations", "impratio", "tolerance")
-_CONFIGURED = (*_SOLVER, "timestep", "integrator", "cone")  # by groups timing and solver
+SOLVER = ("iterations", "ls_iterations", "impratio", "tolerance")
+_CONFIGURED = (*SOLVER, "timestep", "integrator", "cone")  # by groups timing and solver
 SAG = 0.002  # m: how far off its target a hand is of which gravity, or a report, takes no notice
 _WRAPS = (mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER)
 PREFIX = "robot_"
 OWN_WORLD = PREFIX + WORLD  # body for the file's worldbody, where robot.exclude names that
 _NAMED = ("geoms", "bodies", "cameras")  # elements that a scene has too
-_NAMING = {  # elements with the names of others, whose kind another field has, or is always renamed
+_NAMING = {  # fields with their names, whose kind another field has, or is always renamed
+    "geoms": {"name": ""},
+    "bodies": {"name": ""},
+    "cameras": {"name": "", "targetbody": ""},
     "pairs": {"geomname1": "", "geomname2": ""},
     "excludes": {"bodyname1": "", "bodyname2": ""},
     "equalities": {"name1": "objtype", "name2": "objtype"},
     "sensors": {"objname": "objtype", "refname": "reftype"},
     "actuators": {"target": "trntype"},
-    "cameras": {"targetbody": ""},
     "lights": {"targetbody": ""},
 }
 _RENAMED = {
@@ -85,7 +88,7 @@ def as_guest(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) ->
     _rename(spec, robot, reserved)
     if spec.compiler.settotalmass > 0.0:  # it counts all bodies of a compilation
         fix_masses(spec)
-    for name in _SOLVER:
+    for name in SOLVER:
         setattr(fresh.option, name, getattr(spec.option, name))
     world = fresh.worldbody
     if any(WORLD in pair for pair in robot.exclude):  # table and floor are not excluded
@@ -142,11 +145,9 @@ def mujoco_errors(robot: str) -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        problem = ", ".join(str(error).removeprefix("Error: ").splitlines())
-        raise MjstackError(
-            f"robot {robot}: {problem}. Correct the robot's file or the scene, whose names (floor,"
-            " table and the objects) the robot cannot have."
-        ) from error
+        fix = "Correct the robot's file or the scene, whose names (floor, table and objects) the"
+        fix += " robot cannot have"
+        raise MjstackError(f"robot {robot}: {mujoco_lines(error)}", fix) from error
 
 
 def left_behind(
@@ -210,29 +211,25 @@ def _strangers(spec: mujoco.MjSpec, robot: RobotCfg) -> list[Any]:
     else floors, lights, and bodies that are free or mocap; and keyframes, which fit no scene.
     """
     world = spec.worldbody
-    joints = {name: spec.joint(name) for name in robot.joints}
-    trees = {_tree(joint.parent).name for joint in joints.values()}
-    free = [
-        body
-        for body in world.bodies
-        if body.name not in trees
-        and any(b.mocap or any(j.type == FREE for j in b.joints) for b in _below(body))
-    ]
-    out = [*scenery(spec), *free]
-    if robot.root:
-        require_names("robot.root: body", [robot.root], [body.name for body in spec.bodies])
-        root = spec.body(robot.root)
-        subtree = {body.name for body in (*_below(root), *_above(root))}
-        outside = [b for b in spec.bodies if b.name not in subtree and b.parent.name in subtree]
-        missing = [n for n, joint in joints.items() if joint.parent.name not in subtree]
-        require_names(
-            f"robot.root={robot.root}: joint",
-            missing,
-            [j.name for b in _below(root) for j in b.joints],
-        )
-        carried = [joint for body in _above(root) for joint in body.joints]  # its base stands
-        out = [*spec.keys, *world.lights, *world.geoms, *outside, *carried]
-    return out
+    carriers = {name: spec.joint(name).parent for name in robot.joints}
+    if not robot.root:
+        trees = {_tree(body).name for body in carriers.values()}
+        free = [
+            body
+            for body in world.bodies
+            if body.name not in trees
+            and any(b.mocap or any(j.type == FREE for j in b.joints) for b in _below(body))
+        ]
+        return [*scenery(spec), *free]
+    require_names("robot.root: body", [robot.root], [body.name for body in spec.bodies])
+    root = spec.body(robot.root)
+    subtree = {body.name for body in (*_below(root), *_above(root))}
+    outside = [b for b in spec.bodies if b.name not in subtree and b.parent.name in subtree]
+    missing = [name for name, body in carriers.items() if body.name not in subtree]
+    known = [joint.name for joint in root.find_all("joint")]
+    require_names(f"robot.root={robot.root}: joint", missing, known)
+    carried = [joint for body in _above(root) for joint in body.joints]  # its base stands
+    return [*spec.keys, *world.lights, *world.geoms, *outside, *carried]
 
 
 def _idle_servos(
@@ -272,7 +269,7 @@ def _above(body: mujoco.MjsBody) -> list[mujoco.MjsBody]:
 
 def _below(body: mujoco.MjsBody) -> list[mujoco.MjsBody]:
     """A body and its descendants."""
-    return [body, *(low for child in body.bodies for low in _below(child))]
+    return [body, *body.find_all("body")]
 
 
 def _clashes(spec: mujoco.MjSpec, reserved: Collection[str]) -> list[str]:
@@ -290,10 +287,9 @@ def _rename(spec: mujoco.MjSpec, robot: RobotCfg, reserved: Collection[str]) -> 
             f"robot {robot.name}: the scene has {', '.join(sorted(names))} too, expected other"
             " names in the robot's file. Rename them there"
         )
-    for kind in (*_NAMED, *_NAMING):
+    for kind, fields in _NAMING.items():
         for element in getattr(spec, kind):
-            fields = {"name": ""} if kind in _NAMED else {}
-            for field, of in (fields | _NAMING.get(kind, {})).items():
+            for field, of in fields.items():
                 typed = not of or getattr(element, of) in _RENAMED
                 if typed and getattr(element, field) in clashes:
                     setattr(element, field, PREFIX + getattr(element, field))

@@ -1,15 +1,19 @@
 """The arms and hands of an MJCF file: which joints are an arm's, and which its gripper's."""
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
+from mjstack.robots.bodies import ancestors, subtree
+from mjstack.robots.posture import actuator_moment
+
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)  # hinges follow; others are not an arm's
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
-_TENDON = int(mujoco.mjtTrn.mjTRN_TENDON)
-_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+_JOINT_OR_TENDON = [
+    int(getattr(mujoco.mjtTrn, f"mjTRN_{kind}")) for kind in ("JOINT", "JOINTINPARENT", "TENDON")
+]
 _BASE = 0.4  # m: a geom of the world that is all so near an arm is its base
 _FINGER = 3  # joints with a servo that a finger has at most; an arm has more
 
@@ -40,30 +44,30 @@ def find_hands(model: mujoco.MjModel) -> list[Hand]:
     is there.
     """
     driven = _driven(model)
-    below = [_below(model, body) for body in range(model.nbody)]
+    subtrees = [subtree(model, body) for body in range(model.nbody)]
     jointed = {int(body) for body in model.jnt_bodyid}
 
     def branches(body: int) -> list[list[int]]:
         """Subtrees with joints that begin at a body's children."""
         children = np.flatnonzero(model.body_parentid == body)
-        return [below[c] for c in children if c != 0 and jointed & {*below[c]}]
+        return [subtrees[c] for c in children if c != 0 and jointed & {*subtrees[c]}]
 
     def is_palm(body: int) -> bool:
         fingers = branches(body)
-        counts = [len(_joints(model, bodies) & driven) for bodies in fingers]
+        counts = [len(driven & {*_joints(model, bodies)}) for bodies in fingers]
         return body != 0 and len(fingers) > 1 and max(counts) <= _FINGER and any(counts)
 
     palms = [b for b in range(model.nbody) if is_palm(b)]
-    palms = [b for b in palms if not any(p != b and p in below[b] for p in palms)]
+    palms = [b for b in palms if not any(p != b and p in subtrees[b] for p in palms)]
     hands = [
         _hand(model, palm, [b for sub in branches(palm) for b in sub], driven) for palm in palms
     ]
-    gripping = {b for palm in palms for b in below[palm]}
-    leaves = [b for b in jointed if not any(b != j and j in below[b] for j in jointed)]
+    gripping = {b for palm in palms for b in subtrees[palm]}
+    leaves = [b for b in jointed if not any(b != j and j in subtrees[b] for j in jointed)]
     for leaf in leaves:  # a jaw against the body that carries it
         if leaf not in gripping and model.body_jntnum[leaf] == 1:
             palm = int(model.body_parentid[leaf])
-            hands.append(_hand(model, palm, below[leaf], driven, one_finger=True))
+            hands.append(_hand(model, palm, subtrees[leaf], driven, one_finger=True))
     hands = [hand for hand in hands if len(hand.arm) > 1 and hand.gripper]
     hands.sort(key=lambda hand: hand.palm)
     fixed = [h for h in hands if all(model.jnt_type[j] != _FREE for j in h.outside)]
@@ -78,11 +82,11 @@ def _hand(
     *,
     one_finger: bool = False,
 ) -> Hand:
-    path = [j for body in reversed([*ancestors(model, palm)]) for j in _body_joints(model, body)]
+    path = _joints(model, [*ancestors(model, palm)])
     unbounded = (model.jnt_type < _SLIDE) | (model.jnt_type == _SLIDE) & (model.jnt_limited == 0)
     bases = [int(model.jnt_bodyid[j]) for j in path if unbounded[j]]
     last = max((path.index(j) for j in path if model.jnt_bodyid[j] in bases), default=-1)
-    joints = sorted(j for j in _joints(model, bodies) if model.jnt_type[j] >= _SLIDE)
+    joints = [j for j in _joints(model, bodies) if model.jnt_type[j] >= _SLIDE]
     fingers = [j for j in joints if j in driven] or joints
     return Hand(
         palm, tuple(path[last + 1 :]), tuple(fingers), tuple(bodies), one_finger,
@@ -94,14 +98,10 @@ def _driven(model: mujoco.MjModel) -> set[int]:
     """Joints with an actuator, also by a tendon; where a hand or arm has none, each that no
     equality ties to another.
     """
-    driven: set[int] = set()
-    for kind, (target, _) in zip(model.actuator_trntype, model.actuator_trnid, strict=True):
-        if kind in _JOINT:
-            driven.add(int(target))
-        elif kind == _TENDON:
-            first = model.tendon_adr[target]
-            wraps = range(first, first + model.tendon_num[target])
-            driven |= {int(model.wrap_objid[w]) for w in wraps if model.wrap_type[w] == 1}
+    data = mujoco.MjData(model)
+    mujoco.mj_fwdPosition(model, data)
+    moved = actuator_moment(data)[np.isin(model.actuator_trntype, _JOINT_OR_TENDON)] != 0.0
+    driven = {*model.dof_jntid[moved.any(axis=0)].tolist()}
     joint = int(mujoco.mjtEq.mjEQ_JOINT)
     ties = zip(model.eq_type, model.eq_obj1id, model.eq_obj2id, strict=True)
     followers = {int(follower) for kind, follower, leader in ties if kind == joint and leader >= 0}
@@ -111,24 +111,10 @@ def _driven(model: mujoco.MjModel) -> set[int]:
     return {j for j in driven | (bare - followers) if model.jnt_type[j] >= _SLIDE}
 
 
-def ancestors(model: mujoco.MjModel, body: int) -> Iterator[int]:
-    """A body and those that carry it, without the world."""
-    while body:
-        yield int(body)
-        body = model.body_parentid[body]
-
-
-def _below(model: mujoco.MjModel, body: int) -> list[int]:
-    return [b for b in range(body, model.nbody) if b == body or body in ancestors(model, b)]
-
-
-def _body_joints(model: mujoco.MjModel, body: int) -> list[int]:
-    first = int(model.body_jntadr[body])
-    return list(range(first, first + int(model.body_jntnum[body])))
-
-
-def _joints(model: mujoco.MjModel, bodies: list[int]) -> set[int]:
-    return {j for body in bodies for j in _body_joints(model, body)}
+def _joints(model: mujoco.MjModel, bodies: Sequence[int]) -> list[int]:
+    """Joints of some bodies, in order."""
+    joints: list[int] = np.flatnonzero(np.isin(model.jnt_bodyid, bodies)).tolist()
+    return joints
 
 
 def find_root(model: mujoco.MjModel, hand: Hand) -> int:
@@ -136,11 +122,11 @@ def find_root(model: mujoco.MjModel, hand: Hand) -> int:
     the whole file, if there is nothing else in it than what a scene leaves out by itself, and the
     arm's base.
     """
-    arm_joints = {*hand.arm} | _joints(model, list(hand.bodies))
+    arm_joints = {*hand.arm, *_joints(model, hand.bodies)}
     path = [*reversed([*ancestors(model, hand.palm)])]
-    root = next(b for b in path if _joints(model, _below(model, b)) <= arm_joints)
+    root = next(b for b in path if {*_joints(model, subtree(model, b))} <= arm_joints)
     tops = np.flatnonzero(model.body_parentid == 0)[1:]
-    free = {t for t in tops if _FREE in model.jnt_type[_body_joints(model, t)]}
+    free = {t for t in tops if _FREE in model.jnt_type[_joints(model, [t])]}
     plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
     here = np.flatnonzero((model.geom_bodyid == 0) & ~plane)
     far = np.linalg.norm(model.geom_pos[here] - model.body_pos[path[0]], axis=1)

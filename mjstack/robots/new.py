@@ -57,8 +57,6 @@ def write_new(args: Sequence[str], arm: str = "") -> tuple[list[Path], list[Gues
         path = f"conf/robot/{name}.yaml"
         source = os.path.relpath(file, folder / "conf" / "robot")
         lines = [("file", source, "relative to this YAML"), *profile]
-        if len({key for key, *_ in lines}) < len(lines):
-            raise MjstackError(f"{file}: a key of its profile was guessed twice.")
         contents[path] += "".join(_line(*line) for line in lines)
     paths = [folder / path for path in contents]
     for target, content in zip(paths, contents.values(), strict=True):

@@ -62,8 +62,8 @@ class Posture:
         self._data = mujoco.MjData(m)
         plain = np.flatnonzero(m.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE))
         self._dofs, self._addresses = m.jnt_dofadr[plain], m.jnt_qposadr[plain]
-        limits = np.where(m.jnt_limited[plain, None], m.jnt_range[plain], [-np.inf, np.inf])
-        self._low, self._high = limits.T
+        ranges = np.where(m.jnt_limited[:, None], m.jnt_range, [-np.inf, np.inf])
+        self._low, self._high = ranges[plain].T
         self._stiffness = m.jnt_stiffness[plain] / max(m.jnt_stiffness.max(initial=0.0), 1e-9)
         numbers = [m.joint(name).id for name in joints]
         self.commanded = m.jnt_qposadr[numbers]
@@ -86,8 +86,7 @@ class Posture:
 
         # Tables
         tables: dict[int, tuple[int, float, float, ndarray]] = {}
-        limited = m.jnt_limited[numbers, None]
-        self.limits = np.where(limited, m.jnt_range[numbers], [-np.inf, np.inf])
+        self.limits = ranges[numbers]
         for k, address in enumerate(self.commanded):
             if address in tables or not self._linked[self._addresses == address].any():
                 continue
@@ -111,14 +110,11 @@ class Posture:
         coupled = [k for k, address in enumerate(self.commanded) if address in tables]
         self.coupled = np.array(coupled, dtype=int)
         self.columns = np.array([c for c in tables if c not in self.commanded], dtype=int)
-        rows = [tables[c] for c in (*self.columns, *self.commanded[self.coupled])]
-        leader, low, step, value = zip(*rows, strict=True) if rows else ((), (), (), ())
-        self.leader, self.low, self.step = (
-            np.array(leader, dtype=int),
-            np.array(low),
-            np.array(step),
-        )
-        self.value = np.reshape(value, (-1, KNOTS))
+        rows = [tables[address] for address in self.follows]
+        self.leader = np.array([leader for leader, *_ in rows], dtype=int)
+        self.low = np.array([low for _, low, *_ in rows])
+        self.step = np.array([step for *_, step, _ in rows])
+        self.value = np.reshape([value for *_, value in rows], (-1, KNOTS))
         self._tensors: dict[tuple, list[Tensor]] = {}
 
     @property
@@ -130,7 +126,7 @@ class Posture:
         """All positions at a command [rad, m], shapes ``(nq,)`` and ``(n,)``."""
         qpos = self.rest.copy()
         qpos[self.commanded] = command
-        follow, _ = self.follow(torch.from_numpy(np.array(command, dtype=float)))
+        follow, _ = self.follow(torch.tensor(command, dtype=torch.float64))
         qpos[self.columns] = follow[: len(self.columns)].numpy()
         return qpos
 

@@ -11,15 +11,15 @@ import mujoco
 import numpy as np
 from numpy import ndarray
 
-from mjstack.config.mjcf import read_mjcf
+from mjstack.config.mjcf import compile_scene
 from mjstack.config.schema import ModelCfg, RobotCfg, SceneCfg, ServoCfg
 from mjstack.config.schema.robot import BasePoseCfg
 from mjstack.errors import ConfigError, MjstackError
-from mjstack.robots.guest import compile_scene, mujoco_errors
+from mjstack.robots.guest import mujoco_errors
 from mjstack.robots.hand import Hand, find_hands, find_root
 from mjstack.robots.posture import actuator_moment, posture
 from mjstack.robots.servos import prepare_servos, servo_problem
-from mjstack.robots.source import robot_spec
+from mjstack.robots.source import read_robot, robot_spec
 from mjstack.robots.tips import Fingers, Grip
 from mjstack.robots.workspace import Workspace, find_workspace
 
@@ -35,6 +35,7 @@ _TURN = 6.283  # rad either way, for a hinge without a range
 _BANDWIDTH = 40.0  # rad/s of a servo that is made
 _FLOOR = 0.024  # m: a table's top, at least
 _THICK = 0.012  # m: half of a table's thickness
+_BUILTIN = ModelCfg(source="builtin")  # of the file itself
 _AWAY = 0.4  # m: to a table below a gantry
 
 
@@ -57,19 +58,12 @@ def guess_profile(file: Path, scene: SceneCfg, arm: str = "") -> list[Guess]:
     Raises:
         MjstackError: The file cannot be read, or no arm with a gripper in it can be used.
     """
-    spec = read_mjcf(file, "Correct the file.")
-    for number, body in enumerate(spec.bodies):  # as `read_robot` names them
-        body.name = body.name or f"unnamed_{number}"
+    spec = read_robot(RobotCfg(name="guess", file=str(file)), _BUILTIN)
     spec.compiler.fusestatic = False
     with mujoco_errors(str(file)):
         model = spec.copy().compile()
     hands, problems = [], []
     for hand in find_hands(model):
-        bare = [j for j in (*hand.arm, *hand.gripper) if not model.joint(j).name]
-        if bare:
-            body = model.body(model.jnt_bodyid[bare[0]]).name
-            problems.append(f"the joint of body {body} has no name")
-            continue
         try:
             servos, limits = _fit(spec, model, hand)
             grip = Fingers(spec, hand, limits[len(hand.arm) :]).measure(_WIDTH)
@@ -201,7 +195,9 @@ def _guess_home(
     model: mujoco.MjModel, hand: Hand, grip: Grip, space: Workspace, limits: ndarray
 ) -> Iterator[Guess]:
     home = _within(np.concatenate((space.home, grip.opened)), limits)
-    why = f"hand down {100 * space.height:.0f} cm above the table's middle, by inverse kinematics"
+    why = (
+        f"hand down {100 * space.arm.height:.0f} cm above the table's middle, by inverse kinematics"
+    )
     yield Guess(
         "home", home, f"{why}; off the vertical by {math.degrees(space.tilt):.0f} deg at most"
     )
@@ -213,9 +209,9 @@ def _guess_home(
     if roll:
         yield Guess("roll_joint", roll, "its axis is the approach axis")
         yield Guess("yaw_alignment", 1.0, "the jaws turn to a face")
-    if space.upright and len(names) - len(space.locked) > 3:
+    if space.arm.upright and len(names) - len(space.locked) > 3:
         yield Guess("approach_gain", 0.5, "the first joint is upright, and joints are left")
-    yield Guess("approach_height", space.height, "m above an object")
+    yield Guess("approach_height", space.arm.height, "m above an object")
     yield Guess("finger_room", 0.03, "m beside an object")
 
 
@@ -260,7 +256,7 @@ def _guess_scene(
     made = {name: ServoCfg(**servo) for name, servo in servos.items()}
     robot = RobotCfg(name="guess", file=str(file), servos=made, base=base, **values)
     with mujoco_errors(str(file)):
-        model = compile_scene(robot_spec(robot, ModelCfg(source="builtin")))
+        model = compile_scene(robot_spec(robot, _BUILTIN))
     gripper = [model.actuator(name).id for name in robot.gripper_joints]
     gains, damping = model.actuator_gainprm[gripper, 0], -model.actuator_biasprm[gripper, 2]
     limited = model.actuator_forcelimited[gripper]
@@ -317,12 +313,12 @@ def _effort(data: mujoco.MjData, joint: int) -> float:
 
 def _guess_table(space: Workspace, scene: SceneCfg) -> Iterator[Guess]:
     """Where the arm stands, the table before it, and what stands on it."""
-    distance = float(np.linalg.norm((space.center - space.shoulder)[:2]))
+    distance = float(np.linalg.norm((space.center - space.arm.shoulder)[:2]))
     cos, sin = math.cos(space.azimuth), math.sin(space.azimuth)
     turn = np.array([[cos, sin], [-sin, cos]])  # so that the table is ahead
     shift = np.array([0.0, 0.0, max(0.0, _FLOOR - space.center[2], -space.lowest)])
-    if space.azimuth or distance < 0.15 or np.linalg.norm(space.shoulder[:2]) > 0.1:
-        shift[:2] = -turn @ space.shoulder[:2]
+    if space.azimuth or distance < 0.15 or np.linalg.norm(space.arm.shoulder[:2]) > 0.1:
+        shift[:2] = -turn @ space.arm.shoulder[:2]
         shift[0] += _AWAY * (distance < 0.15)
     if space.azimuth or shift.any():
         quat = [math.cos(-0.5 * space.azimuth), 0.0, 0.0, math.sin(-0.5 * space.azimuth)]
@@ -333,10 +329,10 @@ def _guess_table(space: Workspace, scene: SceneCfg) -> Iterator[Guess]:
     x, y = _numbers(turn @ space.center[:2] + shift[:2], 3)
     top = float(space.center[2] + shift[2])
     half = [round(min(0.14, max(0.09, distance - 0.1)) if distance > 0.15 else 0.14, 3)]
-    sides = np.linspace(-space.apart, space.apart, len(scene.objects))
+    sides = np.linspace(-space.arm.apart, space.arm.apart, len(scene.objects))
     places = {
         "table_center": [x, y, round(top - _THICK, 3)],
-        "table_half": [*half, round(space.apart + 0.12, 3), _THICK],
+        "table_half": [*half, round(space.arm.apart + 0.12, 3), _THICK],
         "objects": {
             name: [x, round(y + s, 3)] for name, s in zip(scene.objects, sides, strict=True)
         },

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from numpy import ndarray
 
+from mjstack.robots.bodies import geom_corners, solid_geoms
 from mjstack.robots.hand import Hand
 from mjstack.robots.posture import Posture
 
@@ -71,7 +72,7 @@ class Fingers:
         self._ranges = ranges
         self._posture = Posture(model, [model.joint(j).name for j in (*hand.arm, *hand.gripper)])
         self._arm = self._posture.rest[self._posture.commanded[: len(hand.arm)]]
-        self._solid = np.flatnonzero((model.geom_contype | model.geom_conaffinity) != 0)
+        self._solid = solid_geoms(model)
         palm = model.body_weldid[hand.palm]
         self._fixed = np.flatnonzero(model.body_weldid == palm) if palm else np.array([hand.palm])
 
@@ -86,12 +87,19 @@ class Fingers:
         return whole[len(self._arm) :]
 
     def points(self, bodies: Sequence[int]) -> ndarray:
-        """Points of the solid geoms of bodies in the palm's frame [m], shape ``(n, 3)``."""
+        """Vertices of the solid meshes of bodies, corners of the boxes around other solid geoms,
+        in the palm's frame [m], shape ``(n, 3)``.
+        """
         model, data = self.model, self._data
         clouds = [np.zeros((0, 3))]
-        for geom in self._solid[np.isin(model.geom_bodyid[self._solid], bodies)]:
-            local = _corners(model, geom) @ data.geom_xmat[geom].reshape(3, 3).T
-            clouds.append(self._to_palm(local + data.geom_xpos[geom]))
+        for geom in solid_geoms(model, bodies):
+            cloud = geom_corners(data, [geom])[0]
+            if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
+                mesh = model.geom_dataid[geom]
+                first = model.mesh_vertadr[mesh]
+                cloud = model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
+                cloud = cloud @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
+            clouds.append(self._to_palm(cloud))
         return np.concatenate(clouds)
 
     def measure(self, width: float, deepest: float = math.inf) -> Grip:
@@ -101,21 +109,21 @@ class Fingers:
         hand = self._hand
         middle = self._ranges.mean(axis=1)
         self.settle(middle)
-        clouds = {body: self.points([body]) for body in hand.bodies}
-        bodies = [body for body, cloud in clouds.items() if len(cloud)]
+        bodies = [body for body in hand.bodies if len(self.points([body]))]
         if not bodies:
             raise ValueError("the fingers have no geoms that collide")
-        centres = np.array([clouds[body].mean(axis=0) for body in bodies])
-        ways = np.zeros((len(middle), len(bodies), 3))  # from a joint's lower end to its upper
-        for number, ends in enumerate(self._ranges):
-            for end, sign in zip(ends, (-1.0, 1.0), strict=True):
-                target = middle.copy()
-                target[number] = end
-                self.settle(target)
-                means = [self.points([body]).mean(axis=0) for body in bodies]
-                ways[number] += sign * np.array(means)
+
+        def centres(gripper: ndarray) -> ndarray:
+            self.settle(gripper)
+            return np.array([self.points([body]).mean(axis=0) for body in bodies])
+
+        ways = np.empty((len(middle), len(bodies), 3))  # from a joint's lower end to its upper
+        for number in range(len(middle)):
+            still = np.arange(len(middle)) != number
+            low, high = (centres(np.where(still, middle, ends)) for ends in self._ranges.T)
+            ways[number] = high - low
         closing = np.linalg.svd(ways.reshape(-1, 3))[2][0]
-        along = centres @ closing
+        along = centres(middle) @ closing
         right = along > 0.5 * (along.min() + along.max())
         if right[0]:  # the first jaw is the one that the file has first
             closing, right = -closing, ~right
@@ -129,20 +137,20 @@ class Fingers:
                 closing = -closing
         elif not second:  # all move in step
             raise ValueError("its fingers do not close on each other")
-        moves = ways @ closing
-        opens = moves[:, right].mean(axis=1)
-        if not right.all():
-            opens = opens - moves[:, ~right].mean(axis=1)
+
+        def relative(moves: ndarray) -> ndarray:
+            """How the second side moves, seen from the first, from the bodies' ways."""
+            first_way = 0.0 if right.all() else moves[~right].mean(axis=0)
+            return moves[right].mean(axis=0) - first_way
+
+        opens = relative((ways @ closing).T)
         low, high = self._ranges.T
         opened = self._agree(np.where(opens > 0.0, high, low))
         shut = self._agree(np.where(opens > 0.0, low, high))
-        nearly = []  # shut: there a jaw on a hinge lies along the approach axis
-        for share in (0.15, 0.0):
-            self.settle(shut + share * (opened - shut))
-            nearly.append(np.array([self.points([body]).mean(axis=0) for body in bodies]))
-        away = nearly[0] - nearly[1]
-        away = away[right].mean(axis=0) - (0.0 if right.all() else away[~right].mean(axis=0))
-        approach = self._approach(nearly[1].mean(axis=0), _unit(away))
+        # Nearly shut a jaw on a hinge lies along the approach axis
+        nearly, closed = (centres(shut + share * (opened - shut)) for share in (0.15, 0.0))
+        away = relative(nearly - closed)
+        approach = self._approach(closed.mean(axis=0), _unit(away))
         closing = _unit(away - (away @ approach) * approach)
         self._frame = np.stack((np.cross(approach, closing), approach, closing), axis=1)
         self._sides = first, second
@@ -247,16 +255,6 @@ class Fingers:
     def _from_palm(self, point: ndarray) -> ndarray:
         palm = self._hand.palm
         return self._data.xpos[palm] + self._data.xmat[palm].reshape(3, 3) @ point
-
-
-def _corners(model: mujoco.MjModel, geom: int) -> ndarray:
-    """Vertices of a mesh, or corners of the box around another geom, in its frame [m]."""
-    mesh = model.geom_dataid[geom]
-    if mesh >= 0 and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
-        first = model.mesh_vertadr[mesh]
-        return model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
-    middle, half = model.geom_aabb[geom].reshape(2, 3)
-    return middle + half * np.stack(np.meshgrid(*[[-1, 1]] * 3), axis=-1).reshape(-1, 3)
 
 
 def _last(gaps: ndarray, gap: float) -> float:

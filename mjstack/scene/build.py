@@ -23,7 +23,8 @@ from mjstack.config.mjcf import (
 from mjstack.config.schema import CameraCfg, Config, ObjectCfg, SceneCfg
 from mjstack.errors import ConfigError, MjstackError, UnknownName, require_names
 from mjstack.robots import robot_spec
-from mjstack.robots.guest import WORLD, compile_robot_scene, mujoco_errors
+from mjstack.robots.bodies import forward_kinematics
+from mjstack.robots.guest import SOLVER, WORLD, compile_robot_scene, mujoco_errors
 from mjstack.robots.jaws import jaw_members
 
 TABLE = "table"
@@ -92,7 +93,7 @@ def add_scene(spec: mujoco.MjSpec, cfg: Config, *, visuals: bool = False) -> Non
     option.timestep = cfg.timing.physics_dt
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.cone = getattr(mujoco.mjtCone, f"mjCONE_{solver.cone.upper()}")
-    for name in ("iterations", "ls_iterations", "impratio", "tolerance"):
+    for name in SOLVER:
         if (value := getattr(solver, name)) is not None:
             setattr(option, name, value)
     parents = {body.name: body.parent.name for body in spec.bodies[1:]}
@@ -248,8 +249,7 @@ def _require_objects(scene: SceneCfg) -> None:
 
 def _require_clear(model: mujoco.MjModel, scene: SceneCfg) -> None:
     """Raise a `ConfigError` for the first moving object that starts inside of another thing."""
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
+    data = forward_kinematics(model)
     root = model.body_rootid[model.geom_bodyid]
     geoms = {name: np.flatnonzero(root == model.body(name).id) for name in scene.objects}
     for name, thing in scene.free.items():

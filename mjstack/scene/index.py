@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import combinations, product
+from itertools import combinations
 
 import mujoco
 import numpy as np
@@ -14,13 +14,14 @@ from torch import Tensor
 from mjstack.config.schema import RobotCfg, SceneCfg
 from mjstack.errors import ConfigError, require_names
 from mjstack.math import lowest_point, quat_mul, quat_to_matrix
+from mjstack.robots.bodies import forward_kinematics, solid_geoms
 from mjstack.robots.guest import OWN_WORLD
 from mjstack.robots.jaws import Jaws
 from mjstack.robots.posture import Posture, idle_servos, posture
 from mjstack.scene.build import CAPSULE_TURN, WORLD, force_sensor
 from mjstack.sim.simulation import Columns
 
-_jaws = lru_cache(maxsize=8)(Jaws)
+_jaws = lru_cache(maxsize=8)(Jaws)  # probed once per model
 _APART = 1e-4  # [rad, m] that a joint value may be off
 _OFF_EQUALITY = 1e-3  # of the joint's range, that it may besides: values in files are rounded
 _GRIP = 20.0  # [N] of each jaw on an object, where the configuration has no joint target
@@ -109,13 +110,11 @@ class SceneIndex:
                 span = model.actuator(name).ctrlrange.tolist()
                 raise ConfigError(f"ctrlrange of joint {name}", span, expected)
         self.n_arm = len(robot.arm_joints)
-        data = mujoco.MjData(model)
-        mujoco.mj_kinematics(model, data)
         first = model.jnt_bodyid[joints[0]]
         carrier = model.body_parentid[first]
         if model.body(carrier).name in (WORLD, OWN_WORLD):
             carrier = first
-        self.base = data.xpos[carrier, :2].tolist()
+        self.base = forward_kinematics(model).xpos[carrier, :2].tolist()
         self.grasp_sites = [model.site(name).id for name in robot.grasp_sites]
         self.objects = {
             name: (int(model.joint(name).qposadr[0]), int(model.joint(name).dofadr[0]))
@@ -215,18 +214,14 @@ def _check_poses(places: Posture, robot: RobotCfg) -> None:
             raise ConfigError(f"robot.{key} of {name}", float(command[k]), expected)
 
 
-def joint_limits(
-    model: mujoco.MjModel, robot: RobotCfg, numbers: Sequence[int] | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Narrower of the range of each joint, or of those of some numbers, as far as what follows it
-    can, and its servo's: low and high limits [rad, m], each of shape ``(n,)``; infinite where there
-    is none.
+def joint_limits(model: mujoco.MjModel, robot: RobotCfg) -> tuple[np.ndarray, np.ndarray]:
+    """Narrower of the range of each joint, as far as what follows it can, and its servo's: low and
+    high limits [rad, m], each of shape ``(n,)``; infinite where there is none.
     """
     servos = [model.actuator(name).id for name in robot.joints]
     limited = model.actuator_ctrllimited[servos, None]
     span = np.where(limited, model.actuator_ctrlrange[servos], [-np.inf, np.inf])
     spans = np.stack((posture(model, tuple(robot.joints)).limits, span))
-    spans = spans if numbers is None else spans[:, list(numbers)]
     return spans[..., 0].max(axis=0), spans[..., 1].min(axis=0)
 
 
@@ -240,8 +235,9 @@ def gripper_targets(
     is given, it is for any object; where it is not given either, the jaws press with 20 N.
     ``widths`` are those of the objects across the jaws [m]; None is for the open gripper.
     """
-    jaws = jaws_of(model, robot)
-    low, high = joint_limits(model, robot, range(len(robot.arm_joints), len(robot.joints)))
+    names = (robot.joints, robot.gripper_joints, robot.jaw_bodies, robot.grasp_sites)
+    jaws = _jaws(model, *map(tuple, names))
+    low, high = (limits[len(robot.arm_joints) :] for limits in joint_limits(model, robot))
     opened, closed = (
         np.clip(end, low, high) if target is None else np.array(target, dtype=float)
         for end, target in ((jaws.opened, robot.gripper_open), (jaws.shut, robot.gripper_closed))
@@ -268,12 +264,6 @@ def gripper_targets(
     return rows
 
 
-def jaws_of(model: mujoco.MjModel, robot: RobotCfg) -> Jaws:
-    """The robot's jaws, probed once per model."""
-    names = (robot.joints, robot.gripper_joints, robot.jaw_bodies, robot.grasp_sites)
-    return _jaws(model, *map(tuple, names))
-
-
 def locked_home(robot: RobotCfg) -> np.ndarray:
     """The robot's home with the locked joints where they are locked [rad, m], shape ``(nu,)``."""
     pairs = zip(robot.joints, robot.home, strict=True)
@@ -293,24 +283,11 @@ def turn_sign(model: mujoco.MjModel, robot: RobotCfg) -> float:
     Raises:
         ConfigError: It does not turn about the vertical.
     """
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    up = float(data.joint(robot.arm_joints[0]).xaxis[2])
+    up = float(forward_kinematics(model).joint(robot.arm_joints[0]).xaxis[2])
     if abs(up) < 0.999:
         expected = f"0, because joint {robot.arm_joints[0]} does not turn about the vertical"
         raise ConfigError("robot.approach_gain", robot.approach_gain, expected)
     return math.copysign(1.0, up)
-
-
-def geom_corners(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray:
-    """Corners of the boxes around some geoms, by signs [m], shape ``(n, 8, 3)``."""
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    signs = np.array(list(product((-1.0, 1.0), repeat=3)))
-    middle, half = model.geom_aabb[geoms].reshape(-1, 2, 3).swapaxes(0, 1)
-    corners = middle[:, None] + signs * half[:, None]
-    turned = corners @ data.geom_xmat[geoms].reshape(-1, 3, 3).swapaxes(1, 2)
-    return data.geom_xpos[geoms][:, None] + turned
 
 
 def lowest_height(
@@ -323,10 +300,8 @@ def lowest_height(
     Of shapes that objects do not have, such as meshes, the bounding box counts, which reaches
     lower, never higher.
     """
-    owners = [model.body(name).id for name in bodies]
-    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     lowest = []
-    for geom in np.flatnonzero(collides & np.isin(model.geom_bodyid, owners)):
+    for geom in solid_geoms(model, [model.body(name).id for name in bodies]):
         shape = _SHAPES.get(model.geom_type[geom], "box")
         middle, half = model.geom_aabb[geom].reshape(2, 3)
         size = half if shape == "box" else model.geom_size[geom]

@@ -40,8 +40,8 @@ def source_names(scene: SceneCfg) -> list[str]:
 
 def nominal_xy(scene: SceneCfg) -> np.ndarray:
     """Nominal position of every source [m], shape ``(sources, 2)``."""
-    objects = [thing.xy for thing in scene.objects.values()]
-    return np.array([*objects, *(place.xy for place in scene.places.values())]).reshape(-1, 2)
+    sources = scene.objects | scene.places
+    return np.array([source.xy for source in sources.values()]).reshape(-1, 2)
 
 
 def build_phases(cfg: Config) -> list[Phase]:

@@ -145,14 +145,13 @@ class BoxCheck(EpisodeCheck):
             after=release,
         )
         text = "an object not at rest in the box at the end"
+        inside = ("INSIDE", text, self.resting, t.window)
         measured = [Figure(f"slot_err_{name}", unit="m") for name in self.objects]
         measured += [Figure("beyond", unit="m"), Figure("corner_speed", unit="m/s")]
         return [
             *(grasp, lift, carry, drop, release, settled),
             _Order(self.objects, release),
-            parts.InWindow(
-                *("INSIDE", text, self.resting, t.window), measure=self.trace, measured=measured
-            ),
+            parts.InWindow(*inside, measure=self.trace, measured=measured),
             _JawClear(self.cfg.robot, self._high[2], t.jaw_clearance),
         ]
 
@@ -277,7 +276,7 @@ class _Drop(parts.AtLeast):
     high: parts.Condition
 
     def counts(self) -> list[Figure]:
-        return [Figure(self.value, low=0.0, high=0.0)]
+        return [Figure(self.value, high=0.0)]
 
     def start(self, step: Step) -> None:
         super().start(step)
@@ -331,8 +330,7 @@ class _Order(Rule):
     def __init__(self, objects: Sequence[str], release: _Release) -> None:
         pairs = itertools.pairwise(objects)
         text = " or ".join(f"{later} grasped before {name} was released" for name, later in pairs)
-        figures = [Figure("too_early", low=0.0, high=0.0)]
-        super().__init__("ORDER", text or "never broken", figures=figures)
+        super().__init__("ORDER", text or "never broken", figures=[Figure("too_early", high=0.0)])
         self._release = release
 
     def start(self, step: Step) -> None:

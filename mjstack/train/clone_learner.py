@@ -47,7 +47,7 @@ class CloneLearner(Learner):
         stage: Stage,
         demonstrations: Demonstrations,
         folder: Path,
-        pool: ImagePool | None = None,
+        pool: ImagePool | None,
     ) -> None:
         """Make the network with the scale of the first demonstrations; the folder gets policies
         and state, and the pool has the images, if it sees any.
@@ -55,7 +55,7 @@ class CloneLearner(Learner):
         cfg = with_observation(stage.cfg)
         job: CloneJobCfg = cfg.job
         self._job = job
-        super().__init__(stage, cfg, folder, job.save_every)
+        super().__init__(stage, cfg, folder)
         self.trainer = "dagger" if job.rounds else "clone"
         ranks = stage.ranks
         device = demonstrations.seen.device

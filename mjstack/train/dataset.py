@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from mjstack.config.schema import CloneJobCfg, Config
-from mjstack.datasets import lerobot, reader, tables
+from mjstack.datasets import lerobot, reader
 from mjstack.datasets.spec import term_columns
 from mjstack.episodes.stage import Stage
 from mjstack.errors import FolderError
@@ -107,8 +107,8 @@ def _open(
     """
     job: CloneJobCfg = cfg.job
     folder = Path(str(job.dataset))
-    info = tables.read_info(folder)
-    with tables.readable(folder / lerobot.INFO):
+    info = reader.read_info(folder)
+    with reader.readable(folder / lerobot.INFO):
         if not info["total_episodes"]:
             raise ValueError("it has no episodes")
         names = {

@@ -37,14 +37,14 @@ class Learner(ABC):
     _networks: nn.ModuleDict
     _optimizer: Optimizer
 
-    def __init__(self, stage: Stage, cfg: Config, folder: Path, save_every: int) -> None:
-        """Begin without a step; ``save_every`` steps lie between two saves in the folder."""
+    def __init__(self, stage: Stage, cfg: Config, folder: Path) -> None:
+        """Begin without a step; ``job.save_every`` steps lie between two saves in the folder."""
         self._stage = stage
         self._cfg = cfg
         self._progress = stage.progress
         self._ranks = stage.ranks
         self._folder = folder
-        self._save_every = save_every
+        self._save_every = cfg.job.save_every
         self.done = 0  # steps so far
         self.seconds = 0.0  # of them, in all calls
         self.curve: list[Facts] = []  # a row for each time that policies were saved

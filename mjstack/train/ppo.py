@@ -77,7 +77,7 @@ class PpoLearner(Learner):
         """
         job: PpoJobCfg = cfg.job
         self._job = job
-        super().__init__(stage, cfg, folder, job.save_every)
+        super().__init__(stage, cfg, folder)
         worlds = stage.worlds
         backend, device = stage.backend
         self._env = build_env(

@@ -112,7 +112,7 @@ def round_file(number: object, rank: object) -> str:
 
 
 def make_round(
-    stage: Stage, folder: Path, policy: Policy | None, number: int, pool: ImagePool | None = None
+    stage: Stage, folder: Path, policy: Policy | None, number: int, pool: ImagePool | None
 ) -> Demonstrations:
     """Play a round, or read it where an earlier call has played it in every rank. Each rank keeps
     its own part in the training's folder; the pool gets the images, which no file has. Without a

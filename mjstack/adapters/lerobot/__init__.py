@@ -4,10 +4,6 @@ LeRobot's commands find them by ``--env.discover_packages_path=mjstack.adapters.
 ``--robot.`` in the place of ``--env.``.
 """
 
-import sys
-from types import TracebackType
-
-from mjstack.errors import MjstackError, describe_error
 from mjstack.policy.lerobot import require_lerobot
 
 require_lerobot("mjstack.adapters.lerobot")
@@ -17,17 +13,3 @@ from mjstack.adapters.lerobot.policy import MjstackConfig, MjstackPolicy  # noqa
 from mjstack.adapters.lerobot.robot import MjstackFollower  # noqa: E402
 
 __all__ = ["LerobotVectorEnv", "MjstackConfig", "MjstackEnv", "MjstackFollower", "MjstackPolicy"]
-
-
-def _print_error(kind: type, error: BaseException, trace: TracebackType | None) -> None:
-    """Print an error of ours in one line, also where LeRobot wraps it."""
-    cause: BaseException | None = error
-    while cause is not None and not isinstance(cause, MjstackError):
-        cause = cause.__cause__
-    if cause is None:
-        _print_others(kind, error, trace)
-    else:
-        print(f"error: {describe_error(cause)}", file=sys.stderr)
-
-
-_print_others, sys.excepthook = sys.excepthook, _print_error

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from mjstack.config.schema import Config, ObjectCfg, SceneCfg
 from mjstack.errors import ParameterError
-from mjstack.kinematics.reach import PointReach
 from mjstack.managers.view import EnvView
 from mjstack.rng import uniform
+from mjstack.robots.bodies import forward_kinematics, solid_geoms, world_boxes
 from mjstack.scene.index import gripper_targets
 from mjstack.scene.phases import nominal_xy, object_targets, source_names, target_xy
 
@@ -30,6 +30,7 @@ _FIRST = 3  # candidates that are tried first
 _ARM_ROOM = 0.001
 _GRID = 0.02  # [m] between the positions whose reach is tried
 _ROOMY: set[tuple] = set()  # regions that have room, by all that `require_room` depends on
+_PLANE = mujoco.mjtGeom.mjGEOM_PLANE
 _UNDER = 1e-5  # m: a box is under an object if its top is this much higher at most
 
 
@@ -71,19 +72,17 @@ class Placement:
         objects = list(scene.free.values())
         radii = [thing.footprint for thing in objects]
         self._apart = [[a + b + gap for b in radii] for a in radii]
-        data = mujoco.MjData(model)
-        data.qpos[:] = env.index.posture.qpos(np.array(pose))
-        mujoco.mj_kinematics(model, data)
+        data = forward_kinematics(model, env.index.posture.qpos(np.array(pose)))
         mujoco.mj_comPos(model, data)
-        collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-        bolted = model.body_weldid[model.geom_bodyid] == 0
-        bolted[[geom for name in env.index.fixed for geom in env.index.geoms[name]]] = True
-        loose = np.isin(model.geom_bodyid, list(env.index.bodies.values()))
-        arm = _arm_boxes(env.cfg, data, np.flatnonzero(collides & ~bolted & ~loose), noise)
+        geoms = solid_geoms(model)
+        owners = model.geom_bodyid[geoms]
+        fixtures = [geom for name in env.index.fixed for geom in env.index.geoms[name]]
+        bolted = (model.body_weldid[owners] == 0) | np.isin(geoms, fixtures)
+        loose = np.isin(owners, list(env.index.bodies.values()))
+        arm = _arm_boxes(env.cfg, data, geoms[~bolted & ~loose], noise)
         # Floor, the only plane in a scene, and table are left out.
-        ground = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
-        ground[model.geom("table").id] = True
-        fixed = _fixed_boxes(data, np.flatnonzero(collides & bolted & ~ground))
+        ground = (model.geom_type[geoms] == _PLANE) | (geoms == model.geom("table").id)
+        fixed = _fixed_boxes(data, geoms[bolted & ~ground])
 
         rectangles = []
         top = scene.table_top
@@ -230,14 +229,6 @@ def _arm_boxes(cfg: Config, data: mujoco.MjData, geoms: ndarray, noise: float) -
     return centers, halves, np.tile([0.0, 1.0, 0.0], (len(geoms), 1))
 
 
-def world_boxes(data: mujoco.MjData, geoms: list[int] | ndarray) -> tuple[ndarray, ndarray]:
-    """Centres and half sizes, ``(n, 3)``, of the world-aligned boxes that hold some geoms."""
-    model = data.model
-    rotation = data.geom_xmat[geoms].reshape(-1, 3, 3)
-    centers = data.geom_xpos[geoms] + np.einsum("nij,nj->ni", rotation, model.geom_aabb[geoms, :3])
-    return centers, np.einsum("nij,nj->ni", np.abs(rotation), model.geom_aabb[geoms, 3:])
-
-
 def require_reach(env: EnvView, region: Sequence[float]) -> None:
     """Try a grid over each object's region, as far as it is on the table.
 
@@ -266,6 +257,8 @@ def out_of_reach(env: EnvView, name: str, xy: np.ndarray) -> tuple[int, str] | N
     """The position of an object that is farthest out of reach, by its row in ``xy``, where it may
     stand [m], shape ``(n, 2)``, and a sentence on it; None if the arm reaches them all.
     """
+    from mjstack.kinematics.batched_ik import find_reach  # loads Warp
+
     # How far the grasp point stays from each target at each position
     scene = env.cfg.scene
     targets = object_targets(env.cfg)[name]
@@ -275,13 +268,10 @@ def out_of_reach(env: EnvView, name: str, xy: np.ndarray) -> tuple[int, str] | N
     for column, (_, target) in enumerate(targets):
         points[:, column, :2] = target_xy(target, sources)
         points[:, column, 2] = target.z
-    distances = np.zeros(points.shape[:2])
-    for width in {phase.width for phase, _ in targets}:
-        (gripper,) = gripper_targets(env.sim.model, env.cfg.robot, [width])
-        reach = PointReach(env.sim.model, env.cfg.robot, gripper.tolist())
-        columns = [phase.width == width for phase, _ in targets]
-        left = reach.solve(points[:, columns].reshape(-1, 3))[1]
-        distances[:, columns] = left.reshape(len(xy), -1)
+    model, robot = env.sim.model, env.cfg.robot
+    grips = gripper_targets(model, robot, [phase.width for phase, _ in targets])
+    _, left = find_reach(model, robot, points.reshape(-1, 3), np.tile(grips, (len(xy), 1)))
+    distances = left.amin(0).view(len(xy), -1).numpy()
     if (distances <= env.cfg.controller.ik_tolerance).all():
         return None
 

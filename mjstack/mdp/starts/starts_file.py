@@ -18,8 +18,9 @@ from mjstack.math import quat_mul
 from mjstack.mdp.geometry import Pose, place_xy, pose_w, robot, write_robot
 from mjstack.mdp.observation import fixture_pos, joint_pos
 from mjstack.mdp.reset import ActuatorGains, ObjectFriction, ObjectMass
-from mjstack.mdp.starts.placement import out_of_reach, world_boxes
+from mjstack.mdp.starts.placement import out_of_reach
 from mjstack.mdp.starts.randomization import Randomized, bounds
+from mjstack.robots.bodies import world_boxes
 from mjstack.scene.index import joint_limits
 from mjstack.sim.simulation import Columns
 
