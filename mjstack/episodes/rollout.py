@@ -292,8 +292,8 @@ class Judge(Observer):
 
     @override
     def update(self) -> None:
-        if self.env.check is not None:
-            self.env.check.update(self.driver.phase)
+        if self._check is not None:
+            self._check.update(self.driver.phase)
 
     @override
     def finish(self) -> None:
