@@ -74,8 +74,7 @@ def test_a_step_ends_where_mjwarps_own_does(step: str, name: str, device: str) -
         if not exact:
             for view in ("qpos", "qvel", "act"):
                 getattr(sim, view)[:] = getattr(stock, view)
-            for array in ("qacc_warmstart", "cvel", "cdof_dot"):
-                wp.copy(getattr(sim._d, array), getattr(stock._d, array))
+            wp.copy(sim._d.qacc_warmstart, stock._d.qacc_warmstart)
         for batch in (sim, stock):
             batch.ctrl[:] = command
             batch.qvel += thrown
@@ -97,7 +96,9 @@ def test_a_step_ends_where_mjwarps_own_does(step: str, name: str, device: str) -
 
 @pytest.mark.parametrize("name", ARMS)
 def test_errors_against_native_are_not_above_stocks(name: str, device: str) -> None:
-    """A step from each of many states of native MuJoCo, in float64."""
+    """A step from each of many states of native MuJoCo, in float64. Rows of connect and weld read
+    the velocities of that step.
+    """
     model = model_of(name)
     native = mujoco.MjData(model)
     generator = torch.Generator().manual_seed(1)
@@ -128,12 +129,16 @@ def test_errors_against_native_are_not_above_stocks(name: str, device: str) -> N
             sim.step(1)
             sim.synchronize()
             errors[step] += np.abs(sim.qvel.cpu().numpy() - end).max(1).tolist()
+    for step in sims:
+        assert np.median(errors[step]) < 2e-5  # with velocities of the step before 2e-4
     for measure, most in ((np.median, 1.1), (np.linalg.norm, 1.05)):
         assert measure(errors["fused"]) <= most * measure(errors["stock"]) + 1e-8
 
 
 def test_launches(monkeypatch: Patch) -> None:
-    """Of a step whose sensors nothing reads. Six of them are MJWarp's rows beside collision."""
+    """Of a step whose sensors nothing reads. Eight of them are MJWarp's velocities and rows
+    beside collision.
+    """
     counts = []
     for step in ("fused", "stock"):
         sim = worlds("linkage", "cpu", step)
@@ -144,7 +149,7 @@ def test_launches(monkeypatch: Patch) -> None:
                     patch.setattr(wp, name, counted(getattr(wp, name), made))
                 sim._decimation(steps, kinematics=False)
             counts.append(len(made))
-    assert counts[1] - counts[0] <= 14
+    assert counts[1] - counts[0] <= 16
     assert counts[3] - counts[2] >= 5 * 14
 
 
@@ -157,23 +162,6 @@ def counted(launch: Callable, made: list[str]) -> Callable:
         return launch(kernel, *args, dim=dim, **kwargs)
 
     return counting
-
-
-def test_a_world_that_is_reset_forgets_its_velocities(device: str) -> None:
-    """Its connected bodies go on as in a new one."""
-    sim = worlds("linkage", device, "fused")
-    ends = []
-    for spin in (0.0, 30.0):
-        sim.reset()
-        sim.qvel += spin
-        sim.step(3)
-        sim.reset(torch.tensor([True, False, True, False], device=device))
-        sim.qvel[:] = 1.0
-        sim.step(1)
-        ends.append(sim.qvel.clone())
-    # CUDA adds up in an order that is chance
-    torch.testing.assert_close(ends[0][::2], ends[1][::2], rtol=0.0, atol=1e-4 * (device != "cpu"))
-    assert not torch.equal(ends[0], ends[1])
 
 
 def test_the_check_at_the_start_agrees() -> None:

@@ -137,6 +137,24 @@ def test_contacts_that_float32_misses_by_chance_pass_and_lost_ones_do_not() -> N
     assert any("contact_count" in text for text in compared(run, apart)[1])
 
 
+@pytest.mark.full
+@pytest.mark.parametrize("played", ["cylinder"], indirect=True)
+def test_contacts_of_faces_that_a_search_chooses_pass_by_the_deepest(played: Run) -> None:
+    """Of a can that has one contact for the several that native finds; a heavier one fails."""
+    multi = int(mujoco.mjtDisableBit.mjDSBL_MULTICCD)
+    for factor in (1.0, 1.01):
+        result = GateResult(name="parity", status=Status.passed)
+        with closing(
+            make_simulation(played.stage.model, played.cfg, 1, backend=Backend.mjwarp)
+        ) as sim:
+            assert isinstance(sim, MjwarpSimulation)
+            sim.switch(multi, off=True)
+            with Uploaded(played, sim).scaled("body_mass", factor):
+                problems = compare_states(played, sim, result)
+        assert bool(problems) == (factor != 1.0)
+        assert any("compared with one contact of two such shapes" in x for x in result.details)
+
+
 class Uploaded(NamedTuple):
     """A robot's reference episode, and its MJWarp world."""
 

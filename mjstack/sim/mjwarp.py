@@ -24,9 +24,9 @@ from mjstack.sim.fused.step import (
     StepPlan,
     disagreement,
     plan_step,
+    prepare_stock,
     rearranged_forward,
     rearranged_step,
-    reset_worlds,
 )
 from mjstack.sim.graph import StepGraph, side_by_side
 from mjstack.sim.mjwarp_cameras import MjwarpCameras
@@ -157,6 +157,7 @@ class MjwarpSimulation(Simulation):
         with torch_stream_scope(self._device):
             self._place()
             if self.plan.name == "stock":
+                prepare_stock(self._m, self._d)
                 mjw.forward(self._m, self._d)
             else:  # the same kernels as a step's, so that no others are compiled
                 rearranged_forward(self._m, self._d, self.device, self.plan, sensors=True)
@@ -178,8 +179,14 @@ class MjwarpSimulation(Simulation):
         else:
             self._mask.copy_(mask)
         with torch_stream_scope(self._device):
-            reset_worlds(self._m, self._d, self._selected)
+            mjw.reset_data(self._m, self._d, reset=self._selected)
         self._usage.clear(self._mask)
+
+    @override
+    def switch(self, flag: int, *, off: bool) -> None:
+        option = self._m.opt
+        option.disableflags = option.disableflags | flag if off else option.disableflags & ~flag
+        self._graphs.clear()
 
     @override
     def option_values(self) -> dict[str, float | int | str]:
@@ -232,6 +239,7 @@ class MjwarpSimulation(Simulation):
         count = partial(self._usage.count, self._m, self._d, steps=1)
         if self.plan.name == "stock":
             for _ in range(n):
+                prepare_stock(self._m, self._d)
                 mjw.step(self._m, self._d)
                 count()
             if kinematics:

@@ -160,6 +160,11 @@ class NativeSimulation(Simulation):
         return sum(array.nbytes for array in arrays) // self.nworld
 
     @override
+    def switch(self, flag: int, *, off: bool) -> None:
+        option = self.model.opt
+        option.disableflags = option.disableflags | flag if off else option.disableflags & ~flag
+
+    @override
     def option_values(self) -> dict[str, float | int | str]:
         option = self.model.opt
         numbers = {name: getattr(option, name) for name in ("timestep", "impratio", "tolerance")}

@@ -272,6 +272,10 @@ class Simulation(ABC):
         return None
 
     @abstractmethod
+    def switch(self, flag: int, *, off: bool) -> None:
+        """Switch a feature of the physics off or on, by its bit of MuJoCo's ``mjtDisableBit``."""
+
+    @abstractmethod
     def option_values(self) -> dict[str, float | int | str]:
         """The physics options as this backend holds them, by MuJoCo's names."""
 

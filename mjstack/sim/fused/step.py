@@ -16,8 +16,6 @@ from mjstack.sim.graph import side_by_side
 from mjstack.sim.mujoco_warp import mjw, wp
 
 RELEASES = ("4.0.0",)  # of mujoco-warp that docs/design.md, "A new release", was done with
-VELOCITIES = ("cvel", "cdof_dot")
-"""Of bodies and of axes: the previous step's, until the smooth dynamics compute them anew."""
 _CONVERGED = 1e-8  # tolerance of the solver that float32 can still tell
 _STATES = 8
 _WORLDS = 8  # that are compared, at most: each is drawn on the host
@@ -91,15 +89,10 @@ def rearranged_forward(
     ``beside_kinematics`` is work that may run while the poses are computed.
     """
     stages = constraints if plan.name == "fused" else mjw
-    # Rows of equalities between bodies read the velocities of the previous step, which the smooth
-    # dynamics overwrite in the meantime.
-    previous = d
+    # The smooth dynamics compute the same velocities in the meantime.
+    linked = d
     if links_bodies(m):
-        copies = {name: wp.empty_like(getattr(d, name)) for name in VELOCITIES}
-        previous = replace(d, **copies)
-        beside_kinematics += tuple(
-            partial(wp.copy, copy, getattr(d, name)) for name, copy in copies.items()
-        )
+        linked = replace(d, cvel=wp.empty_like(d.cvel), cdof_dot=wp.empty_like(d.cdof_dot))
 
     def poses() -> None:
         if plan.smooth:
@@ -125,14 +118,18 @@ def rearranged_forward(
         side_by_side(device, forces, inertia)
         mjw.fwd_acceleration(m, d, factorize=True)
 
+    def other_rows() -> None:
+        find_velocities(m, linked)
+        constraints.noncontact_rows(m, linked)
+
     def contacts() -> None:
         if plan.name == "fused" and not constraints.why_not_rows(m):
-            rows = partial(constraints.noncontact_rows, m, previous)
-            side_by_side(device, partial(constraints.collision, m, d), rows)
+            side_by_side(device, partial(constraints.collision, m, d), other_rows)
             constraints.contact_rows(m, d)
         else:
             stages.collision(m, d)
-            mjw.make_constraint(m, previous)
+            find_velocities(m, linked)
+            mjw.make_constraint(m, linked)
 
     side_by_side(device, poses, *beside_kinematics)
     side_by_side(device, contacts, dynamics)
@@ -151,14 +148,19 @@ def links_bodies(m: mjw.Model) -> bool:
     return m.eq_connect_adr.size + m.eq_wld_adr.size > 0
 
 
-def reset_worlds(m: mjw.Model, d: mjw.Data, worlds: wp.array) -> None:
-    """`mujoco_warp.reset_data` of the worlds of a mask, shape ``(nworld,)``, bool. They are at rest
-    then, as in MuJoCo: MJWarp leaves velocities, which equalities between bodies would read.
+def find_velocities(m: mjw.Model, d: mjw.Data) -> None:
+    """Compute the velocities of bodies and axes, which rows of connect and weld read. MJWarp makes
+    these rows first, of velocities of the step before; native MuJoCo has those of the step itself.
     """
-    mjw.reset_data(m, d, reset=worlds)
     if links_bodies(m):
-        for name in VELOCITIES:
-            wp.to_torch(getattr(d, name)).masked_fill_(wp.to_torch(worlds)[:, None, None], 0.0)
+        mjw._src.smooth.com_vel(m, d)
+
+
+def prepare_stock(m: mjw.Model, d: mjw.Data) -> None:
+    """Compute these velocities for a `mujoco_warp.forward` or `step` that follows."""
+    if links_bodies(m):
+        mjw.fwd_kinematics(m, d)
+        find_velocities(m, d)
 
 
 def rearranged_step(
@@ -187,18 +189,18 @@ def disagreement(
     worst = 0.0
     try:
         d = mjw.make_data(model, nworld=nworld, nconmax=_CONTACTS, njmax=d.njmax)
-        all_worlds = wp.ones(nworld, dtype=bool)
         for _ in range(_STATES):
             states = np.stack([_draw(model, rng) for _ in range(nworld)])
             state = torch.tensor(states, dtype=torch.float32, device=device)
             ends = []
             for planned in (True, False):
-                reset_worlds(m, d, all_worlds)
+                mjw.reset_data(m, d)
                 wp.to_torch(d.qpos).copy_(state[:, : model.nq])
                 wp.to_torch(d.qvel).copy_(state[:, model.nq :])
                 if planned:
                     rearranged_step(m, d, device, plan, sensors=False)
                 else:
+                    prepare_stock(m, d)
                     mjw.step(m, d)
                 ends.append(wp.to_torch(d.qacc).clone())
             fits = wp.to_torch(d.overflow) == 0
