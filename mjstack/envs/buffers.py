@@ -164,7 +164,7 @@ def measure_peaks(
             backend=backend,
             device=device,
             fields=required_fields(cfg.reset),
-            sizes=BatchSizes(**sizes),
+            sizes=BatchSizes(**sizes, source="measuring"),
         )
         with closing(sim), torch.no_grad():
             play(sim)

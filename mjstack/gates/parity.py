@@ -341,7 +341,7 @@ def _ends_apart(run: Run, *ends: np.ndarray) -> dict[str, list[Figure]]:
         if name in run.cfg.robot.joints:
             continue
         slid, turned = np.split(moved[model.dof_jntid == number], [_SLIDES.get(int(kind), 0)])
-        gaps = out[name] = []
+        gaps = out.setdefault(name, [])
         if slid.size:
             limit = {"high": limits.object_position, "limit": "final.position_m"}
             gaps.append(Figure("position", float(np.linalg.norm(slid)), "m", **limit))
