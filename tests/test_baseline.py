@@ -234,6 +234,13 @@ def test_the_waypoint_error_is_the_arms(passed: GateResult) -> None:
     assert passed.details == []
 
 
+def test_jaws_that_stay_apart_are_named() -> None:
+    loose = baseline("robot.gripper_closed=[0.03,0.03]", "robot.closed_width=0.044")
+    line = "the jaws close to 60.0 mm around an object of 44.0 mm: robot.gripper_closed"
+    assert line in loose.details
+    assert line in loose.reason
+
+
 def test_sag_is_compensated_or_named(tmp_path: Path) -> None:
     soft = arm_file(tmp_path, ('gravcomp="1"', ""), ('kp="5000" kv="140"', 'kp="500" kv="40"'))
     held = baseline(arm=soft)

@@ -1,5 +1,6 @@
 """``mjstack new``: a task and a robot of one's own, from templates."""
 
+import math
 import os
 import runpy
 from collections.abc import Sequence
@@ -7,6 +8,7 @@ from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import escape
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -17,10 +19,15 @@ from omegaconf import OmegaConf
 import mjstack
 from mjstack.cli import run
 from mjstack.config.schema import Config
+from mjstack.episodes.rollout import Hook
+from mjstack.episodes.stage import Stage
 from mjstack.errors import MjstackError
 from mjstack.jobs.new_robot import show_guesses
+from mjstack.mdp.geometry import jaw_forces
 from mjstack.report import picture
+from mjstack.robots.hand import find_hands
 from mjstack.robots.new import write_new
+from mjstack.robots.tips import Fingers
 from mjstack.scene.build import build_model
 
 GATES = "gates=[baseline,parity,capacity,batch]"
@@ -76,6 +83,14 @@ def test_a_robot_is_read_from_its_file(
         assert getattr(robot, key) == getattr(own, key), key
     assert Path(str(robot.file)).samefile(ROOT / file)
     assert [joint for joint in robot.arm_joints if joint in robot.locked] == [*own.locked]
+    # The nominal plan closes the jaws on two faces of the first cube
+    stage = Stage(mjstack.load_config([f"robot=fresh_{name}"], config_dir=folder / "conf"))
+    data = mujoco.MjData(stage.model)
+    grasp = [phase.grasped >= 0 for phase in stage.planner.phases].index(True)
+    data.qpos[stage.index.robot_qpos] = stage.planner.nominal[grasp]
+    mujoco.mj_kinematics(stage.model, data)
+    x, y, _ = np.subtract(*data.site_xpos[stage.index.grasp_sites])
+    assert abs(math.remainder(math.atan2(y, x), 0.5 * math.pi)) < 0.15
 
 
 NAMES = [
@@ -247,6 +262,38 @@ def test_the_reason_tells_the_force_of_the_jaws(here: Path) -> None:
         text = next(Path().glob(f"guess_*/conf/robot/{robot['name']}.yaml")).read_text()
         assert f"to press with {min(limit, 20.0):.0f} N\n" in text
         assert "servos" not in robot
+    # As much as they do, though a cube gives way
+    cfg = mjstack.load_config(
+        [f"robot={robot['name']}", "sim=native"], config_dir=f"{robot['name']}/conf"
+    )
+    stage = Stage(cfg)
+    forces: list[Any] = []
+    look = Hook(lambda _, sim: forces.append(jaw_forces(stage.index, sim, "red")[0].tolist()))
+    stage.play(stage.batch_simulation(1), cfg.reset, [look])
+    assert forces[stage.phase("grasp_red").stop - 1] == pytest.approx([20.0, 20.0], rel=0.2)
+
+
+@pytest.mark.parametrize("lean", [0.0, 0.3])
+def test_jaws_touch_the_cube_where_they_lean(lean: float) -> None:
+    """Of fingers that are nearer to each other at their roots, a cube's upper edges count."""
+    text = gantry()
+    for sign in ("", "-"):
+        jaw = f'pos="0 {sign}0.005 -0.07"'
+        assert jaw in text
+        text = text.replace(jaw, f'{jaw} euler="{sign}{lean} 0 0"')
+    spec = mujoco.MjSpec.from_string(text)
+    hand = find_hands(spec.compile())[0]
+    grip = Fingers(spec, hand, np.array([[0.0, 0.04], [0.0, 0.04]])).measure(0.044)
+    spec.body("hand").add_geom(
+        name="cube", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.022] * 3, pos=grip.point
+    )
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qpos[model.jnt_qposadr[list(hand.gripper)]] = grip.touching
+    mujoco.mj_kinematics(model, data)
+    for jaw in grip.jaws:
+        side = (model, data, model.geom("cube").id, int(model.body_geomadr[jaw]))
+        assert mujoco.mj_geomDistance(*side, 1.0, None) == pytest.approx(0.0, abs=2e-4)
 
 
 def test_the_picture_has_followers_in_their_places(here: Path, monkeypatch: Patch) -> None:
@@ -284,6 +331,9 @@ def test_one_of_two_arms_is_chosen(here: Path) -> None:
     assert (robot["arm_joints"][0], robot["base"]["pos"][1]) == ("b x", 0.6)
     with pytest.raises(MjstackError, match="--arm c x: expected a part of a name of a hand or b"):
         guess(both, "c x")
+    level = both.replace('pos="0 -0.6 0.5"', 'pos="0 -0.6 0.5" quat="1 1 0 0"')
+    with pytest.raises(MjstackError, match="the hand of b hand cannot point down"):
+        guess(level, "b x")
 
 
 def test_a_high_arm_gets_a_table_in_its_reach(here: Path) -> None:
@@ -343,6 +393,16 @@ REFUSED = {
         .replace('type="slide" axis="0 1 0" range="0 0.04"', 'type="ball"')
         .replace('type="slide" axis="0 -1 0" range="0 0.04"', 'type="ball"'),
         "expected an arm of two joints or more with a gripper; no body has fingers",
+    ),
+    "a loose finger": (
+        gantry(
+            ball="<body name='tip' pos='0 0 -.1'><joint type='ball'/><geom size='.005'/></body>"
+        ),
+        "body tip of its hand hangs on a ball joint, which no servo moves",
+    ),
+    "a finger that is held": (
+        gantry(more="<equality><joint joint1='left' polycoef='.02 0 0 0 0'/></equality>"),
+        "joint left is held at one place by an equality, expected one that moves",
     ),
     "along z": (
         gantry()

@@ -25,7 +25,7 @@ from mjstack.robots.guest import left_behind
 from mjstack.robots.jaws import Jaws
 from mjstack.robots.posture import Posture
 from mjstack.scene import build_model
-from mjstack.scene.index import SceneIndex, gripper_targets
+from mjstack.scene.index import SceneIndex, gripper_targets, jaws_of
 
 SERVO = '<position name="right" class="finger" joint="right"/>'
 FINGERS = '<joint name="fingers" joint1="left" joint2="right" polycoef="0 1 0 0 0"/>'
@@ -402,6 +402,16 @@ def test_joint_targets_follow_from_the_jaws_where_none_are_given(
     stiffness = model.actuator("left").gainprm[0]
     for target, width in zip(closed, widths[1:], strict=True):
         assert stiffness * (0.5 * width - target[0]) == pytest.approx(20.0, rel=1e-3)
+
+
+def test_one_jaw_closes_where_no_target_is_given() -> None:
+    """It presses with 20 N too; its pads are beside its own site, wherever it is open."""
+    cfg = load_config()
+    model = build_model(cfg)
+    robot = replace(cfg.robot, gripper_closed=None)
+    (closed,) = gripper_targets(model, robot, [0.044])
+    assert jaws_of(model, robot).gap([closed]) == pytest.approx([0.044], abs=1e-3)
+    assert closed[0] == pytest.approx(0.40, abs=0.02)
 
 
 def test_a_joint_target_of_a_task_is_for_any_object(tmp_path: Path) -> None:

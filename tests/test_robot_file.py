@@ -19,7 +19,7 @@ from mjstack import load_config
 from mjstack.cli import run
 from mjstack.config.fingerprint import config_content
 from mjstack.config.load import load_saved
-from mjstack.config.schema import Config
+from mjstack.config.schema import Config, RobotCfg
 from mjstack.config.session import search_path
 from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.errors import ConfigError, MjstackError, UnknownName
@@ -246,6 +246,25 @@ def test_grasp_sites_are_added_where_the_file_lacks_them(tmp_path: Path) -> None
     robot = replace(cfg.robot, grasp_parts=parts, grasp_pos={"left_grasp": [0.0, 0.0, -0.1]})
     site = build_model(replace(cfg, robot=robot)).site("left_grasp")
     np.testing.assert_allclose(site.pos, [0.0, 0.0, -0.1])
+
+
+def test_grasp_sites_need_not_be_named(tmp_path: Path) -> None:
+    """They go to where the jaws touch an object, or the line says why there is no such place."""
+    cfg = scara()
+    robot = replace(cfg.robot, grasp_sites=RobotCfg().grasp_sites, grasp_parts={})
+    model = build_model(replace(cfg, robot=robot))
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    own, made = (
+        np.mean([data.site(name).xpos for name in sites], axis=0)
+        for sites in (cfg.robot.grasp_sites, robot.grasp_sites)
+    )
+    assert made == pytest.approx(own, abs=0.012)
+    assert made[:2] == pytest.approx(own[:2], abs=1e-4)
+    thick = changed(tmp_path, 'range="0 0.05"', 'range="0 0.01"')
+    lost = replace(thick.robot, grasp_sites=robot.grasp_sites, grasp_parts={})
+    line = "expected two sites of the robot's file. Name them: its fingers open by"
+    refusal(lambda: build_model(replace(thick, robot=lost)), line)
 
 
 def test_fingers_on_a_tendon_move_as_its_own_servo_moves_them(tmp_path: Path) -> None:

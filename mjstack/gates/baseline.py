@@ -2,7 +2,7 @@
 
 from mjstack.episodes.run import Run, needs_episode
 from mjstack.gates.scene_physics import scene_faults
-from mjstack.gates.tracking import find_cause, start_contacts, waypoint_errors
+from mjstack.gates.tracking import find_cause, loose_grips, start_contacts, waypoint_errors
 from mjstack.report.figure import Figure
 from mjstack.report.record import GateResult, Status
 from mjstack.robots import read_robot
@@ -33,6 +33,7 @@ def run_baseline(run: Run) -> list[GateResult]:
         Figure("peak_constraint_rows", int(sim.peak_constraints[0])),
     ]
     causes: list[str] = []
+    loose = [*loose_grips(run.stage)]
     if errors := waypoint_errors(run.stage, run.nominal.states, run.nominal.targets):
         worst = max(errors, key=errors.__getitem__)
         # Beyond half of it a hand over an object and one at it cannot be told apart
@@ -52,7 +53,7 @@ def run_baseline(run: Run) -> list[GateResult]:
             result.beyond.append("waypoint_error_m")
     if result.status is Status.failed:
         contacts = [*start_contacts(run.stage, episode.start[0])]
-        reasons = (result.reason, *causes, *(contacts if causes else ()))
+        reasons = (result.reason, *causes, *loose, *(contacts if causes else ()))
         result.reason = "; ".join(filter(None, reasons))
         causes += contacts
     result.reason = result.reason or headline
@@ -66,5 +67,5 @@ def run_baseline(run: Run) -> list[GateResult]:
         if thing.file is not None:
             lines = object_left_behind(thing.file, run.stage.model, fixed=thing.fixed)
             result.details += [f"file of {name}: {line}" for line in lines]
-    result.details += causes
+    result.details += [*loose, *causes]
     return [result]

@@ -1,6 +1,6 @@
 """Whether the arm goes where it is sent, and otherwise the cause."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import mujoco
 import numpy as np
@@ -10,6 +10,7 @@ from mjstack.episodes.stage import Stage
 from mjstack.robots.guest import OWN_WORLD, WORLD, grasp_jacobian
 from mjstack.robots.posture import actuator_moment
 from mjstack.scene.build import scene_names
+from mjstack.scene.index import gripper_targets, jaws_of
 
 _DEEP = 1e-4  # m: contacts at rest are less deep
 _KINDS = mujoco.mjtConstraint
@@ -91,6 +92,17 @@ def find_cause(stage: Stage, state: State, target: np.ndarray) -> str:
         loads[cause] = loads.get(cause, 0.0) + torque[dof]
     cause, load = min(loads.items(), key=lambda item: item[1] * np.sign(off[worst]))
     return f"{text}; {cause} ({abs(load):.3g} {newton})"
+
+
+def loose_grips(stage: Stage) -> Iterator[str]:
+    """List the objects from which the closed jaws would stay apart, a line for each width."""
+    model, robot = stage.model, stage.cfg.robot
+    widths = sorted({phase.width or 0.0 for phase in stage.phases if phase.grasped >= 0})
+    gaps = jaws_of(model, robot).gap(gripper_targets(model, robot, widths))
+    for width, gap in zip(widths, 1e3 * gaps, strict=True):
+        if gap > 1e3 * width:
+            line = f"the jaws close to {gap:.1f} mm around an object of {1e3 * width:.1f} mm"
+            yield f"{line}: robot.gripper_closed"
 
 
 def start_contacts(stage: Stage, start: np.ndarray) -> list[str]:

@@ -67,6 +67,14 @@ class Posture:
         self._stiffness = m.jnt_stiffness[plain] / max(m.jnt_stiffness.max(initial=0.0), 1e-9)
         numbers = [m.joint(name).id for name in joints]
         self.commanded = m.jnt_qposadr[numbers]
+        constant = (m.eq_obj2id < 0) | ~m.eq_data[:, 1:5].any(axis=1)
+        held = (m.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)) & m.eq_active0 & constant
+        for name, number in zip(joints, numbers, strict=True):
+            if number in m.eq_obj1id[held]:
+                problem = (
+                    f"joint {name} is held at one place by an equality, expected one that moves"
+                )
+                raise MjstackError(problem, "Leave it out of arm_joints and gripper_joints")
 
         # Rest
         self.rest = m.qpos0.copy()

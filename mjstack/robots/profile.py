@@ -27,6 +27,8 @@ _WIDTH = 0.044  # m: of the cube that a closed gripper holds
 _FORCE = 20.0  # N on a cube, as far as the jaws can close farther
 _LEAST = 5.0  # N
 _SQUEEZE = 0.003  # m nearer than the cube's width, at least
+_SOFT = 2.4e-4  # m/N by which the scene's cubes give way between two jaws
+_FACING = 0.8  # rad that the jaws turn to a face, either way
 _LEANS = 0.1  # rad off the vertical
 _SHALLOW = 0.010  # m
 _POSTURES = 30  # random ones
@@ -64,6 +66,11 @@ def guess_profile(file: Path, scene: SceneCfg, arm: str = "") -> list[Guess]:
         model = spec.copy().compile()
     hands, problems = [], []
     for hand in find_hands(model):
+        balls = model.jnt_bodyid[model.jnt_type == int(mujoco.mjtJoint.mjJNT_BALL)]
+        if loose := [body for body in balls if body in hand.bodies and model.body_geomnum[body]]:
+            body = model.body(loose[0]).name
+            problems.append(f"body {body} of its hand hangs on a ball joint, which no servo moves")
+            continue
         try:
             servos, limits = _fit(spec, model, hand)
             grip = Fingers(spec, hand, limits[len(hand.arm) :]).measure(_WIDTH)
@@ -83,8 +90,8 @@ def guess_profile(file: Path, scene: SceneCfg, arm: str = "") -> list[Guess]:
     space = find_workspace(model, hand, grip, limits[: len(hand.arm)])
     if space is None:
         raise MjstackError(
-            f"{file}: the hand of {names[0]} cannot point down over a table within the arm's reach,"
-            " which the drivers' grasps from above need."
+            f"{file}: the hand of {model.body(hand.palm).name} cannot point down over a table"
+            " within the arm's reach, which the drivers' grasps from above need."
         )
     if space.tilt > _LEANS:
         with suppress(ValueError):  # a tip of a hand that leans reaches lower
@@ -194,7 +201,15 @@ def _guess_grip(model: mujoco.MjModel, hand: Hand, grip: Grip, limits: ndarray) 
 def _guess_home(
     model: mujoco.MjModel, hand: Hand, grip: Grip, space: Workspace, limits: ndarray
 ) -> Iterator[Guess]:
-    home = _within(np.concatenate((space.home, grip.opened)), limits)
+    q = space.home.copy()
+    if space.arm.upright and space.roll in space.locked:  # the nominal plan rolls no more than that
+        space.arm.pose(q)
+        away = math.atan2(space.arm.apart, np.linalg.norm((space.center - space.arm.shoulder)[:2]))
+        turn = math.copysign(away, space.arm.data.xaxis[hand.arm[space.roll]][2])
+        low, high = limits[space.roll] + [_FACING, -_FACING]  # what is left to turn to any face
+        roll = q[space.roll]
+        q[space.roll] = np.clip(roll + turn, min(low, roll), max(high, roll))
+    home = _within(np.concatenate((q, grip.opened)), limits)
     why = (
         f"hand down {100 * space.arm.height:.0f} cm above the table's middle, by inverse kinematics"
     )
@@ -208,7 +223,9 @@ def _guess_home(
     roll = None if space.roll is None else names[space.roll]
     if roll:
         yield Guess("roll_joint", roll, "its axis is the approach axis")
-        yield Guess("yaw_alignment", 1.0, "the jaws turn to a face")
+        yield Guess(
+            "yaw_alignment", 1.0, "the jaws turn to a face; at home to one of the first cube"
+        )
     if space.arm.upright and len(names) - len(space.locked) > 3:
         yield Guess("approach_gain", 0.5, "the first joint is upright, and joints are left")
     yield Guess("approach_height", space.arm.height, "m above an object")
@@ -263,7 +280,8 @@ def _guess_scene(
     efforts = np.where(limited, model.actuator_forcerange[gripper, 1], np.inf)
     travel = grip.shut - grip.touching
     press = gains * travel**2 / _WIDTH  # N where they close all the way, without limits
-    force = np.minimum(press, efforts * np.abs(travel) / _WIDTH).sum()
+    soft = 1.0 + press.sum() * _SOFT / _WIDTH
+    force = np.minimum(press / soft, efforts * np.abs(travel) / _WIDTH).sum()
     reasons = []
     if servos:
         why = "made where the file has no position servo: from the inertia,"
@@ -277,8 +295,9 @@ def _guess_scene(
         servos |= zip(robot.gripper_joints, (_servo(*values) for values in stiffer), strict=True)
     if servos:
         yield Guess("servos", servos, "; ".join(reasons))
-    share = min(1.0, max(_FORCE / press.sum(), _SQUEEZE / _WIDTH))
-    force = np.minimum(share * press, efforts * np.abs(travel) / _WIDTH).sum()
+    soft = 1.0 + press.sum() * _SOFT / _WIDTH
+    share = min(1.0, max(_FORCE * soft / press.sum(), _SQUEEZE / _WIDTH))
+    force = np.minimum(share * press / soft, efforts * np.abs(travel) / _WIDTH).sum()
     limits = model.jnt_range[[model.joint(name).id for name in robot.gripper_joints]]
     closed = _within(grip.touching + share * travel, limits)
     yield Guess("gripper_closed", closed, f"around 44 mm, to press with {force:.0f} N")

@@ -11,11 +11,14 @@ from mjstack.config.mjcf import read_mjcf
 from mjstack.config.schema import ModelCfg, RobotCfg
 from mjstack.errors import ConfigError, MjstackError, require_names
 from mjstack.robots.guest import as_guest
+from mjstack.robots.hand import find_hands
 from mjstack.robots.servos import prepare_servos
+from mjstack.robots.tips import Fingers
 
 BUILTIN = Path(__file__).parent
 _MENAGERIE_FIX = "Set MENAGERIE_ROOT to a checkout of MuJoCo Menagerie, or use model=builtin."
 
+_GRASP_SITES = ["grasp_first", "grasp_second"]  # the default
 _CONTACT = ("contype", "conaffinity", "condim", "friction", "solref", "solimp", "priority")
 
 
@@ -106,7 +109,11 @@ def _add_grasp_sites(spec: mujoco.MjSpec, robot: RobotCfg) -> None:
     """Add the grasp sites that the file lacks, each at its place on a body, or at the mean of its
     geoms.
     """
-    for site in [name for name in robot.grasp_sites if spec.site(name) is None]:
+    missing = [name for name in robot.grasp_sites if spec.site(name) is None]
+    if missing == _GRASP_SITES and not robot.grasp_parts:
+        _place_grasp_sites(spec, robot)
+        return
+    for site in missing:
         if site not in robot.grasp_parts:
             _require("grasp site", [site], spec.sites)
         parts = robot.grasp_parts[site]
@@ -122,6 +129,24 @@ def _add_grasp_sites(spec: mujoco.MjSpec, robot: RobotCfg) -> None:
             model = alone.compile()
             pos = np.mean([model.geom(name).pos for name in parts], axis=0)
         bodies[0].add_site(name=site, pos=pos, group=4)
+
+
+def _place_grasp_sites(spec: mujoco.MjSpec, robot: RobotCfg) -> None:
+    """Add grasp sites where the jaws touch an object of ``closed_width``."""
+    alone = spec.copy()
+    alone.compiler.fusestatic = False
+    model = alone.compile()
+    joints = {model.joint(name).id for name in robot.gripper_joints}
+    try:
+        hand = next(hand for hand in find_hands(model) if joints & {*hand.gripper})
+        ranges = [robot.ranges.get(model.joint(j).name, model.jnt_range[j]) for j in hand.gripper]
+        grip = Fingers(alone, hand, np.array(ranges)).measure(robot.closed_width or 0.044)
+    except (StopIteration, ValueError) as error:
+        reason = str(error) or "no hand has the gripper's joints"
+        expected = "two sites of the robot's file"
+        raise ConfigError("robot.grasp_sites", "none", expected, f"Name them: {reason}") from error
+    for name, jaw, pos in zip(_GRASP_SITES, grip.jaws, grip.sites, strict=True):
+        spec.body(model.body(jaw).name).add_site(name=name, pos=pos, group=4)
 
 
 def _require(kind: str, names: Iterable[str | None], available: Iterable) -> None:

@@ -18,9 +18,11 @@ _DEPTHS = ((0.016, 0.013), (0.010, 0.013), (0.005, 0.013), (0.005, 0.004))
 _REACH = 0.018  # m that they may at most, which a jaw on a hinge changes as it opens
 _ROOM = 0.016  # m beside an object that is enough
 _EDGE = 0.002  # m from a tip's end at least
+_HELD = 0.012  # m of an object's side that the shorter tip touches
 _PLATE = [0.004, 0.013, 0.0005]  # m: half sizes of the patch of a surface that counts
 _TIP = 0.004  # m of it that is beyond the grasp point; the rest is as high as an object there
 _FAR = 0.3  # m
+_ADVANCES = 8
 _WIDE = 0.085  # m: as far as jaws open, with room beside a cube
 _SHARES = np.linspace(0.0, 1.0, 33)  # of the way from open to shut
 
@@ -194,8 +196,11 @@ class Fingers:
             self.settle(opened + share * (shut - opened))
             clouds = [self.points(side) @ frame for side in self._sides]
             tops = [cloud[:, 1].max() for cloud in clouds]
-            level = min(min(tops) - _EDGE, max(tops) - depth)
-            tips = [cloud[cloud[:, 1] > level - _EDGE] for cloud in clouds]
+            high = 2.0 * self.model.geom_size[self._plate, 1] - _TIP  # of an object, over the point
+            level = min(min(tops) + max(high - _HELD, -_EDGE), max(tops) - depth)
+            tips = [
+                c[c[:, 1] > min(level, top) - _EDGE] for c, top in zip(clouds, tops, strict=True)
+            ]
             start = np.array([tips[1][:, 0].mean(), level, np.mean([t[:, 2].mean() for t in tips])])
             gaps = np.array([self._gap(opened + s * (shut - opened), start)[0] for s in _SHARES])
             if gaps.min() > width - 0.01:
@@ -231,22 +236,33 @@ class Fingers:
         self.settle(gripper)
         point = start.copy()
         for _ in range(4):
-            (left, first), (right, second) = (self._touch(point, side) for side in self._sides)
+            (left, first), (right, second) = (
+                self._touch(point, side, sign)
+                for side, sign in zip(self._sides, (-1.0, 1.0), strict=True)
+            )
             point[2] += 0.5 * (right - left)
         return left + right + 2.0 * _PLATE[2], point, [first, second]
 
-    def _touch(self, point: ndarray, bodies: Sequence[int]) -> tuple[float, int]:
-        """How far the nearest solid geom of some bodies is from the plate, and which it is."""
+    def _touch(self, point: ndarray, bodies: Sequence[int], sign: float) -> tuple[float, int]:
+        """How far the plate goes along the closing axis until it touches a solid geom of some
+        bodies, and which one.
+        """
         model, data = self.model, self._data
         back = model.geom_size[self._plate, 1] - _TIP
-        data.geom_xpos[self._plate] = self._from_palm(self._frame @ (point - [0.0, back, 0.0]))
         turn = data.xmat[self._hand.palm].reshape(3, 3)
         data.geom_xmat[self._plate] = (turn @ self._frame).ravel()
-        nearest = (_FAR, -1)
-        for geom in self._solid[np.isin(model.geom_bodyid[self._solid], bodies)]:
-            left = mujoco.mj_geomDistance(model, data, self._plate, geom, _FAR, None)
-            nearest = min(nearest, (left, int(geom)))
-        return nearest
+        way, geom = 0.0, -1
+        for _ in range(_ADVANCES):  # by the distance, which is less where the surface is slanted
+            at = point + np.array([0.0, -back, sign * way])
+            data.geom_xpos[self._plate] = self._from_palm(self._frame @ at)
+            left = _FAR
+            for solid in self._solid[np.isin(model.geom_bodyid[self._solid], bodies)]:
+                near = mujoco.mj_geomDistance(model, data, self._plate, solid, _FAR, None)
+                left, geom = min((left, geom), (near, int(solid)))
+            way += left
+            if way >= _WIDE or abs(left) < 1e-5:
+                break
+        return min(way, _WIDE), geom
 
     def _to_palm(self, points: ndarray) -> ndarray:
         palm = self._hand.palm

@@ -114,8 +114,9 @@ class RobotCfg:
     jaw_bodies: list[str] = MISSING
     """Bodies that touch a grasped object, each with all below it. A sensor measures the force of
     each on each object."""
-    grasp_sites: list[str] = spec(length=2)
-    """Two sites, one on each jaw, or both on the palm. Their midpoint is the grasp point."""
+    grasp_sites: list[str] = spec(["grasp_first", "grasp_second"], length=2)
+    """Two sites, one on each jaw, or both on the palm. Their midpoint is the grasp point. Those of
+    the default, which no key places and the file lacks, go to where the jaws touch an object."""
     grasp_parts: dict[str, list[str]] = spec({})
     """Where a grasp site goes that the file lacks: the mean of these geoms of a jaw, or a body."""
     grasp_pos: dict[str, Any] = spec({}, vectors=True, unit="m", length=3)
