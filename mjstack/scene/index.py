@@ -235,8 +235,7 @@ def gripper_targets(
     is given, it is for any object; where it is not given either, the jaws press with 20 N.
     ``widths`` are those of the objects across the jaws [m]; None is for the open gripper.
     """
-    names = (robot.joints, robot.gripper_joints, robot.jaw_bodies, robot.grasp_sites)
-    jaws = _jaws(model, *map(tuple, names))
+    jaws = jaws_of(model, robot)
     low, high = (limits[len(robot.arm_joints) :] for limits in joint_limits(model, robot))
     opened, closed = (
         np.clip(end, low, high) if target is None else np.array(target, dtype=float)
@@ -262,6 +261,12 @@ def gripper_targets(
     if not probed:
         rows[wide == robot.closed_width] = closed
     return rows
+
+
+def jaws_of(model: mujoco.MjModel, robot: RobotCfg) -> Jaws:
+    """The robot's jaws, probed once per model."""
+    names = (robot.joints, robot.gripper_joints, robot.jaw_bodies, robot.grasp_sites)
+    return _jaws(model, *map(tuple, names))
 
 
 def locked_home(robot: RobotCfg) -> np.ndarray:
