@@ -27,7 +27,7 @@ from mjstack.managers import required_fields
 from mjstack.report.record import GateResult
 from mjstack.scene import SceneIndex, build_model
 from mjstack.sim import Simulation, make_simulation
-from mjstack.sim.sizes import resolve_env_sizes
+from mjstack.sim.sizes import resolve_sizes
 
 if TYPE_CHECKING:
     from mjstack.sim.mjwarp import MjwarpSimulation
@@ -145,7 +145,7 @@ def new_sim(backend: str, nworld: int, robot: str = "so101") -> Simulation:
         nworld,
         **on_backend(backend),
         fields=required_fields(cfg.reset),
-        sizes=resolve_env_sizes(cfg),
+        sizes=resolve_sizes(cfg, driven=False),
     )
 
 
@@ -163,7 +163,7 @@ def fused_sim(
     model = build_model(cfg)
     if edit is not None:
         edit(model)
-    sizes = resolve_env_sizes(cfg)
+    sizes = resolve_sizes(cfg, driven=False)
     sim = make_simulation(
         model, cfg, nworld, backend=Backend.mjwarp, device=device, sizes=sizes, fields=fields
     )

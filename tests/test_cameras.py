@@ -437,8 +437,8 @@ def test_images_that_compare_too_little_fail(monkeypatch: Patch) -> None:
     stage = Stage(load_config(["cameras=front", "gate.parity.images=x.npz"]))
     elsewhere = Run(stage)
     for size, robot, says in (
-        (8, 0, ["nothing but the background has gate.parity.image_pixels=1000 ", "71.88 %"]),
-        (64, 40, ["99.56 % of the pixels show the same thing"]),
+        (8, 0, ["nothing but the background has gate.parity.image_pixels=1000 ", "is 0.7188"]),
+        (64, 40, ["front: same thing is 0.9956, expected at least"]),
     ):
         mjwarp = images(size, 0, robot)
         native = images(size, size - 3, robot)
@@ -478,8 +478,8 @@ def test_parity_compares_images_here_and_elsewhere(tmp_path: Path) -> None:
     np.savez(file, **arrays)
     other = GateResult(name="parity", status=Status.passed)
     problems = compare_images(elsewhere, other)
-    assert any(problem.startswith("camera front: IoU of red is 0.") for problem in problems)
-    assert any(problem.startswith("camera top: colours differ by") for problem in problems)
+    assert any(problem.startswith("images, front, iou: red is 0.") for problem in problems)
+    assert any(problem.startswith("images, top: color of 255 is") for problem in problems)
     # Files that cannot be compared are one line, before anything is written.
     there = f"gate.parity.images={file}"
     size = "scene.cameras.front.size=[64,64]"

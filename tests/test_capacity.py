@@ -4,8 +4,7 @@ uses them.
 
 import math
 import weakref
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
@@ -22,7 +21,6 @@ from environments import (
     Patch,
     at_double_speed,
     judge,
-    on_backend,
     on_cuda,
     one_second_episode,
 )
@@ -32,9 +30,9 @@ from mjstack.config.schema import Backend
 from mjstack.envs import Env, build_env
 from mjstack.envs.buffers import (
     SIZED,
-    MeasuringWorlds,
     Peaks,
     join_peaks,
+    measure_peaks,
     measured_sizes,
     play_random_actions,
     read_peaks,
@@ -43,12 +41,11 @@ from mjstack.envs.buffers import (
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Progress, Stage
 from mjstack.errors import FaultError, Unreachable
-from mjstack.gates import capacity as capacity_module
 from mjstack.gates.capacity import find_shortages, run_capacity
 from mjstack.managers.episode import required_fields
 from mjstack.report.record import GateResult, Status
 from mjstack.sim import BatchSizes, Overflow, Simulation, make_simulation, resolve_sizes
-from mjstack.sim.sizes import apply_configured, resolve_env_sizes, resolve_measuring_sizes
+from mjstack.sim.sizes import apply_configured
 
 
 def peaks(
@@ -144,164 +141,57 @@ def test_peaks_join() -> None:
     b = peaks(rows=20, contacts=3, pairs=50, ccd_pairs=0, overflow=np.array([0, 1, 0, 2]))
     both = join_peaks(a, b)
     assert (both.rows.max(), both.contacts.max()) == (20, 9)
-    assert (both.share, both.convex_share) == (50 / 4, 1 / 4)
+    assert both.needs == {"njmax": 20, "nconmax": 50 / 4, "nccdmax": 1 / 4}
     assert both.overflow.tolist() == [0, 1, 0, 2]
-    assert join_peaks(peaks(), peaks()).convex_share is None
+    assert "nccdmax" not in join_peaks(peaks(), peaks()).needs
 
 
 def tried(
-    monkeypatch: Patch, *losses: Callable[[BatchSizes], int], driven: Sequence[bool] = ()
-) -> tuple[list[BatchSizes], list[Peaks]]:
-    """The sizes of the worlds that some workloads are tried in, and the last run of each; they lose
-    physics. By default none is driven.
+    monkeypatch: Patch, loss: Callable[[BatchSizes], int], *overrides: str, driven: bool = False
+) -> tuple[list[tuple[int, int]], Peaks]:
+    """njmax and nconmax of the worlds that a workload is tried in, which loses physics, and the
+    peaks of the last ones.
     """
-    made: list[BatchSizes] = []
+    made: list[tuple[int, int]] = []
 
     def make(*_: object, sizes: BatchSizes, **__: object) -> SimpleNamespace:
-        made.append(sizes)
-        facts = {"sizes": sizes, "fields": {}, "qpos": torch.zeros(4, 1), "description": ""}
-        return SimpleNamespace(**facts, reset=lambda: None, close=lambda: None)
-
-    lost = [0]
+        made.append((sizes.njmax, sizes.nconmax))
+        return SimpleNamespace(sizes=sizes, close=lambda: None)
 
     def read(sim: SimpleNamespace) -> Peaks:
-        return peaks(rows=7, overflow=np.array([0, lost[0], 0, 0]), sizes=sim.sizes)
-
-    def workload(loss: Callable[[BatchSizes], int], sim: SimpleNamespace) -> None:
-        lost[0] = loss(sim.sizes)
+        return peaks(rows=7, overflow=np.array([0, loss(sim.sizes), 0, 0]), sizes=sim.sizes)
 
     monkeypatch.setattr("mjstack.envs.buffers.make_simulation", make)
-    monkeypatch.setattr("mjstack.envs.buffers.gc.collect", lambda: 0)  # nothing is held, and a test
-    # process has much to look through
+    monkeypatch.setattr("mjstack.envs.buffers.gc.collect", lambda: 0)  # a test has much to look at
     monkeypatch.setattr("mjstack.envs.buffers.read_peaks", read)
-    worlds = MeasuringWorlds(load_config([]), None, 4, Backend.mjwarp, "cpu")  # type: ignore[arg-type]
-    pairs = zip(losses, driven or [False] * len(losses), strict=True)
-    runs = [worlds.play(partial(workload, loss), driven=task) for loss, task in pairs]  # type: ignore[arg-type]
-    worlds.close()
-    return made, runs
+    monkeypatch.setattr("mjstack.envs.buffers.play_random_actions", lambda *_, **__: None)
+    drive = (lambda sim: None) if driven else None
+    worlds = (load_config([*overrides]), None, 4, Backend.mjwarp, "cpu")
+    return made, measure_peaks(*worlds, drive=drive)  # type: ignore[arg-type]
 
 
-@pytest.mark.full
 def test_room_to_measure_in_grows_where_it_is_too_little_but_not_for_ever(
     monkeypatch: Patch,
 ) -> None:
-    made, (run,) = tried(
+    made, run = tried(
         monkeypatch,
         lambda s: int(Overflow.NEFC) * (s.njmax < 2000) | int(Overflow.CCD) * (s.nconmax < 200),
     )
-    assert [(s.njmax, s.nconmax) for s in made] == [(768, 128), (1536, 256), (3072, 256)]
+    assert made == [(768, 128), (1536, 256), (3072, 256)]
     assert not run.overflow.any()
-    assert run.sizes == made[-1]
+    assert run.sizes is not None
+    assert run.sizes.njmax == 3072
     assert measured_sizes(load_config([]), run, "").njmax == 16
-    made, (run,) = tried(monkeypatch, lambda _: int(Overflow.NEFC))
+    made, run = tried(monkeypatch, lambda _: SIZED)
+    assert made[-2:] == [(3072, 512), (6144, 1024)]
     assert run.overflow.any()
-    assert len(made) == 4
-    assert run.sizes == made[-1]
-
-
-def test_workloads_share_worlds_and_the_room_that_one_of_them_needs(monkeypatch: Patch) -> None:
-    def calm(_: BatchSizes) -> int:
-        return 0
-
-    def rows(sizes: BatchSizes) -> int:
-        return int(Overflow.NEFC) * (sizes.njmax < 2000)
-
-    def contacts(sizes: BatchSizes) -> int:
-        return int(Overflow.NARROWPHASE) * (sizes.nconmax < 1000)
-
-    made, runs = tried(monkeypatch, calm, calm, calm)
-    assert len(made) == 1
-    # As much of each as a workload gets alone, although that is five growths.
-    made, runs = tried(monkeypatch, calm, rows, contacts, rows)
-    sizes = [(768, 128), (1536, 128), (3072, 128), (3072, 256), (3072, 512), (3072, 1024)]
-    assert [(s.njmax, s.nconmax) for s in made] == sizes
-    assert [run.sizes for run in runs] == [made[0], made[2], made[5], made[5]]
-    assert not any(run.overflow.any() for run in runs)
-    # Two that lose physics in any room do not grow it further than one does.
-    made, runs = tried(monkeypatch, *[lambda _: int(Overflow.NEFC)] * 2)
-    assert [s.njmax for s in made] == [768, 1536, 3072, 6144]
-    assert all(run.overflow.any() for run in runs)
-
-
-def test_a_driven_workload_begins_with_less_room_and_gets_as_much(monkeypatch: Patch) -> None:
-    def calm(_: BatchSizes) -> int:
-        return 0
-
-    def rows(sizes: BatchSizes) -> int:
-        return int(Overflow.NEFC) * (sizes.njmax < 5000)
-
-    def always(_: BatchSizes) -> int:
-        return SIZED
-
-    task, random = resolve_sizes(load_config([])), resolve_measuring_sizes(load_config([]))
-    assert (task.njmax, task.nconmax, random.njmax, random.nconmax) == (300, 128, 768, 128)
-    made, runs = tried(monkeypatch, calm, calm, calm, driven=(False, True, True))
-    assert [(s.njmax, s.nconmax) for s in made] == [(768, 128), (300, 128)]
-    assert [run.sizes for run in runs] == [made[0], made[1], made[1]]
-    # Where it is too little, that of random actions is next
-    made, runs = tried(monkeypatch, calm, rows, calm, driven=(False, True, True))
-    assert [s.njmax for s in made] == [768, 300, 768, 1536, 3072, 6144]
-    assert [run.sizes for run in runs] == [made[0], made[5], made[5]]
-    for driven in (False, True):
-        made, (run,) = tried(monkeypatch, always, driven=[driven])
-        assert (made[-1].njmax, made[-1].nconmax) == (6144, 1024)
-        assert run.overflow.any()
-
-
-def test_a_workload_in_used_worlds_ends_as_in_new_ones(backend: str, new_run: NewRun) -> None:
-    """Nothing of the workload before acts on: fields, state, counters. Fields that it does not need
-    change nothing either.
-    """
-    where = on_backend(backend)
-    run = new_run(f"sim={where['backend']}", f"sim.device={where['device']}", "nworld=2")
-    stage = run.stage
-    randomized = run.cfg.gate.capacity.reset
-
-    def steps(sim: Simulation, reset: dict) -> None:
-        env = stage.start(sim, reset)
-        driver = stage.driver(env)
-        for _ in range(20):
-            env.step(driver.command())
-
-    def wild(sim: Simulation) -> None:
-        steps(sim, randomized)
-        for name in ("body_mass", "geom_friction", "actuator_gainprm"):
-            values = torch.from_numpy(getattr(sim.model, name)).to(sim.fields[name])
-            assert not torch.equal(sim.fields[name][0], values)
-        sim.overflow.fill_(int(Overflow.CCD))
-        sim.qpos[1] = math.nan
-        sim.step(2)
-
-    def task(sim: Simulation) -> None:
-        assert not torch.stack(sim.lasting_peaks()).any()
-        for name, field in sim.fields.items():
-            values = torch.from_numpy(getattr(sim.model, name)).to(field)
-            assert torch.equal(field, values.expand_as(field)), name
-        steps(sim, run.cfg.reset)
-        ends.append(sim.qpos.cpu().numpy().tobytes())
-
-    ends: list[bytes] = []
-
-    def last(*workloads: Callable[[Simulation], None], resets: tuple = (), driven: int) -> Peaks:
-        """Of the last one; so many of them are driven."""
-        with closing(stage.measuring_worlds(*resets)) as worlds:
-            first = len(workloads) - driven
-            plays = [worlds.play(w, driven=n >= first) for n, w in enumerate(workloads)]
-            return plays[-1]
-
-    expected = last(task, driven=0)
-    resets = (randomized,)
-    many = [last(task, resets=resets, driven=1)]
-    many += [last(wild, task, resets=resets, driven=driven) for driven in (1, 2)]
-    for seen in many:
-        assert not seen.overflow.any()
-        if where["device"] != "cpu":  # sums have no fixed order
-            continue
-        for name in ("contacts", "rows"):
-            assert getattr(seen, name).tolist() == getattr(expected, name).tolist()
-        assert seen.pools == expected.pools
-    assert len(ends) == 4
-    assert where["device"] != "cpu" or len({*ends}) == 1
+    # A driven task needs less, its steps are faster in less, and it may grow as far
+    calm = partial(tried, monkeypatch, lambda _: 0)
+    assert calm(driven=True)[0] == [(300, 128)]
+    assert tried(monkeypatch, lambda _: SIZED, driven=True)[0][-1] == (6144, 1024)
+    # Room that is set counts where it is more
+    assert [calm(f"batch.njmax={rows}")[0] for rows in (500, 900)] == [[(768, 128)], [(900, 128)]]
+    assert calm("batch.njmax=500", driven=True)[0] == [(500, 128)]
 
 
 @pytest.mark.parametrize(
@@ -332,15 +222,7 @@ def test_what_is_set_wins() -> None:
     found = apply_configured(cfg, BatchSizes(nconmax=16, njmax=100, nccdmax=8, source="measured"))
     assert found == BatchSizes(nconmax=16, njmax=500, nccdmax=8)
     assert found.source == "measured"
-    assert resolve_sizes(cfg).njmax == resolve_env_sizes(cfg).njmax == 500
-    assert resolve_measuring_sizes(cfg).njmax == 768
-    assert resolve_measuring_sizes(load_config(["batch.njmax=900"])).njmax == 900
-    # A driven task needs less, and its steps are faster in less
-    robot = load_config([])
-    assert resolve_measuring_sizes(robot, driven=True) == resolve_sizes(robot)
-    for njmax, room in ((100, 300), (500, 500)):
-        cfg = load_config([f"batch.njmax={njmax}"])
-        assert resolve_measuring_sizes(cfg, driven=True).njmax == room
+    assert resolve_sizes(cfg).njmax == resolve_sizes(cfg, driven=False).njmax == 500
 
 
 @pytest.mark.full
@@ -385,9 +267,10 @@ def test_sizes_at_the_peak_are_enough_and_one_less_is_not(
 ) -> None:
     free = first_steps(BatchSizes(nconmax=128, njmax=300))
     assert not free.overflow.any()
-    assert 2 * free.share == free.pools["contacts"] >= free.pools["pairs"] > 0
+    share = free.needs["nconmax"]
+    assert 2 * share == free.pools["contacts"] >= free.pools["pairs"] > 0
     rows = int(free.rows.max())
-    exact = BatchSizes(nconmax=math.ceil(free.share), njmax=rows)
+    exact = BatchSizes(nconmax=math.ceil(share), njmax=rows)
     at_peak = first_steps(exact)
     assert not at_peak.overflow.any()
     assert at_peak.rows.tolist() == free.rows.tolist()
@@ -411,6 +294,11 @@ def measure(new_run: NewRun, *overrides: str) -> tuple[Run, GateResult, list[str
 
 TOO_SMALL = ("sim=mjwarp", "sim.device=cpu", "nworld=2", "batch.njmax=100", *at_double_speed())
 NATIVE = ("sim=native", *one_second_episode())
+
+
+def recommended(result: GateResult, prefix: str) -> BatchSizes:
+    keys = ("nconmax", "njmax", "nccdmax")
+    return BatchSizes(**{key: int(result.metrics[f"{prefix}.{key}"]) for key in keys})
 
 
 @pytest.fixture(scope="module")
@@ -444,25 +332,25 @@ def test_worlds_of_the_recommended_sizes_have_the_same_peaks(
     """Every workload once more, in exactly these sizes."""
     run, result, _ = too_small
     stage = run.stage
-    other = run.cfg.gate.capacity.reset
+    other = stage.with_config(replace(run.cfg, reset=run.cfg.gate.success.reset))
     plays: dict[str, Callable[[Simulation], object]] = {
-        "": lambda sim: stage.drive(sim, run.cfg.reset),
-        "randomized.": lambda sim: stage.drive(sim, other),
+        "": stage.drive,
+        "randomized.": other.drive,
         "random_actions.": partial(play_random_actions, run.cfg, 20),
     }
+    m = result.metrics
     for prefix, play in plays.items():
         sim = make_simulation(
             stage.model,
             run.cfg,
             2,
             backend=Backend.mjwarp,
-            fields=required_fields(run.cfg.reset, other),
-            sizes=run.stage.measured["env" if prefix else "task"],
+            fields=required_fields(run.cfg.reset, other.cfg.reset),
+            sizes=recommended(result, "recommended_env" if prefix else "recommended"),
         )
         play(sim)
         seen = read_peaks(sim)
         assert not seen.overflow.any()
-        m = result.metrics
         assert m[f"{prefix}peak_constraint_rows_per_world"] == seen.rows.max()
         assert m[f"{prefix}peak_contacts_per_world"] == seen.contacts.max()
         for key, peak in seen.pools.items():
@@ -479,7 +367,7 @@ def test_memory_is_that_of_the_arrays(
     run, result, _ = too_small
     m = result.metrics
     model = get_stage("so101").model
-    wanted = BatchSizes(**{key: m[f"recommended.{key}"] for key in ("nconmax", "njmax", "nccdmax")})
+    wanted = recommended(result, "recommended")
     for which, sizes in (("current", resolve_sizes(run.cfg)), ("recommended", wanted)):
         assert m[f"memory.task.{which}_mb"] == pytest.approx(data_bytes(model, 2, sizes) / 1e6)
     for sizes in (BatchSizes(nconmax=40, njmax=184), BatchSizes(nconmax=24, njmax=77, nccdmax=8)):
@@ -503,10 +391,10 @@ def test_native_tells_what_it_cannot_know_and_a_layout_out_of_reach_leaves_the_r
 ) -> None:
     drive = Stage.drive
 
-    def unreachable(stage: Stage, sim: Simulation, reset: dict) -> None:
-        if reset is stage.cfg.gate.capacity.reset:
+    def unreachable(stage: Stage, sim: Simulation) -> None:
+        if stage.cfg.reset is stage.cfg.gate.success.reset:
             raise Unreachable(0, "grasp_red", "red", (0.9, 0.0, 0.0), 0.3, 5e-4)
-        drive(stage, sim, reset)
+        drive(stage, sim)
 
     monkeypatch.setattr(Stage, "drive", unreachable)
     _, result, lines = measure(new_run, *NATIVE, "nworld=1", "gate.capacity.random_steps=5")
@@ -522,27 +410,9 @@ def workload(overflow: np.ndarray | None = None) -> Peaks:
     return peaks(nworld=2, overflow=overflow, sizes=BatchSizes(nconmax=128, njmax=300))
 
 
-def made_up(monkeypatch: Patch, randomized: dict, play: Callable[[str], Peaks]) -> None:
-    """Have workloads made up from their names, in the place of playing them."""
-
-    class Worlds(MeasuringWorlds):
-        def __init__(self, *_: object) -> None:
-            pass
-
-        def play(self, play_name: Callable, *, driven: bool = False) -> Peaks:
-            name = play_name(None)
-            assert driven == (name != "random_actions")
-            return play(name)
-
-        def close(self) -> None:
-            pass
-
-    def episode(stage: Stage, sim: None, reset: dict) -> str:
-        return "randomized" if reset is randomized else "task"
-
-    monkeypatch.setattr("mjstack.episodes.stage.MeasuringWorlds", Worlds)
-    monkeypatch.setattr(Stage, "drive", episode)
-    monkeypatch.setattr(capacity_module, "play_random_actions", lambda *_, **__: "random_actions")
+def made_up(monkeypatch: Patch, play: Callable[[bool], Peaks]) -> None:
+    """Have peaks made up, for the driven task or for random actions, instead of measured."""
+    monkeypatch.setattr(Stage, "measure", lambda stage, *, driven=True: play(driven))
 
 
 @pytest.mark.parametrize(
@@ -550,20 +420,24 @@ def made_up(monkeypatch: Patch, randomized: dict, play: Callable[[str], Peaks]) 
     [("cpu", (), 600), ("cuda:0", (), 200), ("cuda:0", ("gate.capacity.random_steps=700",), 700)],
 )
 def test_few_worlds_act_at_random_for_an_episode(
-    device: str, choice: tuple[str, ...], steps: int, new_run: NewRun, monkeypatch: Patch
+    device: str, choice: tuple[str, ...], steps: int, monkeypatch: Patch
 ) -> None:
-    run = new_run("sim=mjwarp", "sim.device=cpu", "nworld=2", *choice)
-    run.stage.backend = (Backend.mjwarp, device)  # the runs are made up: no device is used
-    made_up(monkeypatch, run.cfg.gate.capacity.reset, lambda *_: workload())
+    made = []
+
+    def make(*args: Any, **_: object) -> SimpleNamespace:
+        made.append(args[2])
+        return SimpleNamespace(close=lambda: None)
+
     played = []
-
-    def act(cfg: Any, count: int, sim: None, **_: object) -> str:
-        played.append(count)
-        return "random_actions"
-
-    monkeypatch.setattr(capacity_module, "play_random_actions", act)
-    run_capacity(run)
-    assert set(played) == {steps}
+    monkeypatch.setattr("mjstack.envs.buffers.make_simulation", make)
+    monkeypatch.setattr("mjstack.envs.buffers.read_peaks", lambda _: workload())
+    monkeypatch.setattr(
+        "mjstack.envs.buffers.play_random_actions",
+        lambda cfg, count, *_, **__: played.append(count),
+    )
+    measure_peaks(load_config([*choice]), None, 4096, Backend.mjwarp, device)  # type: ignore[arg-type]
+    assert played == [steps]
+    assert made == [8 if device == "cpu" else 4096]
 
 
 @pytest.mark.full
@@ -574,11 +448,7 @@ def test_the_gate_recommends_nothing_from_motion_that_lost_physics(
     run = new_run("sim=mjwarp", "sim.device=cpu", "nworld=2", "batch=auto")
     run.stage.progress = Progress(said.append)
     lost = workload(overflow=np.array([0, int(Overflow.NEFC)]))
-
-    def play(name: str) -> Peaks:
-        return lost if name == "random_actions" else workload()
-
-    made_up(monkeypatch, run.cfg.gate.capacity.reset, play)
+    made_up(monkeypatch, lambda driven: workload() if driven else lost)
     (result,) = run_capacity(run)
     assert result.status is Status.failed
     assert result.reason.startswith(
@@ -610,17 +480,17 @@ def test_contacts_and_convex_pairs_are_held_against_their_keys() -> None:
 
 @pytest.mark.full
 def test_environment_is_sized_by_a_probe() -> None:
-    overrides = ["batch=auto", "sim=mjwarp", "gate.capacity.probe_steps=4"]
+    overrides = ["batch=auto", "sim=mjwarp", "gate.capacity.random_steps=4"]
     env = mjstack.make_env([*overrides], nworld=2, device="cpu")
     sizes = env.sim.sizes
-    assert sizes.source == "batch=auto: 4 steps of random actions in 2 worlds, times 1.25"
+    assert sizes.source == "batch=auto: random actions in 2 worlds, times 1.25"
     play_random_actions(env.cfg, 4, env.sim)
     used = read_peaks(env.sim)
     assert not used.overflow.any()
-    assert used.rows.max() <= sizes.njmax < resolve_env_sizes(env.cfg).njmax
+    assert used.rows.max() <= sizes.njmax < resolve_sizes(env.cfg, driven=False).njmax
     assert sizes.njmax == recommend_sizes(used, 1.25, "").njmax
     chosen = mjstack.make_env(
-        [*overrides, "batch.njmax=400", "gate.capacity.probe_steps=1"], nworld=1, device="cpu"
+        [*overrides, "batch.njmax=400", "gate.capacity.random_steps=1"], nworld=1, device="cpu"
     )
     assert chosen.sim.sizes.njmax == 400
     assert chosen.sim.sizes.nconmax < 128
@@ -629,9 +499,7 @@ def test_environment_is_sized_by_a_probe() -> None:
 @pytest.mark.full
 def test_a_probe_that_lost_physics_makes_no_environment(monkeypatch: Patch) -> None:
     small = BatchSizes(nconmax=128, njmax=4)  # and 32 after the last growth
-    monkeypatch.setattr(
-        "mjstack.envs.buffers.resolve_measuring_sizes", lambda _, driven=False: small
-    )
+    monkeypatch.setattr("mjstack.envs.buffers.robot_sizes", lambda _, driven: small)
     made: list[weakref.ref[Env]] = []
 
     def keep(*args: object, **kwargs: object) -> Env:
@@ -643,8 +511,8 @@ def test_a_probe_that_lost_physics_makes_no_environment(monkeypatch: Patch) -> N
         return env
 
     monkeypatch.setattr("mjstack.envs.buffers.Env", keep)
-    overrides = ["batch=auto", "sim=mjwarp", "gate.capacity.probe_steps=1"]
-    message = r"^batch=auto: sizes cannot be measured by 1 steps .*Set batch\.njmax higher still\.$"
+    overrides = ["batch=auto", "sim=mjwarp", "gate.capacity.random_steps=1"]
+    message = r"^batch=auto: sizes cannot be measured by random .*Set batch\.njmax higher still\.$"
     with pytest.raises(FaultError, match=message):
         mjstack.make_env(overrides, nworld=1, device="cpu")
     assert len(made) == 4
@@ -656,9 +524,9 @@ def test_gates_get_no_sizes_from_a_task_that_lost_physics(
     new_run: NewRun, monkeypatch: Patch
 ) -> None:
     lost = workload(overflow=np.array([int(Overflow.NEFC), 0]))
-    made_up(monkeypatch, {}, lambda *_: lost)
+    made_up(monkeypatch, lambda driven: lost)
     run = new_run("sim=mjwarp", "sim.device=cpu", "nworld=2", "batch=auto")
-    message = "measured by the driven task in 2 worlds: NEFC overflow in 1 of 2 worlds"
+    message = "measured by the driven task: NEFC overflow in 1 of 2 worlds"
     with pytest.raises(FaultError, match=message):
         run.stage.sizes  # noqa: B018
     assert "task" not in run.stage.measured
@@ -666,24 +534,24 @@ def test_gates_get_no_sizes_from_a_task_that_lost_physics(
 
 @pytest.mark.full
 def test_native_environment_measures_nothing(monkeypatch: Patch) -> None:
-    monkeypatch.setattr(MeasuringWorlds, "play", lambda *_: pytest.fail("measured"))
+    monkeypatch.setattr("mjstack.envs.build.measure_peaks", lambda *_: pytest.fail("measured"))
     mjstack.make_env(["batch=auto", "sim=native"], nworld=1).reset(seed=0)
 
 
 @pytest.mark.full
-def test_batch_uses_what_capacity_measured(new_run: NewRun) -> None:
-    run = new_run("sim=mjwarp", "sim.device=cpu", "nworld=2", "batch=auto", "batch.nconmax=48")
-    run.stage.measured["task"] = BatchSizes(nconmax=40, njmax=184, source="batch=auto: somewhere")
+def test_batch_uses_what_capacity_measured(new_run: NewRun, monkeypatch: Patch) -> None:
+    made_up(monkeypatch, lambda driven: peaks(rows=140 if driven else 300, nworld=2))
+    auto = ("batch=auto", "batch.nconmax=48")
+    runs = [new_run("sim=mjwarp", "sim.device=cpu", "nworld=2", *keys) for keys in (auto, ())]
+    for run in runs:
+        run_capacity(run)
+    run, plain = runs
     sim = run.stage.batch_simulation(2)
-    assert sim.sizes == BatchSizes(nconmax=48, njmax=184)  # type: ignore[attr-defined]
+    assert sim.sizes == BatchSizes(nconmax=48, njmax=176)  # type: ignore[attr-defined]
     other = make_simulation(run.stage.model, run.cfg, 1, backend=Backend.mjwarp)
     assert other.sizes == BatchSizes(nconmax=48, njmax=300)
-    assert run.stage.env_sizes is None
-    run.stage.measured["env"] = BatchSizes(nconmax=64, njmax=400)
-    assert run.stage.env_sizes == BatchSizes(nconmax=48, njmax=400)
-    plain = new_run("sim=mjwarp", "sim.device=cpu", "nworld=2")
-    plain.stage.measured |= dict.fromkeys(("task", "env"), BatchSizes(nconmax=8, njmax=8))
-    assert (plain.stage.sizes, plain.stage.env_sizes) == (BatchSizes(nconmax=128, njmax=300), None)
+    assert run.stage.measured["env"] == BatchSizes(nconmax=48, njmax=384)
+    assert (plain.stage.sizes, plain.stage.measured) == (BatchSizes(nconmax=128, njmax=300), {})
 
 
 @pytest.mark.full
@@ -716,6 +584,6 @@ def test_gate_on_cuda(new_run: NewRun) -> None:
     assert sizes.source.startswith("batch=auto: gate capacity, 64 worlds")
     batch = judge(run)
     assert batch.status is Status.passed, batch.reason
-    env = build_env(run.cfg, model=run.stage.model, sizes=run.stage.env_sizes)
+    env = build_env(run.cfg, model=run.stage.model, sizes=run.stage.measured["env"])
     play_random_actions(run.cfg, 100, env.sim)
     assert not read_peaks(env.sim).overflow.any()

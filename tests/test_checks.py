@@ -99,7 +99,8 @@ def test_a_check_of_ones_own_judges_native_worlds() -> None:
     assert list(check.rules)[3:] == [
         *("GRASP", "AT_PLACE", "REST_SPEED", "REST_POSITION", "REST_ROTATION")
     ]
-    assert check.thresholds() == {"grasp_steps": 3, "distance_m": 0.01, "window_steps": 10}
+    thresholds = {figure.key: figure.high for figure in check.thresholds()}
+    assert thresholds == {"grasp_steps": 3, "distance_m": 0.01, "window_steps": 10}
     check.start(env, 20)
     for step in range(20):
         sim.step(cfg.timing.decimation)

@@ -244,7 +244,7 @@ BAD = [
     (["reward.porgress.weight=3"], "Did you mean 'reward.progress'?"),
     (["reward.progress.params.force=1"], "To add it, write +reward.progress.params.force=..."),
     (["termination.time_out.params.step=3"], "steps'?"),
-    (["gate.capacity.reset.cubes.parms.yaw=1"], "parms"),
+    (["gate.success.reset.cubes.parms.yaw=1"], "parms"),
     (["batch=automatic"], "Did you mean 'auto'?"),
     (["batch.naconmax=8"], "'batch.naconmax' does not exist. Did you mean 'batch.nconmax'?"),
     (
@@ -365,7 +365,6 @@ REFUSED_BY_THE_CHECK = [
     (["task.check.func=mjstack.tasks.check.EpisodeCheck"], "method 'build' is missing"),
     (["task.success.func=nope"], "task.success: "),
     (["controller.action.arm.func=nope"], "controller.action.arm: "),
-    (["gate.capacity.reset.cubes.func=nope", "gates=[capacity]"], "gate.capacity.reset.cubes: "),
     (["gate.success.reset.cubes.func=nope", "gates=[success]"], "gate.success.reset.cubes: "),
     (["sim=mjwarp", "sim.device=cuda:77"], "cuda:77"),
     (["sim=native", "sim.device=cuda:0"], "sim.device=cuda:0"),

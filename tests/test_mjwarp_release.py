@@ -159,11 +159,11 @@ from mjstack.config import load_config
 from mjstack.config.schema import Backend
 from mjstack.scene import build_model
 from mjstack.sim import make_simulation
-from mjstack.sim.sizes import resolve_env_sizes, resolve_sizes
+from mjstack.sim.sizes import resolve_sizes
 
 for robot in sys.argv[1:]:
     cfg = load_config([f"robot={robot}"])
-    for sizes in (resolve_sizes(cfg), resolve_env_sizes(cfg)):  # the first ones overflow
+    for sizes in (resolve_sizes(cfg), resolve_sizes(cfg, driven=False)):  # the first ones overflow
         print(make_simulation(
             build_model(cfg), cfg, 8, backend=Backend.mjwarp, device="cpu", sizes=sizes
         ).plan)

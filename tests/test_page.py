@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from mjstack.report.figure import Figure
 from mjstack.report.html import to_html
 from mjstack.report.page import Map, Page, Worlds
 from mjstack.report.record import GateResult, Report, Status
@@ -66,20 +67,27 @@ def batch(count: int) -> tuple[GateResult, Worlds]:
         names=[str(world) for world in range(count)],
         broken=broken,
         rules={"STACKED": "not stacked"},
-        values={
-            "xy_err_m": rng.uniform(0.0, 0.02, count),
-            "steps": np.full(count, 600.0),
-            "lost_m": np.where(np.arange(count) == 1, np.nan, rng.uniform(0.0, 1.0, count)),
-        },
+        values=[
+            (Figure("xy_err", unit="m", high=0.015), rng.uniform(0.0, 0.02, count)),
+            (Figure("steps"), np.full(count, 600.0)),
+            (
+                Figure("lost", unit="m"),
+                np.where(np.arange(count) == 1, np.nan, rng.uniform(0.0, 1.0, count)),
+            ),
+        ],
         maps=[Map(title="red", xy=rng.uniform(0.1, 0.2, (count, 2)), table=table)],
     )
     gate = GateResult(
         name="batch",
         status=Status.failed,
         reason="some failed",
-        metrics={"xy_err_max_m": 0.02, "dz_m": 0.04, "final.red.m": 1.0, "final.blue.m": 2.0},
-        thresholds={"xy_err_m": 0.015, "dz_min_m": 0.03, "dz_max_m": 0.05, "window_steps": 50},
-        beyond=["stacked_steps.xy_err"],
+        figures=[
+            Figure("xy_err_max", 0.02, "m", high=0.015),
+            Figure("dz", 0.04, "m", low=0.03, high=0.05),
+            Figure("far", 1.0, "m", "final.red"),
+            Figure("far", 2.0, "m", "final.blue"),
+            Figure("window", unit="steps", high=50),
+        ],
     )
     return gate, worlds
 
@@ -89,8 +97,12 @@ def page(tmp_path: Path, count: int = 64) -> str:
     parity = GateResult(
         name="parity",
         status=Status.passed,
-        metrics={"lifted.step1.qpos": 2e-7, "lifted.step1.qvel": 4e-4, "placed.step1.qpos": 8e-7},
-        thresholds={"step1.qpos": 1e-6, "step1.qvel": 1e-4},
+        figures=[
+            Figure("qpos", 2e-7, group="lifted.step1", high=1e-6),
+            Figure("qvel", 4e-4, group="lifted.step1", high=1e-4),
+            Figure("qpos", 8e-7, group="placed.step1", high=1e-6),
+            Figure("qvel", 8e-5, group="placed.step1", high=1e-4),
+        ],
     )
     Image.new("L", (1, 1)).save(tmp_path / "scene.png")
     report = Report(
@@ -122,14 +134,14 @@ def test_the_page_asks_for_nothing_but_itself(tmp_path: Path) -> None:
 
 def test_gates_are_tables(tmp_path: Path) -> None:
     tables = Reader(page(tmp_path)).tables
-    (differences,) = (t for t in tables if t[0][:1] == ["state"])
-    assert differences[0] == ["state", "qpos", "qvel"]
+    (differences,) = (t for t in tables if "qpos" in t[0])
+    assert differences[0] == ["", "qpos", "qvel"]
     assert differences[1] == ["lifted, step1", "2e-07 / 1e-06", "0.0004 / 0.0001"]
-    assert differences[2] == ["placed, step1", "8e-07 / 1e-06", ""]
-    assert [["", "m"], ["final: red", "1"], ["final: blue", "2"]] in tables
+    assert differences[2] == ["placed, step1", "8e-07 / 1e-06", "8e-05 / 0.0001"]
+    assert [["", "far"], ["final, red", "1 m"], ["final, blue", "2 m"]] in tables
     assert ["dz", "0.04 m", "0.03 m to 0.05 m"] in [row for t in tables for row in t]
-    assert ["xy err max", "0.02 m", "0.015 m"] in [row for t in tables for row in t]
-    assert ["window steps", "", "50"] in [row for t in tables for row in t]
+    assert ["xy err max", "0.02 m", "at most 0.015 m"] in [row for t in tables for row in t]
+    assert ["window", "50 steps"] in [row for t in tables for row in t]
     (outcomes,) = (t for t in tables if t[0][:1] == ["outcome"])
     assert [row[:3] for row in outcomes[1:]] == [
         ["success", "", "51"],
@@ -184,13 +196,12 @@ def test_maps_show_ways(tmp_path: Path) -> None:
     assert " ways in 3 of the episodes." in text
 
 
-def test_a_limit_of_a_rule_is_dashed_under_any_name(tmp_path: Path) -> None:
-    """One end, the other, or both; an end at zero or without bound is none."""
+def test_the_limits_of_a_value_are_dashed(tmp_path: Path) -> None:
+    """One end, the other, or both."""
     gate, worlds = batch(64)
     span = np.linspace(0.5, 2.0, 64)
-    worlds.values = {"open_m": span, "away_m": span, "between_m": span, "free_m": span}
-    infinite = float("inf")
-    worlds.limits = {"open_m": (1.0, infinite), "away_m": (0.0, 1.5), "between_m": (0.75, 1.25)}
+    ends = ({"low": 1.0}, {"high": 1.5}, {"low": 0.75, "high": 1.25}, {})
+    worlds.values = [(Figure(f"value {len(end)}", unit="m", **end), span) for end in ends]
     text = batch_page(tmp_path, gate, worlds)
     limits = [
         re.findall(r"<title>threshold ([\d.]+) m<", plot)
@@ -223,8 +234,7 @@ def test_text_is_not_markup(tmp_path: Path) -> None:
         name=bad,
         status=Status.failed,
         reason=bad,
-        metrics={bad: 1.0},
-        thresholds={f"{bad}x": 1.0},
+        figures=[Figure(bad, 1.0, bad, high=2.0), Figure(f"{bad}x", high=1.0)],
         notes={bad: bad},
         details=[bad],
         tables=[Table(title=bad, header=[bad], rows=[[bad]])],
@@ -233,7 +243,11 @@ def test_text_is_not_markup(tmp_path: Path) -> None:
     ways = [(bad, True, np.zeros((2, 2)))]
     maps = [Map(title=bad, xy=np.zeros((2, 2)), table=([0.3, 0.0], [0.2, 0.3]), ways=ways)]
     worlds = Worlds(
-        names=[bad] * 2, broken=[[bad], []], rules={bad: bad}, values={bad: two}, maps=maps
+        names=[bad] * 2,
+        broken=[[bad], []],
+        rules={bad: bad},
+        values=[(Figure(bad), two)],
+        maps=maps,
     )
     report = Report(folder=tmp_path, provenance={bad: bad}, gates=[gate])
     shown = Page(title=bad, command=bad, worlds={bad: worlds}, notes=[bad])
@@ -245,8 +259,8 @@ def test_text_is_not_markup(tmp_path: Path) -> None:
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_numbers_that_are_not_finite_have_a_page(tmp_path: Path, value: float) -> None:
     gate, worlds = batch(8)
-    worlds.values["xy_err_m"][:] = value
+    worlds.values[0][1][:] = value
     worlds.maps[0].xy[:] = value
-    gate.metrics["lifted.step1.qpos"] = gate.thresholds["step1.qpos"] = value
+    gate.figures.append(Figure("qpos", value, group="lifted.step1", high=value))
     text = batch_page(tmp_path, gate, worlds)
     assert str(float(value)) in text

@@ -12,14 +12,15 @@ from environments import Patch
 
 from mjstack.files import write_atomic
 from mjstack.report import formats
+from mjstack.report.figure import Figure, figures
 from mjstack.report.page import Page
 from mjstack.report.record import GateResult, Report, Status
 from mjstack.report.sections import Section
 from mjstack.report.write import safely_write
 
 
-def gate(status: Status, name: str = "g", **metrics: float) -> GateResult:
-    return GateResult(name=name, status=status, metrics=metrics)
+def gate(status: Status, name: str = "g", **numbers: float) -> GateResult:
+    return GateResult(name=name, status=status, figures=figures(**numbers))
 
 
 def write_report(report: Report) -> None:
@@ -68,7 +69,7 @@ def test_file_appears_complete(tmp_path: Path, monkeypatch: Patch) -> None:
 
 def test_numbers_that_are_not_finite_stay_json(tmp_path: Path) -> None:
     bad = gate(Status.failed, a=math.nan, b=math.inf, c=-math.inf, d=0.5)
-    bad.thresholds["t"] = math.nan
+    bad.figures.append(Figure("t", high=math.nan))
     facts = {"x": math.nan, "versions": {"y": math.inf}}
     report = Report(folder=tmp_path, provenance=facts, gates=[bad])
     report.conclude()
@@ -135,22 +136,39 @@ def test_table_cells_survive_a_bar_in_a_reason(tmp_path: Path) -> None:
 def test_figures_and_limits_have_a_row_each(tmp_path: Path) -> None:
     """Repetitions as median and range, the rest with its unit; tables as in test_page.py."""
     rate = {"median": 12_000.0, "min": 11_500.0, "max": 12_500.0}
-    metrics = {f"physics.world_steps_per_s.{end}": value for end, value in rate.items()}
-    metrics |= {"lifted.step1.qpos": 2e-7, "physics.captured": True}
+    measured = [
+        Figure("world_steps", value, "/s", "physics", column=end) for end, value in rate.items()
+    ]
+    measured += [
+        Figure("captured", True, group="physics"),
+        *(
+            Figure(field, 2e-7, group=f"lifted.{step}", high=1e-6)
+            for step in ("step1", "step50")
+            for field in ("qpos", "qvel")
+        ),
+        Figure("distance", 0.002, "m", high=0.01),
+        Figure("rate", 0.95, low=0.9),
+        Figure("margin", high=1.25),
+        Figure("shared", 1.0, "N", "final.red", high=2.0, limit="final.shared_n"),
+    ]
     result = GateResult(
-        name="parity",
-        status=Status.passed,
-        metrics=metrics,
-        thresholds={"step1.qpos": 1e-6, "rate_min": 0.9},
-        notes={"backend": "native"},
+        name="parity", status=Status.passed, figures=measured, notes={"backend": "native"}
     )
+    assert {f"physics.world_steps_per_s.{end}" for end in rate} <= result.metrics.keys()
+    assert result.metrics["final.red.shared_n"] == 1.0
+    assert result.thresholds == {
+        **{f"lifted.step{n}.{field}": 1e-6 for n in (1, 50) for field in ("qpos", "qvel")},
+        **{"distance_m": 0.01, "rate_min": 0.9, "margin": 1.25, "final.shared_n": 2.0},
+    }
     write_report(Report(folder=tmp_path, gates=[result]))
     text = (tmp_path / "report.md").read_text()
     assert "| physics: world steps | 12,000 /s | 11,500 /s | 12,500 /s |" in text
-    assert "| lifted, step1 | 2e-07 / 1e-06 |" in text
+    assert "| lifted, step1 | 2e-07 / 1e-06 | 2e-07 / 1e-06 |" in text
+    assert "| distance | 0.002 m | at most 0.01 m |" in text
+    assert "| final, red: shared | 1 N | at most 2 N |" in text
     assert "| physics: captured | yes |" in text
     assert "| backend | native |" in text
-    assert "| rate min |  | 0.9 |" in text
+    assert "| margin | 1.25 |" in text
     assert "step1.qpos" not in text
 
 
@@ -170,8 +188,8 @@ def test_a_failed_picture_is_a_line_and_leaves_no_part(tmp_path: Path) -> None:
 @pytest.mark.full
 def test_a_gate_may_return_numpy_scalars_and_a_median_alone(tmp_path: Path) -> None:
     own = gate(Status.passed, small=np.float32(0.5), count=np.int64(3), good=np.bool_(True))
-    own.metrics["gap_m.median"] = 0.25
+    own.figures.append(Figure("gap", 0.25, "m", column="median"))
     write_report(Report(folder=tmp_path, gates=[own]))
     (held,) = strict_json(tmp_path / "report.json")["gates"]
     assert held["metrics"] == {"small": 0.5, "count": 3, "good": True, "gap_m.median": 0.25}
-    assert "| gap m: median | 0.25 |" in (tmp_path / "report.md").read_text()
+    assert "| gap: median | 0.25 m |" in (tmp_path / "report.md").read_text()

@@ -12,12 +12,12 @@ from mjstack.sim import make_simulation
 from mjstack.sim.fused.step import StepPlan, why_stock
 from mjstack.sim.mjwarp import MjwarpSimulation
 from mjstack.sim.mujoco_warp import mjw
-from mjstack.sim.sizes import resolve_env_sizes
+from mjstack.sim.sizes import resolve_sizes
 
 
 def worlds(robot: str, device: str, step: str) -> MjwarpSimulation:
     cfg = configure(robot=robot)
-    sizes = resolve_env_sizes(cfg)
+    sizes = resolve_sizes(cfg, driven=False)
     sim = make_simulation(
         build_model(cfg), cfg, 3, backend=Backend.mjwarp, device=device, sizes=sizes
     )

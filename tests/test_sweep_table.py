@@ -24,8 +24,9 @@ from mjstack.errors import MjstackError
 from mjstack.jobs import check_job, sweep, sweep_table
 from mjstack.jobs.sweep import LOG, SweepJob, add_jobs
 from mjstack.jobs.sweep_table import sweep_rows, write_summary
+from mjstack.report.figure import figures
 from mjstack.report.record import GateResult, Report, Status
-from mjstack.report.sweep_picture import Plot, Row, crossover, save_sweep
+from mjstack.report.sweep_picture import Plot, Row, save_sweep
 from mjstack.report.write import write_report
 
 SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "run.py"
@@ -116,7 +117,7 @@ def listed(folder: Path, *overrides: str) -> list[SweepJob]:
 
 def report(job: SweepJob, status: Status, reason: str = "", **metrics: float) -> Report:
     job.folder.mkdir(parents=True, exist_ok=True)
-    gate = GateResult(name="batch", status=status, reason=reason, metrics=metrics)
+    gate = GateResult(name="batch", status=status, reason=reason, figures=figures(**metrics))
     facts = {"git_commit": "abc"}
     made = Report(folder=job.folder, overrides=list(job.overrides), provenance=facts)  # type: ignore[arg-type]
     made.gates = [gate]
@@ -284,39 +285,18 @@ def test_jobs_of_the_experiment() -> None:
 PLOT = Plot(title="T", over="nworld", lines=["sim"], panels={"rate": RATE, "none": "missing"})
 
 
-def rates(values: dict[str, dict[int, float | None]]) -> list[Row]:
+def rates(values: dict[str, dict[int, float]]) -> list[Row]:
     return [
-        {"nworld": nworld, "sim": engine, "status": "fail" if rate is None else "pass", RATE: rate}
+        {"nworld": nworld, "sim": engine, "status": "pass", RATE: rate}
         for engine, by_worlds in values.items()
         for nworld, rate in by_worlds.items()
     ]
 
 
-@pytest.mark.parametrize(
-    ("mjwarp", "native", "at"),
-    [
-        ({1: 1.0, 100: 100.0}, {1: 10.0, 100: 10.0}, 10.0),
-        ({1: 1.0, 10: None, 100: 100.0}, {1: 10.0, 10: 10.0, 100: 10.0}, 10.0),
-        ({1: 1.0, 100: 5.0}, {1: 10.0, 100: 10.0}, None),
-        ({1: 20.0, 100: 50.0}, {1: 10.0, 100: 10.0}, None),
-        ({1: 1.0}, {100: 10.0}, None),
-        ({1: None}, {1: None}, None),
-    ],
-)
-def test_crossover(
-    mjwarp: dict[int, float | None], native: dict[int, float | None], at: float | None
-) -> None:
-    rows = rates({"mjwarp": mjwarp, "native": native})
-    assert crossover(PLOT, rows) == (None if at is None else pytest.approx(at))
-
-
 def test_a_job_that_failed_is_a_gap_even_with_figures(tmp_path: Path, monkeypatch: Patch) -> None:
-    """Of three jobs the middle one measured physics and then failed; its figure would move the
-    crossover.
-    """
+    """Of three jobs the middle one measured physics and then failed."""
     rows = rates({"mjwarp": {1: 1.0, 10: 99.0, 100: 100.0}, "native": {1: 10.0, 10: 10, 100: 10}})
     rows[1]["status"] = "fail"
-    assert crossover(PLOT, rows) == pytest.approx(10.0)
     drawn: list[tuple[str, list[float]]] = []
     plot = Axes.plot
 

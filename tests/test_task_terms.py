@@ -122,7 +122,6 @@ def test_a_reset_of_the_task_acts_in_every_gate(turned: Path, tmp_path: Path) ->
     assert np.ptp(cubes[:, 0]) > 0.005
     saved = load_config(["task=turned"], config_dir=turned)
     assert list(saved.gate.success.reset) == [*SHIPPED, "turn", "slide"]
-    assert list(saved.gate.capacity.reset) == [*SHIPPED, "turn", "slide"]
     assert list(saved.gate.baseline.reset) == ["home", "turn", "slide"]
 
 

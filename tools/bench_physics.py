@@ -28,7 +28,7 @@ from mjstack.sim.fused.step import StepPlan
 from mjstack.sim.graph import StepGraph
 from mjstack.sim.mjwarp import MjwarpSimulation
 from mjstack.sim.mujoco_warp import mjw, torch_stream_scope
-from mjstack.sim.sizes import resolve_env_sizes
+from mjstack.sim.sizes import resolve_sizes
 
 BARE = "bare mujoco_warp.step"
 
@@ -55,7 +55,7 @@ def _measure_plans(
     """Milliseconds per batched physics step, one number per repetition, by the step's name."""
     cfg = stage.cfg
     decimation = cfg.timing.decimation
-    sizes = resolve_env_sizes(cfg) if random else None
+    sizes = resolve_sizes(cfg, driven=False) if random else None
     device = resolve_device(cfg.sim.device)
     sim = stage.simulation(cfg.nworld, Backend.mjwarp, device, sizes=sizes)
     assert isinstance(sim, MjwarpSimulation)

@@ -36,7 +36,7 @@ from mjstack.report.table import Table
 from mjstack.sim import SolverLimit, resolve_device
 from mjstack.sim.mjwarp import MjwarpSimulation
 from mjstack.sim.native import NativeSimulation
-from mjstack.sim.sizes import resolve_env_sizes
+from mjstack.sim.sizes import resolve_sizes
 
 TOLERANCES = "cost, in tolerances"  # its change
 AGREEMENT = 1e-3  # relative difference of the two solvers
@@ -53,7 +53,9 @@ def measure(args: argparse.Namespace, cfg: Config, advance: Advance) -> Iterator
     """Record states, solve each with both solvers and with native MuJoCo, and report."""
     stage = Stage(cfg, progress=Progress(advance=advance))
     device = resolve_device(cfg.sim.device)
-    sim = stage.simulation(cfg.nworld, Backend.mjwarp, device, sizes=resolve_env_sizes(cfg))
+    sim = stage.simulation(
+        cfg.nworld, Backend.mjwarp, device, sizes=resolve_sizes(cfg, driven=False)
+    )
     assert isinstance(sim, MjwarpSimulation)
     pipeline = Pipeline(sim)
     samples = record_states(stage, sim, args.states)

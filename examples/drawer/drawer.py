@@ -8,6 +8,7 @@ from mjstack.config.fields import spec
 from mjstack.managers import EnvView, uses_fields
 from mjstack.mdp.geometry import place_xy
 from mjstack.mdp.observation import fixture_pos, fixture_vel, grasp_point_pos
+from mjstack.report.figure import Figure
 from mjstack.tasks.check import EpisodeCheck, Rule
 from mjstack.tasks.parts import InWindow
 from mjstack.tasks.view import Step
@@ -77,8 +78,10 @@ class DrawerCheck(EpisodeCheck):
         def alone(step: Step) -> torch.Tensor:
             return (force(step.env, "cabinet") == 0.0)[:, None]
 
+        opening = [Figure("open", unit="m", low=t.open)]
+        rule = ("OPEN", "drawer not open", self.is_open, t.window)
         return [
-            InWindow("OPEN", "drawer not open", self.is_open, t.window, measure=self.trace),
+            InWindow(*rule, measure=self.trace, measured=opening),
             InWindow("STILL", "drawer moving", still, t.window),
             InWindow("LET_GO", "handle not let go of", self.let_go, t.window),
             InWindow("INSIDE", "cube not in the drawer", self.inside, t.window),

@@ -7,6 +7,7 @@ import torch
 from mjstack.config.fields import spec
 from mjstack.managers import EnvView
 from mjstack.mdp.observation import object_to_object
+from mjstack.report.figure import Figure
 from mjstack.tasks.check import EpisodeCheck, Rule
 from mjstack.tasks.parts import AtRest, InWindow, in_zone, on_table, released, upright
 from mjstack.tasks.view import Step
@@ -36,10 +37,10 @@ class PegCheck(EpisodeCheck):
         t = self.t
         self.over = in_zone("peg", "hole", low=[-t.within] * 2, high=[t.within] * 2)
         self.stands = on_table("peg", gap=t.gap) & upright("peg", tilt_deg=t.tilt_deg)
-        hole = InWindow("IN_HOLE", "peg not in the hole", self.over, t.window, measure=self.trace)
-        hole.limits[0]["off_m"] = (0.0, t.within)
+        measured = [Figure("off", unit="m", high=t.within), Figure("tilt", unit="deg")]
+        hole = ("IN_HOLE", "peg not in the hole", self.over, t.window)
         return [
-            hole,
+            InWindow(*hole, measure=self.trace, measured=measured),
             InWindow("BOTTOM", "peg does not stand at the bottom", self.stands, t.window),
             InWindow("RELEASED", "peg not released", released("peg", open_fraction=0.8), t.window),
             AtRest(t.window, speed=0.05, position=0.005, rotation_deg=3.0),

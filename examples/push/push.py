@@ -7,6 +7,7 @@ import torch
 from mjstack.config.fields import spec
 from mjstack.managers import EnvView
 from mjstack.mdp.observation import object_to_place
+from mjstack.report.figure import Figure
 from mjstack.tasks.check import EpisodeCheck, Rule
 from mjstack.tasks.parts import AtRest, InWindow, at_place, away, flat, on_table, released
 from mjstack.tasks.view import Step
@@ -40,11 +41,11 @@ class PushCheck(EpisodeCheck):
         slid = down & flat("puck", tilt_deg=t.tip_deg)
         there = at_place("puck", "goal", distance=t.within)
         self.there = there & lies
-        at_goal = InWindow("AT_GOAL", "puck not at goal", there, t.window, measure=self.trace)
-        at_goal.limits[0]["distance_m"] = (0.0, t.within)
+        measured = [Figure("distance", unit="m", high=t.within), Figure("tilt", unit="deg")]
+        at_goal = ("AT_GOAL", "puck not at goal", there, t.window)
         return [
             InWindow("FLAT", "puck does not lie flat", lies, t.window),
-            at_goal,
+            InWindow(*at_goal, measure=self.trace, measured=measured),
             InWindow("LEFT_ALONE", "puck touched", released("puck", open_fraction=0.0), t.window),
             AtRest(t.window, speed=0.05, position=0.005, rotation_deg=3.0),
             InWindow("SLID", "puck lifted or tipped over", slid, self.cfg.task.episode_steps),

@@ -30,6 +30,7 @@ from mjstack.config.functions import offered
 from mjstack.envs import Env
 from mjstack.envs.buffers import Advance
 from mjstack.episodes.rollout import restore, snapshot
+from mjstack.report.figure import Figure, figures
 from mjstack.sim.cameras import image_bytes
 from mjstack.sim.graph import StepGraph
 
@@ -82,16 +83,16 @@ def measure_env_step(env: Env, name: str, advance: Advance) -> Measurement:
         "managers_alone_over_physics": managers / physics,
         "residual_ms_per_step": ms * (whole - physics - managers - images),
     }
-    out.facts["episodes_ended"] = int(ended)
+    out.facts += figures(episodes_ended=int(ended))
     out.problem = timing.describe_lost(parts.lost) or parts.problem or out.problem
     cameras = env.cameras.cameras if env.cameras is not None else {}
-    out.headline = f"{out.median('env_steps_per_s'):,.0f} env-steps/s"
+    out.headline = f"{out.median('env_steps'):,.0f} env-steps/s"
     if cameras:
         samples["images_ms_per_step"] = ms * images
-        samples["images_per_s"] = rate = len(cameras) * env.nworld * steps / images
+        samples["images"] = rate = len(cameras) * env.nworld * steps / images
         samples["images_over_physics"] = images / physics
         size = image_bytes(sim.model, cameras, env.nworld, mjwarp=sim.backend == "mjwarp")
-        out.facts["images_mb"] = size / 1e6
+        out.facts.append(Figure("images", size / 1e6, "MB"))
         out.headline += f" with images, {np.median(rate):,.0f} images/s"
     else:
         samples["managers_over_physics"] = whole / physics - 1.0

@@ -13,6 +13,7 @@ from mjstack.episodes.rollout import Episode, State, restore, rollout, snapshot
 from mjstack.episodes.stage import Stage
 from mjstack.errors import name_worlds
 from mjstack.mdp.geometry import objects_in_hand
+from mjstack.report.figure import figures
 from mjstack.sim import Simulation
 
 
@@ -34,7 +35,7 @@ def measure_physics(stage: Stage, sim: Simulation, carry: State | None = None) -
     full = sim.nworld
     if carried >= 0:  # both jaws press on the phase's object
         full = int(objects_in_hand(stage.index, sim)[:, carried].sum())
-        out.facts["worlds_with_object_in_hand"] = full
+        out.facts += figures(worlds_with_object_in_hand=full)
         if 2 * full < sim.nworld:
             where = f"as {t.from_phase} begins (gate.throughput.from_phase)"
             out.problem = f"only {full} of {sim.nworld} worlds have the object in hand {where}"
@@ -62,13 +63,13 @@ def measure_physics(stage: Stage, sim: Simulation, carry: State | None = None) -
     graph = sim.graph_of(decimation)
     captured = graph is not None and graph.captured
     out.add_repetitions(sim, stage.cfg, times, steps, meter, graph, captured=captured, whole=False)
-    out.facts |= {
-        "peak_contacts_per_world": int(sim.peak_contacts.max()),
-        "peak_constraint_rows_per_world": int(sim.peak_constraints.max()),
-    }
+    out.facts += figures(
+        peak_contacts_per_world=int(sim.peak_contacts.max()),
+        peak_constraint_rows_per_world=int(sim.peak_constraints.max()),
+    )
     out.problem = timing.describe_lost(lost) or out.problem
     out.headline = (
-        f"{out.median('world_steps_per_s'):,.0f} world-steps/s,"
+        f"{out.median('world_steps'):,.0f} world-steps/s,"
         f" {out.median('ms_per_batched_step'):.3g} ms per step of {sim.nworld} worlds"
     )
     if full < sim.nworld:
@@ -143,10 +144,10 @@ def measure_episode(
     timings = [episode.timing for episode in played]
     times = [spent.seconds for spent in timings]
     out.samples = {"seconds": times}
-    out.facts = {
-        "of_the_batch_gate": int(played[0] is before),
-        "succeeded": sim.nworld - len(failed),
-    }
+    out.failed = bool(failed)
+    out.facts = figures(
+        of_the_batch_gate=int(played[0] is before), succeeded=sim.nworld - len(failed)
+    )
     used = meter if played[-1] is not before else timing.NO_METER
     captured = all(spent.captured for spent in timings)
     out.add_repetitions(sim, cfg, times, steps, used, *timings, captured=captured)

@@ -3,7 +3,7 @@
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 from torch import Tensor
@@ -12,10 +12,12 @@ from typing_extensions import override
 from mjstack.config.schema import Config
 from mjstack.episodes.rollout import Observer, RolloutTiming
 from mjstack.math import not_finite
+from mjstack.report.figure import Figure, figures
 from mjstack.sim import LOST_PHYSICS, Simulation
 from mjstack.sim.build import cuda_uuid, device_memory
 from mjstack.sim.graph import StepGraph
 
+_RATES = ("world_steps", "env_steps", "images")  # samples per second
 WARM_UP = 3  # calls: eager, captured, replayed
 EAGER = 2  # steps: the warm-up, and the one that is captured
 SHORTEST = 0.5  # s, of a stretch of work on average: the counter moves some ten times a second
@@ -69,11 +71,12 @@ class EnergyMeter:
             return self.reason
         return f"stretches of {mean:.2g} s are too short for NVML's counter"
 
-    def metrics(self) -> dict[str, float]:
+    def figures(self) -> list[Figure]:
         """Energy and mean power of the stretches; nothing where they are missing."""
         if self._counter is None or self.missing:
-            return {}
-        return {"gpu_power_mean_w": self._joules / self._seconds, "gpu_energy_j": self._joules}
+            return []
+        power = Figure("gpu_power_mean", self._joules / self._seconds, "W")
+        return [power, Figure("gpu_energy", self._joules, "J")]
 
 
 NO_METER = EnergyMeter("cpu")  # which has no counter
@@ -104,10 +107,12 @@ class Measurement:
 
     Attributes:
         name: Such as ``physics``; it begins the names of all metrics.
-        samples: Figures by name with unit, a number per repetition.
+        samples: A number per repetition, by the figure's name.
         totals: Figures over all repetitions, such as the energy.
-        facts: Numbers that hold with or without figures.
+        facts: Figures that hold with or without samples.
         notes: Facts in words.
+        captured: Whether all that should be captured was.
+        failed: Whether a world failed the check.
         problem: Why the figures are void; empty where they count.
         missing: Why there are no figures, which is no failure; empty where there are.
         headline: The measurement in a few words.
@@ -115,9 +120,11 @@ class Measurement:
 
     name: str
     samples: dict[str, list[float]] = field(default_factory=dict)
-    totals: dict[str, float] = field(default_factory=dict)
-    facts: dict[str, float] = field(default_factory=dict)
+    totals: list[Figure] = field(default_factory=list)
+    facts: list[Figure] = field(default_factory=list)
     notes: dict[str, str] = field(default_factory=dict)
+    captured: bool = True
+    failed: bool = False
     problem: str = ""
     missing: str = ""
     headline: str = ""
@@ -153,47 +160,50 @@ class Measurement:
         """
         # Time and rate per physics step and per whole control step
         decimation = cfg.timing.decimation
-        counts = {("ms_per_batched_step", "world_steps_per_s"): steps * decimation}
+        counts = {("ms_per_batched_step", "world_steps"): steps * decimation}
         if whole:
-            counts["ms_per_env_step", "env_steps_per_s"] = steps
+            counts["ms_per_env_step", "env_steps"] = steps
         for (ms, rate), count in counts.items():
             self.samples[ms] = [1e3 * s / count for s in seconds]
             self.samples[rate] = [sim.nworld * count / s for s in seconds]
 
         # Energy, and the memory that is taken on the GPU
-        self.totals |= meter.metrics()
+        self.totals += meter.figures()
         if meter.missing:
             self.notes["gpu_power_mean_w"] = f"not measured: {meter.missing}"
         if (used := device_memory(str(sim.device))) is not None:
-            self.facts["gpu_memory_arrays_mib"] = used[0] / 2**20
-            self.facts["gpu_memory_whole_gpu_mib"] = used[1] / 2**20
+            self.facts += [
+                Figure("gpu_memory_arrays", used[0] / 2**20, "MiB"),
+                Figure("gpu_memory_whole_gpu", used[1] / 2**20, "MiB"),
+            ]
 
         # The capture. On Warp's CPU device physics alone is captured
         graphs = [graph for graph in work if graph is not None]
         cuda = sim.device.type == "cuda"
-        self.facts |= {
-            "steps_per_repetition": steps,
-            "repetitions": len(seconds),
-            "warm_up_s": max([0.0, *(graph.warm_up_seconds for graph in graphs)]),
-            "capture_s": max([0.0, *(graph.capture_seconds for graph in graphs)]),
-            "captured": captured,
-        }
+        self.captured = captured
+        self.facts += [
+            *figures(steps_per_repetition=steps, repetitions=len(seconds)),
+            Figure("warm_up", max([0.0, *(graph.warm_up_seconds for graph in graphs)]), "s"),
+            Figure("capture", max([0.0, *(graph.capture_seconds for graph in graphs)]), "s"),
+            *figures(captured=captured),
+        ]
         physics = None if cuda else sim.graph_of(decimation, kinematics=True)
         if physics is not None:
-            self.facts["physics_captured"] = physics.captured
+            self.facts += figures(physics_captured=physics.captured)
         if cuda and not captured and cfg.graph != "off":
             eager = "it was not captured and ran eagerly (run.log says why)"
             self.problem = self.problem or f"{eager}; graph=off measures it like that"
 
-    def metrics(self) -> dict[str, float]:
-        """All numbers that count, under the measurement's name: median and range of samples."""
-        figures = dict(self.facts)
+    def figures(self) -> list[Figure]:
+        """All that count, under the measurement's name: median and range of samples."""
+        counted = list(self.facts)
         if not self.problem:
             for name, values in self.samples.items():
+                unit = "/s" if name in _RATES else ""
                 ends = {"median": statistics.median(values), "min": min(values), "max": max(values)}
-                figures |= {f"{name}.{end}": value for end, value in ends.items()}
-            figures |= self.totals
-        return {f"{self.name}.{key}": value for key, value in figures.items()}
+                counted += [Figure(name, value, unit, column=end) for end, value in ends.items()]
+            counted += self.totals
+        return [replace(figure, group=self.name) for figure in counted]
 
     def named_notes(self) -> dict[str, str]:
         """The notes, under the measurement's name."""

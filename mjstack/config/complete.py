@@ -21,7 +21,6 @@ _TERMS = {
     "controller.action": schema.TermCfg,
     "reset": schema.TermCfg,
     "gate.baseline.reset": schema.TermCfg,
-    "gate.capacity.reset": schema.TermCfg,
     "termination": schema.TerminationTermCfg,
     "reward": schema.RewardTermCfg,
     "observation": schema.ObservationGroupCfg,

@@ -5,7 +5,7 @@ actions to find them.
 import gc
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 import torch
 
-from mjstack.config.schema import Backend, Config, TermCfg
+from mjstack.config.schema import Backend, Config
 from mjstack.envs.camera_schedule import without_images
 from mjstack.envs.env import Env
 from mjstack.envs.faults import NO_KEY, POOL, describe_loss
@@ -23,13 +23,16 @@ from mjstack.managers.episode import required_fields
 from mjstack.managers.view import random_uniform
 from mjstack.scene import SceneIndex
 from mjstack.sim import LOST_PHYSICS, BatchSizes, Overflow, Simulation, make_simulation
-from mjstack.sim.sizes import apply_configured, resolve_measuring_sizes
+from mjstack.sim.sizes import apply_configured, robot_sizes
 
 log = logging.getLogger(__name__)
 
 ROWS = int(Overflow.NEFC | Overflow.NJMAX_NNZ)
 SIZED = ROWS | POOL | int(Overflow.CCD)
-_GROWTH = 8  # times the room to measure in, at most
+_GROWTH = 8  # times the room for random actions: the most to measure in
+# Of random actions on CUDA. Peaks of a whole episode are less than the margin higher in thousands
+# of worlds, not in the few that a CPU plays: docs/history/first-run-2026-11-27.md.
+_RANDOM_STEPS = 200
 _STEP = 8  # sizes are multiples of this
 # Sizes above _LARGE are multiples of _COARSE. Every njmax needs another solver kernel, which takes
 # seconds to compile, and on CUDA random actions differ from run to run.
@@ -38,8 +41,6 @@ _POOLS = ("contacts", "pairs", "ccd_pairs")  # as the simulation counts them
 
 Advance = Callable[[str, int, int], None]
 """Reports progress: the work in progress, how much is done, and of how much."""
-Play = Callable[[Simulation], object]
-"""Plays in some worlds."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,14 +70,15 @@ class Peaks:
     description: str
 
     @property
-    def share(self) -> float:
-        """Entries that the contact pool must have, per world."""
-        return max(self.pools["contacts"], self.pools.get("pairs", 0)) / len(self.rows)
-
-    @property
-    def convex_share(self) -> float | None:
-        """Convex pairs that must fit, per world; None where they are not counted."""
-        return self.pools["ccd_pairs"] / len(self.rows) if "ccd_pairs" in self.pools else None
+    def needs(self) -> dict[str, float]:
+        """Entries that each buffer must have, per world, by the key of its size. Pools are shared:
+        what all worlds had at once, divided by their number. Native MuJoCo counts no convex pairs.
+        """
+        pool = max(self.pools["contacts"], self.pools.get("pairs", 0))
+        needs = {"njmax": float(self.rows.max()), "nconmax": pool / len(self.rows)}
+        if "ccd_pairs" in self.pools:
+            needs["nccdmax"] = self.pools["ccd_pairs"] / len(self.rows)
+        return needs
 
     @property
     def loss(self) -> str:
@@ -117,112 +119,91 @@ def join_peaks(a: Peaks, b: Peaks) -> Peaks:
 
 
 def recommend_sizes(peaks: Peaks, margin: float, source: str) -> BatchSizes:
-    """Sizes with a margin over the peaks, in multiples of 8, from 256 on of 64.
-
-    Pools are shared: what all worlds had at once, divided by their number, is what each needs.
-    Where convex pairs are not counted, their room stays as much as there is for contacts.
+    """Sizes with a margin over the peaks, in multiples of 8, from 256 on of 64. Where convex pairs
+    are not counted, their room stays as much as there is for contacts.
     """
-
-    def size(peak: float) -> int:
-        step = _STEP if margin * peak <= _LARGE else _COARSE
-        return max(step, step * math.ceil(margin * peak / step))
-
-    nconmax = size(peaks.share)
-    convex = peaks.convex_share
-    return BatchSizes(
-        nconmax=nconmax,
-        njmax=size(peaks.rows.max()),
-        nccdmax=None if convex is None else min(nconmax, size(convex)),
-        source=source,
-    )
+    sizes = {}
+    for key, need in peaks.needs.items():
+        step = _STEP if margin * need <= _LARGE else _COARSE
+        sizes[key] = max(step, step * math.ceil(margin * need / step))
+    if "nccdmax" in sizes:
+        sizes["nccdmax"] = min(sizes["nccdmax"], sizes["nconmax"])
+    return BatchSizes(**sizes, source=source)
 
 
-class MeasuringWorlds:
-    """Worlds in which workloads are played one after the other, each as if the worlds were new."""
+def measure_peaks(
+    cfg: Config,
+    model: mujoco.MjModel,
+    nworld: int,
+    backend: Backend,
+    device: str,
+    *,
+    drive: Callable[[Simulation], object] | None = None,
+    advance: Advance = lambda what, done, total: None,
+) -> Peaks:
+    """Play a workload in new worlds, and again in worlds with twice the room wherever it was too
+    little, up to a limit: ``drive``, the driven task, or else random actions.
 
-    def __init__(
-        self,
-        cfg: Config,
-        model: mujoco.MjModel,
-        nworld: int,
-        backend: Backend,
-        device: str,
-        *resets: Mapping[str, TermCfg],
-    ) -> None:
-        """Make nothing yet. Worlds can start as the configuration and ``resets`` say; other
-        arguments as of `make_simulation`.
-        """
-        fields = required_fields(cfg.reset, *resets)
-        self._make = partial(
-            make_simulation, model, cfg, nworld, backend=backend, device=device, fields=fields
+    Peaks of a run that lost physics are those of another motion. Where the last run, which is
+    returned, has lost some too, its ``overflow`` tells: nothing may be sized from it.
+    """
+    c = cfg.gate.capacity
+    on_cuda = device.startswith("cuda")
+    steps = min(_RANDOM_STEPS if on_cuda else cfg.task.episode_steps, cfg.task.episode_steps)
+    play = drive or partial(play_random_actions, cfg, c.random_steps or steps, advance=advance)
+    first = robot_sizes(cfg, driven=drive is not None)
+    most = robot_sizes(cfg, driven=False)
+    sizes = {
+        key: max(getattr(first, key), getattr(cfg.batch, key) or 0) for key in ("nconmax", "njmax")
+    }
+    while True:
+        sim = make_simulation(
+            model,
+            cfg,
+            nworld if on_cuda else min(nworld, c.cpu_nworld),
+            backend=backend,
+            device=device,
+            fields=required_fields(cfg.reset),
+            sizes=BatchSizes(**sizes, source="measuring"),
         )
-        self._sim: Simulation | None = None
-        self._first = resolve_measuring_sizes(cfg)  # for random actions
-        self._rooms = {False: self._first, True: resolve_measuring_sizes(cfg, driven=True)}
-
-    def play(self, play: Play, *, driven: bool = False) -> Peaks:
-        """Play a workload, and again in worlds of more room, twice as much or more, wherever it
-        was too little, up to a limit. One that is ``driven`` begins with the room of the driven
-        task, not with that of random actions, which is larger, so that steps take longer.
-
-        Peaks of a run that lost physics are those of another motion. Where the last run, which is
-        returned, has lost some too, its ``overflow`` tells: nothing may be sized from it.
-        """
-        while True:
-            room = self._rooms[driven]
-            run = self._play_once(play, room)
-            bits = int(np.bitwise_or.reduce(run.overflow)) & SIZED
-            # In this room convex pairs have as much as contacts, so they grow together.
-            for key, lacking in {"njmax": bits & ROWS, "nconmax": bits & ~ROWS}.items():
-                size, first = getattr(room, key), getattr(self._first, key)
-                if lacking:
-                    grown = min(max(2 * size, first), _GROWTH * first)
-                    room = replace(room, **{key: max(size, grown)})
-            if run.sizes is None or room == self._rooms[driven]:
-                return run
-            self._rooms[driven] = room
-            log.info("%s overflow while measuring: again, %s", Overflow(bits), room.as_overrides())
-
-    def close(self) -> None:
-        """Give the worlds back, and all that was built on them."""
-        if self._sim is not None:
-            self._sim.close()
-        self._sim = None
+        with closing(sim), torch.no_grad():
+            play(sim)
+            peaks = read_peaks(sim)
+        del sim
         gc.collect()  # an environment and its managers refer to each other, and hold the worlds
+        bits = int(np.bitwise_or.reduce(peaks.overflow))
+        # In this room convex pairs have as much as contacts, so they grow together.
+        lacking = {"njmax": bits & ROWS, "nconmax": bits & SIZED & ~ROWS}
+        larger = {
+            key: max(size, min(2 * size, _GROWTH * getattr(most, key))) if lacking[key] else size
+            for key, size in sizes.items()
+        }
+        if peaks.sizes is None or larger == sizes:
+            return peaks
+        sizes = larger
+        log.info("%s overflow while measuring: again with %s", Overflow(bits), sizes)
 
-    def _play_once(self, play: Play, room: BatchSizes) -> Peaks:
-        if self._sim is not None and self._sim.sizes not in (None, room):
-            self.close()
-        else:
-            gc.collect()  # what the play before left: an environment, its graphs and their memory
-        self._sim = sim = self._sim or self._make(sizes=room)
-        for name, field in sim.fields.items():
-            field.copy_(torch.from_numpy(getattr(sim.model, name)))
-        sim.reset()
-        play(sim)
-        return read_peaks(sim)
 
-
-def measured_sizes(cfg: Config, run: Peaks, source: str) -> BatchSizes:
-    """Sizes for ``batch=auto`` from one run, which ``source`` has in words, with the configured
+def measured_sizes(cfg: Config, peaks: Peaks, source: str) -> BatchSizes:
+    """Sizes for ``batch=auto`` from a workload, which ``source`` has in words, with the configured
     margin; sizes that the configuration sets win.
 
     Raises:
         FaultError: A world lost physics; names the worlds and what to do.
     """
-    if run.loss:
-        raise FaultError(f"batch=auto: sizes cannot be measured by {source}: {run.loss}")
+    if peaks.loss:
+        raise FaultError(f"batch=auto: sizes cannot be measured by {source}: {peaks.loss}")
     margin = cfg.gate.capacity.margin
-    how = f"batch=auto: {source}, times {margin:g}"
-    return apply_configured(cfg, recommend_sizes(run, margin, how))
+    how = f"batch=auto: {source} in {len(peaks.rows)} worlds, times {margin:g}"
+    sizes = apply_configured(cfg, recommend_sizes(peaks, margin, how))
+    log.info("%s", sizes)
+    return sizes
 
 
 def play_random_actions(
     cfg: Config, steps: int, sim: Simulation, advance: Advance = lambda what, done, total: None
 ) -> None:
-    """Step worlds with actions drawn evenly from the action range, for `MeasuringWorlds.play`.
-    Worlds that end start anew.
-    """
+    """Step worlds with actions drawn evenly from the action range. Worlds that end start anew."""
     index = SceneIndex(sim.model, cfg.robot, cfg.scene)
     env = Env(sim, index, without_images(cfg), check_faults=False)  # a lack of room is looked for
     env.reset(seed=cfg.seed)
@@ -233,21 +214,3 @@ def play_random_actions(
         )
         env.step(actions.low + (actions.high - actions.low) * share)
         advance("random actions", step + 1, steps)
-
-
-def probe_env_sizes(cfg: Config, model: mujoco.MjModel, nworld: int, device: str) -> BatchSizes:
-    """Sizes for an environment on MJWarp with ``batch=auto``, from a probe of random actions; sizes
-    that the configuration sets win.
-
-    Raises:
-        FaultError: Physics was lost in all the room that the probe tried.
-    """
-    c = cfg.gate.capacity
-    worlds = min(nworld, c.probe_nworld if device.startswith("cuda") else c.cpu_nworld)
-    measuring = MeasuringWorlds(cfg, model, worlds, Backend.mjwarp, device)
-    with torch.no_grad(), closing(measuring):
-        probe = measuring.play(partial(play_random_actions, cfg, c.probe_steps))
-    source = f"{c.probe_steps} steps of random actions in {worlds} worlds"
-    sizes = measured_sizes(cfg, probe, source)
-    log.info("%s", sizes)
-    return sizes

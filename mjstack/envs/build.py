@@ -10,14 +10,13 @@ import torch
 
 from mjstack.config import load_config
 from mjstack.config.schema import Backend, Config, TermCfg
-from mjstack.envs.buffers import probe_env_sizes
+from mjstack.envs.buffers import measure_peaks, measured_sizes
 from mjstack.envs.camera_schedule import without_images
 from mjstack.envs.env import Env
 from mjstack.errors import ArgumentError
 from mjstack.managers.episode import required_fields
 from mjstack.scene import SceneIndex, build_model
-from mjstack.sim import BatchSizes, make_simulation, resolve_backend
-from mjstack.sim.sizes import resolve_env_sizes
+from mjstack.sim import BatchSizes, make_simulation, resolve_backend, resolve_sizes
 
 
 def make_env(
@@ -86,8 +85,9 @@ def build_env(
     nworld = nworld or cfg.nworld
     backend, device = resolve_backend(cfg, backend, device)
     if sizes is None and cfg.batch.auto and backend is Backend.mjwarp:
-        sizes = probe_env_sizes(cfg, model, nworld, device)
-    sizes = sizes or resolve_env_sizes(cfg)
+        peaks = measure_peaks(cfg, model, nworld, backend, device)
+        sizes = measured_sizes(cfg, peaks, "random actions")
+    sizes = sizes or resolve_sizes(cfg, driven=False)
     fields = required_fields(cfg.reset)
     sim = make_simulation(
         model, cfg, nworld, backend=backend, device=device, fields=fields, sizes=sizes

@@ -285,7 +285,7 @@ class Judge(Observer):
     @override
     def start(self, env: Env, driver: Driver) -> None:
         super().start(env, driver)
-        self.result = CheckResult(torch.zeros(env.nworld, dtype=torch.int32), {}, {}, False)
+        self.result = CheckResult(torch.zeros(env.nworld, dtype=torch.int32), {}, False)
         self._check = env.check if env.cfg.task.check is not None else None
         if self._check is not None:
             self._check.start(env, driver.steps, driver.phases)

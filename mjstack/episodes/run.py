@@ -166,14 +166,23 @@ class Run:
         else:
             self.page.pictures.append(name)
 
-    def judge_one(self, episode: Episode) -> tuple[Status, str, dict[str, float], list[str]]:
-        """Status, reason and metrics of a one-world episode, and names of those beyond limits."""
-        metrics = {name: float(values[0]) for name, values in episode.values.items()}
+    def judge_one(self, name: str, episode: Episode) -> tuple[GateResult, str]:
+        """The result of a one-world episode, with the rules that it broke as its reason, and its
+        values in a few words.
+        """
         check = self.stage.check
         broken, beyond = check.why(episode.failed, episode.values)
-        words = ", ".join(f"{check.rules.texts[name]}{why}" for name, why in broken.items())
-        status = Status.failed if broken else Status.passed
-        return status, f"failed: {words}" if words else "", metrics, beyond
+        words = ", ".join(f"{check.rules.texts[rule]}{why}" for rule, why in broken.items())
+        values = {key: float(values[0]) for key, values in episode.values.items()}
+        measured = [replace(check.figures[key], value=value) for key, value in values.items()]
+        result = GateResult(
+            name=name,
+            status=Status.failed if broken else Status.passed,
+            reason=f"failed: {words}" if words else "",
+            figures=[*check.thresholds(), *measured],
+            beyond=beyond,
+        )
+        return result, check.headline(values)
 
     def show_world(
         self,

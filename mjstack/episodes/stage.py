@@ -5,7 +5,7 @@ them. All that a trainer or a benchmark needs of a run.
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import mujoco
@@ -15,7 +15,7 @@ from mjstack.distributed import Ranks, current_ranks
 from mjstack.drivers.driver import Assets, Driver, find_driver
 from mjstack.drivers.open_loop import OpenLoopPlanner
 from mjstack.envs import Env, build_env, driven_config
-from mjstack.envs.buffers import Advance, MeasuringWorlds, measured_sizes
+from mjstack.envs.buffers import Advance, Peaks, measure_peaks, measured_sizes
 from mjstack.episodes.rollout import (
     Episode,
     Observer,
@@ -37,7 +37,6 @@ from mjstack.sim import (
     resolve_sizes,
 )
 from mjstack.sim.cameras import with_outputs
-from mjstack.sim.sizes import apply_configured
 from mjstack.tasks.check import EpisodeCheck, make_check
 
 TextHook = Callable[[str], None]
@@ -66,9 +65,8 @@ class Stage:
         assets: Scene, plan and policy, which several configurations may share; by default those of
             this one.
         ranks: The processes of the run.
-        measured: Buffer sizes that were measured, with a margin: those that the driven ``task``
-            needs, from *capacity* or from ``batch=auto``, and those that environments (``env``)
-            need, from *capacity*.
+        measured: Buffer sizes of ``batch=auto`` that were measured: those of the driven ``task``,
+            and from *capacity* those of environments (``env``).
         progress: Where the run prints.
         observers: Look on at every rollout of many worlds, such as the live view.
     """
@@ -205,9 +203,9 @@ class Stage:
         env = self.start(sim, reset, **options)
         return play_episode(env, self.driver(env), observers, advance=self.progress.advance)
 
-    def drive(self, sim: Simulation, reset: Reset) -> None:
+    def drive(self, sim: Simulation) -> None:
         """Roll out one episode without the task's check."""
-        env = self.start(sim, reset)
+        env = self.start(sim, self.cfg.reset)
         rollout(env, self.driver(env), advance=self.progress.advance)
 
     # Simulations
@@ -252,31 +250,16 @@ class Stage:
         if not self.cfg.batch.auto or self.backend[0] is Backend.native:
             return resolve_sizes(self.cfg)
         if "task" not in self.measured:
-            source = f"the driven task in {self.measuring_nworld} worlds"
-            with closing(self.measuring_worlds()) as worlds:
-                task = worlds.play(partial(self.drive, reset=self.cfg.reset), driven=True)
-            self.measured["task"] = measured_sizes(self.cfg, task, source)
+            self.measured["task"] = measured_sizes(self.cfg, self.measure(), "the driven task")
             self.progress.print_line(str(self.measured["task"]))
-        return apply_configured(self.cfg, self.measured["task"])
+        return self.measured["task"]
 
-    @property
-    def env_sizes(self) -> BatchSizes | None:
-        """Buffer sizes of environments with ``batch=auto``, if *capacity* has measured them; None
-        leaves it to `build_env`.
-        """
-        sizes = self.measured.get("env")
-        return apply_configured(self.cfg, sizes) if self.cfg.batch.auto and sizes else None
-
-    @property
-    def measuring_nworld(self) -> int:
-        """How many worlds size the buffers."""
-        most = self.cfg.gate.capacity.cpu_nworld
-        on_cuda = self.backend[1].startswith("cuda")
-        return self.cfg.nworld if on_cuda else min(self.cfg.nworld, most)
-
-    def measuring_worlds(self, *resets: Reset) -> MeasuringWorlds:
-        """Worlds that size the buffers, which can start as ``resets`` say, too."""
-        return MeasuringWorlds(self.cfg, self.model, self.measuring_nworld, *self.backend, *resets)
+    def measure(self, *, driven: bool = True) -> Peaks:
+        """The most that the driven task, or else random actions, use of the buffers."""
+        cfg = self.cfg
+        worlds = (cfg, self.model, cfg.nworld, *self.backend)
+        drive = self.drive if driven else None
+        return measure_peaks(*worlds, drive=drive, advance=self.progress.advance)
 
     def native_env(self, cfg: Config, nworld: int = 1) -> closing[Env]:
         """An environment of the scene on native MuJoCo, to find out about its terms."""

@@ -1,5 +1,6 @@
 """Sums over a gate's episodes, and their report."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from mjstack.episodes.stage import Stage
 from mjstack.errors import name_worlds
 from mjstack.files import to_csv
 from mjstack.math import rate_interval, wilson_interval
+from mjstack.report.figure import Figure, figures
 from mjstack.report.page import Map, World, Worlds
 from mjstack.report.record import GateResult, Status
 from mjstack.report.table import Table
@@ -141,26 +143,31 @@ class EpisodeTally:
             remark = f"{name} has every failing episode with what was measured"
             self.write(name, Path.write_text, to_csv(rows), remark)
 
-    def metrics(self) -> dict[str, float]:
-        """Counts, the success rate with its interval, and the extremes of what was measured."""
-        metrics: dict[str, float] = {
-            "worlds": len(self.records[0].failed),
-            "seeds": len(self.records),
-            "episodes": self.episodes,
-            **rate_metrics(self.successes, self.episodes),
-        }
+    def figures(self, rate: float) -> list[Figure]:
+        """Counts, the success rate with its interval and the least one that is wanted, and the
+        extremes of what was measured.
+        """
+        counts = figures(
+            worlds=len(self.records[0].failed), seeds=len(self.records), episodes=self.episodes
+        )
+        rates = rate_metrics(self.successes, self.episodes)
+        success = Figure("success_rate", rates.pop("success_rate"), low=rate)
+        measured = [*counts, success, *figures(**rates)]
         # NaN, which a diverged world has, is handed on
         values = self.values
-        for metric, (value, side) in self.check.summaries.items():
-            metrics[metric] = float(getattr(values[value], side)())
-        metrics["ik_error_max_m"] = float(self.array("measured.ik_error_m").max())
+        for name, (key, side) in self.check.summaries.items():
+            value = float(getattr(values[key], side)())
+            measured.append(replace(self.check.figures[key], name=name, value=value))
+        ik_error = float(self.array("measured.ik_error_m").max())
+        measured.append(Figure("ik_error_max", ik_error, "m"))
         for name in ("contacts", "constraint_rows"):
-            metrics[f"peak_{name}_per_world"] = int(self.array(f"measured.peak_{name}").max())
+            peak = int(self.array(f"measured.peak_{name}").max())
+            measured.append(Figure(f"peak_{name}_per_world", peak))
         if self.several:
             for record in self.records:
-                metrics[f"seed{record.seed}.succeeded"] = int(record.succeeded.sum())
+                measured += figures(f"seed{record.seed}", succeeded=int(record.succeeded.sum()))
         broken = self.check.rules.failing(self.array("failed"))
-        return metrics | {f"failed.{rule}": len(episodes) for rule, episodes in broken.items()}
+        return measured + figures("failed", **{rule: len(which) for rule, which in broken.items()})
 
     @property
     def summary(self) -> str:
@@ -177,13 +184,13 @@ class EpisodeTally:
         parts: Sequence[str],
         *,
         passed: bool,
-        metrics: dict[str, float],
-        thresholds: dict[str, float],
+        figures: Sequence[Figure],
+        rate: float = -math.inf,
         tables: Sequence[Table] = (),
     ) -> GateResult:
         """The episodes as the gate's result, in words (``parts``) before failures and problems;
-        with a problem it has failed. Metrics, thresholds and tables add to those of the tally and
-        the check.
+        with a problem it has failed. Figures and tables add to those of the tally and the check.
+        ``rate`` is the least success rate that is wanted.
         """
         bits = self.array("failed")
         failed = np.flatnonzero(bits)
@@ -210,8 +217,7 @@ class EpisodeTally:
             name=self.gate,
             status=Status.passed if passed and not self.problems else Status.failed,
             reason="; ".join([*reason, *self.problems]) + look,
-            thresholds=self.check.thresholds() | thresholds,
-            metrics=self.metrics() | metrics,
+            figures=[*self.check.thresholds(), *self.figures(rate), *figures],
             beyond=beyond,
             notes=self.notes,
             details=named + self.details,
@@ -238,8 +244,7 @@ class EpisodeTally:
             names=self.names(plotted),
             broken=[rules.broken(failed) for failed in bits[plotted].tolist()],
             rules=rules.texts,
-            values={name: values[plotted] for name, values in self.values.items()},
-            limits=self.check.limits,
+            values=[(self.check.figures[key], v[plotted]) for key, v in self.values.items()],
         )
         # What the check judges, and what else differs
         index = stage.index

@@ -3,6 +3,7 @@
 from mjstack.episodes.run import Run, needs_episode
 from mjstack.gates.scene_physics import scene_faults
 from mjstack.gates.tracking import find_cause, loose_grips, start_contacts, waypoint_errors
+from mjstack.report.figure import Figure
 from mjstack.report.record import GateResult, Status
 from mjstack.robots import read_robot
 from mjstack.robots.guest import SAG, left_behind, object_left_behind
@@ -21,46 +22,44 @@ def run_baseline(run: Run) -> list[GateResult]:
         return [failed]
     sim = run.nominal.sim
     episode = run.nominal.episode
-    status, reason, metrics, beyond = run.judge_one(episode)
-    headline = run.stage.check.headline(metrics)
+    result, headline = run.judge_one("baseline", episode)
     run.print_line(f"{cfg.task.name} check: {headline}")
     timing = episode.timing
-    metrics |= {
-        "episode_s": timing.seconds,
-        "world_steps_per_s": timing.steps * cfg.timing.decimation / timing.seconds,
-        "peak_contacts": int(sim.peak_contacts[0]),
-        "peak_constraint_rows": int(sim.peak_constraints[0]),
-    }
-    thresholds = run.stage.check.thresholds()
+    result.notes["backend"] = sim.description
+    result.figures += [
+        Figure("episode", timing.seconds, "s"),
+        Figure("world_steps", timing.steps * cfg.timing.decimation / timing.seconds, "/s"),
+        Figure("peak_contacts", int(sim.peak_contacts[0])),
+        Figure("peak_constraint_rows", int(sim.peak_constraints[0])),
+    ]
     causes: list[str] = []
     loose = [*loose_grips(run.stage)]
     if errors := waypoint_errors(run.stage, run.nominal.states, run.nominal.targets):
         worst = max(errors, key=errors.__getitem__)
-        metrics["waypoint_error_m"] = errors[worst]
-        metrics["ik_error_m"] = float(episode.ik_error.max())
         # Beyond half of it a hand over an object and one at it cannot be told apart
-        thresholds["waypoint_error_m"] = 0.5 * cfg.robot.approach_height
-        thresholds["ik_error_m"] = cfg.controller.ik_tolerance
+        most = 0.5 * cfg.robot.approach_height
+        ik_error = float(episode.ik_error.max())
+        result.figures += [
+            Figure("waypoint_error", errors[worst], "m", high=most),
+            Figure("ik_error", ik_error, "m", high=cfg.controller.ik_tolerance),
+        ]
         if errors[worst] > SAG:
             end = run.stage.phase(worst).stop - 1
             cause = find_cause(run.stage, run.nominal.states[end], run.nominal.targets[end])
             miss = f"the arm is {1e3 * errors[worst]:.1f} mm off its target as {worst} ends"
             causes = [f"{miss}: {cause}"]
-        if not errors[worst] <= thresholds["waypoint_error_m"]:
-            status = Status.failed
-            beyond.append("waypoint_error_m")
-    if status is Status.failed:
+        if not errors[worst] <= most:
+            result.status = Status.failed
+            result.beyond.append("waypoint_error_m")
+    if result.status is Status.failed:
         contacts = [*start_contacts(run.stage, episode.start[0])]
-        reason = "; ".join(filter(None, (reason, *causes, *loose, *(contacts if causes else ()))))
+        reasons = (result.reason, *causes, *loose, *(contacts if causes else ()))
+        result.reason = "; ".join(filter(None, reasons))
         causes += contacts
+    result.reason = result.reason or headline
     world = run.nominal.world
     label = "baseline, native"
     run.show_world("baseline", label, world.qpos, episode, world.env, "baseline world")
-    result = GateResult(name="baseline", status=status, reason=reason or headline)
-    result.thresholds = thresholds
-    result.metrics = metrics
-    result.beyond = beyond
-    result.notes["backend"] = sim.description
     names = scene_names(cfg.scene)
     lines = left_behind(read_robot(cfg.robot, cfg.model), cfg.robot, run.stage.model, names)
     result.details += [f"robot's file: {line}" for line in lines]

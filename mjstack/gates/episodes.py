@@ -29,6 +29,7 @@ from mjstack.gates.regions import BOUNDS, find_regions, regions_table
 from mjstack.interrupt import check_interrupt
 from mjstack.math import wilson_interval
 from mjstack.mdp.starts.starts_file import start_arrays
+from mjstack.report.figure import Figure, figures
 from mjstack.report.page import MOST_WORLDS
 from mjstack.report.record import GateResult
 from mjstack.report.text import format_percent
@@ -71,15 +72,16 @@ def judge_episodes(run: Run) -> list[GateResult]:
     rate = float(succeeded.mean())
     ends = len(np.unique(tally.array("end")))
     starts = _count_distinct(tally.array("start_qpos"), 4)
-    metrics: dict[str, float] = {"distinct_final_states": ends, "episode_s": tally.seconds}
-    thresholds = {"success_rate_min": t.rate}
-    if t.distinct_fraction:
-        thresholds["distinct_fraction"] = t.distinct_fraction
+    measured = [
+        Figure("distinct_final_states", ends),
+        Figure("distinct_fraction", high=t.distinct_fraction),
+        Figure("episode", tally.seconds, "s"),
+    ]
     words = [f"{tally.summary}, {format_percent(t.rate)} wanted"]
     tables = []
     if succeeded.all():  # worlds that fail have no speed
         steps = sum(record.steps for record in tally.records)
-        metrics["world_steps_per_s"] = steps / tally.seconds
+        measured.append(Figure("world_steps", steps / tally.seconds, "/s"))
     # Worlds that start apart may end alike, as a peg in its hole does.
     if tally.episodes > 1 and max(ends, starts) < t.distinct_fraction * tally.episodes:
         problem = f"only {ends} distinct final states of {tally.episodes} episodes"
@@ -91,14 +93,14 @@ def judge_episodes(run: Run) -> list[GateResult]:
         retries = tally.array("retries")
         retried = int((retries > 0).sum())
         retried_succeeded = int(((retries > 0) & succeeded).sum())
-        metrics |= {
-            "distinct_starts": distinct,
+        measured += figures(
+            distinct_starts=distinct,
             **({} if lost is None else {"reached_and_lost": lost}),
-            "retried": retried,
-            "retries": int(retries.sum()),
-            "retried_succeeded": retried_succeeded,
-            "unreachable": int(tally.array("unreachable").sum()),
-        }
+            retried=retried,
+            retries=int(retries.sum()),
+            retried_succeeded=retried_succeeded,
+            unreachable=int(tally.array("unreachable").sum()),
+        )
         tally.notes["starts"] = _describe_start(cfg, run.gate)
         if retried:
             words.append(f"{retried} retried, {retried_succeeded} of them succeeded")
@@ -111,9 +113,7 @@ def judge_episodes(run: Run) -> list[GateResult]:
         tally.write(f"{run.gate}_regions.csv", write_atomic, to_csv(regions, ("object", *BOUNDS)))
         tables = regions_table(t.cell_episodes, regions)
     return [
-        tally.result(
-            words, passed=rate >= t.rate, metrics=metrics, thresholds=thresholds, tables=tables
-        )
+        tally.result(words, passed=rate >= t.rate, figures=measured, rate=t.rate, tables=tables)
     ]
 
 

@@ -15,10 +15,10 @@ from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
 from mjstack.errors import FolderError, MjstackError
 from mjstack.files import read_npz, reading, write_npz
+from mjstack.report.figure import Figure
 from mjstack.report.gl import require_offscreen
 from mjstack.report.picture import save_images
 from mjstack.report.record import GateResult
-from mjstack.report.table import Table
 from mjstack.sim import StateRenderer
 from mjstack.sim.cameras import thing_of, with_outputs
 
@@ -46,7 +46,7 @@ def compare_images(run: Run, result: GateResult) -> list[str]:
     """Render states of the reference episode with MJWarp and with native MuJoCo, and compare them.
 
     MJWarp's images and the states are kept in the run's folder. Where native MuJoCo cannot render,
-    another machine compares them with its own. The result gets figures, thresholds and notes.
+    another machine compares them with its own. The result gets figures and notes.
 
     Returns:
         The problems.
@@ -86,17 +86,11 @@ def compare_images(run: Run, result: GateResult) -> list[str]:
         rows[f"{name}, state {camera.worst}"] = [a, b, difference]
     columns = ["native MuJoCo", "MJWarp", f"difference x {_AMPLIFIED}"]
     run.draw(PICTURE, save_images, rows, columns)
-    result.thresholds |= {
-        "images.same_thing": limits.image_same,
-        "images.iou": limits.image_iou,
-        "images.color_of_255": limits.image_color,
-        "images.depth_m": limits.image_depth,
-    }
     return _report(stage, result, agreements)
 
 
 def _report(stage: Stage, result: GateResult, agreements: dict[str, _Agreement]) -> list[str]:
-    """Add figures and a table; return where images differ too much, and which cameras compared
+    """Add figures; return where images differ too much, and which cameras compared
     nothing but the background.
     """
     limits = stage.cfg.gate.parity
@@ -105,45 +99,39 @@ def _report(stage: Stage, result: GateResult, agreements: dict[str, _Agreement])
     least = f"gate.parity.image_pixels={limits.image_pixels}"
     problems = []
     for name, camera in agreements.items():
-        result.metrics |= {
-            f"images.{name}.same_thing": camera.same,
-            f"images.{name}.color_of_255": camera.color,
-            f"images.{name}.depth_m": camera.depth,
-            **{f"images.{name}.iou.{thing}": iou for thing, iou in camera.iou.items()},
-        }
-        same = f"{100 * camera.same:.2f} % of the pixels"
+        group = f"images.{name}"
+        figures = [
+            Figure(thing, iou, group=f"{group}.iou", low=limits.image_iou, limit="images.iou")
+            for thing, iou in camera.iou.items()
+        ]
+        same = Figure("same_thing", camera.same, low=limits.image_same)
+        color = Figure("color_of_255", camera.color, high=limits.image_color)
+        depth = Figure("depth", camera.depth, "m", high=limits.image_depth)
+        figures += [
+            replace(figure, group=group, limit=f"images.{figure.key}")
+            for figure in (same, color, depth)
+        ]
+        result.figures += figures
         stage.progress.print_line(
-            f"camera {name}: the same thing in {same}, IoU at least"
-            f" {min(camera.iou.values(), default=1.0):.4f}, colours within {camera.color:.2f} of"
-            " 255"
+            f"camera {name}: the same thing in {100 * camera.same:.2f} % of the pixels, IoU at"
+            f" least {min(camera.iou.values(), default=1.0):.4f}, colours within"
+            f" {camera.color:.2f} of 255"
         )
         if camera.left_out:
             result.details.append(
                 f"camera {name}: not compared, with fewer than {least} pixels:"
                 f" {', '.join(camera.left_out)}"
             )
-        alone = (
-            f"nothing but the background has {least} pixels, so nothing was compared; raise"
-            f" scene.cameras.{name}.size"
-        )
-        verdicts = {
-            alone: bool(camera.iou.keys() - background),
-            **{
-                f"IoU of {thing} is {iou:.4f}": iou >= limits.image_iou
-                for thing, iou in camera.iou.items()
-            },
-            f"{same} show the same thing": camera.same >= limits.image_same,
-            f"colours differ by {camera.color:.2f} of 255": camera.color <= limits.image_color,
-            f"depths differ by {camera.depth:.2g} m": camera.depth <= limits.image_depth,
-        }
-        problems += [f"camera {name}: {text}" for text, passes in verdicts.items() if not passes]
-    ious = [camera.iou for camera in agreements.values()]
-    rows = [
-        [thing, *(f"{iou[thing]:.4f}" if thing in iou else "-" for iou in ious)]
-        for thing in dict.fromkeys(thing for iou in ious for thing in iou)
-    ]
-    title = "Images of both backends: intersection over union of each thing"
-    result.tables.append(Table(header=["thing", *agreements], rows=rows, title=title))
+        if not camera.iou.keys() - background:
+            problems.append(
+                f"camera {name}: nothing but the background has {least} pixels, so nothing was"
+                f" compared; raise scene.cameras.{name}.size"
+            )
+        problems += [
+            f"{figure.label} is {figure.text(figure.value)}, expected {figure.allowed}"
+            for figure in figures
+            if not figure.holds(figure.value)
+        ]
     return problems
 
 

@@ -4,6 +4,8 @@ import copy
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import closing
+from dataclasses import replace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -17,6 +19,7 @@ from mjstack.episodes.run import Run, needs_episode
 from mjstack.gates.images import compare_images
 from mjstack.managers.episode import required_fields
 from mjstack.math import quat_angle, quat_to_matrix
+from mjstack.report.figure import Figure, figures
 from mjstack.report.record import GateResult, Status
 from mjstack.sim import Simulation, describe_overflow, make_simulation
 from mjstack.sim.native import NativeSimulation
@@ -50,13 +53,7 @@ def run_parity(run: Run) -> list[GateResult]:
 
 def _compare(run: Run, mjwarp: Simulation) -> GateResult:
     """The result of the gate, measured in one MJWarp world."""
-    cfg = run.cfg
-    result = GateResult(
-        name="parity",
-        status=Status.passed,
-        thresholds=run.stage.check.thresholds(),
-        notes={"backend": mjwarp.description},
-    )
+    result = GateResult(name="parity", status=Status.passed, notes={"backend": mjwarp.description})
     problems = compare_states(run, mjwarp, result)
     for option, (native, uploaded, equal) in compare_options(run.nominal.sim, mjwarp).items():
         line = f"option {option}: native {native}, uploaded {uploaded}"
@@ -65,23 +62,22 @@ def _compare(run: Run, mjwarp: Simulation) -> GateResult:
 
     world = WorldRecorder()
     episode = run.stage.play(mjwarp, run.cfg.gate.baseline.reset, [*run.viewers, world])
-    status, reason, judged, result.beyond = run.judge_one(episode)
-    if status is Status.failed:
-        problems.append(reason)
+    judged, headline = run.judge_one("parity", episode)
+    result.beyond = judged.beyond
+    problems += [judged.reason] if judged.reason else []
     if bits := int(mjwarp.overflow[0]):
         problems.append(f"{describe_overflow(bits)} overflow: raise batch.njmax or batch.nconmax")
-    result.metrics |= judged | {
-        "peak_contacts": int(mjwarp.peak_contacts[0]),
-        "peak_constraint_rows": int(mjwarp.peak_constraints[0]),
-        "episode_s": episode.timing.seconds,
-    }
+    peaks = figures(
+        peak_contacts=int(mjwarp.peak_contacts[0]),
+        peak_constraint_rows=int(mjwarp.peak_constraints[0]),
+    )
+    result.figures += [*judged.figures, *peaks, Figure("episode", episode.timing.seconds, "s")]
     apart, ends = _compare_ends(run, world.qpos[-1], result, rounded=not problems)
     problems += apart
-    if cfg.scene.cameras:
+    if run.cfg.scene.cameras:
         problems += compare_images(run, result)
 
-    headline = run.stage.check.headline(judged)
-    run.print_line(f"{cfg.task.name} check: {headline} ({mjwarp.description})")
+    run.print_line(f"{run.cfg.task.name} check: {headline} ({mjwarp.description})")
     run.show_world("parity", "parity, MJWarp", world.qpos, episode, world.env, "parity world")
     summary = "; ".join([headline, *ends])
     if "images" in result.notes:
@@ -143,9 +139,8 @@ def compare_states(run: Run, mjwarp: Simulation, result: GateResult) -> list[str
                     allowed = multiples[steps] * (allowed + rounding)
                 worst = int((apart[field] / allowed.clamp(min=1e-30)).argmax())
                 error, limit = float(apart[field][worst]), float(allowed[worst])
-                key = f"{name}.step{steps}.{field}"
-                result.metrics[key] = error
-                result.thresholds[key] = limit
+                group = f"{name}.step{steps}"
+                result.figures.append(Figure(field, error, group=group, high=limit))
                 if not error <= limit:
                     owner = _owner(model, field, worst)
                     text = f"{field} of {owner} differs by {error:.2g}, limit {limit:.2g}"
@@ -303,13 +298,10 @@ def _compare_ends(
     With ``rounded``, native MuJoCo plays the task in rounded worlds if one is off by more than the
     limits: they may be off from where it is in the nearest of these instead.
     """
-    limits = run.cfg.gate.parity
-    allowed = {"position_m": limits.object_position, "rotation_deg": limits.object_rotation_deg}
-    result.thresholds |= {f"final.{key}": limit for key, limit in allowed.items()}
 
     def shares(target: np.ndarray) -> dict[str, float]:
         return {
-            name: float(np.max([v / max(allowed[key], 1e-30) for key, v in gaps.items()]))
+            name: float(np.max([gap.value / max(gap.high, 1e-30) for gap in gaps]))
             for name, gaps in _ends_apart(run, end, target).items()
         }
 
@@ -326,8 +318,8 @@ def _compare_ends(
     problems = []
     farthest: dict[bool, tuple[float, str]] = {}  # object, and other joint
     for name, gaps in _ends_apart(run, end, native).items():
-        result.metrics |= {f"final.{name}.{key}": value for key, value in gaps.items()}
-        values = [(v, "deg") if "deg" in key else (1e3 * v, "mm") for key, v in gaps.items()]
+        result.figures += [replace(gap, group=f"final.{name}") for gap in gaps]
+        values = [(1e3 * f.value, "mm") if f.unit == "m" else (f.value, f.unit) for f in gaps]
         text = f"{name} ends {' and '.join(f'{v:.2f} {unit}' for v, unit in values)} from native's"
         problems += [] if share[name] <= 1.0 else [text]
         joint = name not in run.cfg.scene.objects
@@ -336,22 +328,30 @@ def _compare_ends(
     return problems, [text for _, text in farthest.values()]
 
 
-def _ends_apart(run: Run, *ends: np.ndarray) -> dict[str, dict[str, float]]:
-    """How far objects and joints that the robot does not command are apart at two ends [m, deg]."""
+def _ends_apart(run: Run, *ends: np.ndarray) -> dict[str, list[Figure]]:
+    """How far objects and joints that the robot does not command are apart at two ends."""
     model = run.stage.model
+    limits = run.cfg.gate.parity
     moved = np.empty(model.nv)
     mujoco.mj_differentiatePos(model, moved, 1.0, *ends)
-    out = {}
+    out: dict[str, list[Figure]] = {}
+    limit: dict[str, Any]
     for number, kind in enumerate(model.jnt_type):
         name = model.joint(number).name or f"joint {number}"
         if name in run.cfg.robot.joints:
             continue
         slid, turned = np.split(moved[model.dof_jntid == number], [_SLIDES.get(int(kind), 0)])
-        pairs = {"position_m": slid, "rotation_deg": np.degrees(turned)}
-        out[name] = {key: float(np.linalg.norm(part)) for key, part in pairs.items() if part.size}
-        if thing := run.cfg.scene.objects.get(name):
-            quats = [torch.from_numpy(q[model.jnt_qposadr[number] :][3:7]) for q in ends]
-            out[name]["rotation_deg"] = math.degrees(turn_between(thing.shape, *quats))
+        gaps = out.setdefault(name, [])
+        if slid.size:
+            limit = {"high": limits.object_position, "limit": "final.position_m"}
+            gaps.append(Figure("position", float(np.linalg.norm(slid)), "m", **limit))
+        if turned.size:
+            angle = math.degrees(np.linalg.norm(turned))
+            if thing := run.cfg.scene.objects.get(name):
+                quats = [torch.from_numpy(q[model.jnt_qposadr[number] :][3:7]) for q in ends]
+                angle = math.degrees(turn_between(thing.shape, *quats))
+            limit = {"high": limits.object_rotation_deg, "limit": "final.rotation_deg"}
+            gaps.append(Figure("rotation", angle, "deg", **limit))
     return out
 
 

@@ -21,7 +21,6 @@ from mjstack.report.record import GateResult, Status
 log = logging.getLogger(__name__)
 
 Gate = Callable[[Run], list[GateResult]]
-_RATE = "_per_s.median"
 
 
 def find_gates(cfg: Config) -> dict[str, Gate]:
@@ -121,10 +120,11 @@ def _in_each_rank(run: Run, gate: Gate) -> list[GateResult]:
             if part.status is Status.failed and result.status is not Status.failed:
                 result.status = Status.failed
                 result.reason = f"rank {rank}: {part.reason}"
-        for key in [key for key in result.metrics if key.endswith(_RATE)]:
-            if all(key in part.metrics for part in later):
-                rates = (part.metrics[key] for part in (result, *later))
-                result.metrics[f"all_ranks.{key}"] = sum(rates)
+        for figure in [f for f in result.figures if f.unit == "/s" and f.column == "median"]:
+            if all(figure.key in part.metrics for part in later):
+                total = sum(part.metrics[figure.key] for part in (result, *later))
+                group = f"all_ranks.{figure.group}"
+                result.figures.append(replace(figure, value=total, group=group))
     return results
 
 

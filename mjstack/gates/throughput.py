@@ -15,6 +15,7 @@ from mjstack.episodes.rollout import lacks_episode
 from mjstack.episodes.run import Run, each_rank
 from mjstack.errors import MjstackError
 from mjstack.gates.runner import log_error
+from mjstack.report.figure import Figure, figures
 from mjstack.report.gl import require_offscreen
 from mjstack.report.record import GateResult, Status
 
@@ -53,7 +54,7 @@ def _measure(run: Run, gate: str, backend: Backend, device: str) -> GateResult:
         return result
     began = time.perf_counter()
     on_cuda = device.startswith("cuda")
-    result.metrics = {"worlds": cfg.nworld}
+    result.figures = figures(worlds=cfg.nworld)
 
     # The measurements
     worlds = (run, backend, device, result)
@@ -66,7 +67,7 @@ def _measure(run: Run, gate: str, backend: Backend, device: str) -> GateResult:
 
     # Whether they count
     episode = measured.get("episode", Measurement(name="episode"))
-    if episode.facts.get("succeeded", cfg.nworld) < cfg.nworld:
+    if episode.failed:
         for part in measured.values():
             part.problem = part.problem or f"the episode failed, and {_UNVERIFIED}"
     verified = batch is not None and batch.status is Status.passed
@@ -75,11 +76,11 @@ def _measure(run: Run, gate: str, backend: Backend, device: str) -> GateResult:
     if not verified and not lacks_episode(cfg):
         result.reason += " (the task was not verified in this run: add batch to gates)"
     for part in measured.values():
-        result.metrics |= part.metrics()
+        result.figures += part.figures()
         result.notes |= part.named_notes()
     if not any(part.problem for part in measured.values()):
-        figures = any(part.samples for part in measured.values())
-        result.status = Status.passed if figures else Status.skipped
+        sampled = any(part.samples for part in measured.values())
+        result.status = Status.passed if sampled else Status.skipped
     if result.status is not Status.skipped:
         result.seconds = time.perf_counter() - began
     return result
@@ -90,7 +91,7 @@ def _describe(measured: Measurement, on_cuda: bool) -> str:
         return f"no figure: {measured.problem}"
     if measured.missing:
         return f"not measured: {measured.missing}"
-    eager = on_cuda and not measured.facts["captured"]
+    eager = on_cuda and not measured.captured
     return f"{measured.headline} (eager)" if eager else measured.headline
 
 
@@ -113,7 +114,7 @@ def _on_driven_worlds(
     except Exception as error:
         problem = log_error(error)
         return measured | {name: Measurement(name=name, problem=problem) for name in names}
-    result.metrics["build_and_compile_s"] = time.perf_counter() - began
+    result.figures.append(Figure("build_and_compile", time.perf_counter() - began, "s"))
     result.notes["backend"] = sim.description
     if sim.sizes is not None:
         result.notes["sizes"] = str(sim.sizes)
@@ -147,13 +148,17 @@ def _on_environment(
     gc.collect()
     began = time.perf_counter()
     worlds = build_env(
-        cfg, model=run.stage.model, backend=backend, device=device, sizes=run.stage.env_sizes
+        cfg,
+        model=run.stage.model,
+        backend=backend,
+        device=device,
+        sizes=run.stage.measured.get("env"),
     )
     build_seconds = time.perf_counter() - began
     with closing(worlds) as env:
         result.notes.setdefault("backend", env.sim.description)
         measured = measure_env_step(env, name, run.stage.progress.advance)
-        measured.facts["build_and_compile_s"] = build_seconds
+        measured.facts.append(Figure("build_and_compile", build_seconds, "s"))
         if env.sim.sizes is not None:
             measured.notes["sizes"] = str(env.sim.sizes)
         return measured

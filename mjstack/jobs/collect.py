@@ -39,6 +39,7 @@ from mjstack.jobs.collect_plan import (
 )
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import CheckedJob, Job
+from mjstack.report.figure import Figure, figures
 from mjstack.report.record import GateResult, Status
 
 _SPARE = 1.05  # worlds played over episodes that are missing: some fail
@@ -248,13 +249,10 @@ class Collection:
             name=NAME,
             status=status,
             seconds=seconds,
-            thresholds={"episodes": self._job.episodes},
-            metrics={
-                "episodes": self.committed,
-                "episodes_of_this_call": new,
-                "steps": self.writer.frames,
-                "megabytes": size,
-            },
+            figures=[
+                Figure("episodes", self.committed, low=self._job.episodes, limit="episodes"),
+                *figures(episodes_of_this_call=new, steps=self.writer.frames, megabytes=size),
+            ],
             notes={"dataset": str(self.path), "config_sha256": self._plan.spec.config_sha256},
         )
         asked = f"{self.committed:,} episodes, {self._job.episodes:,} asked for"
@@ -264,8 +262,11 @@ class Collection:
             result.notes["seeds"] = f"{self.batches[0].seed} to {self.batches[-1].seed}"
             worlds = sum(batch.worlds for batch in self.batches)
             succeeded = sum(batch.succeeded for batch in self.batches)
-            result.metrics |= {"worlds_played": worlds, **rate_metrics(succeeded, worlds)}
-            result.metrics["retries"] = sum(batch.retries for batch in self.batches)
+            result.figures += figures(
+                worlds_played=worlds,
+                **rate_metrics(succeeded, worlds),
+                retries=sum(batch.retries for batch in self.batches),
+            )
             driver = self._stage.driver_class.noun
             share = f"{succeeded:,} of {worlds:,} worlds ({100.0 * succeeded / worlds:.4g} %)"
             reasons.append(f"the {driver} succeeded in {share}")
@@ -274,10 +275,12 @@ class Collection:
 
         # This call
         if new:
-            result.metrics["episodes_per_s"] = new / seconds
+            result.figures.append(Figure("episodes", new / seconds, "/s"))
             if self._plan.spec.videos:
-                result.metrics["drawing_s"] = self._source.drawing
-                result.metrics["encoding_wait_s"] = self.writer.waited
+                result.figures += [
+                    Figure("drawing", self._source.drawing, "s"),
+                    Figure("encoding_wait", self.writer.waited, "s"),
+                ]
             reasons.append(f"{new / seconds:.3g} episodes/s in all")
         elif self.committed >= self._job.episodes:
             reasons.append("they were there already")

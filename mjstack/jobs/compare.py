@@ -30,6 +30,7 @@ from mjstack.jobs.gates import check_machine
 from mjstack.jobs.runner import CheckedJob, Job
 from mjstack.math import mcnemar_p_value
 from mjstack.mdp.starts.starts_file import start_arrays
+from mjstack.report.figure import figures
 from mjstack.report.page import World
 from mjstack.report.record import GateResult, Status
 from mjstack.report.sweep_picture import Plot, save_sweep
@@ -41,11 +42,10 @@ TABLE = "compare.csv"
 _SIDES = ("a", "b")
 _PAGE_WORLDS = 8  # worlds on the page that only one side won, of each side
 _LEVEL = 0.05  # of significance
-_ENDS = {"min": "low", "max": "high"}  # of the picture's whiskers, in metrics of a rate
 _ROUNDING = 1e-6  # [m, rad], by which equal starts on two backends or devices may differ
 _PANELS = {
-    "success rate, 95 % interval": "success_rate",
-    "episodes that only this one won": "only",
+    "success rate, 95 % interval": {"": "success_rate"},
+    "episodes that only this one won": {"": "only"},
 }
 
 Sides = Mapping[str, Stage]
@@ -120,8 +120,7 @@ def _compare(sides: Sides, notes: Mapping[str, str], folder: Path, run: Run) -> 
         m |= {f"only_{name}": int(alone.sum()), **{f"{name}.{key}": v for key, v in rate.items()}}
         broken = rules.failing(lost[alone])
         m |= {f"only_{name}.failed.{rule}": len(worlds) for rule, worlds in broken.items()}
-        ends = {f"success_rate_{end}": rate[f"success_rate_{at}95"] for end, at in _ENDS.items()}
-        bars.append({"side": name, "status": "pass", "only": m[f"only_{name}"]} | rate | ends)
+        bars.append({"side": name, "only": m[f"only_{name}"]} | rate)
         won = [
             {"seed": run.cfg.seed + seed, "world": world, "succeeded": name}
             | {"rules": " ".join(rules.broken(lost[seed, world]))}
@@ -155,7 +154,7 @@ def _compare(sides: Sides, notes: Mapping[str, str], folder: Path, run: Run) -> 
             reason=f"{verdict} (McNemar's exact test, p = {p_value:.3g}): of {m['episodes']}"
             f" episodes a succeeded in {m['a.succeeded']} and b in {m['b.succeeded']}, only a in"
             f" {m['only_a']}, only b in {m['only_b']}",
-            metrics=m,
+            figures=figures(**m),
             notes={**notes, "table": TABLE},
             tables=[table] if table.rows else [],
         )

@@ -22,6 +22,7 @@ from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import CheckedJob, Job, model_bytes
 from mjstack.policy.checkpoint import policy_facts
 from mjstack.policy.onnx import require_onnx, to_onnx
+from mjstack.report.figure import Figure
 from mjstack.report.record import GateResult, Status
 from mjstack.version import __version__
 
@@ -83,13 +84,13 @@ def export_policy(stage: Stage, folder: Path) -> list[GateResult]:
         raise FolderError(problem, "Make room, or set hydra.run.dir to another") from error
     width = sum(policy.widths.values())
     shape = f"{policy.network.chunk} x {policy.network.width} numbers of its action terms"
-    sizes = {f"{name.replace('.', '_')}_mb": len(data) / 1e6 for name, data in files.items()}
+    sizes = [Figure(n.replace(".", "_"), len(data) / 1e6, "MB") for n, data in files.items()]
     return [
         GateResult(
             name=NAME,
             status=Status.passed,
             reason=f"{folder}: {', '.join(files)}: {width} numbers observed, {shape}",
-            metrics={"inputs": width, **sizes},
+            figures=[Figure("inputs", width), *sizes],
             notes={"policy": str(policy.folder)},
         )
     ]

@@ -69,8 +69,8 @@ def _check_starts(stage: Stage) -> None:
     cfg = stage.cfg
     if "capacity" in cfg.gates:
         with suppress(Unreachable):  # the gate reports it
-            driven = driven_config(cfg, cfg.gate.capacity.reset)
-            check_env(stage, driven, reset="gate.capacity.reset")
+            driven = driven_config(cfg, cfg.gate.success.reset)
+            check_env(stage, driven, reset="gate.success.reset")
     for gate in cfg.episode_gates:
         driven = driven_config(gate_config(cfg, gate))
         if driven.reset != cfg.reset:

@@ -20,6 +20,7 @@ from mjstack.gates.runner import run_guarded
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import VIEWS, CheckedJob, Job
 from mjstack.jobs.showing import check_showing
+from mjstack.report.figure import figures
 from mjstack.report.gl import require_offscreen
 from mjstack.report.page import World
 from mjstack.report.picture import save_video
@@ -81,9 +82,9 @@ def play_worlds(run: Run) -> list[GateResult]:
         sim = batch.env.sim
         outcome = "not judged: the task has no check"
         if judged:
-            status, outcome, metrics, _ = run.judge_one(batch.episode)
-            succeeded += status is Status.passed
-            outcome = outcome or f"succeeded, {stage.check.headline(metrics)}"
+            played, headline = run.judge_one(NAME, batch.episode)
+            succeeded += played.status is Status.passed
+            outcome = played.reason or f"succeeded, {headline}"
         qpos = recorder.qpos
         seen = draw_seen(stage, qpos, sim) if cfg.video and job.camera is None else {}
         (fields,) = world_fields(stage, batch.env, [0])
@@ -94,7 +95,7 @@ def play_worlds(run: Run) -> list[GateResult]:
         result.notes["backend"] = sim.description
         run.print_line(result.details[-1])
     result.reason = f"{succeeded} of {cfg.nworld} worlds succeeded" if judged else outcome
-    result.metrics = {"worlds": cfg.nworld, **({"succeeded": succeeded} if judged else {})}
+    result.figures = figures(worlds=cfg.nworld, **({"succeeded": succeeded} if judged else {}))
     if cfg.video:
         _save(run, worlds, looks, result)
     return [result]

@@ -28,6 +28,7 @@ from mjstack.gates.runner import run_guarded
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import VIEWS, CheckedJob, Job, run_provenance
 from mjstack.jobs.showing import check_showing
+from mjstack.report.figure import figures
 from mjstack.report.record import GateResult, Status
 from mjstack.report.table import Table
 from mjstack.sim import resolve_backend, resolve_device
@@ -231,7 +232,7 @@ def _replay(
         episode = next(batches).episode
         lines = trace.explain(episode)
         qpos = trace.arrays["qpos"]
-        status, reason, metrics, beyond = run.judge_one(episode)
+        result, headline = run.judge_one(f"replay_{backend}", episode)
         title = f"world {plan.world} of seed {plan.seed}, replayed ({backend})" if first else ""
         label = f"{plan.world}, {backend}"
         run.show_world(f"replay_{backend}", label, qpos, episode, trace.env, title)
@@ -243,18 +244,12 @@ def _replay(
     ends = {"backend": episode.description, "failed": int(episode.failed[0])}
     write_npz(folder / name, facts | ends | trace.arrays)
     recorded = check.rules.describe(plan.bits[plan.seed][plan.world]) or "succeeded"
-    return [
-        GateResult(
-            name=f"replay_{backend}",
-            status=status if agrees else Status.failed,
-            reason=f"{reason or f'succeeded, {check.headline(metrics)}'}; {comparison}",
-            thresholds=check.thresholds(),
-            metrics=facts | metrics,
-            beyond=beyond,
-            notes={"backend": episode.description, "recorded": recorded, "trajectory": name},
-            details=lines + changes,
-        )
-    ]
+    result.status = result.status if agrees else Status.failed
+    result.reason = f"{result.reason or f'succeeded, {headline}'}; {comparison}"
+    result.figures = figures(**facts) + result.figures
+    result.notes = {"backend": episode.description, "recorded": recorded, "trajectory": name}
+    result.details = lines + changes
+    return [result]
 
 
 def _first_sign(monitor: FailureMonitor, episode: Episode) -> str:
@@ -344,7 +339,7 @@ def _play_failing(
             status=Status.failed if again else Status.passed,
             reason=f"{again} of {len(played)} failing worlds fail again ({rate}, 95 % interval"
             f" {interval}), {same} by the same rules",
-            metrics={"worlds": len(played), "fail_again": again, "by_the_same_rules": same},
+            figures=figures(worlds=len(played), fail_again=again, by_the_same_rules=same),
             notes={"backend": f"{backend} on {device}", "table": TABLE},
             tables=[Table.of(columns, table_rows, f"Failing worlds (all of them: {TABLE})")],
         )

@@ -54,7 +54,7 @@ def write_summary(
         title=title,
         over=over,
         lines=swept[1:],
-        panels={name: name for name in _headlines(rows)[:_PANELS]},
+        panels={name: {"": name} for name in _headlines(rows)[:_PANELS]},
     )
     picture = folder / "summary.png"
     problem = ""

@@ -24,16 +24,14 @@ from mjstack.gates.runner import run_guarded
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import CheckedJob, Job
 from mjstack.jobs.showing import check_showing
-from mjstack.report.picture import save_curves
+from mjstack.report.figure import Figure
 from mjstack.report.record import GateResult, Status
+from mjstack.report.sweep_picture import Plot, save_sweep
 from mjstack.report.table import Table
-from mjstack.report.text import label
 from mjstack.train.trainer import FAILED, LAST, Trainer, whole_starts
 
 NAME = "train"
 CONFIG = "training.json"  # the configuration of the training in the folder
-_TIMES = ("expert_s", "training_s")  # metrics of a training: parts of its time
-_ENDS = ("low", "high")  # of an interval
 
 
 def training_fingerprint(cfg: Config) -> dict[str, Any]:
@@ -91,9 +89,9 @@ def _run(trainer: Trainer, run: Run, folder: Path) -> None:
         judged = run.on(judged_stage(run.stage, folder / LAST))
         run_guarded(judged, "success", judge_episodes)
         trained = run.artifacts.results[NAME]
-        times = {name: trained.metrics[name] for name in _TIMES if name in trained.metrics}
-        times["judgement_s"] = judged.artifacts.results["success"].seconds
-        rows = [[label(name), f"{seconds:.1f} s"] for name, seconds in times.items()]
+        judgement = Figure("judgement", judged.artifacts.results["success"].seconds, "s")
+        times = [figure for figure in trained.figures if figure.unit == "s"]
+        rows = [[f.label, f"{f.value:.1f} s"] for f in (*times, judgement)]
         trained.tables.append(Table(title="Time", header=["part", "time"], rows=rows))
 
 
@@ -123,17 +121,13 @@ def _train(trainer: Trainer, folder: Path, run: Run) -> list[GateResult]:
     if run.stage.ranks.writes:
         write_atomic(folder / f"{NAME}.csv", to_csv(rows))
         title = f"{run.cfg.robot.title}, task {run.cfg.task.name}: training"
-        lines = {words[name]: [row[name] for row in rows] for name in trained.lines}
-        at = [row[trained.abscissa] for row in rows]
-        bands = {
-            words[name]: [[row[f"{name}_{end}95"] for row in rows] for end in _ENDS]
-            for name in trained.lines
-            if all(f"{name}_low95" in row for row in rows)
-        }
-        picture = (at, lines, title, trained.abscissa, trained.scale, bands)
-        run.draw(f"{NAME}.png", save_curves, *picture)
+        curves = {words[name]: name for name in trained.lines}
+        plot = Plot(
+            title=title, over=trained.abscissa, lines=[], panels={"": curves}, log=trained.log
+        )
+        run.draw(f"{NAME}.png", save_sweep, plot, rows)
     seconds = time.perf_counter() - began
-    figures = ", ".join(f"{words[name]} {last[name]:.4g}" for name in trained.lines)
+    reached = ", ".join(f"{words[name]} {last[name]:.4g}" for name in trained.lines)
     rules = {name.removeprefix(FAILED): name for name in last if name.startswith(FAILED)}
     columns = {words[name]: name for name in last if name not in rules.values()}
     tables = [Table.of(columns, rows, "Curve")]
@@ -145,9 +139,9 @@ def _train(trainer: Trainer, folder: Path, run: Run) -> list[GateResult]:
             name=NAME,
             status=Status.passed,
             reason=f"{trained.notes['policy']} after {trained.abscissa}"
-            f" {last[trained.abscissa]:,}: {figures}",
+            f" {last[trained.abscissa]:,}: {reached}",
             seconds=seconds,
-            metrics=trained.metrics,
+            figures=trained.figures,
             notes=trained.notes,
             tables=tables,
         )

@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from mjstack.report.figure import Figure
+
 MOST_WORLDS = 64  # in motion, of a page
 
 
@@ -38,19 +40,17 @@ class Worlds:
         names: Of the episodes, as ``world=`` of job=replay takes them.
         broken: The rules that each episode broke; empty where it succeeded.
         rules: The rules in words, by name.
-        values: Measurements by name with unit, each of shape ``(n,)``.
+        values: Measured values, each of shape ``(n,)``, and their figures.
         maps: Where judged objects, moved bodies and drawn places were.
         unjudged: Names of objects that have no map, because the task's check does not read them.
-        limits: The least and the largest of measurements for which a rule holds, by name.
     """
 
     names: Sequence[str]
     broken: Sequence[Sequence[str]]
     rules: Mapping[str, str]
-    values: Mapping[str, np.ndarray]
+    values: Sequence[tuple[Figure, np.ndarray]]
     maps: list[Map] = field(default_factory=list)
     unjudged: list[str] = field(default_factory=list)
-    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)

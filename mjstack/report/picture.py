@@ -331,26 +331,3 @@ def save_images(
                 axis.set(xticks=[], yticks=[])
         for axis, name in zip(axes[0], columns, strict=True):
             axis.set_title(name)
-
-
-def save_curves(
-    path: Path,
-    at: Sequence[float],
-    lines: Mapping[str, Sequence[float]],
-    title: str,
-    label: str,
-    scale: str,
-    bands: Mapping[str, Sequence[Sequence[float]]],
-) -> None:
-    """Plot values over a number that counts, on a ``log`` or ``linear`` scale, a line for each by
-    its name; ``bands`` are the lower and the upper ends of their intervals, for those that have
-    some.
-    """
-    with figure(path, title, figsize=(7.5, 4.5)) as (_, axes):
-        for name, values in lines.items():
-            axes.plot(at, values, ".-", label=name)
-            if name in bands:
-                axes.fill_between(at, *bands[name], alpha=0.2)
-        axes.set(xlabel=label, yscale=scale)
-        axes.grid(alpha=0.3, which="both")
-        axes.legend(frameon=False)

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 
+from mjstack.report.figure import Figure
 from mjstack.report.table import Table
 
 Provenance = dict[str, str | int | list[str] | dict[str, str] | None]
@@ -27,9 +28,8 @@ class GateResult:
         status: pass, fail or skip.
         reason: Why, in one line; empty where a pass needs no word.
         seconds: Wall time.
-        thresholds: Required values, by name with unit.
-        metrics: Measured values, by name with unit; numbers alone.
-        beyond: Names of those that broke a rule's threshold.
+        figures: Measured values, and required ones.
+        beyond: Keys of those that broke a rule's threshold.
         notes: Facts in words, by name: the backend, why something was not measured.
         details: Longer findings, a line each, for the report's text.
         tables: Tables for the report's text.
@@ -39,12 +39,21 @@ class GateResult:
     status: Status
     reason: str = ""
     seconds: float = 0.0
-    thresholds: dict[str, float] = field(default_factory=dict)
-    metrics: dict[str, float] = field(default_factory=dict)
+    figures: list[Figure] = field(default_factory=list)
     beyond: list[str] = field(default_factory=list)
     notes: dict[str, str] = field(default_factory=dict)
     details: list[str] = field(default_factory=list)
     tables: list[Table] = field(default_factory=list)
+
+    @property
+    def metrics(self) -> dict[str, float]:
+        """Measured values, by key."""
+        return {f.key: f.value for f in self.figures if f.value is not None}
+
+    @property
+    def thresholds(self) -> dict[str, float]:
+        """Required values, by key."""
+        return dict(limit for figure in self.figures for limit in figure.thresholds())
 
 
 @dataclass(kw_only=True, slots=True)

@@ -4,7 +4,6 @@ plots as SVG: histograms, and maps of the table.
 
 import itertools
 import math
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -12,10 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
+from mjstack.report.figure import Figure
 from mjstack.report.page import Map, Page, Worlds
 from mjstack.report.record import GateResult, Report
 from mjstack.report.table import Marked, Table
-from mjstack.report.text import format_percent, format_value, label, unit_ending, with_unit
+from mjstack.report.text import format_percent, format_value
 
 _POINTS = 3000  # starts in a map: a page of more is slow
 _NAMES = 12  # episodes of a rule
@@ -110,103 +110,59 @@ def _parts(gate: GateResult, worlds: Mapping[str, Worlds]) -> Iterator[Part]:
     """Result, episodes, tables with every number once, remarks."""
     yield gate.reason
     if gate.name in worlds and len(worlds[gate.name].names):
-        yield from _episode_parts(worlds[gate.name], gate.thresholds)
-    metrics = dict(gate.metrics)
-    thresholds = dict(gate.thresholds)
-    yield from _take_limited(metrics, thresholds)
+        yield from _episode_parts(worlds[gate.name])
     yield from gate.tables
-    yield from _take_matrices(metrics)
-    yield from _beside_limits(metrics, thresholds, gate.beyond)
+    yield from _figure_tables(gate.figures)
     if gate.notes:
-        rows = [[label(name), format_value(value)] for name, value in gate.notes.items()]
+        rows = [[name.replace("_", " "), text] for name, text in gate.notes.items()]
         yield Table(title="Notes", header=["note", ""], rows=rows)
     yield gate.details
 
 
-def _take_limited(metrics: dict[str, float], thresholds: dict[str, float]) -> Iterator[Table]:
-    """Metrics ``STATE.GROUP.NAME`` with a threshold of this name or ``GROUP.NAME``, taken out of
-    both mappings: a row per state and group, in which each stands beside its limit.
+def _figure_tables(figures: Sequence[Figure]) -> Iterator[Table]:
+    """Every figure once: groups with the same columns as a table with a row each, others in a row
+    of their own beside what is required; then requirements alone.
     """
-    cells: dict[str, dict[str, str]] = {}
-    limits = set()
-    for name in list(metrics):
-        state, _, quantity = name.partition(".")
-        group, dot, column = quantity.rpartition(".")
-        key = name if name in thresholds else quantity
-        if not dot or key not in thresholds:
-            continue
-        limits.add(key)
-        limit = float(thresholds[key])
-        value = float(metrics.pop(name))
-        grade = "good" if value <= 0.5 * limit else "near" if value <= limit else "bad"
-        row = cells.setdefault(f"{label(state)}, {label(group)}", {})
-        row[column] = Marked(f"{format_value(value)} / {format_value(limit)}", grade=grade)
-    for quantity in limits:
-        del thresholds[quantity]
-    columns = list(dict.fromkeys(column for row in cells.values() for column in row))
-    rows = [[name, *(row.get(column, "") for column in columns)] for name, row in cells.items()]
-    if rows:
-        yield Table(title="Found / allowed", header=["state", *columns], rows=rows)
-
-
-def _take_matrices(metrics: dict[str, float]) -> Iterator[Table]:
-    """Metrics ``ROW.COLUMN`` of which several rows have the same columns, or one row a median and
-    its range, taken out of the mapping.
-    """
-    rows: dict[str, list[str]] = {}
-    for name in metrics:
-        row, dot, column = name.rpartition(".")
-        if dot:
-            rows.setdefault(row, []).append(column)
+    groups: dict[str, list[Figure]] = {}
+    for figure in figures:
+        if figure.value is not None:
+            groups.setdefault(figure.row, []).append(figure)
     alike: dict[tuple[str, ...], list[str]] = {}
-    for row, names in rows.items():
-        alike.setdefault(tuple(names), []).append(row)
-    for columns, names in alike.items():
-        if len(names) < 2 and columns != _SPREAD:
-            continue
-        body = []
-        for name in names:
-            cells = [
-                with_unit(column if unit_ending(column) else name, metrics.pop(f"{name}.{column}"))
-                for column in columns
-            ]
-            body.append([label(name), *cells])
-        yield Table(title="Figures", header=["", *map(label, columns)], rows=body)
-
-
-def _beside_limits(
-    metrics: Mapping[str, float], thresholds: Mapping[str, float], beyond: Sequence[str]
-) -> Iterator[Table]:
-    """Measured values beside their limits, in red where a threshold broke."""
-    broken = {*beyond, *(name.rpartition(".")[2] for name in beyond)}
-    required = {name: with_unit(name, value) for name, value in thresholds.items()}
+    for row, members in groups.items():
+        alike.setdefault(tuple(figure.title for figure in members), []).append(row)
     rows = []
-    for name, value in metrics.items():
-        limits = _limits_of(name, thresholds)
-        cell = " to ".join(with_unit(limit, thresholds[limit]) for limit in limits)
-        measured = with_unit(name, value)
-        names = {name, *(limit.removesuffix(unit_ending(limit)) for limit in limits)}
-        grade = "" if broken.isdisjoint(names) else "bad"
-        rows.append([label(name), Marked(measured, grade=grade), cell])
-        required = {name: text for name, text in required.items() if name not in limits}
-    rows += [[label(name), "", text] for name, text in required.items()]
+    for columns, names in alike.items():
+        if len(names) > 1 or columns == _SPREAD:
+            body = [[name, *map(_cell, groups[name])] for name in names]
+            yield Table(title="Figures", header=["", *columns], rows=body)
+            continue
+        for figure in groups[names[0]]:
+            measured = Marked(figure.text(figure.value), grade=_grade(figure))
+            rows.append([figure.label, measured, figure.allowed])
     if rows:
         yield Table(title="Values", header=["", "measured", "required"], rows=rows)
+    if rows := [[f.label, f.text(f.high)] for f in figures if f.value is None]:
+        yield Table(title="Thresholds", header=["", "required"], rows=rows)
 
 
-def _limits_of(name: str, thresholds: Mapping[str, float]) -> list[str]:
-    """Thresholds of a measurement: its name, or with ``_min``, ``_max`` before the unit."""
-    unit = unit_ending(name)
-    stem = name.removesuffix(unit)
-    for base in (stem, re.sub("_(min|max)$", "", stem)):
-        for ends in (("",), ("_min", "_max")):
-            limits = [f"{base}{end}{unit}" for end in ends]
-            if limits := [limit for limit in limits if limit in thresholds]:
-                return limits
-    return []
+def _cell(figure: Figure) -> str:
+    """A figure with its limit, if it has one, and how near it is."""
+    limit = "".join(f" / {format_value(limit)}" for limit in figure.limits)
+    text = format_value(figure.value) + limit if limit else figure.text(figure.value)
+    return Marked(text, grade=_grade(figure))
 
 
-def _episode_parts(worlds: Worlds, thresholds: Mapping[str, float]) -> Iterator[Part]:
+def _grade(figure: Figure) -> str:
+    """Good, near or bad by its limits; empty without any."""
+    if not figure.limits:
+        return ""
+    if not figure.holds(figure.value):
+        return "bad"
+    near = math.isinf(figure.low) and not figure.holds(2.0 * figure.value)
+    return "near" if near else "good"
+
+
+def _episode_parts(worlds: Worlds) -> Iterator[Part]:
     """Rate, failures by rule, histograms of what was measured, and maps of the starts."""
     count = len(worlds.names)
     failed = np.array([bool(broken) for broken in worlds.broken])
@@ -223,12 +179,7 @@ def _episode_parts(worlds: Worlds, thresholds: Mapping[str, float]) -> Iterator[
         rows.append([outcome, worlds.rules.get(outcome, ""), f"{len(names):,}", bar, listed])
     header = ["outcome", "meaning", "episodes", "share", "which"]
     yield Table(title="Outcomes", header=header, rows=rows)
-    histograms = []
-    for name, values in worlds.values.items():
-        ends = {float(thresholds[end]) for end in _limits_of(name, thresholds)}
-        low, high = worlds.limits.get(name, (0.0, math.inf))
-        ends |= {end for end in (low or math.inf, high) if math.isfinite(end)}
-        histograms.append(histogram(name, values, failed, sorted(ends)))
+    histograms = [histogram(figure, values, failed) for figure, values in worlds.values]
     if any(histograms):
         text = "Number of episodes; failed ones in red on top, thresholds dashed."
         yield Plots(title="Over the worlds", text=text, figures=histograms)
@@ -249,15 +200,15 @@ def _episode_parts(worlds: Worlds, thresholds: Mapping[str, float]) -> Iterator[
         yield Plots(title="Over the table", text=text, figures=figures)
 
 
-def histogram(name: str, values: np.ndarray, failed: np.ndarray, limits: Sequence[float]) -> str:
-    """A figure of the distribution of a value; empty where all are the same."""
+def histogram(figure: Figure, values: np.ndarray, failed: np.ndarray) -> str:
+    """The distribution of a figure's values, with its limits; empty where all are the same."""
     finite = np.isfinite(values)
     numbers = values[finite].astype(float)
     span = np.ptp(numbers) if len(numbers) else 0.0
     if not span > 1e-9 * np.abs(numbers).max(initial=1e-12):
         return ""
     # A threshold far away would squeeze the bars into one.
-    near = [x for x in limits if numbers.min() - span <= x <= numbers.max() + span]
+    near = [x for x in figure.limits if numbers.min() - span <= x <= numbers.max() + span]
     low = float(min([numbers.min(), *near]))
     high = float(max([numbers.max(), *near]))
     edges = np.linspace(low, high, _BINS + 1)
@@ -269,7 +220,7 @@ def histogram(name: str, values: np.ndarray, failed: np.ndarray, limits: Sequenc
     for k, (lost, total) in enumerate(zip(losses, totals, strict=True)):
         if not total:
             continue
-        ends = " to ".join(with_unit(name, float(edge)) for edge in edges[k : k + 2])
+        ends = " to ".join(figure.text(float(edge)) for edge in edges[k : k + 2])
         tip = f"{ends}: {total:,}" + (f", {lost:,} failed" if lost else "")
         marks.append(f"<g>{_tip(tip)}")
         for css, top, count in (("g", total - lost, total - lost), ("b", total, lost)):
@@ -280,14 +231,14 @@ def histogram(name: str, values: np.ndarray, failed: np.ndarray, limits: Sequenc
         marks.append("</g>")
     for limit in near:
         x = _WIDTH * (limit - low) / (high - low)
-        tip = _tip(f"threshold {with_unit(name, float(limit))}")
+        tip = _tip(f"threshold {figure.text(float(limit))}")
         marks.append(f"<line class=limit x1={x:.1f} x2={x:.1f} y1=0 y2={_HEIGHT}>{tip}</line>")
     marks.append(f"<line class=axis x1=0 x2={_WIDTH} y1={_HEIGHT} y2={_HEIGHT} />")
     for x, anchor, end in ((0, "start", low), (_WIDTH, "end", high)):
-        text = escape(with_unit(name, end))
+        text = escape(figure.text(end))
         marks.append(f"<text x={x} y={_HEIGHT + 13} text-anchor={anchor}>{text}</text>")
     lacking = int((~finite).sum())
-    caption = f"{label(name)}{f', {lacking:,} not finite' if lacking else ''}"
+    caption = f"{figure.label}{f', {lacking:,} not finite' if lacking else ''}"
     return _figure(caption, _WIDTH, _HEIGHT + 16, marks)
 
 

@@ -5,9 +5,11 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from mjstack.files import write_atomic
 from mjstack.interrupt import check_interrupt
+from mjstack.report.figure import Figure
 from mjstack.report.record import GateResult, Report, Status
 
 log = logging.getLogger(__name__)
@@ -26,7 +28,7 @@ def write_report(report: Report) -> None:
         "status": report.status,
         "resumes": report.resumes,
         "provenance": report.provenance,
-        "gates": [asdict(gate) for gate in report.gates],
+        "gates": [_gate_json(gate) for gate in report.gates],
         "pictures": report.pictures,
     }
     # A gate may return NumPy scalars. A number that is not finite becomes its name: JSON has none.
@@ -34,6 +36,12 @@ def write_report(report: Report) -> None:
     finite = json.loads(text, parse_constant=lambda name: str(float(name)))
     text = json.dumps(finite, indent=2) + "\n"
     write_atomic(report.folder / "report.json", text)
+
+
+def _gate_json(gate: GateResult) -> dict[str, Any]:
+    data = asdict(gate)
+    del data["figures"]
+    return data | {"metrics": gate.metrics, "thresholds": gate.thresholds}
 
 
 def read_report(folder: Path, overrides: Sequence[str] = ()) -> Report | None:
@@ -49,7 +57,7 @@ def read_report(folder: Path, overrides: Sequence[str] = ()) -> Report | None:
                 status=Status(gate["status"]),
                 reason=gate["reason"],
                 seconds=float(gate.get("seconds", 0.0)),
-                metrics=dict(gate.get("metrics", {})),
+                figures=[Figure(name, value) for name, value in gate.get("metrics", {}).items()],
                 notes=dict(gate.get("notes", {})),
             )
             for gate in data["gates"]

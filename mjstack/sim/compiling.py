@@ -4,6 +4,7 @@ import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import partial
+from typing import Any
 
 import mujoco
 
@@ -64,15 +65,9 @@ def _stages(m: mjw.Model, plan: StepPlan) -> list[Stage]:
     rows: list[Stage] = [mjw.make_constraint]
     if plan.name == "fused" and not constraints.why_not_rows(m):
         rows = [constraints.contact_rows, constraints.noncontact_rows]
-    context = mjw._src.collision_core.create_collision_context
     # Kernels of convex pairs take half a minute each
-    stages: list[Stage] = [
-        lambda m, d, types=types: mjw._src.collision_convex.convex_narrowphase(
-            m, d, context(d.naconmax), [types]
-        )
-        for types in constraints.convex_pairs(m)
-    ]
-    stages.append(lambda m, d: constraints.primitive_pairs(m, d, context(d.naconmax)))
+    stages: list[Stage] = [partial(_convex_pairs, types) for types in constraints.convex_pairs(m)]
+    stages.append(lambda m, d: constraints.primitive_pairs(m, d, _context(d)))
     stages += [constraints.broad_phase, mjw.sensor_acc, source.solve, *rows]
     stages += [mjw.sensor_pos, mjw.sensor_vel]
     stages.append(lambda m, d: mjw.reset_data(m, d, reset=wp.zeros(1, dtype=bool)))
@@ -84,3 +79,11 @@ def _stages(m: mjw.Model, plan: StepPlan) -> list[Stage]:
     if m.opt.integrator == mjw.IntegratorType.IMPLICITFAST:
         stages.append(mjw.implicit)
     return stages
+
+
+def _convex_pairs(types: Any, m: mjw.Model, d: mjw.Data) -> None:
+    mjw._src.collision_convex.convex_narrowphase(m, d, _context(d), [types])
+
+
+def _context(d: mjw.Data) -> Any:
+    return mjw._src.collision_core.create_collision_context(d.naconmax)

@@ -41,40 +41,25 @@ class BatchSizes:
         return f"{self.as_overrides()} ({self.source})"
 
 
-def resolve_sizes(cfg: Config) -> BatchSizes:
-    """The configured sizes, with the defaults of this robot and scene where they are null."""
-    sizes = _placements(cfg)
-    return apply_configured(cfg, BatchSizes(nconmax=sizes.nconmax, njmax=sizes.njmax))
-
-
-def resolve_env_sizes(cfg: Config) -> BatchSizes:
-    """The configured sizes, where they are null with room for random actions: the worst case for
-    contacts.
+def robot_sizes(cfg: Config, *, driven: bool = True) -> BatchSizes:
+    """The defaults of this robot and scene: for the driven task, or else for random actions, the
+    worst case for contacts.
     """
-    return apply_configured(cfg, resolve_measuring_sizes(cfg))
-
-
-def resolve_measuring_sizes(cfg: Config, *, driven: bool = False) -> BatchSizes:
-    """Room to begin to measure in: the robot's sizes for random actions, or for a ``driven``
-    task; configured ones where they are larger.
-    """
-    sizes = _placements(cfg)
-    nconmax, njmax = sizes.env_nconmax, sizes.env_njmax
+    # A scene that gives all its own positions needs no placements.
+    sizes = cfg.robot.placements.get(cfg.scene.name) or PlacementsCfg()
     if driven:
-        nconmax, njmax = sizes.nconmax, sizes.njmax
-    return BatchSizes(
-        nconmax=max(nconmax, cfg.batch.nconmax or 0), njmax=max(njmax, cfg.batch.njmax or 0)
-    )
+        return BatchSizes(nconmax=sizes.nconmax, njmax=sizes.njmax)
+    return BatchSizes(nconmax=sizes.env_nconmax, njmax=sizes.env_njmax)
+
+
+def resolve_sizes(cfg: Config, *, driven: bool = True) -> BatchSizes:
+    """The configured sizes, where they are null those of `robot_sizes`."""
+    return apply_configured(cfg, robot_sizes(cfg, driven=driven))
 
 
 def apply_configured(cfg: Config, sizes: BatchSizes) -> BatchSizes:
     """The sizes, with what the configuration sets in their place."""
     return replace(sizes, **configured_sizes(cfg.batch))
-
-
-def _placements(cfg: Config) -> PlacementsCfg:
-    """Those of the scene; a scene that gives all its own positions needs none."""
-    return cfg.robot.placements.get(cfg.scene.name) or PlacementsCfg()
 
 
 def configured_sizes(sizes: BatchSizes | BatchCfg) -> dict[str, Any]:

@@ -1,7 +1,6 @@
 """Task *box*: objects into a box, one after the other, each to its place."""
 
 import itertools
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -15,6 +14,7 @@ from mjstack.errors import ConfigError, require_names
 from mjstack.managers.state import shared
 from mjstack.managers.view import EnvView
 from mjstack.mdp.geometry import place_xy
+from mjstack.report.figure import Figure
 from mjstack.robots.jaws import jaw_bodies
 from mjstack.scene.index import lowest_height
 from mjstack.tasks import parts
@@ -86,13 +86,13 @@ class BoxCheck(EpisodeCheck):
         self.objects = list(t.objects)
         self._read_box()
         self.summaries = {
-            "beyond_max_m": ("beyond_m", "max"),
-            "corner_speed_max_m_per_s": ("corner_speed_m_per_s", "max"),
-            "jaw_clearance_min_m": ("jaw_clearance_m", "min"),
+            "beyond_max": ("beyond_m", "max"),
+            "corner_speed_max": ("corner_speed_m_per_s", "max"),
+            "jaw_clearance_min": ("jaw_clearance_m", "min"),
         }
         for name in self.objects:
             self.summaries |= {
-                f"slot_err_{name}_max_m": (f"slot_err_{name}_m", "max"),
+                f"slot_err_{name}_max": (f"slot_err_{name}_m", "max"),
                 f"grasp_steps_{name}_min": (f"grasp_steps_{name}", "min"),
                 f"settled_steps_{name}_min": (f"settled_steps_{name}", "min"),
             }
@@ -145,10 +145,13 @@ class BoxCheck(EpisodeCheck):
             after=release,
         )
         text = "an object not at rest in the box at the end"
+        inside = ("INSIDE", text, self.resting, t.window)
+        measured = [Figure(f"slot_err_{name}", unit="m") for name in self.objects]
+        measured += [Figure("beyond", unit="m"), Figure("corner_speed", unit="m/s")]
         return [
             *(grasp, lift, carry, drop, release, settled),
             _Order(self.objects, release),
-            parts.InWindow("INSIDE", text, self.resting, t.window, measure=self.trace),
+            parts.InWindow(*inside, measure=self.trace, measured=measured),
             _JawClear(self.cfg.robot, self._high[2], t.jaw_clearance),
         ]
 
@@ -245,6 +248,9 @@ class _CarriedOver(parts.Carried):
     inside: parts.Condition
     hold: PhaseNames
 
+    def counts(self) -> list[Figure]:
+        return [*super().counts(), Figure("over_box{}")]
+
     def start(self, step: Step) -> None:
         super().start(step)
         self._hold = step.during(self.hold)
@@ -256,8 +262,8 @@ class _CarriedOver(parts.Carried):
         self.over.copy_(torch.where(hold, self.inside(step), self.over))
 
     def judge(self, end: Step) -> Judgement:
-        holds, values = super().judge(end)
-        return holds & (self.over > 0.0), values | self.by_object("over_box{}", self.over)
+        holds = self.holds() & (self.over > 0.0)
+        return holds, self.by_object(self.best, self._longest, self.over)
 
 
 @dataclass(eq=False, kw_only=True)
@@ -269,10 +275,8 @@ class _Drop(parts.AtLeast):
     carry: _CarriedOver
     high: parts.Condition
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.expected = ["0"] * len(self.objects)
-        self.limits = [dict.fromkeys(limits, (0.0, 0.0)) for limits in self.limits]
+    def counts(self) -> list[Figure]:
+        return [Figure(self.value, high=0.0)]
 
     def start(self, step: Step) -> None:
         super().start(step)
@@ -326,7 +330,7 @@ class _Order(Rule):
     def __init__(self, objects: Sequence[str], release: _Release) -> None:
         pairs = itertools.pairwise(objects)
         text = " or ".join(f"{later} grasped before {name} was released" for name, later in pairs)
-        super().__init__("ORDER", text or "never broken", expected="0")
+        super().__init__("ORDER", text or "never broken", figures=[Figure("too_early", high=0.0)])
         self._release = release
 
     def start(self, step: Step) -> None:
@@ -337,7 +341,7 @@ class _Order(Rule):
         self._early.masked_fill_(early.any(1), 1.0)
 
     def judge(self, end: Step) -> Judgement:
-        return self._early == 0.0, {"too_early": self._early}
+        return self._early == 0.0, [self._early]
 
 
 class _JawClear(Rule):
@@ -346,8 +350,8 @@ class _JawClear(Rule):
     at_end = True
 
     def __init__(self, robot: RobotCfg, rim: float, least: float) -> None:
-        super().__init__("JAW_CLEAR", "gripper too low at the end", expected=f"at least {least:g}")
-        self.limits = [{"jaw_clearance_m": (least, math.inf)}]
+        figures = [Figure("jaw_clearance", unit="m", low=least)]
+        super().__init__("JAW_CLEAR", "gripper too low at the end", figures=figures)
         self._robot = robot
         self._rim = rim
         self._least = least
@@ -357,7 +361,7 @@ class _JawClear(Rule):
         sim.kinematics()
         jaws = [body for jaw in jaw_bodies(sim.model, self._robot.jaw_bodies) for body in jaw]
         clearance = lowest_height(sim.model, jaws, sim.xpos, sim.xquat) - self._rim
-        return clearance >= self._least, {"jaw_clearance_m": clearance}
+        return clearance >= self._least, [clearance]
 
 
 class BoxSuccess(HeldSuccess):

@@ -1,8 +1,8 @@
 """Episode checks: how a task judges an episode. `mjstack new task NAME` writes one."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from itertools import chain
 from typing import Any, ClassVar, Self, cast
 
@@ -18,6 +18,7 @@ from mjstack.errors import ConfigError, TermError, require_names
 from mjstack.managers.state import lost_state
 from mjstack.managers.view import EnvView
 from mjstack.mdp.geometry import LOADED
+from mjstack.report.figure import Figure, suffix
 from mjstack.scene.phases import Phase
 from mjstack.sim.simulation import LOST_PHYSICS
 from mjstack.tasks.view import PhaseNames, Step
@@ -28,9 +29,9 @@ _EVERY_TASK = {
     "OVERFLOW": "buffer overflow",
 }
 
-Judgement = tuple[Tensor, dict[str, Tensor]]
-"""Whether a rule was shown to hold, bool, shape ``(nworld,)`` or ``(nworld, rules)``, and measured
-values by name with unit, each ``(nworld,)``."""
+Judgement = tuple[Tensor, Iterable[Tensor]]
+"""Whether a rule was shown to hold, bool, shape ``(nworld,)`` or ``(nworld, rules)``, and values of
+its figures and of ``measured``, in their order, each ``(nworld,)``."""
 
 
 class Rules(dict[str, int]):
@@ -72,14 +73,12 @@ class CheckResult:
 
     Attributes:
         failed: Bits of the task's rules, shape ``(nworld,)``, int32.
-        values: Measured values, by name with unit, each ``(nworld,)``.
-        value_names: Names of those that tell about each rule, by its name.
+        values: Measured values, by the keys of the check's figures, each ``(nworld,)``.
         phased: Whether the driver had phases, so that rules counted in those that they name.
     """
 
     failed: Tensor
     values: dict[str, Tensor]
-    value_names: dict[str, list[str]]
     phased: bool
 
 
@@ -90,23 +89,19 @@ class Rule(ABC):
 
     Attributes:
         texts: The failure in words if it is broken, by name; one entry, or one for each object.
-        suffixes: Part of the names of the measured values that tell about each of them.
-        expected: The measured values that each of them expects, in words.
-        limits: The least and the largest of each measured value for which each of them holds, by
-            the value's name: they tell which of several thresholds broke.
+        figures: What tells about each of them, with the limits within which it holds: they tell
+            which of several thresholds broke.
+        measured: What else it measures.
         phases: For each object, the phases in which it counts.
         at_end: Whether it can only hold at the end of a whole episode.
     """
 
+    measured: Sequence[Figure] = ()
     phases: PhaseNames = ()
     at_end = False
 
     def __init__(
-        self,
-        name: str,
-        text: str,
-        objects: Sequence[str] = (),
-        expected: str = "see the thresholds",
+        self, name: str, text: str, objects: Sequence[str] = (), figures: Sequence[Figure] = ()
     ) -> None:
         """Name the rule.
 
@@ -114,16 +109,16 @@ class Rule(ABC):
             name: In capital letters. The rule of one of several objects is ``NAME_OBJECT``.
             text: The failure in words if it is broken; ``{object}`` is the object's name.
             objects: The objects that it judges one by one.
-            expected: The measured values that the rule expects, in words.
+            figures: What it measures of each of them, without values; of several objects, ``{}``
+                in a name is ``_OBJECT``.
         """
         self.objects = list(objects)
-        self.suffixes = [f"_{object}" for object in objects] if len(objects) > 1 else [""]
+        suffixes = [f"_{object}" for object in objects] if len(objects) > 1 else [""]
         self.texts = {
             f"{name}{suffix.upper()}": text.format(object=object)
-            for suffix, object in zip(self.suffixes, objects or [""], strict=True)
+            for suffix, object in zip(suffixes, objects or [""], strict=True)
         }
-        self.expected = [expected] * len(self.texts)
-        self.limits: list[dict[str, tuple[float, float]]] = [{} for _ in self.texts]
+        self.figures = [[replace(f, name=f.name.format(s)) for f in figures] for s in suffixes]
 
     def start(self, step: Step) -> None:  # noqa: B027
         """Allocate for the worlds of an environment, at their start."""
@@ -139,14 +134,16 @@ class Rule(ABC):
             end: The state at its end.
         """
 
-    def by_object(self, name: str, value: Tensor) -> dict[str, Tensor]:
-        """Columns by name: ``{}`` in it is the object, if there are several.
+    def declared(self) -> Iterator[Figure]:
+        """All that it measures, in the order of its values."""
+        for figure in chain(*self.figures, self.measured):
+            yield replace(figure, limit="")  # the check's thresholds have it
 
-        Args:
-            name: Such as ``lift_steps{}``.
-            value: Shape ``(nworld, objects)``.
+    def by_object(self, *values: Tensor) -> Iterable[Tensor]:
+        """Values of each object, shape ``(nworld, objects)`` for each of its figures, in the order
+        of all figures.
         """
-        return dict(zip(map(name.format, self.suffixes), value.unbind(1), strict=True))
+        return torch.stack(torch.broadcast_tensors(*values), dim=2).flatten(1).unbind(1)
 
 
 class EpisodeCheck(ABC):
@@ -164,8 +161,9 @@ class EpisodeCheck(ABC):
         t: The thresholds.
         rules: Names, bits and words of the rules.
         objects: The objects that the task is about, which the rules read; perhaps none.
-        summaries: Metrics of a batch: by name, a measured value and which of its worlds' counts,
-            ``min`` or ``max``.
+        figures: What the rules measure, without values, by key.
+        summaries: Metrics of a batch: by name without unit, the key of a figure and which of its
+            worlds' counts, ``min`` or ``max``.
     """
 
     Thresholds: ClassVar[type]
@@ -195,6 +193,7 @@ class EpisodeCheck(ABC):
             named = chain(*chain(*(rule.phases for rule in self._rules)))
             require_names("task.check: phase", named, phases)
         self.rules = Rules(dict(chain(*(rule.texts.items() for rule in self._rules))))
+        self.figures = {f.key: f for rule in self._rules for f in rule.declared()}
 
     @classmethod
     def from_env(cls, env: EnvView) -> Self:
@@ -260,45 +259,42 @@ class EpisodeCheck(ABC):
             "OVERFLOW": (sim.overflow & LOST_PHYSICS) == 0,
         }
         values: dict[str, Tensor] = {}
-        names: dict[str, list[str]] = {}
         for rule in self._rules:
             holds, measured = rule.judge(end)
             if rule.at_end:
                 holds = holds & complete
             passed |= zip(rule.texts, holds.view(len(holds), -1).unbind(1), strict=True)
-            values |= measured
-            for name, suffix in zip(rule.texts, rule.suffixes, strict=True):
-                names[name] = [value for value in measured if f"{suffix}_" in f"{value}_"]
+            values |= zip((figure.key for figure in rule.declared()), measured, strict=True)
         bits = [bit * (~passed[name]).int() for name, bit in self.rules.items()]
         failed = torch.stack(bits).sum(0, dtype=torch.int32)
-        return CheckResult(failed, values, names, end.phased)
+        return CheckResult(failed, values, end.phased)
 
     def why(
         self, failed: np.ndarray, values: Mapping[str, np.ndarray]
     ) -> tuple[dict[str, str], list[str]]:
         """The thresholds that broke, in words, by the name of each rule that was broken, empty
-        where the rule has but one; and the names of all values beyond their limits. ``failed`` are
+        where the rule has but one; and the keys of all figures beyond their limits. ``failed`` are
         the rules' bits, ``values`` what was measured, each of shape ``(nworld,)``.
         """
         broken = dict.fromkeys(self.rules.failing(failed), "")
         beyond = []
-        for name, limits in chain(*(zip(r.texts, r.limits, strict=True) for r in self._rules)):
-            wrong = failed & self.rules[name] != 0
+        for name, figures in chain(*(zip(r.texts, r.figures, strict=True) for r in self._rules)):
+            limited = [figure for figure in figures if figure.limits]
             words = []
-            for value, (low, high) in limits.items() if name in broken else ():
-                measured = values[value]
-                if count := int(np.sum(wrong & ~((low <= measured) & (measured <= high)))):
-                    number = f"{measured[0]:.4g} of {low:g}" if len(failed) == 1 else f"in {count}"
-                    words.append(f"{value.rpartition('.')[2]} {number}")
-                    beyond.append(value)
-            if words and len(limits) > 1:
+            for figure in limited if name in broken else ():
+                measured = values[figure.key]
+                wrong = (failed & self.rules[name] != 0) & ~figure.holds(measured)
+                if wrong.any():
+                    limit = figure.high if measured[0] > figure.high else figure.low
+                    number = f"{measured[0]:.4g} of {limit:g}"
+                    words.append(
+                        f"{figure.column or figure.key}"
+                        f" {number if len(failed) == 1 else f'in {wrong.sum()}'}"
+                    )
+                    beyond.append(figure.key)
+            if words and len(limited) > 1:
                 broken[name] = f" ({', '.join(words)})"
         return broken, beyond
-
-    @property
-    def limits(self) -> dict[str, tuple[float, float]]:
-        """The least and the largest of each measured value for which its rule holds, by name."""
-        return dict(chain(*(limits.items() for r in self._rules for limits in r.limits)))
 
     @abstractmethod
     def placed(self, step: Step) -> Tensor:
@@ -317,16 +313,15 @@ class EpisodeCheck(ABC):
         """Values that a replay keeps at every step end, by name with unit, each ``(nworld,)``."""
         return {}
 
-    def thresholds(self) -> dict[str, float]:
-        """The rules' numbers, by name with unit."""
-        numbers: dict[str, float] = {}
+    def thresholds(self) -> list[Figure]:
+        """The rules' numbers, as requirements."""
+        numbers = []
         for item in fields(self.Thresholds):
             value = getattr(self.t, item.name)
             unit = field_range(item).unit
-            suffix = "n" if unit == "N" else unit.replace("/", "_per_")
-            bare = not suffix or item.name.endswith(f"_{suffix}")
             if isinstance(value, int | float):
-                numbers[item.name if bare else f"{item.name}_{suffix}"] = value
+                name = item.name.removesuffix(suffix(unit))
+                numbers.append(Figure(name, unit=unit, high=value))
         return numbers
 
     def report(self, result: CheckResult) -> dict[str, tuple[str, str]]:
@@ -334,11 +329,12 @@ class EpisodeCheck(ABC):
         report = {}
         for rule in self._rules:
             phases = rule.phases if result.phased and rule.phases else [()] * len(rule.texts)
-            for name, expected, names in zip(rule.texts, rule.expected, phases, strict=True):
+            for name, figures, names in zip(rule.texts, rule.figures, phases, strict=True):
                 during = f" in {' and '.join(names)}" if names else ""
-                values = {key: float(result.values[key][0]) for key in result.value_names[name]}
+                values = {f.key: float(result.values[f.key][0]) for f in figures}
                 measured = EpisodeCheck.headline(self, values) or "see the values"
-                report[name] = (measured, expected + during)
+                allowed = dict.fromkeys(f.allowed for f in figures if f.limits)
+                report[name] = (measured, (", ".join(allowed) or "see the thresholds") + during)
         return report
 
     def headline(self, values: Mapping[str, float]) -> str:

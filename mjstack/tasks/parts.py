@@ -6,7 +6,7 @@ A condition is a function of a `Step` that returns a bool tensor, shape ``(nworl
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import KW_ONLY, dataclass, field
+from dataclasses import KW_ONLY, dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -14,6 +14,7 @@ from typing_extensions import override
 
 from mjstack.math import norm, quat_angle, quat_to_matrix
 from mjstack.mdp.geometry import place_xy, pose_w
+from mjstack.report.figure import Figure
 from mjstack.tasks.check import Judgement, Rule
 from mjstack.tasks.view import AllOf, PhaseNames, Step
 
@@ -156,7 +157,7 @@ class AtLeast(Rule):
         least: The threshold.
         phases: For each object, the phases in which it counts.
         after: Without phases it counts once this rule holds.
-        value: Name of the number, with ``{}`` for the suffix of the object.
+        value: Name of the number, with ``{}`` for the suffix of the object, if it is no steps.
         key: Of the phases, for `Step.judged`.
         best: The number so far, shape ``(nworld, objects)``, float32.
     """
@@ -172,9 +173,11 @@ class AtLeast(Rule):
     value: str = ""
 
     def __post_init__(self) -> None:
-        self.value = self.value or f"{self.name.lower()}_steps{{}}"
-        super().__init__(self.name, self.text, self.objects, expected=f"at least {self.least:g}")
-        self.limits = [{self.value.format(end): (self.least, math.inf)} for end in self.suffixes]
+        super().__init__(self.name, self.text, self.objects, self.counts())
+
+    def counts(self) -> list[Figure]:
+        """What tells about each object."""
+        return [Figure(self.value or f"{self.name.lower()}_steps{{}}", low=self.least)]
 
     @override
     def start(self, step: Step) -> None:
@@ -191,7 +194,7 @@ class AtLeast(Rule):
 
     @override
     def judge(self, end: Step) -> Judgement:
-        return self.holds(), self.by_object(self.value, self.best)
+        return self.holds(), self.by_object(self.best)
 
 
 @dataclass(eq=False)
@@ -231,14 +234,15 @@ class Carried(Streak):
 
     distance: float = field(kw_only=True)
 
-    def __post_init__(self) -> None:
+    @override
+    def counts(self) -> list[Figure]:
         self._steps = self.least
         self.least = self.distance
-        self.value = f"{self.name.lower()}{{}}_m"
-        super().__post_init__()
-        self._count = f"{self.name.lower()}_steps{{}}"
-        for limits, end in zip(self.limits, self.suffixes, strict=True):
-            limits[self._count.format(end)] = (self._steps, math.inf)
+        name = self.name.lower()
+        return [
+            Figure(f"{name}{{}}", unit="m", low=self.least),
+            Figure(f"{name}_steps{{}}", low=self._steps),
+        ]
 
     @override
     def start(self, step: Step) -> None:
@@ -263,8 +267,7 @@ class Carried(Streak):
 
     @override
     def judge(self, end: Step) -> Judgement:
-        holds, values = super().judge(end)
-        return holds, values | self.by_object(self._count, self._longest)
+        return self.holds(), self.by_object(self.best, self._longest)
 
 
 @dataclass(eq=False)
@@ -276,7 +279,7 @@ class InWindow(Rule):
         name: See `Rule`; also ``text``.
         condition: If it has several columns, all have to hold.
         window: How many steps.
-        measure: Gives values at the end of the episode, by name with unit.
+        measure: Gives values at the end of the episode, by the keys of ``measured``.
     """
 
     name: str
@@ -285,21 +288,22 @@ class InWindow(Rule):
     window: int
     _: KW_ONLY
     measure: Callable[[Step], dict[str, Tensor]] = lambda end: {}
+    measured: Sequence[Figure] = ()
 
     at_end = True
 
     def __post_init__(self) -> None:
-        super().__init__(self.name, self.text, expected=f"at least {self.window}")
-        self._total = f"{self.name.lower()}_steps"
         rule = self.condition
         self._rule = rule if isinstance(rule, AllOf) else AllOf(("",), lambda step: (rule(step),))
         names = self._rule.names if len(self._rule.names) > 1 else ()
-        self._values = [f"{self._total}.{name}" for name in names]
-        self.limits = [dict.fromkeys(self._values or [self._total], (self.window, math.inf))]
+        steps = Figure(f"{self.name.lower()}_steps", low=self.window)
+        total = replace(steps, low=-math.inf) if names else steps  # its parts have the limit
+        counts = [total, *(replace(steps, column=name) for name in names)]
+        super().__init__(self.name, self.text, figures=counts)
 
     @override
     def start(self, step: Step) -> None:
-        self.length = step.zeros(len(self._values) or 1)  # of the streaks that last to the end
+        self.length = step.zeros(len(self._rule.names))  # of the streaks that last to the end
 
     @override
     def update(self, step: Step) -> None:
@@ -308,8 +312,8 @@ class InWindow(Rule):
     @override
     def judge(self, end: Step) -> Judgement:
         total = self.length.amin(1)
-        parts = dict(zip(self._values, self.length.unbind(1), strict=False))
-        return total >= self.window, {self._total: total, **parts, **self.measure(end)}
+        parts = self.length.unbind(1) if self.length.shape[1] > 1 else ()
+        return total >= self.window, [total, *parts, *self.measure(end).values()]
 
 
 @dataclass(eq=False)
@@ -332,17 +336,17 @@ class AtRest(Rule):
     rotation_deg: float
 
     def __post_init__(self) -> None:
-        super().__init__("REST", "")
         self.texts = {
             "REST_SPEED": "object moving",
             "REST_POSITION": "object drifting",
             "REST_ROTATION": "object turning",
         }
-        self.suffixes = ["speed_m_per_s", "position_m", "rotation_deg"]
-        limits = (self.speed, self.position, self.rotation_deg)
-        self.expected = [f"at most {limit:g}" for limit in limits]
-        named = zip(self.suffixes, limits, strict=True)
-        self.limits = [{f"rest_{name}": (0.0, limit)} for name, limit in named]
+        self.figures = [
+            [Figure("rest_speed", unit="m/s", high=self.speed)],
+            [Figure("rest_position", unit="m", high=self.position)],
+            [Figure("rest_rotation", unit="deg", high=self.rotation_deg)],
+        ]
+        self.measured = [Figure("peak_speed", unit="m/s")]
 
     @override
     def start(self, step: Step) -> None:
@@ -372,9 +376,5 @@ class AtRest(Rule):
             angle = torch.maximum(angle, quat_angle(a[..., 3:], b[..., 3:]).amax((1, 2)))
         turn = math.radians(self.rotation_deg)
         holds = (rms <= self.speed, distance <= self.position, angle <= turn)
-        return torch.stack(holds, dim=1), {
-            "rest_speed_m_per_s": rms,
-            "peak_speed_m_per_s": self._speeds.amax((1, 2)),
-            "rest_position_m": distance,
-            "rest_rotation_deg": angle.double().rad2deg(),
-        }
+        peak = self._speeds.amax((1, 2))
+        return torch.stack(holds, dim=1), (rms, distance, angle.double().rad2deg(), peak)

@@ -9,6 +9,7 @@ from typing_extensions import override
 from mjstack.config.fields import spec
 from mjstack.math import norm
 from mjstack.mdp.observation import grasp_point_to_object
+from mjstack.report.figure import Figure
 from mjstack.tasks.check import EpisodeCheck, Rule
 from mjstack.tasks.parts import InWindow
 from mjstack.tasks.view import Step
@@ -31,13 +32,15 @@ class ReachCheck(EpisodeCheck):
         """Last steps, in which the grasp point is near."""
 
     t: Thresholds
-    summaries = {"distance_max_m": ("distance_m", "max")}  # noqa: RUF012
+    summaries = {"distance_max": ("distance_m", "max")}  # noqa: RUF012
 
     @override
     def build(self) -> list[Rule]:
         self.objects = [self.t.object]
         text = f"grasp point not above {self.t.object}"
-        return [InWindow("REACHED", text, self.placed, self.t.window, measure=self.trace)]
+        measured = [Figure("distance", unit="m", high=self.t.distance)]
+        rule = (self.placed, self.t.window)
+        return [InWindow("REACHED", text, *rule, measure=self.trace, measured=measured)]
 
     def placed(self, step: Step) -> Tensor:
         """Whether the grasp point is near, shape ``(nworld, 1)``."""

@@ -12,6 +12,7 @@ from typing_extensions import override
 from mjstack.config.fields import spec
 from mjstack.managers.state import branches
 from mjstack.managers.view import EnvView
+from mjstack.report.figure import Figure
 from mjstack.sim.graph import where_any
 from mjstack.tasks import parts
 from mjstack.tasks.check import EpisodeCheck, Rule
@@ -68,13 +69,13 @@ class StackCheck(EpisodeCheck):
 
     t: Thresholds
     summaries = {  # noqa: RUF012
-        "xy_err_max_m": ("xy_err_m", "max"),
-        "dz_min_m": ("dz_m", "min"),
-        "dz_max_m": ("dz_m", "max"),
-        "peak_speed_max_m_per_s": ("peak_speed_m_per_s", "max"),
-        "rest_speed_max_m_per_s": ("rest_speed_m_per_s", "max"),
-        "rest_position_max_m": ("rest_position_m", "max"),
-        "rest_rotation_max_deg": ("rest_rotation_deg", "max"),
+        "xy_err_max": ("xy_err_m", "max"),
+        "dz_min": ("dz_m", "min"),
+        "dz_max": ("dz_m", "max"),
+        "peak_speed_max": ("peak_speed_m_per_s", "max"),
+        "rest_speed_max": ("rest_speed_m_per_s", "max"),
+        "rest_position_max": ("rest_position_m", "max"),
+        "rest_rotation_max": ("rest_rotation_deg", "max"),
     }
 
     @override
@@ -99,7 +100,14 @@ class StackCheck(EpisodeCheck):
         return [
             lift,
             carry,
-            parts.InWindow("STACKED", "not stacked", self.stacked, t.window, measure=self.trace),
+            parts.InWindow(
+                *("STACKED", "not stacked", self.stacked, t.window),
+                measure=self.trace,
+                measured=[
+                    Figure("xy_err", unit="m", high=t.xy_err),
+                    Figure("dz", unit="m", low=t.dz_min, high=t.dz_max),
+                ],
+            ),
             parts.InWindow("SUPPORTED", f"{t.onto} not on the table", self.supported, t.window),
             parts.AtRest(t.window, t.rest_speed, t.rest_position, t.rest_rotation_deg),
             parts.InWindow("RELEASED", f"{t.object} not released", self.released, t.window),

@@ -15,6 +15,7 @@ from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, MjstackError, require_names
 from mjstack.math import rate_interval
 from mjstack.policy.checkpoint import Facts
+from mjstack.report.figure import Figure, figures
 from mjstack.sim.memory import give_back_memory
 from mjstack.train.clone_learner import CloneLearner
 from mjstack.train.clone_network import vision_of
@@ -146,23 +147,26 @@ def _trained(job: CloneJobCfg, folder: Path, facts: Facts) -> Trained:
     curve = facts["curve"]
     expert = dict(facts["expert"])
     notes = {"policy": str(folder / LAST), "demonstrations": expert.pop("source")}
-    metrics = expert | {
+    seconds = expert.pop("expert_s")
+    numbers = expert | {
         "batches": facts["done"],
-        "training_s": facts["seconds"],
         "loss": curve[-1]["loss"],
         "validation_loss": curve[-1]["validation_loss"],
         "best_validation_loss": min(row["validation_loss"] for row in curve),
     }
     if job.rounds:
         best = max(row["success"] for row in curve)
-        metrics |= {"rounds": job.rounds, "best_training_success": best}
-        metrics["expert_s"] += curve[-1].get("played_s", 0.0)  # the round of the last policy
+        numbers |= {"rounds": job.rounds, "best_training_success": best}
+        seconds += curve[-1].get("played_s", 0.0)  # the round of the last policy
+    times = [Figure("expert", seconds, "s"), Figure("training", facts["seconds"], "s")]
+    measured = [*figures(**numbers), *times]
+    if job.rounds:
         # A row has the rules that were broken in its round
         rules = {name: 0 for row in curve for name in row if name.startswith(FAILED)}
         curve = [{k: v for k, v in row.items() if k not in rules} | rules | row for row in curve]
-        return Trained(metrics=metrics, notes=notes, curve=curve, abscissa="round")
+        return Trained(figures=measured, notes=notes, curve=curve, abscissa="round")
     lines = ["loss", "validation_loss"]
-    return Trained(metrics=metrics, notes=notes, curve=curve, lines=lines, scale="log")
+    return Trained(figures=measured, notes=notes, curve=curve, lines=lines, log=True)
 
 
 TRAINER = Trainer(check_clone, train_clone)

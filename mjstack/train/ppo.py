@@ -30,6 +30,7 @@ from mjstack.managers.term import check_params
 from mjstack.mdp.starts.expert_states import VIEWS, write_states
 from mjstack.policy import Policy, PolicyNetwork
 from mjstack.policy.checkpoint import Facts, read_state
+from mjstack.report.figure import Figure, figures
 from mjstack.train.learner import Learner
 from mjstack.train.trainer import LAST, STATE, Trained, Trainer, observed_group, whole_starts
 
@@ -333,12 +334,11 @@ def train_ppo(stage: Stage, folder: Path) -> Trained:
         learner.learn()
     last = learner.curve[-1]
     return Trained(
-        metrics={
-            "iterations": learner.done,
-            "decisions": last["decisions"],
-            "training_s": learner.seconds,
-            "best_training_success": max(map(learner.score, learner.curve))[0],
-        },
+        figures=[
+            *figures(iterations=learner.done, decisions=last["decisions"]),
+            Figure("training", learner.seconds, "s"),
+            Figure("best_training_success", max(map(learner.score, learner.curve))[0]),
+        ],
         notes={"policy": str(folder / LAST), "seeds": str(cfg.seed)},
         curve=learner.curve,
         lines=["success", *(["progress"] if "progress" in last else [])],

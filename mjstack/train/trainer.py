@@ -13,6 +13,7 @@ from mjstack.config.schema import CloneJobCfg, Config, ObservationGroupCfg, PpoJ
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, FolderError, MjstackError, renamed_keys, require_names
 from mjstack.policy.checkpoint import Facts, read_state
+from mjstack.report.figure import Figure
 
 # In the folder of a training: two policies, and what it needs to go on.
 LAST = "last"
@@ -27,12 +28,12 @@ FAILED = "failed."  # a column of the curve: judged episodes that broke the rule
 class Trained:
     """The result of a training."""
 
-    metrics: dict[str, float]  # figures, by name with unit
+    figures: list[Figure]
     notes: dict[str, str]  # facts in words, by name
     curve: list[Facts]  # rows of the training curve: values by column
     lines: list[str] = field(default_factory=lambda: ["success"])  # columns that are drawn
     abscissa: str = "batch"  # the column over which they are drawn
-    scale: str = "linear"  # of their axis: log or linear
+    log: bool = False  # whether their axis is logarithmic
 
 
 @dataclass(frozen=True)

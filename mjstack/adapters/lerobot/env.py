@@ -25,7 +25,7 @@ from mjstack.rng import check_seed
 from mjstack.robots.units import LEROBOT
 from mjstack.sim import StateRenderer
 from mjstack.sim.cameras import with_outputs
-from mjstack.sim.sizes import resolve_env_sizes
+from mjstack.sim.sizes import resolve_sizes
 
 Info = dict[str, Any]
 TIMINGS = {30: "hz30", 50: "default"}  # by control rate [Hz]
@@ -128,7 +128,7 @@ class LerobotVectorEnv(VectorEnv):
             observation={GROUP: replace(cfg.observation[GROUP], noise=False)},
             scene=replace(cfg.scene, cameras=with_outputs(cfg.scene.cameras, ["rgb"], cameras)),
         )
-        sim = stage.simulation(nworld, *stage.backend, sizes=resolve_env_sizes(cfg))
+        sim = stage.simulation(nworld, *stage.backend, sizes=resolve_sizes(cfg, driven=False))
         self.inner = env = Env(sim, stage.index, played, check_faults=False)
         self.words = LerobotWords(env, env.observation_manager.groups, env.images, units)
         self._phase = torch.zeros(nworld, dtype=torch.int64, device=env.device)

@@ -157,20 +157,15 @@ class ParityCfg(GateFuncCfg):
 
 @dataclass(slots=True)
 class CapacityCfg(GateFuncCfg):
-    """How buffers are sized."""
+    """How buffers are sized, in the gate and with ``batch=auto``."""
 
     cpu_nworld: int = spec(unit="worlds", ge=1, le=MOST_WORLDS)
-    """Worlds that size the buffers on a CPU; on CUDA all nworld do."""
+    """Most worlds that size the buffers on a CPU; on CUDA all nworld do."""
     margin: float = spec(ge=1.0)
     """Recommended sizes over the peaks."""
     random_steps: int | None = spec(None, unit="steps", ge=1, le=MOST_COUNT)
-    """Steps of random actions; null: one whole episode, on CUDA 200 steps at most."""
-    probe_nworld: int = spec(unit="worlds", ge=1, le=MOST_WORLDS)
-    """Most worlds that size an environment with ``batch=auto`` on CUDA; on a CPU, cpu_nworld."""
-    probe_steps: int = spec(unit="steps", ge=1, le=MOST_COUNT)
-    """Steps of random actions that size an environment with ``batch=auto``."""
-    reset: dict[str, Any] = spec({})
-    """Reset terms of the workload with randomised starts."""
+    """Steps of random actions, which size environments; null: one whole episode, on CUDA 200 steps
+    at most."""
 
 
 @dataclass(slots=True)
