@@ -12,7 +12,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-com
 .PHONY: demo run test test-rest test-long test-all test-lerobot fuzz docs dist setup clean
 
 demo: $(READY)
-	$(BIN)/mjstack demo $(ARGS)
+	$(BIN)/mjstack experiment=demo $(ARGS)
 
 run: $(READY)
 	$(BIN)/python scripts/run.py robot=so101 nworld=32 $(ARGS)
@@ -44,7 +44,6 @@ test-all: test test-rest test-long
 fuzz: $(READY_DEV)
 	$(BIN)/python tests/test_fuzz.py commands 0-999
 	$(BIN)/python tests/test_fuzz.py folders 0-499
-	$(BIN)/python tests/test_fuzz.py small 0-71
 	$(BIN)/python tests/test_fuzz.py datasets 0-199
 
 # In an environment of its own with LeRobot, which it makes: some 6 GB, and Python 3.12 or 3.13.

@@ -29,9 +29,8 @@ from mjstack.config.help import help_text, key_help, list_text
 from mjstack.config.load import compose, extended_search_path, to_config
 from mjstack.config.session import (
     CONFIG_NAME,
-    command_line,
+    added_folders,
     hydra_session,
-    lacking_folders,
     list_items,
     search_path,
     search_path_args,
@@ -67,7 +66,7 @@ def run(args: list[str]) -> int:
             print(f"mjstack {__version__}")
             return 0
         flags = _parse(args)
-        with command_line(), extended_search_path(flags.overrides, flags.config_dir) as overrides:
+        with extended_search_path(flags.overrides, flags.config_dir) as overrides:
             return _dispatch(flags, overrides)
     except KeyboardInterrupt:  # the job has said so
         return EXIT_CODE
@@ -88,17 +87,13 @@ def run(args: list[str]) -> int:
 
 def _dispatch(flags: Namespace, overrides: list[str]) -> int:
     """Do what the flags ask for, on the current search path."""
-    demonstrates = overrides[:1] == ["demo"]
-    if demonstrates and any(override.startswith("experiment=") for override in overrides):
-        raise MjstackError("demo: expected no experiment=NAME, because it is one. Leave it out.")
-    if demonstrates:
-        overrides = ["experiment=demo", *overrides[1:]]
+    command = overrides[0] if overrides else ""
     with hydra_session() as hydra:
-        if overrides[:1] == ["list"]:
+        if command == "list":
             print(list_text(overrides[1:]), flush=True)
-        elif overrides[:1] == ["new"]:
+        elif command == "new":
             return _write_new(overrides[1:], flags.arm)
-        elif overrides[:1] == ["doctor"]:
+        elif command == "doctor":
             from mjstack.jobs.doctor import findings  # it loads Warp
 
             for name, words in findings(overrides[1:]):
@@ -112,13 +107,7 @@ def _dispatch(flags: Namespace, overrides: list[str]) -> int:
         elif flags.multirun:
             return _sweep(hydra, overrides)
         else:
-            status = _run_one(hydra, overrides)
-            if demonstrates and _results:
-                from mjstack.jobs.demo import show_demo  # the other commands need no browser
-
-                arm = "so101" if "robot=rebot" in overrides else "rebot"
-                show_demo(_results[-1].folder, arm)
-            return status
+            return _run_one(hydra, overrides)
     return 0
 
 
@@ -235,9 +224,7 @@ def _sweep(hydra: Any, overrides: list[str]) -> int:
     check_jobs(master, jobs, _check)
     begin_job()
     from mjstack.jobs.sweep import list_jobs
-    from mjstack.jobs.sweep_table import sweep_config
 
-    sweep = sweep_config(master)
     reports: dict[int, Report] = {}
     with claim_sweep(master, jobs) as claimed:
         try:
@@ -246,7 +233,7 @@ def _sweep(hydra: Any, overrides: list[str]) -> int:
             reports = dict(enumerate(_results))
         finally:
             if reports or any(job.report() for job in list_jobs(claimed)):
-                print_sweep(claimed, sweep, reports)
+                print_sweep(claimed, reports)
     return _status()
 
 
@@ -271,7 +258,7 @@ def run_job(cfg: DictConfig) -> Report:
     logging.raiseExceptions = False  # a full disk would print a traceback for each line of run.log
     settings = HydraConfig.get()
     overrides = list(settings.overrides.task)
-    with search_path(lacking_folders(settings.runtime.config_sources)):
+    with search_path(added_folders(settings.runtime)):
         folder = Path(settings.runtime.output_dir)
         sweep = Path(settings.sweep.dir) if settings.mode is RunMode.MULTIRUN else None
         if sweep is not None:
@@ -286,7 +273,7 @@ def run_job(cfg: DictConfig) -> Report:
             _save_config(cfg, folder)
         result = checked.run(folder, overrides)
         if sweep is not None:
-            update_summary(sweep, cfg, {settings.job.num: result})
+            update_summary(sweep, {settings.job.num: result})
     _results.append(result)
     if result.status is Status.interrupted:
         raise KeyboardInterrupt

@@ -10,7 +10,6 @@ from omegaconf import DictConfig, OmegaConf
 
 from mjstack.config.explain import assign, own_overrides, parse
 from mjstack.config.load import compose
-from mjstack.config.schema import SweepCfg
 from mjstack.errors import ConfigError, MjstackError, is_out_of_memory
 from mjstack.files import claim_folder
 from mjstack.report.record import Report
@@ -85,12 +84,12 @@ def hydra_path(cfg: DictConfig, key: str) -> Path:
     return Path(str(OmegaConf.select(cfg, f"hydra.{key}", throw_on_missing=True)))
 
 
-def print_sweep(folder: Path, sweep: SweepCfg, reports: dict[int, Report]) -> None:
+def print_sweep(folder: Path, reports: dict[int, Report]) -> None:
     """Write and print the table of a sweep: a row for each job."""
     from mjstack.jobs.sweep_table import write_summary
 
     console = Console(soft_wrap=True)
-    table, problem = write_summary(folder, sweep, reports, draw=True)
+    table, problem = write_summary(folder, reports, draw=True)
     Console().print(table.to_console())
     if problem:
         console.print(problem)

@@ -4,7 +4,7 @@ one line.
 
 import runpy
 from collections.abc import Iterator
-from dataclasses import Field, fields, is_dataclass
+from dataclasses import Field, fields, is_dataclass, replace
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
@@ -21,6 +21,8 @@ from omegaconf.errors import OmegaConfBaseException
 import mjstack
 from mjstack.config import fields as config_fields
 from mjstack.config import load_config, schema
+from mjstack.config.check import validate
+from mjstack.config.fingerprint import config_content
 from mjstack.config.help import list_keys
 from mjstack.config.load import compose
 from mjstack.config.schema import Backend, CloneJobCfg, Config
@@ -294,29 +296,41 @@ def test_null_is_no_name_to_put_into_a_list() -> None:
     assert message == "gates=null: expected a list of names."
 
 
-@pytest.mark.parametrize(
-    ("overrides", "starts"),
-    [
-        ([], "randomized"),
-        pytest.param(["gate.success.reset=jitter"], "jitter", marks=pytest.mark.full),
-        (["gates=[success]", "reset=jitter"], "jitter"),
-        (["job=compare", "reset=nominal"], "nominal"),
-        (["gates=[success]", "reset=jitter", "gate.success.reset=nominal"], "nominal"),
-        (["gates=[batch,success]", "reset=jitter"], "randomized"),
-        (["gates=[success]", "cameras=front", "looks=randomized"], "randomized looks=randomized"),
-    ],
-)
-def test_how_the_success_gate_starts(overrides: list[str], starts: str) -> None:
-    reset = mjstack.load_config(overrides).gate.success.reset
+STARTS = [
+    ([], "randomized", []),
+    (["reset@gate.success.reset=jitter"], "jitter", []),
+    (["gates=[success]", "reset=jitter"], "randomized", ["reset=jitter"]),
+    (["job=compare", "reset=nominal"], "randomized", ["reset=nominal"]),
+    (["gates=[batch,success]", "cameras=front", "looks=randomized"], "randomized", ["looks=rand"]),
+    (
+        ["gates=[success]", "cameras=front", "+looks@gate.success.reset=randomized"],
+        "randomized looks=randomized",
+        [],
+    ),
+    (["reset=jitter"], "randomized", []),  # it does not run
+]
+
+
+@pytest.mark.parametrize(("overrides", "starts", "unused"), STARTS)
+def test_how_the_success_gate_starts(overrides: list[str], starts: str, unused: list[str]) -> None:
+    """By its own choice, which a line names where another was made."""
+    cfg = mjstack.load_config(overrides)
     alone = [o for o in overrides if o.startswith("cameras")]
-    assert reset == compositions.load_config([*f"reset={starts}".split(), *alone]).reset
+    expected = compositions.load_config([*f"reset={starts}".split(), *alone]).reset
+    assert cfg.gate.success.reset == expected
+    assert len(cfg.unused_terms) == len(unused)
+    for line, choice in zip(cfg.unused_terms, unused, strict=True):
+        assert line.startswith(choice)
+        assert f"@gate.success.reset={choice.partition('=')[2]}" in line
+        fix = line.split(": ")[1].split()[0]
+        assert not mjstack.load_config([*overrides, fix]).unused_terms
 
 
-def test_choices_by_key() -> None:
-    message = refusal(lambda: mjstack.load_config(["gate.success.reset=jiter"]))
-    assert "'jiter' does not exist. Did you mean 'jitter'?" in message
-    job = mjstack.load_config(["job=train", "job.observation=state"]).job
-    assert job.observation == mjstack.load_config(["job=train", "observation=state"]).observation  # type: ignore[attr-defined]
+@pytest.mark.parametrize("choice", ["gate.success.reset=jitter", "job.observation=state"])
+def test_a_choice_by_key_is_told_how(choice: str) -> None:
+    line = refusal(lambda: mjstack.load_config(["job=train", choice]))
+    assert line.endswith(f" Write {choice.partition('=')[0].rpartition('.')[2]}@{choice}.")
+    mjstack.load_config(["job=train", line.split(" Write ")[1].rstrip(".")])
 
 
 @pytest.mark.parametrize(
@@ -370,46 +384,14 @@ def test_the_whole_job_is_checked_before_its_folder_exists(
     refusal(lambda: check_machine(load_config(["gates=[baseline]", *overrides])), words)
 
 
-def test_a_swapped_function_does_not_inherit_parameters() -> None:
-    same = "reward.reach.func=mjstack.mdp.reward.reach"
-    swap = "reward.reach.func=mjstack.mdp.reward.action_rate"
-    task = "task=reach"
-    home = "gate.success.reset.joint_noise.func=mjstack.mdp.reset.home"
-    cfg = load_config([task, same, home])
-    assert cfg.reward["reach"].params
-    assert cfg.gate.success.reset["joint_noise"].params == {}
-    check = ["task.check.func=mine.Check", "task.check.window=7"]
-    cfg = load_config([task, swap, "reward.reach.weight=3.0", *check])
-    assert cfg.reward["reach"].params == {}
-    assert cfg.task.check == {"func": "mine.Check", "window": 7}
-    values = ["+reward.reach.params.mine=2", "reward.reach.params={scale: 1}"]
-    term = load_config([task, swap, *values]).reward["reach"]
-    assert term.params == {"mine": 2, "scale": 1}
-    whole = "{func: mjstack.mdp.reward.action_rate, params: {mine: 3}}"
-    assert load_config([task, f"+reward.reach={whole}"]).reward["reach"].params == {"mine": 3}
-
-
-SWAPS = {
-    "action.arm": ["scale", "joints", "mode", "pose"],
-    "controller.action.arm": ["joints", "mode"],
-    "observation.policy.terms.red_to_blue": ["a", "b"],
-    "job.observation.policy.terms.goals": [],
-    "reset.cubes": ["xy", "yaw"],
-    "gate.success.reset.cubes": ["xy", "gap"],
-    "gate.capacity.reset.cubes": ["xy", "gap"],
-    "termination.joint_limit": ["margin"],
-    "reward.progress": ["scale"],
-    "task.success": [],
-    "task.check": ["window", "xy_err"],
-}
-
-
-def term_of(cfg: Config, key: str) -> dict[str, Any]:
-    """Function and parameters of a term as a mapping."""
-    node: Any = cfg
-    for name in key.split("."):
-        node = node[name] if isinstance(node, dict) else getattr(node, name)
-    return node if isinstance(node, dict) else {"func": node.func, **node.params}
+def test_a_replaced_function_is_told_which_parameters_are_not_its_own() -> None:
+    """A line names what leaves one out, or how a file does."""
+    swap = ["task=reach", "reward.reach.func=mjstack.mdp.reward.action_rate", "sim=native"]
+    line = refusal(lambda: mjstack.make_env(swap))
+    assert line.startswith("reward.reach: parameter 'object' does not exist.")
+    fixes = line.rstrip(".").split("add ")[1].split()
+    assert fixes[0] == "~reward.reach.params.object"
+    mjstack.make_env([*swap, *fixes]).close()
 
 
 def write_yaml(path: Path, values: dict[str, Any]) -> None:
@@ -421,50 +403,46 @@ def write_yaml(path: Path, values: dict[str, Any]) -> None:
     path.write_text(f"# @package _global_\n{OmegaConf.to_yaml(nested)}")
 
 
-@pytest.mark.parametrize("key", SWAPS)
-def test_a_file_swaps_a_function_as_the_command_line_does(key: str, tmp_path: Path) -> None:
-    """Parameters of the other function are left out: those that come with the new one, or after it
-    on the command line, stay. With the same function all stay.
-    """
-    job = ["job=train", "trainer=clone"] if key.startswith("job.") else []
-    before = term_of(load_config(job), key)
-    assert {*SWAPS[key]} <= {*before}
-    own = {"mine": 3} if key == "task.check" else {"params": {"mine": 3}}
-    write_yaml(tmp_path / "conf/experiment/swap.yaml", {key: {"func": "lab.mine", **own}})
-    write_yaml(tmp_path / "conf/experiment/keep.yaml", {key: {"func": before["func"], **own}})
-    section = key if key == "task.check" else f"{key}.params"
-    more = [*job, f"+{section}.more=4"]
-
-    def composed(*overrides: str) -> dict[str, Any]:
-        return term_of(load_config(overrides, config_dir=tmp_path / "conf"), key)
-
-    swapped = {"func": "lab.mine", "mine": 3, "more": 4}
-    assert composed("experiment=swap", *more) == swapped
-    assert composed("experiment=keep", *more) == before | {"mine": 3, "more": 4}
-    assert composed(f"{key}.func=lab.mine", f"++{section}.mine=3", *more) == swapped
-    # A later file or the command line swaps it back: parameters from before do not come back.
-    back = [f"{key}.func={before['func']}", *more]
-    assert composed("experiment=swap", *back) == {"func": before["func"], "more": 4}
-    assert composed("experiment=[swap,keep]", *job) == {"func": before["func"], "mine": 3}
-
-
-def test_parameters_that_are_another_terms_stay_its(tmp_path: Path) -> None:
-    interpolated = {"func": "lab.mine", "params": "${reward.progress.params}"}
-    write_yaml(tmp_path / "conf/experiment/swap.yaml", {"action.arm": interpolated})
-    cfg = load_config(["experiment=swap"], config_dir=tmp_path / "conf")
-    assert cfg.action["arm"].params == cfg.reward["progress"].params
-    assert "within" in cfg.reward["progress"].params
-
-
 def test_the_next_composition_is_not_touched(tmp_path: Path) -> None:
     """In one session each composition has its own files."""
-    write_yaml(tmp_path / "conf/experiment/swap.yaml", {"action.arm": {"func": "lab.mine"}})
+    write_yaml(tmp_path / "conf/experiment/swap.yaml", {"action.arm.func": "lab.mine"})
     with search_path([tmp_path / "conf"]), hydra_session():
         swapped, plain = ["experiment=swap"], ["nworld=3"]
-        seen = [compose(o).action.arm.params for o in (swapped, plain, swapped, plain)]
-    assert seen[0] == seen[2] == {}
-    assert seen[1] == seen[3]
-    assert seen[1].scale == 1.2
+        seen = [compose(o).action.arm.func for o in (swapped, plain, swapped, plain)]
+    assert seen[0] == seen[2] == "lab.mine"
+    assert seen[1] == seen[3] == "mjstack.mdp.action.JointPosition"
+
+
+RESULTS = ("report", "training", "episodes", "policy", "images")  # as of `fields.CHANGES`
+EFFECTS = {
+    "web.port=9000": "",
+    "graph=off": "report",
+    "gate.batch.seeds=2": "report",
+    "job.test_seed=7": "report",
+    "sim.device=cpu": "report",
+    "nworld=3": "training",
+    "job.length=0.5": "training",
+    "seed=1": "episodes",
+    "scene.cameras.front.rate=10": "episodes",
+    "robot.home=[0,0,0.5,1.1,1.5,0.7]": "episodes policy",
+    "scene.objects.red.size=[0.02,0.02,0.02]": "episodes policy",
+    "scene.cameras.front.fovy=50": "episodes policy images",
+}
+
+
+@pytest.mark.parametrize("override", EFFECTS)
+def test_which_results_depend_on_a_key(override: str) -> None:
+    args = ["job=train", "cameras=front", "sim=native"]
+    before, after = (load_config([*args, *more]) for more in ([], [override]))
+    changed = [r for r in RESULTS if config_content(before, r) != config_content(after, r)]
+    assert changed == EFFECTS[override].split()
+    assert (config_content(before) != config_content(after)) == bool(changed)
+
+
+def test_a_name_may_have_dots() -> None:
+    cfg = load_config()
+    cfg.scene.objects["a.b"] = replace(cfg.scene.objects["red"], mass=None)
+    refusal(lambda: validate(cfg), "scene.objects.a.b.mass=null: expected a number [kg]")
 
 
 @pytest.mark.full

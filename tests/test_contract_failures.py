@@ -124,9 +124,9 @@ def test_batch_gate_names_world_and_rule_and_voids_throughput(
     monkeypatch.setattr(gate_module, "play_episode", broken_episode)
     batch = judge(run)
     assert batch.status is Status.failed
-    assert "1 of 4 worlds (2) failed" in batch.reason
+    assert "1 of 4 episodes (2) failed" in batch.reason
     assert "not stacked" in batch.reason
-    assert batch.details == ["not stacked: 1 of 4 worlds (2)"]
+    assert batch.details == ["not stacked: 1 of 4 episodes (2)"]
     expected = {"succeeded": 3, "success_rate": 0.75, "failed.STACKED": 1}
     assert batch.metrics.items() >= expected.items()
 

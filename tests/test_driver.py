@@ -128,7 +128,7 @@ def test_its_worlds_are_replayed_on_the_users_search_path_alone(conf: Path) -> N
     sys.modules.pop("holding", None)
     line = refusal(lambda: load_saved(saved))
     assert "controller.func=holding.Hold: expected one of the drivers of mjstack" in line
-    assert f"config_dir='{conf}'" in line
+    assert f"add --config-dir {conf}." in line
     assert "holding" not in sys.modules
     # A module beside the run's own folder is not the user's.
     saved.write_text(saved.read_text().replace("holding.Hold", "shutil.rmtree"))

@@ -28,8 +28,8 @@ from mjstack.episodes.stage import Stage
 from mjstack.errors import FolderError, MissingExtra, MjstackError
 from mjstack.jobs import play as play_job
 from mjstack.jobs.export import check_export, export_facts
+from mjstack.jobs.export_lerobot import lerobot_files
 from mjstack.policy import Vision, lerobot, load_policy, save_policy
-from mjstack.policy.lerobot import lerobot_files
 from mjstack.policy.onnx import to_onnx
 
 SEEN = ("observation=state", "+observation.policy.terms.joint_vel.history=2")
@@ -208,8 +208,8 @@ def test_a_task_that_brings_a_controller_takes_a_policy(
     conf = EXAMPLE.parent / "push" / "conf"
     write_policy(tmp_path / "policy", load_config(["task=push"], config_dir=conf))
     args = [f"job={job}", "task=push", "sim=native", f"policy={tmp_path / 'policy'}"]
+    args += ["controller=policy"] if job == "play" else []
     cfg = load_config(args, config_dir=conf)
-    assert cfg.controller.name == "closed_loop"
     monkeypatch.setattr(play_job, "require_offscreen", lambda model: None)
     with search_path([conf]):
         checked = {"export": check_export, "play": play_job.check_play}[job](cfg)
@@ -281,9 +281,9 @@ def test_lerobots_folder_has_its_own_files_and_the_weights(
 def test_lerobots_robots_take_joint_targets_alone(tmp_path: Path) -> None:
     cfg = configure("action=ee_delta", "timing.policy_decimation=5")
     save_policy(tmp_path / "policy", make_policy(cfg, chunk=1, execute=5))
-    limits = np.zeros((6, 2))
+    stage = Stage(replace(configure("job=export"), policy=str(tmp_path / "policy")))
     with pytest.raises(FolderError, match=r"its actions are arm, gripper, expected joint targets"):
-        lerobot_files(load_policy(tmp_path / "policy"), limits)
+        lerobot_files(stage)
 
 
 def test_a_missing_lerobot_and_another_version_are_one_line(monkeypatch: Patch) -> None:

@@ -1,9 +1,8 @@
-"""Seeded command lines, damaged folders of policies, datasets and runs, and small files that stand
-for much.
+"""Seeded command lines, and damaged folders of policies, runs and datasets.
 
 The check of each passes, or ends in one line and exit status 2. Then nothing is written. Nothing
-in the home folder changes, and no process is left. A tenth of the command lines that pass, and
-eight of the folders, are run to the end.
+in the home folder changes, and no process is left. A tenth of the command lines that pass
+are run to the end.
 
 The cases run in forked children of a process of their own, whose modules are loaded already:
 ``python tests/test_fuzz.py commands 17 200-220`` runs these cases and prints what they say.
@@ -37,20 +36,18 @@ import mjstack.cli  # before mujoco, which decides at its import how it draws
 # isort: split
 import pytest
 import torch
-from fuzz_cases import CHOSEN, QUICK, Make, command_lines, damaged_folders, is_short, small_files
+from fuzz_cases import CHOSEN, QUICK, Make, command_lines, damaged_folders, is_short
 from fuzz_datasets import damaged_datasets
 
 from mjstack.config.load import compose
 from mjstack.config.session import hydra_session
 
-# `make fuzz` tries 1,000, 500, 200 and 72
-COUNTS = {"commands": 30, "folders": 30, "datasets": 10, "small": 18}
-REAL = 8  # folders that commands in a process of their own are given
+# `make fuzz` tries 1,000, 500 and 200
+COUNTS = {"commands": 30, "folders": 40, "datasets": 10}
 CASES = {
     "commands": command_lines,
     "folders": damaged_folders,
     "datasets": damaged_datasets,
-    "small": small_files,
 }
 UNTOUCHED = ("policy", "run")  # what is only read
 PASSED = 77  # exit status of a child whose check has passed
@@ -78,7 +75,6 @@ class Outcome(NamedTuple):
     err: str
     changed: list[str]
     left: bool
-    seconds: float
     megabytes: float
 
     def problem(self, *, ran: bool = False) -> str:
@@ -120,7 +116,6 @@ class Child:
 
     case: int
     ran: bool
-    real: bool
     args: list[str]
     home: Path
     before: dict[str, str]
@@ -142,7 +137,6 @@ def main(kind: str = "", *numbers: str) -> int:
 def judge_cases(kind: str, cases: Sequence[int]) -> int:
     """Run cases of a kind, or as many as the test tries; 1 if one of them ends badly."""
     began = time.monotonic()
-    earlier = resource.getrusage(resource.RUSAGE_CHILDREN)
     with tempfile.TemporaryDirectory() as temporary:
         fixture = Path(temporary)
         make = CASES[kind](fixture)
@@ -152,10 +146,10 @@ def judge_cases(kind: str, cases: Sequence[int]) -> int:
         talks = len(cases) < 30
         counts: Counter[str] = Counter()
 
-        def judge(numbers: Sequence[int], *, run: bool = False, real: bool = False) -> list[int]:
+        def judge(numbers: Sequence[int], *, run: bool = False) -> list[int]:
             """Count how cases end, and return those that pass and are short."""
             passed = []
-            for child, outcome in _fork_all(numbers, make, fixture, run=run, real=real):
+            for child, outcome in _fork_all(numbers, make, fixture, run=run):
                 problem = outcome.problem(ran=run)
                 counts["bad"] += bool(problem)
                 counts[problem or ENDS.get(outcome.status, f"status {outcome.status}")] += 1
@@ -167,33 +161,24 @@ def judge_cases(kind: str, cases: Sequence[int]) -> int:
             return passed
 
         passed = judge(cases)
-        draw = random.Random(kind)
-        if kind == "small":
-            pass
-        elif kind != "commands":
-            judge(draw.sample(cases, min(REAL, len(cases))), run=True, real=True)
-        else:
+        if kind == "commands":
             tenth = min(counts["passed"] // 10 + 1, len(passed))
-            judge(passed if talks else draw.sample(passed, tenth), run=True)
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    worked = used.ru_utime + used.ru_stime - earlier.ru_utime - earlier.ru_stime
+            judge(passed if talks else random.Random(kind).sample(passed, tenth), run=True)
     print(
-        f"{kind}: {len(cases)} cases: {dict(counts)}; {time.monotonic() - began:.0f} s, of which"
-        f" the processors worked {worked:.0f} s",
-        flush=True,
+        f"{kind}: {len(cases)} cases: {dict(counts)}; {time.monotonic() - began:.0f} s", flush=True
     )
     return min(counts["bad"], 1)
 
 
 def _fork_all(
-    cases: Sequence[int], make: Make, fixture: Path, *, run: bool = False, real: bool = False
+    cases: Sequence[int], make: Make, fixture: Path, *, run: bool = False
 ) -> Iterator[tuple[Child, Outcome]]:
     """Fork a child per case, some at a time."""
     running: dict[int, Child] = {}
     waiting = iter(cases)
     while True:
         while len(running) < AT_ONCE and (case := next(waiting, None)) is not None:
-            child = _fork(case, make, fixture, run, real)
+            child = _fork(case, make, fixture, run)
             running[child.pid] = child
         if not running:
             return
@@ -208,14 +193,14 @@ def _fork_all(
                     os.killpg(child.pid, signal.SIGKILL)
 
 
-def _fork(case: int, make: Make, fixture: Path, run: bool, real: bool = False) -> Child:
+def _fork(case: int, make: Make, fixture: Path, run: bool) -> Child:
     home = Path(tempfile.mkdtemp(dir=fixture))
     (home / "cwd").mkdir()
     for name in (".bashrc", "notes.txt", "policy/policy.json", "run/report.json"):
         (home / "user" / name).parent.mkdir(parents=True, exist_ok=True)
         (home / "user" / name).write_text("the user's")
     args = make(case, home / "cwd")
-    child = Child(case, run, real, args, home, _content(home))
+    child = Child(case, run, args, home, _content(home))
     child.pid = os.fork()
     if not child.pid:
         _be_the_command(child)
@@ -239,8 +224,6 @@ def _be_the_command(child: Child) -> None:
             f"XDG_{name.upper()}_HOME": f"{caches}/.{name}" for name in ("cache", "config")
         }
         os.environ["HOME"] = str(child.home / "user")
-        if child.real:
-            os.execv(sys.executable, [sys.executable, "-m", "mjstack", *child.args])
         if not child.ran:
             from hydra._internal.hydra import Hydra
 
@@ -280,7 +263,7 @@ def _outcome(child: Child, status: int, megabytes: float) -> Outcome:
         os.killpg(child.pid, 0)
     except ProcessLookupError:
         left = False
-    return Outcome(status, out, err, changed, left, time.monotonic() - child.began, megabytes)
+    return Outcome(status, out, err, changed, left, megabytes)
 
 
 def _content(folder: Path) -> dict[str, str]:

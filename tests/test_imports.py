@@ -136,6 +136,27 @@ def test_no_circle_of_modules() -> None:
     TopologicalSorter({name: found & graph.keys() for name, found in graph.items()}).prepare()
 
 
+# Found by name: `controller.func`, `job.func`, `job.source` and `job.formats`
+PLUG_INS = re.compile(
+    r"(datasets/|adapters/lerobot/|jobs/collect|(policy|drivers)/lerobot\.py|train/dataset\.py"
+    r"|jobs/export_lerobot\.py).*"
+)
+
+
+def test_the_core_finds_datasets_and_lerobot_by_name() -> None:
+    """No module beside these imports one of them, lazily or not."""
+    modules = {f"mjstack.{f[:-3].replace('/', '.')}" for f in FILES if PLUG_INS.fullmatch(f)}
+    modules |= {name.removesuffix(".__init__") for name in modules}
+    assert len(modules) > 20
+    wrong = [
+        f"{file} imports {name}"
+        for file, names in FILES.items()
+        if not PLUG_INS.fullmatch(file)
+        for name in names & modules
+    ]
+    assert not wrong
+
+
 def test_trainers_and_benchmarks_take_a_stage() -> None:
     """Folder, records and page are the run's: gates and jobs alone know it."""
     users = {file for file, names in FILES.items() if "mjstack.episodes.run" in names}

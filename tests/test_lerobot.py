@@ -226,7 +226,7 @@ SCENE = ("timing=hz30", "observation=state", "cameras=front", "scene.cameras.fro
 
 
 def drive(folder: Path, *overrides: str) -> Stage:
-    args = ["sim=native", "controller=policy", f"policy=lerobot:{folder}", *overrides]
+    args = ["sim=native", "controller=lerobot", f"policy={folder}", *overrides]
     return Stage(configure(*args))
 
 
@@ -259,9 +259,9 @@ def test_our_rollout_drives_as_lerobots_does(act: Path) -> None:
 def test_gate_success_judges_act_with_its_interval_and_failing_rules(
     act: Path, tmp_path: Path
 ) -> None:
-    args = ["gates=[success]", "sim=native", "nworld=3", *SCENE, "controller=policy"]
+    args = ["gates=[success]", "sim=native", "nworld=3", *SCENE, "controller=lerobot"]
     short = ["task.episode_steps=60"]
-    assert run([*args, *short, f"policy=lerobot:{act}", f"hydra.run.dir={tmp_path / 'run'}"]) == 1
+    assert run([*args, *short, f"policy={act}", f"hydra.run.dir={tmp_path / 'run'}"]) == 1
     (gate,) = json.loads((tmp_path / "run" / "report.json").read_text())["gates"]
     assert gate["reason"].startswith("0 of 3 episodes succeeded (0 %, 95 % interval 0 to 56.15 %)")
     assert gate["metrics"]["distinct_starts"] == 3
@@ -293,7 +293,7 @@ def test_a_scene_without_what_it_sees_is_one_line(
 def test_a_folder_that_cannot_be_loaded_is_one_line(act: Path, tmp_path: Path) -> None:
     for _ in range(2):  # without a file, and without its weights
         with pytest.raises(FolderError, match="LeRobot cannot load it"):
-            load_lerobot(f"lerobot:{tmp_path}", "cpu")
+            load_lerobot(str(tmp_path), "cpu")
         shutil.copy(act / "config.json", tmp_path)
 
 

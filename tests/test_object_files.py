@@ -268,6 +268,9 @@ def test_starts_of_a_fixture_are_drawn_and_come_back_from_a_file(tmp_path: Path)
         bad = term.replace("[0.2, 0.6]", wrong)
         message = "expected two numbers in 0 to 1.5708"
         refusal(partial(build, path, f"+reset.door={bad}", keys=", fixed: true"), message)
+    bad = term.replace("thing_hinge", "0")  # it would be the first joint of the model
+    message = "joint of a fixture '0' does not exist"
+    refusal(partial(build, path, f"+reset.door={bad}", keys=", fixed: true"), message)
     env.close()
     again.close()
 

@@ -19,6 +19,7 @@ from doc_blocks import ROOT, write_files
 
 import mjstack
 from mjstack.config.schema import Backend
+from mjstack.episodes.rollout import State
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
 from mjstack.gates.parity import (
@@ -137,22 +138,41 @@ def test_contacts_that_float32_misses_by_chance_pass_and_lost_ones_do_not() -> N
     assert any("contact_count" in text for text in compared(run, apart)[1])
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("played", ["cylinder"], indirect=True)
-def test_contacts_of_faces_that_a_search_chooses_pass_by_the_deepest(played: Run) -> None:
-    """Of a can that has one contact for the several that native finds; a heavier one fails."""
-    multi = int(mujoco.mjtDisableBit.mjDSBL_MULTICCD)
-    for factor in (1.0, 1.01):
-        result = GateResult(name="parity", status=Status.passed)
-        with closing(
-            make_simulation(played.stage.model, played.cfg, 1, backend=Backend.mjwarp)
-        ) as sim:
-            assert isinstance(sim, MjwarpSimulation)
-            sim.switch(multi, off=True)
-            with Uploaded(played, sim).scaled("body_mass", factor):
-                problems = compare_states(played, sim, result)
-        assert bool(problems) == (factor != 1.0)
-        assert any("compared with one contact of two such shapes" in x for x in result.details)
+MESH = """
+<mujoco>
+  <option timestep="0.002" integrator="implicitfast" cone="elliptic" tolerance="1e-10"/>
+  <asset><mesh name="brick" vertex="-.03 -.02 -.01  .03 -.02 -.01  -.03 .02 -.01  .03 .02 -.01
+    -.03 -.02 .01  .03 -.02 .01  -.03 .02 .01  .03 .02 .01"/></asset>
+  <worldbody>
+    <geom type="box" size=".2 .2 .02"/>
+    <body pos="0 0 .0297" quat="1 .002 .003 0">
+      <freejoint/><geom type="mesh" mesh="brick" mass=".1"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_one_contact_of_a_mesh_is_the_same_on_both_backends() -> None:
+    """Where one backend finds several, and the other one, their steps differ."""
+    model = mujoco.MjModel.from_xml_string(MESH)
+    cfg = load_config([])
+    state = State(model.qpos0[None], np.full((1, 6), 0.1), np.zeros((1, 0)))
+    sims = [
+        make_simulation(model, cfg, 1, backend=kind, device="cpu")
+        for kind in (Backend.native, Backend.mjwarp)
+    ]
+    apart = []
+    for off in ((False, True), (True, True), (False, False)):
+        for sim, flag in zip(sims, off, strict=True):
+            sim.switch(int(mujoco.mjtDisableBit.mjDSBL_MULTICCD), off=flag)
+        apart.append(differences(*(end_state(sim, state, 1) for sim in sims)))
+    counts = [float(gaps["contact_count"].max()) for gaps in apart]
+    speeds = [float(gaps["qvel"].max()) for gaps in apart]
+    assert counts[0] > 0.0
+    assert counts[1:] == [0.0, 0.0]
+    assert speeds[0] > 0.01
+    assert max(speeds[1:]) < 1e-3
 
 
 class Uploaded(NamedTuple):

@@ -122,7 +122,14 @@ def test_what_a_policy_saw_is_drawn_again(trained: Path) -> None:
 @pytest.mark.full
 @pytest.mark.skipif(not has_gl(), reason="MuJoCo cannot draw offscreen here")
 def test_a_video_has_what_the_policy_saw_in_a_corner(trained: Path, tmp_path: Path) -> None:
-    clip = ["job=play", f"policy={trained}/last", "nworld=1", "job.format=webp", "job.fps=5"]
+    clip = [
+        "job=play",
+        "controller=policy",
+        f"policy={trained}/last",
+        "nworld=1",
+        "job.format=webp",
+        "job.fps=5",
+    ]
     assert run([*SMALL, *clip, f"hydra.run.dir={tmp_path}"]) == 0
     with Image.open(tmp_path / "episode.webp") as video:
         corner = np.asarray(video.convert("RGB"), int)[:120]  # a quarter of 480 pixels

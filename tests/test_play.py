@@ -49,7 +49,19 @@ def test_a_policy_plays_worlds_as_a_batch_starts_them(
 ) -> None:
     policy = write_policy(tmp_path / "policy", configure("task=reach"))
     out = tmp_path / "out"
-    assert run([*REACH, f"policy={policy}", "nworld=2", "seed=5", f"hydra.run.dir={out}"]) == 0
+    assert (
+        run(
+            [
+                *REACH,
+                "controller=policy",
+                f"policy={policy}",
+                "nworld=2",
+                "seed=5",
+                f"hydra.run.dir={out}",
+            ]
+        )
+        == 0
+    )
     gate = gate_of(out)
     assert gate["reason"] == "0 of 2 worlds succeeded"  # a world that fails is shown all the same
     assert "world 1: failed: grasp point not above red" in gate["details"]
@@ -90,7 +102,14 @@ def test_a_task_without_a_check_is_shown_unjudged(saved: list[np.ndarray], tmp_p
     cfg = configure("task=reach")
     policy = write_policy(tmp_path / "policy", cfg)
     out = tmp_path / "out"
-    args = [*REACH, "task.check=null", "task.success=null", f"policy={policy}", "nworld=1"]
+    args = [
+        *REACH,
+        "task.check=null",
+        "task.success=null",
+        "controller=policy",
+        f"policy={policy}",
+        "nworld=1",
+    ]
     args.append(f"hydra.run.dir={out}")
     assert run(args) == 0
     assert gate_of(out)["reason"] == "not judged: the task has no check"
@@ -125,7 +144,7 @@ def test_a_camera_of_the_scene_draws_the_video(tmp_path: Path) -> None:
     out = tmp_path / "out"
     seen = ["cameras=front", "looks=randomized", "scene.cameras.front.size=[48,64]", "seed=3"]
     clip = ["job.camera=front", "job.format=gif", "job.fps=10", "job.width=128", "nworld=2"]
-    args = [*REACH, *seen, *clip, f"policy={policy}", "web.episode=false"]
+    args = [*REACH, *seen, *clip, "controller=policy", f"policy={policy}", "web.episode=false"]
     assert run([*args, f"hydra.run.dir={out}"]) == 0
     with Image.open(out / "episode.gif") as video:
         assert video.info["loop"] == 0
@@ -184,7 +203,8 @@ BAD = [
     (["job.camera=front"], "scene.cameras: there is none. Add a camera: cameras=front"),
     (["job.width=10"], "job.width=10: expected an integer from 64 to 1280 [pixels] or null"),
     (["nworld=65"], "nworld=65: expected at most 64 worlds"),
-    (["policy=nowhere"], "policy=nowhere: has no policy.json"),
+    (["policy=nowhere"], "policy=nowhere: expected null, because no policy drives"),
+    (["controller=policy", "policy=nowhere"], "policy=nowhere: has no policy.json"),
     (["policy=null", "task=lonely"], "lonely"),
     (["controller=policy"], "policy=null: expected the folder of a trained policy"),
 ]
@@ -230,7 +250,14 @@ def test_a_video_that_cannot_be_written_fails_the_job(
     monkeypatch.setattr(play, "save_video", full)
     policy = write_policy(tmp_path / "policy", configure("task=reach"))
     out = tmp_path / "out"
-    args = [*REACH, f"policy={policy}", "nworld=1", "web.episode=false", f"hydra.run.dir={out}"]
+    args = [
+        *REACH,
+        "controller=policy",
+        f"policy={policy}",
+        "nworld=1",
+        "web.episode=false",
+        f"hydra.run.dir={out}",
+    ]
     assert run(args) == 1
     assert "episode.mp4 was not written: No space left on device" in gate_of(out)["reason"]
     assert not (out / "episode.mp4").exists()

@@ -183,7 +183,7 @@ MISFITS = [
     (["robot.home=[0,0,0.4,1.2,1.6,0.7]"], "was trained with robot.home=[0.0, 0.0, 0.473"),
     (["timing.command_delay=5"], "was trained with timing.command_delay=0"),
     (["timing.decimation=20", "task.control_hz=25"], "was trained with task.control_hz=50.0"),
-    (["scene.objects.red.size=[0.021,0.021,0.021]"], "scene.objects.red=box [0.022"),
+    (["scene.objects.red.size=[0.021,0.021,0.021]"], "scene.objects.red.size=[0.022"),
 ]
 
 
@@ -282,7 +282,7 @@ DAMAGED: dict[str, tuple[Callable[[Path], object], str]] = {
     "version 0.1": (change("format", value=4), "has format 4 of version 0.1, expected 5"),
     "another network": (change("network", "hidden", value=[16]), "cannot be read"),
     "no number": (change("action", "execute", value=0), "cannot be read"),
-    "a key less": (edit(lambda d: d["config"]["robot"].pop("home")), "cannot be read (KeyError"),
+    "a key less": (edit(lambda d: d["config"]["robot"].pop("home")), "with robot.home=missing"),
     "a strange function": (
         change(*TERM, "func", value="os.system"),
         "joint_pos.func=os.system: expected one of the",

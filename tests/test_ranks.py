@@ -199,9 +199,7 @@ def untrapped(trap: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path
 def test_a_rank_that_breaks(
     env: dict[str, str], why: str, trap: list[str], untrapped: Path, tmp_path: Path
 ) -> None:
-    """The run fails with the rank and the reason, within seconds; finished seeds are kept, and one
-    process goes on with them.
-    """
+    """The run fails with the rank and the reason, within seconds; finished seeds are kept."""
     folder = tmp_path / "run"
     began = time.monotonic()
     text = play(2, [*trap, f"hydra.run.dir={folder}"], tmp_path, 1, **env)

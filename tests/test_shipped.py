@@ -4,9 +4,7 @@ import json
 import re
 import runpy
 import shutil
-import stat
 import sys
-import webbrowser
 from pathlib import Path
 
 import pytest
@@ -20,7 +18,6 @@ import mjstack
 from mjstack.cli import run
 from mjstack.config.fingerprint import SHIPPED, policy_folder, shipped_policies
 from mjstack.config.load import load_config
-from mjstack.jobs.demo import show_demo
 from mjstack.policy import load_policy, save_policy
 
 NAMES = ["rebot_stack", "so101_stack"]
@@ -142,62 +139,9 @@ def test_the_tool_writes_folder_and_card(folder: Path, monkeypatch: Patch, capsy
     assert [path.name for path in written.glob("*.safetensors")] == [after.name]
 
 
-def test_the_demonstration_shows_its_page(
-    folder: Path, monkeypatch: Patch, capsys: Capture
-) -> None:
-    """In the browser that the user names; nothing is left beside its run's folder."""
-    browser = folder.parent / "browser"
-    browser.write_text(f"#!/bin/sh\necho $1 > {folder.parent}/opened\n")
-    browser.chmod(browser.stat().st_mode | stat.S_IXUSR)
-    monkeypatch.setenv("BROWSER", str(browser))
-    monkeypatch.setattr("webbrowser._tryorder", None)
-    assert run(["demo", *SOME_OF_THEM]) == 0
+def test_the_demonstration_leaves_its_page(folder: Path, refused: Refused) -> None:
+    assert "Write experiment=demo." in refused("demo", *SOME_OF_THEM)
+    assert run(["experiment=demo", *SOME_OF_THEM]) == 0
     (out,) = Path("outputs").glob("*/*")
-    assert [*Path().iterdir()] == [Path("outputs")]
-    uri = (folder.parent / "opened").read_text().strip()
-    assert uri == (out.absolute() / "episode.html").as_uri()
+    assert (out / "episode.html").is_file()
     assert report_of(out)["gates"][0]["metrics"]["episodes"] == 2
-    last = capsys.readouterr().out.splitlines()[-5:]
-    assert last[0] == f"In a browser: {uri}"
-    assert all(line.startswith("  mjstack ") for line in last[2:])
-
-
-@pytest.mark.parametrize("browser", ["lynx", None])
-def test_no_browser_is_no_error(browser: str | None, folder: Path, monkeypatch: Patch) -> None:
-    """One of the terminal, which nobody named, would take it."""
-    monkeypatch.delenv("BROWSER", raising=False)
-
-    def get() -> webbrowser.BaseBrowser:
-        if browser is None:
-            raise webbrowser.Error("could not locate runnable browser")
-        found = webbrowser.GenericBrowser(browser)
-        monkeypatch.setattr(found, "open", lambda *_: pytest.fail("it has the terminal"))
-        return found
-
-    monkeypatch.setattr(webbrowser, "get", get)
-    show_demo(folder, "so101")
-
-
-def test_without_viser_it_shows_the_report(
-    folder: Path, monkeypatch: Patch, capsys: Capture
-) -> None:
-    monkeypatch.setattr("mjstack.jobs.demo.lacks_viser", lambda: "needs viser")
-    monkeypatch.setattr(webbrowser, "get", lambda: webbrowser.GenericBrowser("none"))
-    show_demo(folder, "so101")
-    uri = (folder / "report.html").as_uri()
-    out = capsys.readouterr().out
-    assert out.startswith(f"needs viser\nIn a browser: {uri}\n")
-    assert "  mjstack demo robot=so101                   # another arm" in out
-
-
-BAD = [
-    (["foo"], "override 'foo' cannot be read"),
-    (["nworld=0"], "nworld=0: expected an integer from 1"),
-    (["experiment=fine"], "demo: expected no experiment=NAME"),
-    (["robot=scara"], "scara"),
-]
-
-
-@pytest.mark.parametrize(("overrides", "says"), BAD, ids=[o[0] for o, _ in BAD])
-def test_the_demonstration_refuses(overrides: list[str], says: str, refused: Refused) -> None:
-    assert says in refused("demo", *overrides)

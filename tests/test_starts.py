@@ -4,6 +4,7 @@ import hashlib
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -18,7 +19,9 @@ from environments import (
 import mjstack
 from mjstack.config.schema import Backend, Config
 from mjstack.envs import Env, build_env
+from mjstack.errors import ParameterError
 from mjstack.mdp.starts.placement import Placement, may_meet
+from mjstack.mdp.starts.randomization import bounds
 
 MANY = 200
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -290,3 +293,9 @@ def check_zeros(env: Env, width: float) -> None:
         np.testing.assert_allclose(env.sim.site_xpos[world], data.site_xpos, rtol=0, atol=1e-9)
         tips.append(data.site_xpos[env.index.grasp_sites[0]].copy())
     assert np.ptp(tips, axis=0).min() > 0.02
+
+
+@pytest.mark.parametrize("values", [3, "ab", [1.0], [2.0, 1.0], [0.0, 1.0], {1: 2, 3: 4}, None])
+def test_two_numbers_are_two_numbers(values: Any) -> None:
+    with pytest.raises(ParameterError, match=r"^scale=.*: expected two positive numbers"):
+        bounds("scale", values)

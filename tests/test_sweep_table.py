@@ -19,7 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mjstack.cli import run
-from mjstack.config.schema import Backend, SweepCfg
+from mjstack.config.schema import Backend
 from mjstack.errors import MjstackError
 from mjstack.jobs import check_job, sweep, sweep_table
 from mjstack.jobs.sweep import LOG, SweepJob, add_jobs
@@ -99,7 +99,7 @@ def test_throughput_goes_on_and_leaves_table_and_plot(
             assert float(row[rate]) == pytest.approx(rate_found)
         assert not {"episode.seconds.median", "succeeded"} & set(row)  # they play no episode
     text = (folder / "summary.md").read_text()
-    assert "| 2000000000 | native | - | - |" in text
+    assert "| 2000000000 | - |" in text
     assert "![summary.png](summary.png)" in text
     assert (folder / "summary.png").stat().st_size > 10_000
     assert [path.name for path in Path().iterdir()] == ["outputs"]
@@ -162,7 +162,7 @@ def test_the_table_of_a_plain_sweep(tmp_path: Path) -> None:
         report(jobs[0], Status.passed, "all", succeeded=2.0),
         report(jobs[1], Status.failed, "a | b", succeeded=1.0),
     ]
-    shown, problem = write_summary(tmp_path, SweepCfg(), dict(enumerate(ended)), draw=True)
+    shown, problem = write_summary(tmp_path, dict(enumerate(ended)), draw=True)
     assert problem == ""
     assert shown.header == ["job", "robot", "batch", "succeeded", "status"]
     assert shown.rows[1] == ["1", "rebot", "fail: a | b", "1", "fail"]
@@ -175,7 +175,7 @@ def test_a_result_has_its_details_in_the_files_alone(tmp_path: Path) -> None:
     jobs = listed(tmp_path, "seed=1", "seed=2")
     reason = "7 of 8 episodes succeeded (87.5 %), 97 % wanted; 1 of 8 episodes (4) failed"
     ended = {job.number: report(job, Status.failed, reason, succeeded=7.0) for job in jobs}
-    table_shown, _ = write_summary(tmp_path, SweepCfg(), ended)
+    table_shown, _ = write_summary(tmp_path, ended)
     assert table_shown.rows[0][2] == "fail: 7 of 8 episodes succeeded"
     assert f"| fail: {reason} |" in (tmp_path / "summary.md").read_text()
     assert table(tmp_path)[0]["batch"] == f"fail: {reason}"
@@ -198,7 +198,7 @@ def test_a_picture_names_its_keys_and_a_rate_ends_at_one(
         for n in (1, 2)
         for gap in (0.01, 0.02)
     ]
-    panels = {"rate": {"": "success_rate"}, "speed": {"": RATE}}
+    panels = {"rate": "success_rate", "speed": RATE}
     figures: list[Any] = []
     monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: figures.append(self))
     save_sweep(tmp_path / "p.png", Plot(title="T", over=over, lines=["gap"], panels=panels), rows)
@@ -220,7 +220,7 @@ def test_a_picture_that_fails_takes_no_table_back(tmp_path: Path, monkeypatch: P
     (job,) = listed(tmp_path, "seed=1")
     monkeypatch.setattr(sweep_table, "save_sweep", fail)
     ended = {0: report(job, Status.passed, succeeded=1.0)}
-    _, problem = write_summary(tmp_path, SweepCfg(), ended, draw=True)
+    _, problem = write_summary(tmp_path, ended, draw=True)
     assert problem == "summary.png was not written: no fonts"
     assert len(table(tmp_path)) == 1
 
@@ -281,12 +281,7 @@ def test_jobs_of_the_experiment() -> None:
     assert not mjwarp.gate.throughput.native_baseline
 
 
-PLOT = Plot(
-    title="T",
-    over="nworld",
-    lines=["sim"],
-    panels={"rate": {"physics": RATE}, "ms": {"physics": f"{RATE} / 10", "": "missing"}},
-)
+PLOT = Plot(title="T", over="nworld", lines=["sim"], panels={"rate": RATE, "none": "missing"})
 
 
 def rates(values: dict[str, dict[int, float | None]]) -> list[Row]:
@@ -331,7 +326,6 @@ def test_a_job_that_failed_is_a_gap_even_with_figures(tmp_path: Path, monkeypatc
 
     monkeypatch.setattr(Axes, "plot", spy)
     save_sweep(tmp_path / "p.png", PLOT, rows)
-    curves = [y for label, y in drawn if label == "mjwarp, physics"]
-    assert [[math.isnan(value) for value in y] for y in curves] == [[False, True, False]] * 2
-    assert curves[1][2] == pytest.approx(curves[0][2] / 10)
+    (curve,) = [y for label, y in drawn if label == "mjwarp"]
+    assert [math.isnan(value) for value in curve] == [False, True, False]
     assert [len(y) for label, y in drawn if label == "x"] == [1, 0, 1, 0]

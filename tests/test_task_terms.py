@@ -158,7 +158,7 @@ def test_training_is_judged_from_the_starts_of_the_task(turned: Path, tmp_path: 
     assert list(composed(turned, "job=train", "reset=jitter", extra).gate.success.reset)[-1] == (
         "more"
     )
-    chosen = composed(turned, "job=train", "reset=jitter", "gate.success.reset=randomized")
+    chosen = composed(turned, "job=train", "reset=jitter", "reset@gate.success.reset=randomized")
     assert list(chosen.gate.success.reset) == [*SHIPPED, "turn", "slide"]
     # An experiment's choice counts as one of the command line
     (turned / "experiment").mkdir()
@@ -245,20 +245,18 @@ def test_a_policy_sees_what_a_task_writes(turned: Path) -> None:
     noisy = composed(turned, "job=train", "job.observation.policy.terms.joint_pos.noise=0.02")
     assert noisy.job.observation["policy"].terms["joint_pos"].noise == 0.02
     assert "shoulder" in noisy.job.observation["policy"].terms
-    for chosen in ("observation@job.observation=state", "job.observation=state"):
-        cfg = composed(turned, "job=train", chosen)
-        assert "offsets" in cfg.job.observation["policy"].terms
-        (line,) = [line for line in cfg.unused_terms if "see" in line]
-        assert line.endswith(
-            "goals; the task's own shoulder it does not see"
-            " (observation@job.observation=task has them)"
-        )
+    cfg = composed(turned, "job=train", "observation@job.observation=state")
+    assert "offsets" in cfg.job.observation["policy"].terms
+    (line,) = [line for line in cfg.unused_terms if "see" in line]
+    assert line.endswith(
+        "goals; the task's own shoulder it does not see (observation@job.observation=task has them)"
+    )
     # A task with a file of mjstack's, and a term of its own beside it
     more = ["+observation.policy.terms.seen={func: mjstack.mdp.observation.goals}", "job=train"]
     assert not load_config(more).unused_terms  # the policy has that term, by another name
     more[0] = more[0].replace("goals", "gripper_opening")
     assert "the task's own seen it does not see" in load_config(more).unused_terms[-1]
-    chosen = load_config([*more, "job.observation=task"])
+    chosen = load_config([*more, "observation@job.observation=task"])
     assert chosen.job.observation == chosen.observation
     assert not chosen.unused_terms
 
@@ -269,7 +267,7 @@ def test_terms_that_are_null(turned: Path) -> None:
     assert cfg.job.observation == cfg.observation
     assert "shoulder" not in cfg.job.observation["policy"].terms
     assert not [line for line in cfg.unused_terms if "does not see" in line]
-    cfg = composed(turned, "job=train", "job.observation.policy.terms.shoulder=null")
+    cfg = composed(turned, "job=train", "++job.observation.policy.terms.shoulder=null")
     assert "shoulder" not in cfg.job.observation["policy"].terms
     (line,) = [line for line in cfg.unused_terms if "does not see" in line]
     assert "the task's own shoulder it does not see" in line

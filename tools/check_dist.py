@@ -2,10 +2,10 @@
 
 Each Python of ``--python`` gets an empty environment outside of the checkout, where the wheel is
 installed by pip alone; ``python3.11:constraints.txt`` with versions of that file, else the newest.
-There run the gates, ``mjstack demo``, an example in its own folder and the tests that need no
+There run the gates, ``experiment=demo``, an example in its own folder and the tests that need no
 checkout. Then the same with the sdist in the wheel's place. ``--log`` writes the tables as a page.
-``--quick`` builds the wheel alone, and tries its gates and ``mjstack demo`` in an empty environment
-of this Python, with versions of constraints.txt.
+``--quick`` builds the wheel alone, and tries its gates and ``experiment=demo`` in an empty
+environment of this Python, with versions of constraints.txt.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 MOST = 12_000_000  # bytes of either file
-DEMO = ["demo", "nworld=4"]
+DEMO = ["experiment=demo", "nworld=4"]
 GATES = ["gates=[baseline,parity]", "nworld=4"]
 TESTS = (  # they read nothing of the checkout, and need pytest alone
     *("test_rng_math", "test_managers", "test_stack_check", "test_open_loop", "test_simulation"),
@@ -180,7 +180,7 @@ def use(python: str, source: Path, folder: Path) -> list[Row]:
     files = [f"tests/{name}.py" for name in TESTS]
     steps = {
         "`mjstack gates=[baseline,parity] nworld=4`": ([*mjstack, *GATES], folder),
-        "`mjstack demo nworld=4`": ([*mjstack, *DEMO], folder),
+        "`mjstack experiment=demo nworld=4`": ([*mjstack, *DEMO], folder),
         "`mjstack --config-dir conf robot=scara` in `examples/scara`": (
             [*mjstack, *example],
             scara,

@@ -34,7 +34,7 @@ class GpuLauncher(Launcher):
 
         folder = hydra_path(self._config, "sweep.dir")
         jobs = number_jobs(folder, job_overrides, initial_job_idx)
-        finish = partial(update_summary, folder, self._config)
+        finish = partial(update_summary, folder)
         reports = run_jobs(folder, jobs, Queueing.of(self._queueing), finish)
         return [
             JobReturn(overrides=job.overrides, status=JobStatus.COMPLETED, _return_value=report)

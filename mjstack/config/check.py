@@ -67,8 +67,13 @@ def starts_midway(term: TermCfg) -> bool:
 
 def _value(cfg: Config, key: str) -> Any:
     value: Any = cfg
-    for name in key.split("."):
-        value = value[name] if isinstance(value, dict | GateCfg) else getattr(value, name)
+    while key:
+        if isinstance(value, GateCfg):
+            value = vars(value) | value.added
+        names = value if isinstance(value, dict) else dir(value)
+        name = max((n for n in names if f"{key}.".startswith(f"{n}.")), key=len)  # it may have dots
+        value = value[name] if isinstance(value, dict) else getattr(value, name)
+        key = key[len(name) + 1 :]
     return list(value) if isinstance(value, dict) else value
 
 
@@ -94,8 +99,8 @@ def _run(cfg: Config) -> Checks:
     wrong = cfg.devices is not None and not _DEVICES.fullmatch(cfg.devices)
     yield "devices", wrong, "all, or a number of GPUs of at least 1"
     expected = "null, because no policy drives the worlds. Add controller=policy"
-    played = cfg.job.name in ("play", "export")
-    wrong = cfg.policy is not None and not (played or offered(cfg.controller.func, "plays_policy"))
+    wrong = cfg.policy is not None and cfg.job.name != "export"
+    wrong = wrong and not offered(cfg.controller.func, "plays_policy")
     yield "policy", wrong, expected
     resets = (cfg.reset, *(t.reset for t in cfg.gate.episodes().values()))
     wrong = cfg.starts is not None and not any(map(reads_starts_file, resets))

@@ -25,7 +25,7 @@ from mjstack.config.fields import accepted, find_field
 from mjstack.config.schema import JOB_SCHEMAS, Config, GateCfg
 from mjstack.errors import MjstackError, UnknownName, first_line, shorten, suggest
 
-COMMANDS = ("demo", "doctor", "list", "new")  # first words of a command line
+COMMANDS = ("doctor", "list", "new")  # first words of a command line
 LISTS = ("cameras", "experiment")  # groups of which several may be chosen
 TERM_GROUPS = ("action", "observation", "reset", "termination", "reward")
 
@@ -64,7 +64,11 @@ def parse(override: str) -> Override:
     except HydraException as error:
         if override.isidentifier():
             problem = f"override {override!r} cannot be read: expected key=value, or a command"
-            raise MjstackError(f"{problem}. {suggest(override, COMMANDS)}") from error
+            advice = suggest(override, COMMANDS)
+            for group, names in session.list_choices().items():
+                if override in names:
+                    advice = f"Write {group}={override}."
+            raise MjstackError(f"{problem}. {advice}") from error
         raise MjstackError(
             f"override {shorten(override, 60)!r} cannot be read: expected key=value without spaces"
             " around the sign. A value with a bracket, a quote, a letter beyond ASCII or"
@@ -120,7 +124,7 @@ def explain(error: Exception, overrides: Sequence[str] = ()) -> MjstackError:
         choices = error.options or session.list_choices().get(group, [])
         problem: MjstackError = UnknownName(f"{group}={name}:", name, choices)
         if not session.config_folders() and not group.startswith("hydra/"):
-            advice = f"A choice of your own needs {session.folder_advice()}."
+            advice = "A choice of your own needs --config-dir DIR (Python: config_dir)."
             problem = MjstackError(f"{problem} {advice}")
     else:
         problem = _explain(error, overrides)
@@ -153,6 +157,11 @@ def _explain(error: Exception, overrides: Sequence[str]) -> MjstackError:
         value_text = settings[-1].partition("=")[2]
         one_name = settings[-1] in overrides and re.match(r"(?!null$)[^\[{]", value_text)
         names = expected.startswith("a list of names")
+        group = key.rpartition(".")[2]
+        if value_text in session.list_choices().get(group, ()):
+            return MjstackError(
+                f"{settings[-1]}: expected {expected}", f"Write {group}@{settings[-1]}"
+            )
         cure = f" Write {shlex.quote(f'{key}=[{value_text}]')}." if one_name and names else ""
         return MjstackError(f"{settings[-1]}: expected {expected}.{cure}")
     return MjstackError(f"{key or ' '.join(overrides) or 'the values'}: {text}.")

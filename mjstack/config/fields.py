@@ -13,7 +13,7 @@ import ast
 import inspect
 import math
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields, is_dataclass
 from enum import EnumMeta
 from functools import cache
@@ -28,6 +28,17 @@ from mjstack.errors import ConfigError
 MOST_WORLDS = (1 << 31) - 1  # Warp counts them with 32 bits
 MOST_SEEDS = 1 << 32  # seeds are 32-bit
 MOST_COUNT = 1_000_000  # steps or episodes, one after the other
+# Results that depend on a key, see `select`, and a sentence for ``--help KEY``
+CHANGES = {
+    "episodes": "",  # all that is played, recorded or learned
+    "training": "It changes no dataset.",
+    "gates": "It changes episodes of gates alone.",
+    "report": "It changes no episode.",
+    "nothing": "It changes no result.",
+    "policy": "A policy fits the value of its training alone.",
+    "images": "",  # states drawn by a camera
+}
+FITS = ("episodes", "policy")
 _SPEC = "mjstack"  # key of a field's metadata
 _NOUNS = {int: "an integer", float: "a number", bool: "true or false", str: "text"}
 _PLURALS = {int: "integers", float: "numbers", str: "names"}
@@ -48,6 +59,7 @@ class Range:
             type OmegaConf would refuse whole ones.
         choices: The only values.
         finite: Whether infinity is refused; NaN always is.
+        changes: Some of `CHANGES`, which depend on the value; empty: as of the field that holds it.
     """
 
     unit: str = ""
@@ -58,6 +70,7 @@ class Range:
     vectors: bool = False
     choices: tuple[object, ...] = ()
     finite: bool = True
+    changes: tuple[str, ...] = ()
 
     def holds(self, value: object) -> bool:
         """Whether a single value, no list, is accepted."""
@@ -93,9 +106,12 @@ Repeats = Annotated[int, Range(ge=1, le=1000)]  # of a computation that nothing 
 
 def spec(default: Any = MISSING, **limits: Any) -> Any:
     """Declare a configuration field with the attributes of its `Range`. Its default is its value
-    where the YAML has none, of a list or mapping a copy; without one, the YAML must have it.
+    where the YAML has none, of a list or mapping a copy, of a class a new one; without one, the
+    YAML must have it.
     """
     metadata = {_SPEC: Range(**limits)}
+    if isinstance(default, type):
+        return field(default_factory=default, metadata=metadata)
     if isinstance(default, list | dict):
         return field(default_factory=default.copy, metadata=metadata)
     return field(default=default, metadata=metadata)
@@ -120,6 +136,39 @@ def find_field(owner: type, key: str) -> tuple[type, Field] | None:
         return owner, item
     below = rest.partition(".")[2] if holders else rest  # several are by name
     return find_field(kind, below) if below else (owner, item)
+
+
+def select(
+    config: Mapping[str, Any],
+    changes: Collection[str],
+    owner: type,
+    inherited: Sequence[str] = ("episodes",),
+) -> dict[str, Any]:
+    """The keys of a dataclass in JSON's types, or of one that derives from it, that change some of
+    `CHANGES`.
+    """
+    owner = _derived(owner, config.keys()) or owner
+    selected: dict[str, Any] = {}
+    for item in fields(owner):
+        value = config.get(item.name)
+        depends = field_range(item).changes or inherited
+        kind, holders = _kind(_hints(owner)[item.name])
+        if isinstance(value, dict) and isinstance(kind, type) and is_dataclass(kind):
+            parts = value if holders else {"": value}
+            nested = {name: select(part, changes, kind, depends) for name, part in parts.items()}
+            if nested := {name: part for name, part in nested.items() if part}:
+                selected[item.name] = nested if holders else nested[""]
+        elif item.name in config and {*changes} & {*depends}:
+            selected[item.name] = value
+    return selected
+
+
+def _derived(owner: type, names: Collection[str]) -> type | None:
+    """A dataclass, or one that derives from it, whose fields have exactly these names."""
+    if {item.name for item in fields(owner)} == {*names}:
+        return owner
+    derived: list[type] = owner.__subclasses__()
+    return next(filter(None, (_derived(child, names) for child in derived)), None)
 
 
 def check_fields(key: str, value: Any) -> None:
@@ -171,7 +220,7 @@ def accepted(owner: type, item: Field, *, inside: bool = False) -> str:
         mapping = holders[:1] == [dict] or is_dataclass(kind)
         count = "" if limits.length is None else f"{limits.length} "
         words = f"{'keys and' if mapping else 'a list of'} {count}{_PLURALS.get(kind, 'values')}"
-    elif (kind is float or inside) and limits == Range(unit=limits.unit):
+    elif (kind is float or inside) and limits == Range(unit=limits.unit, changes=limits.changes):
         words = "a finite number"
     else:
         words = _NOUNS.get(kind, "a value")

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
 from functools import reduce
 from operator import getitem
@@ -10,36 +10,32 @@ from pathlib import Path
 from typing import Any
 
 from mjstack.config.check import reads_starts_file
+from mjstack.config.fields import CHANGES, select
 from mjstack.config.schema import Config
 from mjstack.config.session import list_items
 from mjstack.errors import ConfigError
 from mjstack.files import check_regular
 
 CONTENT = "sha256:"  # in front of what stands for a file
-_OF_THE_CALL = ("devices", "sweep", "web", "unused_terms")  # they change no result
-# Changing one of these changes no dataset and no training.
-WITHOUT_EFFECT = ("batch", "gates", "gate", "graph", "view", "video", "run", "world")
+_RESULTS = CHANGES.keys() - {"nothing"}
+_LEROBOT_FILE = "model.safetensors"  # the weights of a LeRobot policy
 POLICY_FILE = "policy.json"  # of a policy's folder; it names the weights by their SHA-256
 SHIPPED = Path(__file__).parents[1] / "policies"  # verified policies that come with mjstack
 
 
-def config_content(cfg: Config, without: Iterable[str] = ()) -> dict[str, Any]:
-    """The whole configuration in JSON's types, with the SHA-256 of each MJCF file, of each starts
-    file and of the policy in place of its path; a ConfigError if one cannot be read. Some keys at
-    its top may be left out.
+def config_content(cfg: Config, *changes: str) -> dict[str, Any]:
+    """The keys that change some of `CHANGES`, or any result, in JSON's types, with the SHA-256 of
+    each MJCF file, of each starts file and of the policy in place of its path; a ConfigError if one
+    cannot be read.
     """
     config: dict[str, Any] = json.loads(json.dumps(asdict(cfg)))
     for key, file in cfg.files.items():
         *path, last = key.split(".")
         reduce(getitem, path, config)[last] = _content(key, file)
-    for key in (*_OF_THE_CALL, *without):
-        del config[key]
-    if cfg.policy is None:  # hashes without one are older than it
-        del config["policy"]
-    else:
-        folder = cfg.policy.removeprefix("lerobot:")
-        file = POLICY_FILE if folder == cfg.policy else "model.safetensors"
-        config["policy"] = _content("policy", str(policy_folder(folder) / file))
+    if cfg.policy is not None:
+        folder = policy_folder(cfg.policy)
+        name = POLICY_FILE if (folder / POLICY_FILE).exists() else _LEROBOT_FILE
+        config["policy"] = _content("policy", str(folder / name))
     for name, term in cfg.reset.items():
         path = term.params.get("path")
         params = config["reset"][name]["params"]
@@ -49,7 +45,7 @@ def config_content(cfg: Config, without: Iterable[str] = ()) -> dict[str, Any]:
                 config["starts"] = _content("starts", path)
             else:
                 params["path"] = _content(f"reset.{name}.params.path", path)
-    return config
+    return select(config, changes or _RESULTS, Config)
 
 
 def policy_folder(name: str | Path) -> Path:

@@ -8,9 +8,11 @@ import importlib
 import inspect
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any
+from typing import Any, TypeVar
 
-from mjstack.errors import MissingExtra, TermError, first_line, suggest
+from mjstack.errors import ConfigError, MissingExtra, TermError, first_line, suggest
+
+T = TypeVar("T")
 
 
 def resolve_func(
@@ -59,6 +61,16 @@ def find_object(label: str, path: str) -> Any:
     ]
     hint = suggest(attribute, names)
     raise TermError(label, f"func={path}: '{attribute}' does not exist. {hint}")
+
+
+def find_instance(key: str, path: str, kind: type[T]) -> T:
+    """Find an object of a class by its dotted name, the value of a key; a ConfigError if it is of
+    another class, or a TermError as of `find_object`.
+    """
+    instance = find_object(key, path)
+    if not isinstance(instance, kind):
+        raise ConfigError(key, path, f"a {kind.__module__}.{kind.__name__}")
+    return instance
 
 
 def offered(path: str, name: str) -> Any:

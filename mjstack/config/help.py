@@ -13,7 +13,7 @@ from importlib import import_module
 from typing import Any, NamedTuple
 
 from mjstack.config.complete import typed
-from mjstack.config.fields import accepted, field_docs
+from mjstack.config.fields import CHANGES, accepted, field_docs, field_range
 from mjstack.config.fingerprint import shipped_policies
 from mjstack.config.functions import find_object, offered
 from mjstack.config.schema import Config
@@ -32,7 +32,7 @@ mjstack: a task of a robot arm, from native MuJoCo to thousands of MuJoCo Warp w
 
 Usage: mjstack [group=choice ...] [key=value ...] [flags]
        mjstack list [tasks|robots|terms|conditions|gates|trainers|policies]
-       mjstack demo    16 worlds stack by a shipped policy, shown in a browser
+       mjstack experiment=demo    16 worlds stack by a shipped policy: see episode.html
        mjstack new task|driver|action|robot NAME [FILE.xml]    your own folder
 In a checkout: python scripts/run.py ...  What this machine has: mjstack doctor
 
@@ -51,7 +51,7 @@ Examples:
     a policy that imitates the expert, judged by gate success; resumes
   mjstack controller=policy policy=outputs/mine/last 'gates=[success]'
     the policy in the expert's place, in any gate
-  mjstack job=play policy=outputs/mine/last
+  mjstack job=play controller=policy policy=outputs/mine/last
     four worlds of the policy as a video; view=true: in MuJoCo's viewer
 
 Groups, to be set as group=choice, and their choices, the default first:
@@ -78,12 +78,15 @@ Exit status: 0 passed, 1 a gate failed, 2 bad configuration or input, 130 interr
 
 
 class Key(NamedTuple):
-    """A dotted configuration key, its value, its type with range and unit, and its meaning."""
+    """A dotted configuration key, its value, its type with range and unit, its meaning, and which
+    results depend on it.
+    """
 
     name: str
     value: str
     accepts: str
     words: str
+    effect: str = ""
 
 
 def list_groups() -> dict[str, tuple[list[str], str]]:
@@ -100,7 +103,9 @@ def list_groups() -> dict[str, tuple[list[str], str]]:
     }
 
 
-def list_keys(value: Any, name: str = "", *, named: bool = True) -> Iterator[Key]:
+def list_keys(
+    value: Any, name: str = "", *, named: bool = True, inherited: Sequence[str] = ()
+) -> Iterator[Key]:
     """Keys of a configuration at and below one of its parts, whose dotted key is ``name``.
 
     With ``named``, entries that users name, such as terms, are listed each. Otherwise the first one
@@ -110,16 +115,17 @@ def list_keys(value: Any, name: str = "", *, named: bool = True) -> Iterator[Key
     for item in fields(value) if is_dataclass(value) else ():
         part = getattr(value, item.name)
         key = f"{name}.{item.name}".lstrip(".")
+        changes = field_range(item).changes or inherited
         if is_dataclass(part):
-            yield from list_keys(part, key, named=named)
+            yield from list_keys(part, key, named=named, inherited=changes)
         elif isinstance(part, dict) and any(map(is_dataclass, part.values())):
             for entry in part if named else list(part)[:1]:
-                yield from list_keys(
-                    part[entry], f"{key}.{entry if named else 'NAME'}", named=named
-                )
+                path = f"{key}.{entry if named else 'NAME'}"
+                yield from list_keys(part[entry], path, named=named, inherited=changes)
         else:
             text = "" if ".NAME" in key else _yaml(part)
-            yield Key(key, text, accepted(type(value), item), docs.get(item.name, ""))
+            effect = " ".join(filter(None, map(CHANGES.get, changes)))
+            yield Key(key, text, accepted(type(value), item), docs.get(item.name, ""), effect)
 
 
 def key_help(cfg: Config, prefix: str, width: int) -> str:
@@ -144,7 +150,8 @@ def key_help(cfg: Config, prefix: str, width: int) -> str:
         raise UnknownName("key", prefix, {".".join(names[:depth]) for names in beside})
     lines = []
     for key in matching:
-        words = textwrap.wrap(f"{key.words} Accepts {key.accepts}.".strip(), width - 2)
+        text = f"{key.words} Accepts {key.accepts}. {key.effect}"
+        words = textwrap.wrap(text.strip(), width - 2)
         lines += [f"{key.name}={key.value}", *(f"  {line}" for line in words)]
     return "\n".join(lines)
 
@@ -210,7 +217,7 @@ def _files(group: str) -> Iterator[tuple[str, str]]:
     """Choices of a group, and the comments that their files begin with."""
     for folder in (CONFIG_FOLDER, *config_folders()):
         for path in sorted(folder.glob(f"{group}/*.yaml")):
-            comment = re.search("(?m)^# (?!@)(.+)", path.read_text("utf-8-sig"))
+            comment = re.search("(?m)^# (?!@)(.+)", path.read_text("utf-8"))
             yield path.stem, comment[1] if comment else ""
 
 
@@ -221,7 +228,7 @@ def _functions(kind: str, with_parameters: bool) -> Iterator[tuple[str, str]]:
     if kind == "terms":  # also those that the search path's files name
         modules = [f"mjstack.mdp.{name}" for name in _TERMS]
         paths = [path for folder in config_folders() for path in sorted(folder.rglob("*.yaml"))]
-        text = "".join(path.read_text("utf-8-sig") for path in paths)
+        text = "".join(path.read_text("utf-8") for path in paths)
     names = [f"{m}.{name}" for m in modules for name in vars(import_module(m)) if name[0] != "_"]
     for name in dict.fromkeys([*names, *re.findall(r"func: ([\w.]+)", text)]):
         func: Any = find_object("list", name)

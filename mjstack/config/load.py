@@ -11,7 +11,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError  # type: ignore[import-untyped]
 
@@ -59,9 +59,6 @@ _REPLAYED = {
     r"(gate\.\w+\.)?reset\.": "reset term",
     r"task\.check\.": "check",
 }
-
-# Overrides by the key where a choice of a group goes, such as gate.success.reset=jitter
-_CHOICE = re.compile(r"^(?:gate\.\w+\.|job\.)(reset|observation)=(?!null$)[\w,]+$")
 
 # Interpolations: ${NAME:ARGUMENT,...} is the value of a function of these and of the configuration.
 _RESOLVERS: dict[str, Callable] = {
@@ -111,8 +108,8 @@ def extended_search_path(
     overrides: Sequence[str], folders: Sequence[str | os.PathLike]
 ) -> Iterator[list[str]]:
     """Add folders, and those of overrides of ``hydra.searchpath``, to the search path of every
-    composition inside. Yields the other overrides, starts and observations that they choose by a
-    key as choices of their group, and what the policy that they name was trained for.
+    composition inside. Yields the other overrides, and what the policy that they name was trained
+    for.
     """
     entries = list(map(str, folders))
     remaining = [o for o in overrides if not o.lstrip("+").startswith("hydra.searchpath=")]
@@ -120,22 +117,7 @@ def extended_search_path(
         value = parse(override).value()
         entries += map(str, value if isinstance(value, list) else [value])
     with session.search_path(entries):
-        remaining = [_CHOICE.sub(r"\1@\g<0>", o) for o in remaining]
-        yield [*remaining, *_starts_alone(remaining), *_policy_choices(remaining)]
-
-
-def _starts_alone(overrides: Sequence[str]) -> list[str]:
-    """Let gate *success*, where it alone plays, start worlds as ``reset`` and ``looks`` say."""
-    if not {"gates=[success]", "job=compare"} & set(overrides):
-        return []
-    chosen = []
-    for prefix, choice in (("", r"reset=(?!starts_file)\w+"), ("+", r"looks=(?!null)\w+")):
-        group, _ = choice.split("=", 1)
-        key = f"{prefix}{group}@gate.success.reset="
-        values = [o.partition("=")[2] for o in overrides if re.fullmatch(choice, o)]
-        if not any(o.startswith(key) for o in overrides):
-            chosen += [key + value for value in values]
-    return chosen
+        yield [*remaining, *_policy_choices(remaining)]
 
 
 def _policy_choices(overrides: Sequence[str]) -> list[str]:
@@ -175,7 +157,6 @@ def compose(overrides: Sequence[str], run_mode: RunMode = RunMode.RUN) -> DictCo
         if run_mode is RunMode.RUN:
             check_added(session.without_hydra(cfg), overrides)
             files = [*loader.files[id(cfg)], (Path(), _set_values(overrides))]
-            _drop_inherited(cfg, [values for _, values in files])
             _locate_files(cfg, files)
             _keep_exact(cfg, [values for _, values in files])
             complete_terms(cfg, overrides)
@@ -218,39 +199,10 @@ def _with_file(cfg: DictConfig) -> Iterator[tuple[str, Any]]:
             yield key, owner
 
 
-def _drop_inherited(cfg: DictConfig, files: Sequence[Mapping[str, object]]) -> None:
-    """Leave a term, and the check, whose ``func`` a file or an override swaps with the parameters
-    that are given with the new one or after it: those of the other function are not its own.
-    ``files`` are the keys and values of each, in the order of composition.
-    """
-    functions: dict[str, object] = {}  # by the mapping of their parameters
-    params: dict[str, set[str]] = {}
-    swapped = set()
-    for source in files:
-        for key, value in source.items():
-            term, _, name = key.rpartition(".")
-            section = term if term == "task.check" else f"{term}.params"
-            if name == "func" and functions.setdefault(section, value) != value:
-                functions[section] = value
-                params[section] = {"func"}
-                swapped.add(section)
-        for key in source:
-            section, _, name = key.rpartition(".")
-            params.setdefault(section, set()).add(name)
-    for section in swapped:
-        parent, _, name = section.rpartition(".")
-        owner = OmegaConf.select(cfg, parent)
-        if not isinstance(owner, DictConfig) or name not in owner:
-            continue
-        if isinstance(owner[name], DictConfig) and not OmegaConf.is_interpolation(owner, name):
-            with open_dict(cfg):
-                for key in owner[name].keys() - params[section]:
-                    del owner[name][key]
-
-
 def _keep_exact(cfg: DictConfig, files: Sequence[Mapping[str, object]]) -> None:
     """Joint targets of closed jaws that replace the robot's own are for any object, unless a width
-    comes with them or after them. Arguments as of `_drop_inherited`.
+    comes with them or after them. ``files`` are the keys and values of each, in the order of
+    composition.
     """
     closed, width = "robot.gripper_closed", "robot.closed_width"
     settings = [source for source in files if source.keys() & {closed, width}]

@@ -5,13 +5,14 @@ under the entry point group ``mjstack.configs``, and in folders that the caller 
 beside an added one is importable, so that its YAML can name functions by module.
 """
 
+import codecs
 import copy
 import functools
 import os
 import re
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from importlib.metadata import entry_points
@@ -20,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 from hydra import initialize_config_dir
-from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
@@ -37,8 +37,6 @@ from mjstack.errors import MjstackError
 from mjstack.files import CONFIG_FOLDER, yaml_text
 
 CONFIG_NAME = "config"
-SEEN = "observation@job.observation="  # of a new policy
-TASK_SEEN = f"{SEEN}task"
 ENTRY_POINTS = "mjstack.configs"
 PROVIDER = "mjstack.search_path"  # of added entries, in a run's .hydra/hydra.yaml
 
@@ -49,7 +47,6 @@ _ENTRY = re.compile(
 )
 
 _added: ContextVar[tuple[Path, ...]] = ContextVar("search path", default=())
-_on_command_line: ContextVar[bool] = ContextVar("command line", default=False)
 
 
 @contextmanager
@@ -69,23 +66,6 @@ def search_path(entries: Sequence[str | os.PathLike]) -> Iterator[None]:
         _added.reset(token)
 
 
-@contextmanager
-def command_line() -> Iterator[None]:
-    """Let advice inside be that for a command line, not for Python."""
-    token = _on_command_line.set(True)
-    try:
-        yield
-    finally:
-        _on_command_line.reset(token)
-
-
-def folder_advice(folders: Sequence[Path] = ()) -> str:
-    """The words that add folders to the search path where they are needed; any folder if none."""
-    if _on_command_line.get():
-        return shlex.join(search_path_args(folders)) or "--config-dir DIR"
-    return " and ".join(f"config_dir='{folder}'" for folder in folders) or "config_dir=DIR"
-
-
 def search_path_args(folders: Sequence[Path] | None = None) -> list[str]:
     """Arguments of a command that adds folders; those of the current search path if None."""
     folders = _added.get() if folders is None else folders
@@ -97,24 +77,21 @@ def add_folder(saved: Path, *more: Path) -> str:
     ``more``, where it lacks none of these.
     """
     folders = [folder for folder in used_folders(saved) if folder not in config_folders()]
-    return f"If you trust the folder that it had used, add {folder_advice(folders or more)}."
+    args = shlex.join(search_path_args(folders or more)) or "--config-dir DIR"
+    return f"If you trust the folder that it used, add {args}."
 
 
 def used_folders(saved: Path) -> list[Path]:
-    """Folders of the search path of the run of a config.yaml beside mjstack's; none if it does not
-    say.
-    """
+    """Folders that the run of a config.yaml had added to its search path, as far as it says."""
     try:
-        sources = read_yaml(saved.with_name("hydra.yaml"))["hydra"]["runtime"]["config_sources"]
-        return [Path(source["path"]) for source in sources if source["provider"] == PROVIDER]
+        return added_folders(read_yaml(saved.with_name("hydra.yaml"))["hydra"]["runtime"])
     except Exception:  # the file may be missing, or hold anything
         return []
 
 
-def lacking_folders(sources: Iterable[Any]) -> list[Path]:
-    """Added folders among Hydra's sources of a composition that the current search path lacks."""
-    used = [Path(source["path"]) for source in sources if source["provider"] == PROVIDER]
-    return [folder for folder in used if folder not in config_folders()]
+def added_folders(runtime: Any) -> list[Path]:
+    """Folders that were added to the search path of a composition, from ``hydra.runtime``."""
+    return [Path(s["path"]) for s in runtime["config_sources"] if s["provider"] == PROVIDER]
 
 
 def read_yaml(path: Path) -> Any:
@@ -202,7 +179,6 @@ def hydra_session() -> Iterator[Any]:
     GlobalHydra.instance().clear()
     try:
         Plugins.instance().register(_Folders)
-        Plugins.instance().register(_Folder)
         # All gates of the search path are composed, as mjstack's are.
         added = [
             n for n in list_choices()["gate"] if not (CONFIG_FOLDER / f"gate/{n}.yaml").exists()
@@ -217,31 +193,14 @@ def hydra_session() -> Iterator[Any]:
         Singleton.set_state(outer)
 
 
-class _Folder(FileConfigSource):
-    """A folder of the search path. A file may begin with a byte order mark, which would hide its
-    header from Hydra.
-    """
-
-    @staticmethod
-    @override
-    def scheme() -> str:
-        return "mjstack"
-
-    @override
-    def load_config(self, config_path: str) -> ConfigResult:
-        result = super().load_config(config_path)
-        path = Path(self.path, self._normalize_file_name(config_path))
-        result.header = self._get_header_dict(path.read_text("utf-8-sig"))
-        return result
-
-
 class _Folders(SearchPathPlugin):
     """Lets Hydra find the folders of the current search path."""
 
     @override
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         for folder in config_folders():
-            search_path.append(PROVIDER, f"{_Folder.scheme()}://{folder}")
+            provider = PROVIDER if folder in _added.get() else f"{PROVIDER}.registered"
+            search_path.append(provider, f"file://{folder}")
 
 
 def _compose_once(loader: Any) -> None:
@@ -263,12 +222,8 @@ def _compose_once(loader: Any) -> None:
     def load_once(*, overrides: list[str], run_mode: RunMode, **options: Any) -> DictConfig:
         key = (*overrides, run_mode)
         if key not in composed:
-
-            def compose(overrides: list[str]) -> DictConfig:
-                files.clear()
-                return load(overrides=_add_entries(overrides), run_mode=run_mode, **options)
-
-            composed[key] = compose(_choose_observation(overrides, compose))
+            files.clear()
+            composed[key] = load(overrides=_add_entries(overrides), run_mode=run_mode, **options)
             loader.files[id(composed[key])] = files.copy()
         return composed[key]
 
@@ -290,34 +245,6 @@ def _add_entries(overrides: Sequence[str]) -> list[str]:
         out.append(f"++{text.lstrip('+')}" if entry else text)
     ConfigStore.instance().store("added_entries", entries, package="_global_", provider="mjstack")
     return out
-
-
-def _choose_observation(
-    overrides: list[str], compose: Callable[[list[str]], DictConfig]
-) -> list[str]:
-    """Let a new policy see the task's own observation: where the overrides say so, or where they
-    say nothing and the task writes all of its terms, without a choice of a file. The overrides come
-    back with that choice, whose terms are ready for the next composition.
-    """
-    chosen = [o for o in overrides if o.startswith(SEEN)]
-    trains = any(o.startswith(("job=train", "trainer=", "experiment=")) for o in overrides)
-    if TASK_SEEN not in chosen and (chosen or not trains):
-        return overrides
-    _store_observation({})
-    # An override of one of its terms fits only where the choice has been made.
-    cfg = compose([o for o in overrides if "job.observation" not in o])
-    choices = cfg.hydra.runtime.choices
-    alone = choices.get("observation") is None and bool(cfg.observation)
-    if not (chosen or (alone and choices.get(SEEN.rstrip("=")) == "state")):
-        return overrides
-    _store_observation(OmegaConf.to_container(cfg.observation))
-    return [*(o for o in overrides if o != TASK_SEEN), TASK_SEEN]
-
-
-def _store_observation(terms: Any) -> None:
-    """Set what ``conf/observation/task.yaml`` includes."""
-    node = OmegaConf.create(terms)
-    ConfigStore.instance().store("task_observation", node, provider="mjstack")
 
 
 def without_hydra(cfg: DictConfig) -> DictConfig:
@@ -354,4 +281,6 @@ def _checked_folder(text: str) -> Path:
         if (CONFIG_FOLDER / name).exists():
             problem = f"{path}: {name} is mjstack's own, expected a name that mjstack does not have"
             raise MjstackError(problem, "Rename the file")
+        if path.read_bytes().startswith(codecs.BOM_UTF8):  # it hides the file's header
+            raise MjstackError(f"{path}: begins with a byte order mark", "Save it without")
     return folder.resolve()

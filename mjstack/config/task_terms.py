@@ -10,12 +10,14 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf, open_dict
 
+from mjstack.config.explain import own_overrides, parse
 from mjstack.config.schema import EPISODES, CloneJobCfg
-from mjstack.config.session import CONFIG_FOLDER, TASK_SEEN
+from mjstack.config.session import CONFIG_FOLDER
 
 Terms = dict[str, Any]
 
 _JUDGED = "gate.success.reset"
+_OBSERVED = "observation@job.observation"
 # Groups that a job leaves out, and what stands in their place
 _LEFT_OUT = {
     "action": "drivers command controller.action, policies their own action",
@@ -33,12 +35,44 @@ def complete_terms(cfg: DictConfig, overrides: Sequence[str]) -> None:
     chosen = cfg.hydra.runtime.choices.get(choice) != "randomized"  # what the gate's file has
     chosen = chosen or any(o.startswith(f"{choice}=") for o in overrides)
     with open_dict(cfg):
+        _observe_task(cfg, overrides)
         if cfg.job.name == "train" and not chosen:  # judged from starts as training has them
             terms = {name: f"${{reset.{name}}}" for name in cfg.reset}
             cfg.gate.success.reset = terms | _written(cfg, _JUDGED)
-        gates = [name for name, gate in cfg.gate.items() if gate.get("reset")]
+        played = [
+            name for name in cfg.gate if OmegaConf.select(cfg, f"gate.{name}.func") == EPISODES
+        ]
+        gates = ["baseline", "capacity", *(name for name in played if cfg.gate[name].get("reset"))]
         lines = [line for name in gates for line in _complete_copy(cfg, name)]
-        cfg.unused_terms = [*lines, *_left_out(cfg), *_unseen(cfg)]
+        cfg.unused_terms = [*_choices(cfg, overrides), *lines, *_left_out(cfg), *_unseen(cfg)]
+
+
+def _observe_task(cfg: DictConfig, overrides: Sequence[str]) -> None:
+    """Let a new policy see the task's own observation, in place: where that is chosen, or nothing
+    is and the task writes all of its terms. Overrides of the policy's terms come on top.
+    """
+    choices = cfg.hydra.runtime.choices
+    chosen = any(o.startswith(f"{_OBSERVED}=") for o in overrides)
+    alone = choices.get("observation") is None and bool(cfg.observation) and not chosen
+    if choices.get(_OBSERVED) != "task" and not (alone and choices.get(_OBSERVED) == "state"):
+        return
+    cfg.job.observation = OmegaConf.to_container(cfg.observation)
+    for override in map(parse, own_overrides(overrides)):
+        if override.key_or_group.startswith("job.observation."):
+            value = None if override.is_delete() else override.value()
+            OmegaConf.update(cfg, override.key_or_group, value, force_add=True)
+
+
+def _choices(cfg: DictConfig, overrides: Sequence[str]) -> Iterator[str]:
+    """A line for a choice of starts or looks on the command line, which gate *success* has not."""
+    judges = "success" in cfg.gates or cfg.job.name == "compare"
+    for override in overrides if judges and cfg.job.name != "train" else ():
+        group, _, name = override.partition("=")
+        key = f"{group}@{_JUDGED}="
+        missed = group in ("reset", "looks") and name not in ("starts_file", "null")
+        if missed and not any(o.lstrip("+").startswith(key) for o in overrides):
+            cure = f"{'+' * (group == 'looks')}{key}{name}"
+            yield f"{override} does not act in gate success: {cure} chooses it there"
 
 
 def _complete_copy(cfg: DictConfig, gate: str) -> Iterator[str]:
@@ -83,7 +117,7 @@ def _unseen(cfg: DictConfig) -> Iterator[str]:
     written = _written(cfg, "observation", cfg.job.group)
     if unseen := [n for n, term in written.items() if term and _content(term) not in known]:
         line = f"the policy sees {', '.join(seen)}; the task's own {', '.join(unseen)}"
-        yield f"{line} it does not see ({TASK_SEEN} has them)"
+        yield f"{line} it does not see ({_OBSERVED}=task has them)"
 
 
 def _terms(cfg: DictConfig, key: str, group: str = "") -> Terms:

@@ -16,7 +16,7 @@ INDICES = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Feature:
     """One column of the frames: a vector of named numbers.
 
@@ -95,15 +95,3 @@ class EpisodeData:
     arrays: Mapping[str, np.ndarray]
     row: Mapping[str, float | int | bool | str]
     images: Mapping[str, np.ndarray] = field(default_factory=dict)
-
-
-def term_columns(term: str, dim: int, history: int) -> list[str]:
-    """Names of the ``dim`` numbers of an observation term, over all steps of its ``history``:
-    ``red_pose.2``, and ``red_pose.2.t-1`` one step before.
-    """
-    width = dim // history
-    return [
-        f"{term}{f'.{i}' if width > 1 else ''}{f'.t-{age}' if age else ''}"
-        for age in range(history - 1, -1, -1)
-        for i in range(width)
-    ]

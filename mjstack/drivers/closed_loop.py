@@ -19,6 +19,7 @@ _QUARTER = 0.5 * math.pi
 _ROLL_STEP = 0.05  # rad per step
 _ALIGN = 0.1  # share of a held object's turn that is left, per step
 _OFF = 0.03  # m: so far off the grasp point, a held object is made up for
+_REST = 0.2  # s between the last motion and the window of rest after a retry
 _DONE = 1e-3  # steps: a phase is over this much before its last step would be
 
 
@@ -216,7 +217,7 @@ class ClosedLoopDriver(FeedbackDriver):
         self._handled = column(max(phase.grasped, phase.carried, 0) for phase in phases)
         self._numbers = torch.arange(len(objects), device=self.phase.device)
         window = 0 if cfg.task.check is None else self._env.check.settle_steps
-        self._rest = window + math.ceil(cfg.controller.rest_seconds / cfg.timing.step_dt)
+        self._rest = window + math.ceil(_REST / cfg.timing.step_dt)
 
 
 def _nearest_turns(off: Tensor, oblong: Tensor) -> tuple[Tensor, Tensor]:

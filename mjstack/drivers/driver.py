@@ -23,10 +23,8 @@ from mjstack.managers.view import offers
 from mjstack.math import describe_tensor
 from mjstack.mdp.geometry import source_xy
 from mjstack.policy import Policy, load_policy
-from mjstack.policy.lerobot import PREFIX, load_lerobot
 from mjstack.scene import SceneIndex, build_model
 from mjstack.scene.phases import Phase
-from mjstack.sim import resolve_backend
 
 
 @dataclass(eq=False)
@@ -66,12 +64,6 @@ class Assets:
             expected = "the folder of a trained policy, which controller=policy plays"
             raise ConfigError("policy", None, expected)
         return load_policy(self.cfg.policy)
-
-    @cached_property
-    def lerobot_policy(self) -> tuple[Any, Any, Any] | None:
-        """That of ``policy=lerobot:FOLDER``, as of `load_lerobot`; None if the policy is ours."""
-        name = self.cfg.policy or ""
-        return load_lerobot(name, resolve_backend(self.cfg)[1]) if name.startswith(PREFIX) else None
 
 
 class Driver(ABC):
@@ -129,6 +121,11 @@ class Driver(ABC):
         they are asked for.
         """
         return cls.with_params(cfg, env)
+
+    @classmethod
+    def trained_policy(cls, assets: Assets) -> Policy | None:
+        """The policy whose observation and action terms its environment has; None without one."""
+        return None
 
     @classmethod
     def with_params(cls, cfg: Config, *args: Any) -> "Driver":

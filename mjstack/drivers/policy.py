@@ -1,13 +1,11 @@
-"""Drivers of trained policies: one observes as the policy was trained, and plays a part of each
-chunk of actions before it queries the policy again; the other has a policy of LeRobot's.
+"""The driver of a trained policy: it observes as the policy was trained, and plays a part of each
+chunk of actions before it queries the policy again.
 """
 
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from typing_extensions import override
@@ -15,16 +13,13 @@ from typing_extensions import override
 from mjstack.config.schema import CameraCfg, Config
 from mjstack.drivers.driver import Assets, Driver, require_actions
 from mjstack.envs.env import Env
-from mjstack.errors import ArgumentError, FolderError, TermError
+from mjstack.errors import FolderError, TermError
 from mjstack.managers import offers
 from mjstack.managers.observation import ObservationManager
 from mjstack.policy import Policy
-from mjstack.policy.lerobot import IMAGES, SEEN, STATE
-from mjstack.robots.units import LEROBOT, LerobotUnits
 from mjstack.sim.cameras import Cameras, with_outputs
 
 GRID = 2.0**20  # per unit of an action
-GROUP = "policy"  # the observation group that is LeRobot's environment_state
 
 
 class QueryImages:
@@ -81,9 +76,12 @@ class PolicyDriver(Driver):
     @classmethod
     @override
     def build(cls, env: Env, cfg: Config, assets: Assets) -> Driver:
-        if assets.lerobot_policy:
-            return LerobotDriver.with_params(cfg, env, assets.lerobot_policy, cfg)
         return cls.with_params(cfg, env, assets.policy, cfg.scene.cameras)
+
+    @classmethod
+    @override
+    def trained_policy(cls, assets: Assets) -> Policy | None:
+        return assets.policy
 
     def __init__(
         self, env: Env, policy: Policy, cameras: Mapping[str, CameraCfg] | None = None
@@ -151,89 +149,3 @@ class PolicyDriver(Driver):
         chunk = self._network(self._observed.to(self._dtype), images)[:, : self._chunk.shape[1]]
         chunk = (torch.round(chunk * GRID) / GRID).float()
         torch.where(due[:, None, None], chunk, self._chunk, out=self._chunk)
-
-
-class LerobotWords:
-    """Observations and joint targets of an environment as LeRobot has them, in its ``units``."""
-
-    def __init__(
-        self, env: Env, seen: Mapping[str, Tensor], images: Mapping[str, Tensor], units: str
-    ) -> None:
-        """Take what there is to see: the observation group, if any, and the cameras' images."""
-        self._env = env
-        self._seen = seen
-        self._images = images
-        self._joints = env.index.on(env.device, env.sim.qpos.dtype).qpos
-        self.units = LerobotUnits(env.index.n_arm, env.index.servo_range, units)
-
-    def observe(self) -> dict[str, np.ndarray]:
-        """The observations, by LeRobot's names. A number that is not finite becomes 0: the check
-        fails its world.
-        """
-        positions = self._joints.read(self._env.sim.qpos)
-        seen = {STATE: self.units.from_si(positions.cpu().numpy())}
-        for group in self._seen.values():
-            seen[SEEN] = group.float().cpu().numpy()
-        seen = {name: np.nan_to_num(part, posinf=0.0, neginf=0.0) for name, part in seen.items()}
-        for name, image in self._images.items():
-            seen[f"observation.{name}"] = image.to("cpu", copy=True).numpy()
-        return seen
-
-    def targets(self, actions: np.ndarray) -> Tensor:
-        """Joint targets [rad, m], shape ``(nworld, joints)``, float32, of such actions; an
-        ArgumentError if they have another width, or are radians where degrees are due.
-        """
-        env = self._env
-        shape = (env.nworld, len(env.index.ctrl))
-        if actions.shape != shape:
-            expected = f"shape {shape}, a target for each joint"
-            raise ArgumentError("action", f"shape {actions.shape}", expected)
-        if not env.episode_step.any():
-            self.units.check_commands(actions, self.observe()[STATE])
-        return torch.tensor(self.units.to_si(actions), device=env.device)
-
-
-class LerobotDriver(Driver):
-    """Joint targets of a LeRobot policy, for worlds that begin their episodes together.
-
-    It acts on the host, so a captured step cannot hold it. It sees the observation group ``policy``
-    of the configuration without noise as ``environment_state``.
-    """
-
-    def __init__(self, env: Env, loaded: tuple[Any, Any, Any], cfg: Config) -> None:
-        """Take a policy and its processors, as of `load_lerobot`; a FolderError if the scene does
-        not have what they need. ``cfg`` is the configuration with its cameras and observations.
-        """
-        super().__init__(env.nworld, cfg.task.episode_steps, env.device)
-        self._policy, self._before, self._after = loaded
-        self._task = [cfg.task.instruction or cfg.task.name] * env.nworld
-        config = self._policy.config
-        inputs = {name: tuple(part.shape) for name, part in config.input_features.items()}
-        group = replace(cfg.observation[GROUP], noise=False)
-        self._observations = ObservationManager(env, {GROUP: group} if SEEN in inputs else {})
-        cameras = cfg.scene.cameras
-        names = [name for name in cameras if f"{IMAGES}.{name}" in inputs]
-        period = getattr(config, "n_action_steps", 1) if config.n_obs_steps == 1 else 1
-        self._images = QueryImages(env, cameras, names, period)
-        images = {f"images.{name}": image for name, image in self._images.images.items()}
-        self._words = LerobotWords(env, self._observations.groups, images, LEROBOT)
-        here = {name: part.shape[1:] for name, part in self._words.observe().items()}
-        for name, shape in inputs.items():
-            if here.get(name) not in (shape, (*shape[1:], *shape[:1])):  # images are (…, 3) here
-                there = f"and here it is {here.get(name, 'missing')}: expected the same"
-                problem = f"policy={cfg.policy}: takes {name} of shape {shape}"
-                fix = "Set cameras, scene.cameras.NAME.size and observation as in its training"
-                raise FolderError(f"{problem}, {there}", fix)
-        self._policy.reset()
-
-    def command(self) -> Tensor:
-        """Joint targets of the next step [rad, m], shape ``(nworld, joints)``, float32."""
-        self._images.draw()
-        self._observations.compute()
-        batch: dict[str, Any] = {"task": self._task}
-        for name, part in self._words.observe().items():
-            tensor = torch.from_numpy(part)
-            batch[name] = tensor.permute(0, 3, 1, 2) / 255 if name.startswith(IMAGES) else tensor
-        with torch.inference_mode():
-            actions = self._after(self._policy.select_action(self._before(batch)))
-        return self._words.targets(actions.float().cpu().numpy())

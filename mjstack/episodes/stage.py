@@ -131,9 +131,8 @@ class Stage:
 
     @property
     def policy(self) -> Policy | None:
-        """The policy that drives; None of any other driver, and of a policy of LeRobot's."""
-        plays = self.driver_class.plays_policy and not self.assets.lerobot_policy
-        return self.assets.policy if plays else None
+        """The policy that drives, with action terms of its own; None of any other driver."""
+        return self.driver_class.trained_policy(self.assets)
 
     @property
     def phases(self) -> list[Phase]:
@@ -170,8 +169,7 @@ class Stage:
         if self.cfg.view == "web":
             cfg = replace(cfg, reward=self.cfg.reward, task=self.cfg.task)
         if not self.driver_class.needs_phases:
-            on_host = self.driver_class.on_host or self.assets.lerobot_policy
-            graph = "off" if on_host else cfg.graph
+            graph = "off" if self.driver_class.on_host else cfg.graph
             cfg = replace(cfg, task=self.cfg.task, graph=graph)
         return cfg
 

@@ -72,7 +72,9 @@ def judge_episodes(run: Run) -> list[GateResult]:
     ends = len(np.unique(tally.array("end")))
     starts = _count_distinct(tally.array("start_qpos"), 4)
     metrics: dict[str, float] = {"distinct_final_states": ends, "episode_s": tally.seconds}
-    thresholds = {"success_rate_min": t.rate, "distinct_fraction": t.distinct_fraction}
+    thresholds = {"success_rate_min": t.rate}
+    if t.distinct_fraction:
+        thresholds["distinct_fraction"] = t.distinct_fraction
     words = [f"{tally.summary}, {format_percent(t.rate)} wanted"]
     tables = []
     if succeeded.all():  # worlds that fail have no speed

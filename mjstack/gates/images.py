@@ -2,14 +2,14 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import torch
 
-from mjstack.config.fingerprint import differences
+from mjstack.config.fingerprint import config_content, differences
 from mjstack.config.schema import OUTPUTS, Backend, Config
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
@@ -62,7 +62,8 @@ def compare_images(run: Run, result: GateResult) -> list[str]:
         qpos = path[steps]
         mjwarp, _ = _draw_states(stage.model, cfg, qpos, Backend.mjwarp, stage.backend[1])
         if run.folder is not None:
-            write_npz(run.folder / FILE, {"qpos": qpos, "about": json.dumps(_about(cfg)), **mjwarp})
+            about = json.dumps(config_content(cfg, "images"))
+            write_npz(run.folder / FILE, {"qpos": qpos, "about": about, **mjwarp})
     else:
         qpos, mjwarp = load_images(cfg)
     try:
@@ -203,20 +204,7 @@ def load_images(cfg: Config) -> tuple[np.ndarray, Images]:
         images: Images = read_npz(path)
         about = json.loads(str(images.pop("about")))
         qpos = images.pop("qpos")
-        if changes := differences(about, _about(cfg)):
+        if changes := differences(about, config_content(cfg, "images")):
             fix = "Give the robot, the scene and the cameras of that run"
             raise FolderError(f"{path} was drawn with {changes}", fix)
     return qpos, images
-
-
-def _about(cfg: Config) -> dict[str, object]:
-    """The part of the configuration on which images depend."""
-    cameras = {
-        name: {key: asdict(camera)[key] for key in ("size", "fovy", "pose")}
-        for name, camera in cfg.scene.cameras.items()
-    }
-    return {
-        "robot": {"name": cfg.robot.name},
-        "model": {"source": cfg.model.source},
-        "scene": {"name": cfg.scene.name, "cameras": cameras},
-    }

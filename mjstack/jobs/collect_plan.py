@@ -4,21 +4,20 @@ of the batches that were played.
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import torch
 
-from mjstack.config.fingerprint import WITHOUT_EFFECT, config_content, config_hash
-from mjstack.config.functions import offered
-from mjstack.config.schema import CollectJobCfg, Config, ObservationTermCfg
+from mjstack.config.fingerprint import config_content, config_hash
+from mjstack.config.schema import CollectJobCfg, Config
 from mjstack.datasets.reader import read_begun
-from mjstack.datasets.spec import DatasetSpec, Feature, Video, term_columns
+from mjstack.datasets.spec import DatasetSpec, Feature, Video
 from mjstack.datasets.video import check_encoder
 from mjstack.envs import Env, demonstration_config
+from mjstack.envs.columns import group_columns, joint_units
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError
 from mjstack.files import lock_folder, reading
@@ -34,8 +33,6 @@ STATE = "observation.state"
 ACTION = "action"
 REWARD = "next.reward"
 IMAGES = "observation.images"
-# These change no episode: action terms are the controller's, and nothing ends one early.
-_WITHOUT_EFFECT = (*WITHOUT_EFFECT, "action", "termination", "nworld")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,14 +174,8 @@ def episode_config(cfg: Config) -> dict[str, Any]:
     Raises:
         ConfigError: The starts file cannot be read.
     """
-    config = config_content(cfg, _WITHOUT_EFFECT)
-    config["sim"] = {"backend": resolve_backend(cfg)[0]}
-    job: CollectJobCfg = cfg.job
-    config["job"] = {"keep_failures": job.keep_failures}
-    if job.units == LEROBOT:
-        config["job"]["units"] = job.units
-    if cfg.scene.cameras:
-        config["job"]["codec"] = job.codec
+    config = config_content(cfg, "episodes")
+    config["sim"]["backend"] = resolve_backend(cfg)[0]
     return config | {"starts_schema": SCHEMA}
 
 
@@ -214,7 +205,7 @@ def make_spec(env: Env, cfg: Config, provenance: Mapping[str, Any]) -> DatasetSp
         if name in features or name in videos or "/" in name:
             expected = "a name without / that is neither state nor a camera's"
             raise ConfigError(f"observation.{group}", "a group", expected)
-        features[name] = group_feature(env, group)
+        features[name] = Feature("float32", *group_columns(env, group))
     features |= {
         ACTION: positions,
         REWARD: Feature(dtype="float32", names=("reward",), units=("1",)),
@@ -233,43 +224,3 @@ def make_spec(env: Env, cfg: Config, provenance: Mapping[str, Any]) -> DatasetSp
         values={"retries": "int64", "failed_rules": "string", "config_sha256": "string"},
         provenance={**provenance, "config": config},
     )
-
-
-def joint_units(env: Env) -> tuple[str, ...]:
-    """Units of the robot's joints, arm then gripper: rad for hinges, m for slides."""
-    model = env.sim.model
-    kinds = dict(zip(model.jnt_qposadr.tolist(), model.jnt_type.tolist(), strict=True))
-    hinge = int(mujoco.mjtJoint.mjJNT_HINGE)
-    return tuple("rad" if kinds[int(address)] == hinge else "m" for address in env.index.robot_qpos)
-
-
-def group_feature(env: Env, group: str) -> Feature:
-    """Name and unit of each column of an observation group: ``red_pose.2``, and ``red_pose.2.t-1``
-    one step before.
-    """
-    joints = joint_units(env)
-    names: list[str] = []
-    units: list[str] = []
-    for term, dim in env.observation_manager.term_dims[group].items():
-        cfg: ObservationTermCfg = env.cfg.observation[group].terms[term]
-        width = dim // cfg.history
-        names += term_columns(term, dim, cfg.history)
-        units += cfg.history * _scaled(_term_units(cfg.func, width, joints), cfg.scale)
-    return Feature(dtype="float32", names=tuple(names), units=tuple(units))
-
-
-def _term_units(func: str, width: int, joints: tuple[str, ...]) -> Sequence[str]:
-    unit = offered(func, "unit") or "unknown"
-    if unit == "joint":  # or the actions of a policy, which need not be joint targets
-        return joints if width == len(joints) else ["1"] * width
-    if unit == "joint/s":
-        return [f"{joint}/s" for joint in joints]
-    return [unit] * width if isinstance(unit, str) else unit
-
-
-def _scaled(units: Sequence[str], scale: float) -> list[str]:
-    """Units of 1 after the scaling: ``10 rad/s`` where a speed is multiplied by 0.1."""
-    if scale == 0.0:
-        return ["unknown"] * len(units)
-    factor = "" if scale == 1.0 else f"{1.0 / scale:g} "
-    return [u if u == "unknown" else f"{factor}{u}".removesuffix(" 1") for u in units]

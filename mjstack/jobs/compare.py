@@ -44,8 +44,8 @@ _LEVEL = 0.05  # of significance
 _ENDS = {"min": "low", "max": "high"}  # of the picture's whiskers, in metrics of a rate
 _ROUNDING = 1e-6  # [m, rad], by which equal starts on two backends or devices may differ
 _PANELS = {
-    "success rate, 95 % interval": {"": "success_rate"},
-    "episodes that only this one won": {"": "only"},
+    "success rate, 95 % interval": "success_rate",
+    "episodes that only this one won": "only",
 }
 
 Sides = Mapping[str, Stage]
@@ -75,7 +75,7 @@ def check_compare(cfg: Config, overrides: Sequence[str]) -> CheckedJob:
         require_episode(side)
         stage = check_machine(replace(side, gates=[GATE]))
         sides[name] = stage.with_config(gate_config(stage.cfg, GATE))
-        driver = (sides[name].cfg.controller.name, content.get("policy", ""))
+        driver = (sides[name].cfg.controller.name, content["policy"])
         notes[name] = " ".join(filter(None, driver))
     first, second = map(_start_of_first_world, sides.values())
     if first.keys() != second.keys() or any((first[k] != second[k]).any() for k in first):

@@ -2,25 +2,25 @@
 MuJoCo; or the policy as a folder of LeRobot's.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import mujoco
 
-from mjstack.config.schema import Config
+from mjstack.config.functions import find_instance
+from mjstack.config.schema import Config, ExportJobCfg
 from mjstack.drivers.driver import with_controller
 from mjstack.envs import driven_config
+from mjstack.envs.columns import group_columns, joint_units
 from mjstack.episodes.stage import Stage
-from mjstack.errors import FolderError
+from mjstack.errors import FolderError, require_names
 from mjstack.files import write_atomic
 from mjstack.gates.runner import run_guarded
-from mjstack.jobs.collect_plan import group_feature, joint_units
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import CheckedJob, Job, model_bytes
-from mjstack.policy import save_policy
 from mjstack.policy.checkpoint import policy_facts
-from mjstack.policy.lerobot import lerobot_files
 from mjstack.policy.onnx import require_onnx, to_onnx
 from mjstack.report.record import GateResult, Status
 from mjstack.version import __version__
@@ -30,10 +30,28 @@ POLICY = "policy.onnx"
 MODEL = "model.mjb"
 
 
+@dataclass(frozen=True)
+class Format:
+    """A format of exported policies; ``job.formats`` names it.
+
+    Attributes:
+        files: Their contents by name, in the order in which they are written.
+        require: Raises a MjstackError where a package is missing.
+    """
+
+    files: Callable[[Stage], Mapping[str, str | bytes]]
+    require: Callable[[], object] = lambda: None
+
+
+def find_format(job: ExportJobCfg) -> Format:
+    """The format that the job names; a MjstackError if there is none."""
+    require_names("job.format", [job.format], job.formats)
+    return find_instance(f"job.formats.{job.format}", job.formats[job.format], Format)
+
+
 def check_export(cfg: Config) -> CheckedJob:
     """Raise for what cannot be exported, before anything is written."""
-    if cfg.job.format == "onnx":
-        require_onnx()
+    find_format(cfg.job).require()
     stage = Stage(with_controller(cfg, "policy"))
     check_task(stage)
     return CheckedJob(
@@ -43,21 +61,19 @@ def check_export(cfg: Config) -> CheckedJob:
     )
 
 
+def onnx_files(stage: Stage) -> Mapping[str, str | bytes]:
+    """The policy as ONNX, and the scene's model."""
+    onnx = to_onnx(stage.assets.policy.network, export_facts(stage))
+    return {MODEL: model_bytes(stage.model), POLICY: onnx}
+
+
 def export_policy(stage: Stage, folder: Path) -> list[GateResult]:
     """Write all files, or none."""
     policy = stage.assets.policy
-    lerobot = stage.cfg.job.format == "lerobot"
-    files: Mapping[str, str | bytes]
-    if lerobot:
-        files = lerobot_files(policy, stage.index.servo_range)
-    else:
-        onnx = to_onnx(policy.network, export_facts(stage))
-        files = {MODEL: model_bytes(stage.model), POLICY: onnx}
+    files = find_format(stage.cfg.job).files(stage)
     try:
         for name, content in files.items():
             write_atomic(folder / name, content)
-        if lerobot:
-            save_policy(folder, policy)
     except OSError as error:
         for name in files:
             (folder / name).unlink(missing_ok=True)
@@ -86,13 +102,13 @@ def export_facts(stage: Stage) -> dict[str, Any]:
     cfg.observation = {policy.group: policy.observation}
     with stage.native_env(cfg) as env:
         units = joint_units(env)
-        columns = group_feature(env, policy.group)
+        names, column_units = group_columns(env, policy.group)
         index = env.index
     network = policy.network
     return policy_facts(policy) | {
         "versions": policy.versions,
         "exported_with": {"mjstack": __version__, "mujoco": mujoco.__version__},
-        "columns": {"names": columns.names, "units": columns.units},
+        "columns": {"names": names, "units": column_units},
         "normalization": {
             name: network.get_buffer(name).tolist() for name, _ in network.named_buffers()
         },
@@ -122,4 +138,5 @@ def _fields(cfg: Any, *names: str) -> dict[str, Any]:
     return {name: getattr(cfg, name) for name in names}
 
 
+FORMAT = Format(onnx_files, require_onnx)
 JOB = Job(check_export)

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from mjstack.config.schema import Config, PlayJobCfg
-from mjstack.drivers.driver import find_driver, with_controller
+from mjstack.drivers.driver import find_driver
 from mjstack.episodes.batches import BatchPlan, play_batches
 from mjstack.episodes.motion import draw_seen, world_fields
 from mjstack.episodes.recorder import WorldRecorder
@@ -32,15 +32,15 @@ _MOST = 64  # worlds of a video
 
 def check_play(cfg: Config) -> CheckedJob:
     """Raise for what cannot be shown, before anything is written."""
-    if cfg.policy is not None:
-        cfg = with_controller(cfg, "policy")
     cfg = replace(cfg, video=cfg.video or cfg.view == "false")
     if cfg.video and cfg.nworld > _MOST:
         raise ConfigError("nworld", cfg.nworld, f"at most {_MOST} worlds, as a video has room for")
     driver = find_driver(cfg)
     if not cfg.controller.phases and driver.needs_phases:
         expected = "a task with phases, which the expert follows"
-        raise ConfigError("task", cfg.task.name, expected, "Name a policy: policy=FOLDER")
+        raise ConfigError(
+            "task", cfg.task.name, expected, "Or play a policy: controller=policy policy=FOLDER"
+        )
     job: PlayJobCfg = cfg.job
     if job.camera is not None and job.camera not in cfg.scene.cameras:
         names = ", ".join(cfg.scene.cameras) or "there is none"

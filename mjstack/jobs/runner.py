@@ -22,7 +22,7 @@ from rich.markup import escape
 
 from mjstack.config.explain import command
 from mjstack.config.fingerprint import config_content, config_hash, differences
-from mjstack.config.functions import find_object
+from mjstack.config.functions import find_instance
 from mjstack.config.load import configured
 from mjstack.config.schema import Backend, Config
 from mjstack.episodes.record import EpisodeRecord
@@ -271,7 +271,7 @@ def check_job(cfg: Config, overrides: Sequence[str] = ()) -> CheckedJob:
     """Raise for what this machine cannot do, before anything is written. The overrides are those of
     the command line without Hydra's own.
     """
-    job: Job = find_object("job.func", cfg.job.func)
+    job = find_instance("job.func", cfg.job.func, Job)
     for override in overrides:
         key, _, value = override.lstrip("+~").partition("=")
         if key in ("job.name", "job.func"):  # reports and replays go by them

@@ -5,12 +5,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
-
-from omegaconf import DictConfig, OmegaConf
+from typing import Any
 
 from mjstack.config.explain import parse
-from mjstack.config.schema import SweepCfg
 from mjstack.errors import is_out_of_memory
 from mjstack.files import to_csv, write_atomic
 from mjstack.jobs.sweep import LOG, list_jobs
@@ -28,19 +25,14 @@ _PANELS = 3
 _NOT_RUN = "not run"
 
 
-def sweep_config(master: DictConfig) -> SweepCfg:
-    """How a sweep is shown, from its composition."""
-    return cast(SweepCfg, OmegaConf.to_object(master.sweep))
-
-
-def update_summary(folder: Path, master: DictConfig, reports: Mapping[int, Report]) -> None:
+def update_summary(folder: Path, reports: Mapping[int, Report]) -> None:
     """Write the tables after a job, lest the command be killed. A full disk ends no job."""
     with suppress(OSError):
-        write_summary(folder, sweep_config(master), reports)
+        write_summary(folder, reports)
 
 
 def write_summary(
-    folder: Path, sweep: SweepCfg, reports: Mapping[int, Report], *, draw: bool = False
+    folder: Path, reports: Mapping[int, Report], *, draw: bool = False
 ) -> tuple[Table, str]:
     """Write summary.csv and summary.md into the folder of a sweep, and summary.png if it is drawn
     anew. ``reports`` are those of jobs that have ended, by their numbers; of other jobs in the
@@ -55,21 +47,20 @@ def write_summary(
     """
     rows = sweep_rows(folder, reports)
     swept = _swept(rows)
-    columns = sweep.columns or _columns(rows, swept)
-    title = sweep.title or f"sweep of {len(rows)} job{'s' if len(rows) > 1 else ''}"
-    table = Table.of(columns, rows)
-    over = sweep.over or next(iter(swept), "")
+    title = f"sweep of {len(rows)} job{'s' if len(rows) > 1 else ''}"
+    table = Table.of(_columns(rows, swept), rows)
+    over = next(iter(swept), "")
     plot = Plot(
         title=title,
         over=over,
-        lines=[key for key in swept if key != over] if over in swept else [],
-        panels=sweep.panels or {name: {"": name} for name in _headlines(rows)[:_PANELS]},
+        lines=swept[1:],
+        panels={name: name for name in _headlines(rows)[:_PANELS]},
     )
     picture = folder / "summary.png"
     problem = ""
     if draw and any(row["status"] != _NOT_RUN for row in rows) and plot.shows(rows):
         problem = safely_write(picture, save_sweep, plot, rows, stops=False)
-    notes = list(sweep.notes)
+    notes = []
     for key, name in (("backend", "hardware"), ("git_commit", "commit")):
         values = sorted({str(row[key]) for row in rows if row.get(key)})
         notes += [f"{name}: {value}" for value in values]
@@ -132,7 +123,7 @@ def _swept(rows: Sequence[Row]) -> list[str]:
 
 
 def _columns(rows: Sequence[Row], swept: Sequence[str]) -> dict[str, str]:
-    """The columns of a sweep without an experiment: what differs, and the gates' results."""
+    """The columns of the table by their titles: what differs, and the gates' results."""
     words = [key for row in rows for key, value in row.items() if _is_result(value)]
     return {name: name for name in ("job", *swept, *words, *_headlines(rows), "status")}
 

@@ -8,9 +8,10 @@ import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
-from mjstack.config.fingerprint import WITHOUT_EFFECT, config_content, config_hash, differences
-from mjstack.config.functions import find_object
+from mjstack.config.fingerprint import config_content, config_hash, differences
+from mjstack.config.functions import find_instance
 from mjstack.config.schema import Config, TrainJobCfg
 from mjstack.drivers.driver import with_controller
 from mjstack.episodes.rollout import require_episode
@@ -33,25 +34,18 @@ NAME = "train"
 CONFIG = "training.json"  # the configuration of the training in the folder
 _TIMES = ("expert_s", "training_s")  # metrics of a training: parts of its time
 _ENDS = ("low", "high")  # of an interval
-# Keys of the job; changing one of these changes no training.
-_WITHOUT_EFFECT = ("folder", "test_seed", "iterations", "minutes", "max_minutes")
 
 
-def training_config(cfg: Config) -> dict:
+def training_fingerprint(cfg: Config) -> dict[str, Any]:
     """Everything that a training depends on, in JSON's types."""
-    config = config_content(cfg, WITHOUT_EFFECT)
-    for key in _WITHOUT_EFFECT:
-        config["job"].pop(key, None)
-    return config
+    return config_content(cfg, "training", "episodes")
 
 
 def check_train(cfg: Config) -> CheckedJob:
     """Raise for what cannot be done, before anything is written."""
     require_episode(cfg)
     job: TrainJobCfg = cfg.job
-    trainer = find_object("job.trainer", job.trainer)
-    if not isinstance(trainer, Trainer):
-        raise ConfigError("job.trainer", job.trainer, "a mjstack.train.trainer.Trainer")
+    trainer = find_instance("job.trainer", job.trainer, Trainer)
     stage = Stage(cfg)
     used = trainer.check(stage)  # first: it starts neither Warp nor an expert
     reset = whole_starts(cfg.reset) if trainer.midway else cfg.reset
@@ -61,7 +55,7 @@ def check_train(cfg: Config) -> CheckedJob:
     if used.start < tested.stop and tested.start < used.stop:
         expected = f"seeds that training does not use, which are {used.start} to {used.stop - 1}"
         raise ConfigError("job.test_seed", job.test_seed, expected)
-    name = config_hash(training_config(cfg))[:12]
+    name = config_hash(training_fingerprint(cfg))[:12]
     folder = Path(job.folder or f"outputs/train/{name}")
     if stage.ranks.writes:  # it may have begun there when the others come
         _check_folder(folder, cfg)
@@ -81,7 +75,7 @@ def _check_folder(folder: Path, cfg: Config) -> None:
     if not path.exists():
         return
     with reading(path, "Set job.folder to another folder"):
-        changes = differences(json.loads(path.read_text()), training_config(cfg))
+        changes = differences(json.loads(path.read_text()), training_fingerprint(cfg))
     if changes:
         problem = f"{folder} has a training{made_by(folder)} of another configuration: {changes}"
         raise FolderError(problem, "Set job.folder to another folder, or these keys back")
@@ -91,7 +85,7 @@ def _run(trainer: Trainer, run: Run, folder: Path) -> None:
     """Train, and judge the last policy."""
     if run.stage.ranks.writes:
         _check_folder(folder, run.cfg)  # hydra.run.dir may name one
-        write_atomic(folder / CONFIG, json.dumps(training_config(run.cfg), indent=1) + "\n")
+        write_atomic(folder / CONFIG, json.dumps(training_fingerprint(run.cfg), indent=1) + "\n")
     run_guarded(run, NAME, partial(_train, trainer, folder), "worlds")
     if run.artifacts.results[NAME].status is Status.passed:
         judged = run.on(judged_stage(run.stage, folder / LAST))

@@ -43,9 +43,10 @@ def check_params(
     options = {name: p for name, p in signature.parameters.items() if name not in positional}
     if any(p.kind is p.VAR_KEYWORD for p in options.values()):
         return
-    for name in params:
-        if name not in options:
-            raise TermError(label, f"parameter '{name}' does not exist. {suggest(name, options)}")
+    if unknown := [name for name in params if name not in options]:
+        problem = f"parameter '{unknown[0]}' does not exist. {suggest(unknown[0], options)}"
+        keys = " ".join(f"~{label}.params.{name}" for name in unknown)
+        raise TermError(label, f"{problem} If it was another function's, add {keys}")
     for name, option in options.items():
         if option.default is option.empty and name not in params:
             raise TermError(label, f"parameter '{name}' is missing: set {label}.params.{name}")

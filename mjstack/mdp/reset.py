@@ -188,7 +188,8 @@ class FixtureJoints:
         """Take the smallest and largest position of each joint [rad, m], by its name."""
         if not isinstance(joints, Mapping) or not joints:
             raise ParameterError("joints", joints, "a mapping of a fixture's joints to two numbers")
-        require_names("joints: joint of a fixture", map(str, joints), env.index.joints)
+        joints = {str(name): ends for name, ends in joints.items()}  # YAML has numbers too
+        require_names("joints: joint of a fixture", joints, env.index.joints)
         model = env.sim.model
         for name, ends in joints.items():
             joint = model.joint(name).id

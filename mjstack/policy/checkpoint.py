@@ -21,9 +21,10 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from mjstack.config.complete import typed
+from mjstack.config.fields import select
 from mjstack.config.fingerprint import POLICY_FILE, config_content, policy_folder, shipped_policies
 from mjstack.config.schema import Config, ObservationGroupCfg, ObservationTermCfg, TermCfg
-from mjstack.config.session import check_term, search_path
+from mjstack.config.session import check_term, list_items, search_path
 from mjstack.errors import FolderError
 from mjstack.files import read_inside, read_json, reading, write_atomic
 from mjstack.policy.network import PolicyNetwork, Vision
@@ -92,7 +93,8 @@ class Policy:
         )
 
     def _compare(self, trained: Facts, here: Facts) -> None:
-        for key in dict.fromkeys([*trained, *here]):
+        keys = dict.fromkeys([*trained, *here])
+        for key in sorted(keys, key=lambda key: not key.endswith(".name")):
             before = trained.get(key, "missing")
             now = here.get(key, "missing")
             if before != now:
@@ -105,25 +107,14 @@ class Policy:
                 )
 
 
-_REQUIRED = (
-    *("robot.name", "task.name", "robot.arm_joints", "robot.gripper_joints", "robot.home"),
-    *("robot.gripper_open", "robot.gripper_closed", "task.control_hz", "timing.command_delay"),
-    "task.params",
-)
-
-
 def _requirements(config: Facts, cameras: Sequence[str]) -> Facts:
-    """The values that a policy depends on, by dotted key. Physics, solver and starts may differ."""
-    keys = (key.split(".") for key in _REQUIRED)
-    values = {f"{group}.{key}": config[group][key] for group, key in keys}
-    for name, thing in config["scene"]["objects"].items():
-        values[f"scene.objects.{name}"] = f"{thing['shape']} {thing['size']}"
-    for name in cameras:
-        camera = config["scene"]["cameras"].get(name)
-        if camera is not None:
-            for key in ("size", "fovy", "pose"):
-                values[f"scene.cameras.{name}.{key}"] = camera[key]
-    return values
+    """The values that a policy with these cameras depends on, by dotted key. Physics, solver and
+    starts may differ.
+    """
+    required = select(config, {"policy"}, Config)
+    seen = required["scene"].pop("cameras", {})
+    required["scene"]["cameras"] = {name: seen[name] for name in cameras if name in seen}
+    return {key: value for key, value in list_items(required) if not isinstance(value, dict)}
 
 
 def save_policy(folder: str | os.PathLike, policy: Policy) -> None:
@@ -131,6 +122,24 @@ def save_policy(folder: str | os.PathLike, policy: Policy) -> None:
     where a FolderError says that it cannot be written.
     """
     folder = Path(folder)
+    files = policy_files(policy)
+    earlier = {*folder.glob(_weights_name("*"))}
+    target = folder / next(iter(files))
+    with _writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            for name, content in files.items():
+                write_atomic(folder / name, content)
+        except OSError:
+            if target not in earlier:
+                target.unlink(missing_ok=True)
+            raise
+        for path in earlier - {target}:
+            path.unlink(missing_ok=True)
+
+
+def policy_files(policy: Policy) -> dict[str, str | bytes]:
+    """The files of a policy's folder by name, in the order in which they are written."""
     weights = save({k: v.contiguous() for k, v in policy.network.state_dict().items()})
     digest = sha256(weights).hexdigest()
     facts = {
@@ -140,19 +149,7 @@ def save_policy(folder: str | os.PathLike, policy: Policy) -> None:
         "weights_sha256": digest,
         "config": policy.config,
     }
-    earlier = {*folder.glob(_weights_name("*"))}
-    target = folder / _weights_name(digest)
-    with _writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        try:
-            write_atomic(target, weights)
-            write_atomic(folder / POLICY_FILE, json.dumps(facts, indent=1) + "\n")
-        except OSError:
-            if target not in earlier:
-                target.unlink(missing_ok=True)
-            raise
-        for path in earlier - {target}:
-            path.unlink(missing_ok=True)
+    return {_weights_name(digest): weights, POLICY_FILE: json.dumps(facts, indent=1) + "\n"}
 
 
 def policy_facts(policy: Policy) -> Facts:
@@ -274,7 +271,9 @@ def _from_facts(facts: Facts, path: Path) -> Policy:
     )
     if policy.joints != action["joints"] or list(policy.observation.terms) != list(widths):
         raise ValueError("observation, action and config do not fit together")
-    required = _requirements(policy.config, list(vision.sizes))  # they are all there
+    required = _requirements(policy.config, list(vision.sizes))
+    if "task.control_hz" not in required:  # the others are compared where it drives
+        raise ValueError("config has no task.control_hz")
     for name, size in vision.sizes.items():
         if required.get(f"scene.cameras.{name}.size") != list(size):
             raise ValueError(f"images of {name} are not those of config")

@@ -15,7 +15,6 @@ Row = dict[str, Any]
 """A job of a sweep, by name: its keys, its ``status``, and its metrics."""
 
 _COLORS = ("#2a7d2e", "#2457c7", "#cc2a24", "#8a5a00", "#6a3d9a", "#555555")
-_STYLES = ("-o", "--s", ":^", "-.v")
 _RED = "#cc2a24"
 
 
@@ -27,22 +26,18 @@ class Plot:
         title: Above the panels.
         over: Key of the rows that is drawn from left to right, or from top to bottom.
         lines: Further keys in which the jobs differ: each combination of their values is a line.
-        panels: Curves of each panel by its label: a metric by the curve's label, which may be
-            empty. ``metric * 10`` and ``metric / 10`` scale it.
+        panels: The metric of each panel by its label.
     """
 
     title: str
     over: str
     lines: Sequence[str]
-    panels: Mapping[str, Mapping[str, str]]
+    panels: Mapping[str, str]
 
     def shows(self, rows: Sequence[Row]) -> bool:
         """Whether some job has one of the metrics."""
         return any(
-            not math.isnan(_value(row, metric))
-            for row in rows
-            for curves in self.panels.values()
-            for metric in curves.values()
+            not math.isnan(_value(row, metric)) for row in rows for metric in self.panels.values()
         )
 
     def groups(self, rows: Sequence[Row]) -> Iterator[tuple[str, list[Row]]]:
@@ -68,8 +63,7 @@ def save_sweep(path: Path, plot: Plot, rows: Sequence[Row]) -> None:
 
 
 def crossover(plot: Plot, rows: Sequence[Row]) -> float | None:
-    """Where one of two lines passes the other, in the first curve of the first panel; None if the
-    rows do not show it.
+    """Where one of two lines passes the other in the first panel; None if the rows do not show it.
 
     Interpolated between the two numbers that bracket it, straight in logarithms. Jobs that did not
     pass do not count.
@@ -77,7 +71,7 @@ def crossover(plot: Plot, rows: Sequence[Row]) -> float | None:
     groups = [group for _, group in plot.groups(rows)]
     if len(groups) != 2:
         return None
-    metric = next(iter(next(iter(plot.panels.values())).values()))
+    metric = next(iter(plot.panels.values()))
     first, second = ({row[plot.over]: _value(row, metric) for row in group} for group in groups)
     points = [
         (math.log(x), math.log(first[x] / second[x]))
@@ -91,21 +85,15 @@ def crossover(plot: Plot, rows: Sequence[Row]) -> float | None:
 
 
 def _value(row: Row, metric: str) -> float:
-    """A metric of a job, scaled as it says; NaN where it was not measured, or is void."""
-    name, *factor = metric.split(" ")
-    value = row.get(name, math.nan)
-    void = row["status"] != "pass" and not name.startswith("succe")
-    if void or not isinstance(value, int | float):
-        return math.nan
-    operator, number = factor or ("*", "1")
-    return value * float(number) if operator == "*" else value / float(number)
+    """A metric of a job; NaN where it was not measured, or is void."""
+    value = row.get(metric, math.nan)
+    void = row["status"] != "pass" and not metric.startswith("succe")
+    return math.nan if void or not isinstance(value, int | float) else value
 
 
-def _is_rate(curves: Mapping[str, str]) -> bool:
-    """Whether a panel shows rates of success alone, which end at 1."""
-    return all(
-        metric.startswith("success_rate") and " " not in metric for metric in curves.values()
-    )
+def _is_rate(metric: str) -> bool:
+    """Whether a metric is a rate of success, which ends at 1."""
+    return metric.startswith("success_rate")
 
 
 def _draw_curves(path: Path, plot: Plot, rows: Sequence[Row]) -> None:
@@ -115,17 +103,15 @@ def _draw_curves(path: Path, plot: Plot, rows: Sequence[Row]) -> None:
     size = (6.0 * len(plot.panels), 4.8)
     title = f"{plot.title} (x: no figure)"
     with figure(path, title, len(plot.panels), figsize=size, squeeze=False) as (_, (panels,)):
-        for axes, (label, curves) in zip(panels, plot.panels.items(), strict=True):
+        for axes, (label, metric) in zip(panels, plot.panels.items(), strict=True):
             heights: list[float] = []
             for number, (name, group) in enumerate(plot.groups(rows)):
                 color = _COLORS[number % len(_COLORS)]
                 x = [row[plot.over] for row in group]
-                for (curve, metric), style in zip(curves.items(), itertools.cycle(_STYLES)):
-                    y = [_value(row, metric) for row in group]
-                    text = ", ".join(filter(None, (name, curve))) or label
-                    if not all(map(math.isnan, y)):
-                        axes.plot(x, y, style, label=text, markersize=4, color=color)
-                    heights += y
+                y = [_value(row, metric) for row in group]
+                if not all(map(math.isnan, y)):
+                    axes.plot(x, y, "-o", label=name or label, markersize=4, color=color)
+                heights += y
                 failed = [row[plot.over] for row in group if row["status"] != "pass"]
                 marks = [0.02 + 0.04 * number] * len(failed)
                 axes.plot(failed, marks, "x", color=color, transform=axes.get_xaxis_transform())
@@ -140,7 +126,7 @@ def _draw_curves(path: Path, plot: Plot, rows: Sequence[Row]) -> None:
             if crossing is not None:
                 text = f"crossover, {crossing:,.0f}"
                 axes.axvline(crossing, color="0.4", linestyle=":", label=text)
-            if _is_rate(curves):
+            if _is_rate(metric):
                 axes.set_ylim(top=1.0)
             if axes.get_legend_handles_labels()[0]:
                 axes.legend(title=", ".join(plot.lines), frameon=False, fontsize=8)
@@ -159,8 +145,7 @@ def _draw_bars(path: Path, plot: Plot, rows: Sequence[Row]) -> None:
     size = (5.5 * len(plot.panels), 1.5 + 0.3 * len(rows))
     options: dict[str, Any] = {"figsize": size, "sharey": True, "squeeze": False}
     with figure(path, plot.title, len(plot.panels), **options) as (_, (panels,)):
-        for axes, (label, curves) in zip(panels, plot.panels.items(), strict=True):
-            metric = next(iter(curves.values()))
+        for axes, (label, metric) in zip(panels, plot.panels.items(), strict=True):
             stem = metric.removesuffix(".median")
             joint = "." if stem != metric else "_"
             middle, low, high = (
@@ -170,7 +155,7 @@ def _draw_bars(path: Path, plot: Plot, rows: Sequence[Row]) -> None:
             whiskers = np.array((middle - low, high - middle))
             style = {} if np.isnan(whiskers).all() else {"xerr": np.nan_to_num(whiskers)}
             axes.barh(places, middle, color=colors, ecolor="0.4", capsize=2, **style)
-            if _is_rate(curves):
+            if _is_rate(metric):
                 axes.set_xlim(right=1.0)
             axes.set(xlabel=label)
             axes.grid(alpha=0.3, axis="x")

@@ -42,25 +42,38 @@ def compile_step(
     def play(stage: Stage) -> None:
         stage(m, mjw.put_data(model, data, **sizes.as_kwargs()))
 
-    collision, *later = [partial(play, stage) for stage in _stages(m, plan)]
+    source = constraints if plan.name == "fused" else mjw
+    pairs = len(constraints.convex_pairs(m)) + 1
+    works = [partial(play, stage) for stage in _stages(m, plan)]
     with wp.ScopedDevice(device), ThreadPoolExecutor(available_cores()) as pool:
-        futures = [pool.submit(collision)]
+        futures = [pool.submit(work) for work in works[:pairs]]
         if plan.name != "fused":
             modules = [f"mujoco_warp._src.{name}" for name in SHARED]
             wait([pool.submit(wp.load_module, name, device=device) for name in modules])
-        futures += [pool.submit(stage) for stage in later]
+        futures += [pool.submit(work) for work in works[pairs:]]
         if wait(futures, timeout=_SILENT).not_done:
             log.info("compiling MJWarp's kernels; later runs on this machine load them")
+        wait(futures)
+        wait([pool.submit(play, source.collision)])  # if its flags ask for others
     wp.synchronize_device(device)
 
 
 def _stages(m: mjw.Model, plan: StepPlan) -> list[Stage]:
-    """Stages of a step: collision, which shares no module with the others, then the slowest."""
+    """Stages of a step, the slowest first; pairs of geoms share no module with the others."""
     source = constraints if plan.name == "fused" else mjw
     rows: list[Stage] = [mjw.make_constraint]
     if plan.name == "fused" and not constraints.why_not_rows(m):
         rows = [constraints.contact_rows, constraints.noncontact_rows]
-    stages: list[Stage] = [source.collision, mjw.sensor_acc, source.solve, *rows]
+    context = mjw._src.collision_core.create_collision_context
+    # Kernels of convex pairs take half a minute each
+    stages: list[Stage] = [
+        lambda m, d, types=types: mjw._src.collision_convex.convex_narrowphase(
+            m, d, context(d.naconmax), [types]
+        )
+        for types in constraints.convex_pairs(m)
+    ]
+    stages.append(lambda m, d: constraints.primitive_pairs(m, d, context(d.naconmax)))
+    stages += [constraints.broad_phase, mjw.sensor_acc, source.solve, *rows]
     stages += [mjw.sensor_pos, mjw.sensor_vel]
     stages.append(lambda m, d: mjw.reset_data(m, d, reset=wp.zeros(1, dtype=bool)))
     if plan.smooth:

@@ -243,12 +243,12 @@ class Scratch:
         self._free[self._keys[ptr]].append(ptr)
 
 
-def side_by_side(device: torch.device, *works: Callable[[], object]) -> None:
+def side_by_side(device: torch.device | str, *works: Callable[[], object]) -> None:
     """Do independent works: in a CUDA graph that is being captured as parallel branches, else one
     after the other. None of them may write what another reads or writes, nor keep a temporary that
     another uses.
     """
-    if device.type != "cuda" or not torch.cuda.is_current_stream_capturing():
+    if torch.device(device).type != "cuda" or not torch.cuda.is_current_stream_capturing():
         for work in works:
             work()
         return

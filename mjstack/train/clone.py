@@ -9,6 +9,7 @@ from pathlib import Path
 
 import torch
 
+from mjstack.config.functions import find_instance
 from mjstack.config.schema import CloneJobCfg
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, MjstackError, require_names
@@ -17,8 +18,7 @@ from mjstack.policy.checkpoint import Facts
 from mjstack.sim.memory import give_back_memory
 from mjstack.train.clone_learner import CloneLearner
 from mjstack.train.clone_network import vision_of
-from mjstack.train.dataset import check_dataset, read_demonstrations
-from mjstack.train.demonstrations import Demonstrations
+from mjstack.train.demonstrations import Demonstrations, Source
 from mjstack.train.images import ImagePool, pool_rows
 from mjstack.train.rounds import make_round, round_file
 from mjstack.train.trainer import FAILED, LAST, Trained, Trainer, earlier_state, observed_widths
@@ -34,7 +34,7 @@ def check_clone(stage: Stage) -> range:
         _check_vision(stage, job)
     widths = observed_widths(stage)
     if job.dataset is not None:
-        return check_dataset(stage, widths)
+        return find_instance("job.source", job.source, Source).check(stage, widths)
     least = 2 * stage.ranks.size
     if job.episodes < least:
         expected = f"at least {least}, because one of each rank's is for validation"
@@ -92,7 +92,8 @@ def train_clone(stage: Stage, folder: Path) -> Trained:
         first = make_round(stage, folder, None, 0, pool)
         _judge(stage, "round 0: the expert" if job.rounds else "the expert", first)
     else:
-        first = read_demonstrations(stage, observed_widths(stage))
+        source = find_instance("job.source", job.source, Source)
+        first = source.read(stage, observed_widths(stage))
     if len(first.ends) < 2:
         counts = f"{len(first.ends)} of {first.played} episodes succeeded, expected two at least"
         fix = "Ask for more (job.episodes), or look at why with gates=[success]"

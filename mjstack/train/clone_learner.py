@@ -25,6 +25,7 @@ from mjstack.train.learner import Learner
 from mjstack.train.trainer import made_with, with_observation
 
 _LOSSES = {"absolute": nn.functional.l1_loss, "squared": nn.functional.mse_loss}
+_AVERAGING = 0.999  # share of the weights that a batch keeps: they are an average
 _VALIDATION_SHARE = 20  # of so many episodes one is for validation
 _VALIDATED = 65536  # steps at once
 
@@ -173,7 +174,7 @@ class CloneLearner(Learner):
         if self._pool is not None:
             self._augment.draw(self._generator)
         # The first networks do not count for long.
-        share_kept = min(self._job.averaging, (1.0 + self.done) / (10.0 + self.done))
+        share_kept = min(_AVERAGING, (1.0 + self.done) / (10.0 + self.done))
         self._replaced.fill_(1.0 - share_kept)
         for group in self._optimizer.param_groups:
             group["lr"].fill_(self._job.learning_rate * rate)

@@ -12,10 +12,10 @@ import torch
 
 from mjstack.config.schema import CloneJobCfg, Config
 from mjstack.datasets import lerobot, reader
-from mjstack.datasets.spec import term_columns
+from mjstack.envs.columns import term_columns
 from mjstack.episodes.stage import Stage
 from mjstack.errors import FolderError
-from mjstack.train.demonstrations import Demonstrations
+from mjstack.train.demonstrations import Demonstrations, Source
 
 _ACTION = "action"
 _SUCCESS = "next.success"
@@ -173,3 +173,6 @@ def _numbers(stored: reader.StoredDataset, places: Sequence[Place]) -> np.ndarra
     """Numbers of the frames, shape ``(frames, numbers)``."""
     columns = {feature: stored.frames(feature) for feature in {feature for feature, _ in places}}
     return np.stack([columns[feature][:, number] for feature, number in places], axis=1)
+
+
+SOURCE = Source(check_dataset, read_demonstrations)

@@ -4,7 +4,7 @@ expert has given.
 
 import itertools
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -132,3 +132,17 @@ class Demonstrations:
 
         with closing(renderer):
             pool.add(self.usable(job), len(episode), read)
+
+
+@dataclass(frozen=True)
+class Source:
+    """Demonstrations that are there already: ``job.source`` names it, ``job.dataset`` its folder.
+
+    Attributes:
+        check: Raises a `MjstackError` for what a policy cannot learn from, given the stage and the
+            numbers of each term of its observation. Returns the seeds of the starts.
+        read: The episodes, given the same.
+    """
+
+    check: Callable[[Stage, Mapping[str, int]], range]
+    read: Callable[[Stage, dict[str, int]], Demonstrations]

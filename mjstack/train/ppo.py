@@ -129,10 +129,10 @@ class PpoLearner(Learner):
                 "learning_rate": job.learning_rate,
                 "desired_kl": job.desired_kl,
                 "gamma": job.gamma,
-                "lam": job.gae_lambda,
+                "lam": 0.95,
                 "clip_param": job.clip,
                 "use_clipped_value_loss": False,  # whose limit suits returns around 1
-                "entropy_coef": job.entropy,
+                "entropy_coef": 0.0,
             },
         }
 

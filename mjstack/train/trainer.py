@@ -66,7 +66,7 @@ def observed_group(job: CloneJobCfg | PpoJobCfg) -> ObservationGroupCfg:
     require_names(f"job.leave_out: term of {job.group}", needed, group.terms)
     left_out = {name.removesuffix("?") for name in job.leave_out}
     terms = {name: term for name, term in group.terms.items() if name not in left_out}
-    return replace(group, noise=job.observation_noise, terms=terms)
+    return replace(group, noise=False, terms=terms)
 
 
 def with_observation(cfg: Config) -> Config:

@@ -13,7 +13,7 @@ from lerobot.envs.configs import EnvConfig
 
 from mjstack.config import load_config
 from mjstack.config.schema import Config
-from mjstack.drivers.policy import GROUP, LerobotWords
+from mjstack.drivers.lerobot import GROUP, LerobotWords
 from mjstack.envs import Env, driven_config
 from mjstack.episodes.rollout import reset_worlds
 from mjstack.episodes.stage import Stage

@@ -20,18 +20,18 @@ class JobCfg:
 class CollectJobCfg(JobCfg):
     """Demonstrations of the closed-loop expert, as a dataset."""
 
-    episodes: int = spec(unit="episodes", ge=1)
+    episodes: int = spec(unit="episodes", ge=1, changes=("report",))
     """Episodes of the dataset; a call adds the missing ones."""
-    keep_failures: bool = spec()
+    keep_failures: bool = spec(changes=("episodes",))
     """Whether failed episodes are kept too, marked; they count."""
-    folder: str | None = spec(None)
+    folder: str | None = spec(None, changes=("report",))
     """Folder of the dataset; null: ``outputs/collect/<hash>`` of everything episodes depend on."""
-    buffer_gib: float = spec(unit="GiB", gt=0.0)
+    buffer_gib: float = spec(unit="GiB", gt=0.0, changes=("report",))
     """Device memory for the steps of one batch of worlds; more worlds are played in turns. With
     cameras also memory for images that wait for being encoded."""
-    codec: str = spec("h264", choices=("h264", "av1"))
+    codec: str = spec("h264", choices=("h264", "av1"), changes=("episodes",))
     """Codec of the videos."""
-    units: str = spec("si", choices=("si", "lerobot"))
+    units: str = spec("si", choices=("si", "lerobot"), changes=("episodes",))
     """Joint values: rad and m, or LeRobot's. lerobot also gives the columns and the robot type of a
     recording of the real arm alone, so that both can be merged."""
 
@@ -54,8 +54,10 @@ class PlayJobCfg(JobCfg):
 class ExportJobCfg(JobCfg):
     """A trained policy as files of others."""
 
-    format: str = spec(choices=("onnx", "lerobot"))
+    format: str = spec()
     """onnx: policy.onnx, and the scene as model.mjb; lerobot: the folder of a LeRobot policy."""
+    formats: dict[str, str] = spec()
+    """Dotted names of the ``mjstack.jobs.export.Format`` that makes each."""
 
 
 @dataclass(slots=True)
@@ -72,9 +74,9 @@ class TrainJobCfg(JobCfg):
 
     trainer: str = spec()
     """Dotted name of its ``mjstack.train.trainer.Trainer``."""
-    folder: str | None = spec(None)
+    folder: str | None = spec(None, changes=("report",))
     """Folder of the training; null: ``outputs/train/<hash>`` of everything training depends on."""
-    test_seed: int = spec(ge=0, le=MOST_SEEDS - 1)
+    test_seed: int = spec(ge=0, le=MOST_SEEDS - 1, changes=("report",))
     """First seed of the starts from which the policy is judged, gate.success.seeds of them."""
     observation: dict[str, Any] = spec({}, finite=False)
     """Groups that the policy may see; ``observation@job.observation`` chooses them."""
@@ -82,8 +84,6 @@ class TrainJobCfg(JobCfg):
     """The group that it sees."""
     leave_out: list[str] = spec([])
     """Terms of the group that the policy does not see; NAME? if there is that one."""
-    observation_noise: bool = spec()
-    """Whether its observations have their noise."""
     hidden: list[int] = spec(ge=1, le=65536)
     """Widths of the network's hidden layers."""
     learning_rate: float = spec(gt=0.0)
@@ -137,6 +137,8 @@ class CloneJobCfg(TrainJobCfg):
 
     dataset: str | None = spec(None)
     """Folder of a dataset from which it learns; null: from the expert, who plays now."""
+    source: str = spec()
+    """Dotted name of the ``mjstack.train.demonstrations.Source`` that reads it."""
     chunk: int = spec(unit="steps", ge=1, le=1000)
     """Joint targets of a chunk, which is one action."""
     execute: int = spec(unit="steps", ge=1, le=1000)
@@ -149,8 +151,6 @@ class CloneJobCfg(TrainJobCfg):
     loss: str = spec(choices=("squared", "absolute"))
     """Error of a joint target. Where the expert's action jumps, an absolute error picks one of the
     two actions, and a squared error averages them."""
-    averaging: float = spec(ge=0.0, le=1.0)
-    """Share of the policy's weights that a batch keeps: they are an average."""
     episodes: int = spec(unit="episodes", ge=1)
     """Episodes that the expert plays."""
     batches: int = spec(ge=1)
@@ -172,11 +172,11 @@ class CloneJobCfg(TrainJobCfg):
 class PpoJobCfg(TrainJobCfg):
     """A policy learns from the task's rewards, by rsl_rl's PPO."""
 
-    iterations: int | None = spec(None, ge=1)
+    iterations: int | None = spec(None, ge=1, changes=("report",))
     """Iterations of the training, over all calls; null: as ``minutes`` says."""
-    minutes: float | None = spec(None, unit="min", gt=0.0)
+    minutes: float | None = spec(None, unit="min", gt=0.0, changes=("report",))
     """Time of the training, over all calls; null: as ``iterations`` says."""
-    max_minutes: float | None = spec(None, unit="min", gt=0.0)
+    max_minutes: float | None = spec(None, unit="min", gt=0.0, changes=("report",))
     """Time budget of a call; the next one goes on. null: unlimited."""
     save_every: int = spec(unit="iterations", ge=1)
     """Iterations between two saved policies."""
@@ -190,14 +190,10 @@ class PpoJobCfg(TrainJobCfg):
     """Parts into which they are divided."""
     gamma: float = spec(ge=0.0, le=1.0)
     """Discount per decision."""
-    gae_lambda: float = spec(ge=0.0, le=1.0)
-    """Of the generalised advantage estimation."""
     clip: float = spec(gt=0.0)
     """Largest change of an action's probability that counts."""
     std: float = spec(gt=0.0)
     """Standard deviation of the actions at the start."""
-    entropy: float = spec(ge=0.0)
-    """Weight of the entropy."""
     desired_kl: float = spec(gt=0.0)
     """Change of the policy per iteration to which rsl_rl adapts the learning rate."""
 

@@ -5,7 +5,7 @@ from typing import Any
 
 from omegaconf import MISSING
 
-from mjstack.config.fields import spec
+from mjstack.config.fields import FITS, spec
 from mjstack.config.schema.scene import CameraPoseCfg
 
 
@@ -13,7 +13,7 @@ from mjstack.config.schema.scene import CameraPoseCfg
 class ModelCfg:
     """Source of the robot's MJCF file."""
 
-    source: str = spec(choices=("builtin", "menagerie"))
+    source: str = spec(choices=("builtin", "menagerie"), changes=("episodes", "images"))
     """``builtin``: ``robot.file``, or mjstack's own file. ``menagerie``: MuJoCo Menagerie's."""
 
 
@@ -80,7 +80,7 @@ class RobotCfg:
     Every joint named here has a position servo, and a range. Joint values are rad, or m for slides.
     """
 
-    name: str = MISSING
+    name: str = spec(changes=(*FITS, "images"))
     """The robot's name."""
     title: str = ""
     """The name in tables and reports. Empty: ``name``."""
@@ -107,9 +107,9 @@ class RobotCfg:
     replace_collision: bool = False
     """Whether ``model=menagerie`` gets the collision geoms of mjstack's own file."""
 
-    arm_joints: list[str] = spec()
+    arm_joints: list[str] = spec(changes=FITS)
     """Joints of the arm, from the base on."""
-    gripper_joints: list[str] = MISSING
+    gripper_joints: list[str] = spec(changes=FITS)
     """Joints of the gripper."""
     jaw_bodies: list[str] = MISSING
     """Bodies that touch a grasped object, each with all below it. A sensor measures the force of
@@ -121,13 +121,13 @@ class RobotCfg:
     """Where a grasp site goes that the file lacks: the mean of these geoms of a jaw, or a body."""
     grasp_pos: dict[str, Any] = spec({}, vectors=True, unit="m", length=3)
     """Where such a site lies in the frame of that body; its origin, or the geoms' mean."""
-    home: list[float] = spec(unit="rad, m")
+    home: list[float] = spec(unit="rad, m", changes=FITS)
     """Joint values at which a driven episode begins."""
     start: list[float] = spec([], unit="rad, m")
     """Joint values at which environments begin, clear of the table. Empty: ``home``."""
-    gripper_open: list[float] | None = spec(None, unit="rad, m")
+    gripper_open: list[float] | None = spec(None, unit="rad, m", changes=FITS)
     """Joint targets of the open gripper. null: as far as joints and servos allow."""
-    gripper_closed: list[float] | None = spec(None, unit="rad, m")
+    gripper_closed: list[float] | None = spec(None, unit="rad, m", changes=FITS)
     """Joint targets of the gripper around an object as wide as ``closed_width``; around any object
     where a task or the command line sets it alone. null: the jaws press with 20 N."""
     closed_width: float | None = spec(0.044, unit="m", gt=0.0)

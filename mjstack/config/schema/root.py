@@ -1,6 +1,6 @@
 """The whole configuration."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from mjstack.config.fields import MOST_SEEDS, MOST_WORLDS, spec
@@ -11,7 +11,6 @@ from mjstack.config.schema.run import (
     GateCfg,
     SimCfg,
     SolverCfg,
-    SweepCfg,
     TimingCfg,
     WebCfg,
 )
@@ -38,18 +37,18 @@ class Config:
     """Physics step and control step."""
     solver: SolverCfg = spec()
     """Limits of the constraint solver, and the friction cone."""
-    batch: BatchCfg = spec()
+    batch: BatchCfg = spec(changes=("report",))
     """MJWarp's buffer sizes."""
     sim: SimCfg = spec()
     """Physics engine and device."""
     # Terms by name, which `complete` types.
-    action: dict[str, Any] = spec({})
+    action: dict[str, Any] = spec({}, changes=("training",))
     """Action of a policy."""
     observation: dict[str, Any] = spec({})
     """Observations of a policy."""
     reset: dict[str, Any] = spec({})
     """Start states of the worlds."""
-    termination: dict[str, Any] = spec({})
+    termination: dict[str, Any] = spec({}, changes=("training",))
     """Ends of an episode."""
     reward: dict[str, Any] = spec({})
     """Rewards of a policy."""
@@ -57,40 +56,38 @@ class Config:
     """The task; it chooses some of the groups above."""
     controller: ControllerCfg = spec()
     """Joint trajectories planned before the episode, feedback, or a trained policy."""
-    gate: GateCfg = field(default_factory=GateCfg)
+    gate: GateCfg = spec(GateCfg, changes=("report",))
     """Parameters of the gates, all in use at once; gates=[...] chooses gates."""
-    job: AnyJob = spec()
+    job: AnyJob = spec(changes=("training",))
     """Work of the command."""
-    nworld: int = spec(unit="worlds", ge=1, le=MOST_WORLDS)
+    nworld: int = spec(unit="worlds", ge=1, le=MOST_WORLDS, changes=("training",))
     """Worlds of the batch, capacity and throughput gates."""
     seed: int = spec(ge=0, le=MOST_SEEDS - 1)
     """Seed of every random number."""
-    gates: list[str] = spec()
+    gates: list[str] = spec(changes=("report",))
     """Gates that run; their order is fixed. There is also success."""
-    graph: str = spec(choices=("auto", "require", "off"))
+    graph: str = spec(choices=("auto", "require", "off"), changes=("report",))
     """Capture the step as a CUDA graph: auto, require or off. Ignored on native MuJoCo; on Warp's
     CPU device, of physics alone."""
-    view: str = spec(choices=("false", "true", "web"))
+    view: str = spec(choices=("false", "true", "web"), changes=("report",))
     """true: MuJoCo's viewer on the parity world, or without that gate the baseline world; job=play:
     every world. web: the same, worlds of batch and success, and training, in a browser."""
-    video: bool = spec()
+    video: bool = spec(changes=("report",))
     """Write a video of the same; job=play without view does so."""
-    web: WebCfg = field(default_factory=WebCfg)
+    web: WebCfg = spec(WebCfg, changes=("nothing",))
     """Worlds in a browser."""
-    sweep: SweepCfg = field(default_factory=SweepCfg)
-    """Table and picture of a sweep."""
     starts: str | None = spec(None)
     """reset=starts_file: an npz file with one row per world, from which all of them start."""
     policy: str | None = spec(None)
     """controller=policy, job=play, job=export: the folder of a trained policy."""
-    run: str | None = spec(None)
+    run: str | None = spec(None, changes=("report",))
     """job=replay: the folder of an earlier run."""
-    devices: str | None = spec(None)
+    devices: str | None = spec(None, changes=("nothing",))
     """GPUs that share the job's worlds, a process for each: all, or how many. null: as torchrun
     has it, or one."""
-    world: str | None = spec(None)
+    world: str | None = spec(None, changes=("report",))
     """job=replay: 17; of seed 3, 3:17; success:3:17 where batch ran too; failing: all those."""
-    unused_terms: list[str] = spec([])
+    unused_terms: list[str] = spec([], changes=("nothing",))
     """Terms of the task that this job does not use, a line each; mjstack fills it in."""
 
     @property

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
-from mjstack.config.fields import MOST_COUNT, MOST_WORLDS, spec
+from mjstack.config.fields import FITS, MOST_COUNT, MOST_WORLDS, spec
 
 
 class Backend(StrEnum):
@@ -28,7 +28,7 @@ class TimingCfg:
     the policy's driver repeats each action."""
     control_hz: float = spec(50.0, unit="Hz", gt=0.0, le=1e6)
     """Control rate that these make: ``task.control_hz`` of the built-in tasks."""
-    command_delay: int = spec(0, unit="control steps", ge=0, le=1000)
+    command_delay: int = spec(0, unit="control steps", ge=0, le=1000, changes=FITS)
     """Control steps between a command and its effect; until then the start's command holds."""
     random_delay: int = spec(0, unit="control steps", ge=0, le=1000)
     """The most that commands are later still: each world draws 0 to this for each episode."""
@@ -84,31 +84,12 @@ class SimCfg:
 
     backend: Backend = spec()
     """Physics engine of batch and throughput: auto is MJWarp where there is CUDA."""
-    device: str = spec()
+    device: str = spec(changes=("report",))
     """auto, cpu or cuda:N."""
-    step: str = spec(choices=("auto", "stock"))
+    step: str = spec(choices=("auto", "stock"), changes=("training",))
     """MJWarp's step. stock: ``mujoco_warp.step``; auto: its stages as parallel branches, and
     contact rows, the solver and smooth dynamics as a few kernels, where these do all that the model
     needs."""
-
-
-@dataclass(slots=True)
-class SweepCfg:
-    """The table and the picture of a sweep, ``-m``. A name is that of a key of the command line, of
-    a metric of a gate, or ``job``, ``status`` or ``reason``.
-    """
-
-    title: str = ""
-    """Above both."""
-    over: str | None = None
-    """Name of the values over which the picture is drawn; null: of the first key with several."""
-    columns: dict[str, str] = spec({})
-    """Names by the columns' titles; empty: the keys with several values, and the gates' results."""
-    panels: dict[str, dict[str, str]] = spec({})
-    """Curves of each panel by its label: names by the curves' labels, or names with a factor, such
-    as ``NAME * 10``; empty: success and rates."""
-    notes: list[str] = spec([])
-    """Sentences below the table."""
 
 
 @dataclass(slots=True)
@@ -237,11 +218,11 @@ class EpisodesGateCfg(GateFuncCfg):
     """Share of the episodes that must succeed."""
     distinct_fraction: float = spec(0.0, ge=0.0, le=1.0)
     """Smallest share of distinct starts, or of distinct final states."""
-    region: list[float] | None = spec(None, unit="m", length=2, ge=0.0)
+    region: list[float] | None = spec(None, unit="m", length=2, ge=0.0, changes=("gates",))
     """Half-widths of the objects' region in x and y; null: as ``reset`` has them."""
     cell_episodes: int = spec(20, unit="episodes", ge=1, le=MOST_COUNT)
     """Episodes below which a cell of start positions has no rate."""
-    reset: dict[str, Any] = spec({})
+    reset: dict[str, Any] = spec({}, changes=("gates",))
     """Reset terms of its own: what they add to the task's own terms of ``reset``, or replace by
     name. ``reset=starts_file`` takes the place of those that read no file. With some, closed_loop
     plays in place of a plan, and starts, signs of failure and regions are recorded. Empty: those of

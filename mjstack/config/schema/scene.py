@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import mul
 
-from mjstack.config.fields import spec
+from mjstack.config.fields import FITS, spec
 
+SEEN = (*FITS, "images")  # what a policy sees
 OUTPUTS = ("rgb", "depth", "segmentation")
 _ROUND = (2, "radius and half length")
 SHAPES = {  # and the sizes of each
@@ -22,9 +23,9 @@ SHAPES = {  # and the sizes of each
 class ShapeCfg:
     """A shape, its size, and how it is turned."""
 
-    shape: str = spec("box", choices=tuple(SHAPES))
+    shape: str = spec("box", choices=tuple(SHAPES), changes=FITS)
     """box, cylinder (its length along its z axis), sphere, or capsule (along its x axis)."""
-    size: list[float] = spec([], unit="m", ge=1e-4, le=10.0)
+    size: list[float] = spec([], unit="m", ge=1e-4, le=10.0, changes=FITS)
     """Half sizes of a box; radius of a sphere; radius and half length of the others."""
     yaw: float = spec(0.0, unit="rad")
     """Turn about the vertical."""
@@ -233,11 +234,11 @@ class CameraPoseCfg:
 class CameraCfg:
     """A camera, whose images are observations. Vertical field of view and size give its rays."""
 
-    pose: CameraPoseCfg | None = None
+    pose: CameraPoseCfg | None = spec(None, changes=SEEN)
     """Its pose. null: ``robot.wrist_camera``, on the gripper."""
-    size: list[int] = spec([128, 128], unit="pixels", length=2, ge=1, le=4096)
+    size: list[int] = spec([128, 128], unit="pixels", length=2, ge=1, le=4096, changes=SEEN)
     """Height and width of the image."""
-    fovy: float = spec(45.0, unit="deg", ge=1.0, le=170.0)
+    fovy: float = spec(45.0, unit="deg", ge=1.0, le=170.0, changes=SEEN)
     """Vertical field of view."""
     rate: float | None = spec(None, unit="Hz", gt=0.0)
     """Images per second. null: one in every control step."""
@@ -251,7 +252,7 @@ class CameraCfg:
 class SceneCfg:
     """A table, and objects and places on it."""
 
-    name: str = spec()
+    name: str = spec(changes=("episodes", "images"))
     """Its name, which selects the robot's ``placements``."""
     table_center: list[float] = spec(unit="m", length=3)
     """Centre of the table, a box."""

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from mjstack.config.fields import spec
+from mjstack.config.fields import FITS, spec
 
 
 @dataclass(slots=True)
@@ -60,17 +60,17 @@ class TerminationTermCfg(TermCfg):
 class TaskCfg:
     """The goal of an episode, sampled at step ends."""
 
-    name: str = spec()
+    name: str = spec(changes=FITS)
     """Name of the task."""
     instruction: str | None = None
     """The task in words, for datasets; null: its name."""
-    control_hz: float = spec("${timing.control_hz}", unit="Hz", gt=0.0, le=1e6)
+    control_hz: float = spec("${timing.control_hz}", unit="Hz", gt=0.0, le=1e6, changes=FITS)
     """Control steps per second; a number only for a task that works at no other rate."""
     episode_seconds: float | None = spec(None, unit="s", gt=0.0)
     """Length of an episode of the environment; null: that of the phases."""
     episode_steps: int = spec("${steps:${task.episode_seconds}}", unit="steps", ge=1, le=1_000_000)
     """The same in control steps."""
-    params: dict[str, Any] = spec({})
+    params: dict[str, Any] = spec({}, changes=FITS)
     """Numbers that several terms of the task share, as ``${task.params.NAME}``."""
     check: dict[str, Any] | None = None
     """Judges an episode: ``func`` names a subclass of ``EpisodeCheck``, the other keys are its
@@ -125,7 +125,7 @@ class ControllerCfg:
     """Drives the worlds. Its actions go through the action terms of ``action``."""
 
     name: str = spec()
-    """open_loop, closed_loop, state_based, policy, custom, or one of your own."""
+    """open_loop, closed_loop, state_based, policy, lerobot, custom, or one of your own."""
     func: str = spec()
     """Its driver: a subclass of ``mjstack.drivers.driver.Driver``."""
     params: dict[str, Any] = spec({})
@@ -148,5 +148,3 @@ class ControllerCfg:
     """Share of the turn of the jaws to an object's nearest face."""
     speed_limit: float = spec(ge=1.0, le=100.0)
     """How many times as fast a world may go after a retry."""
-    rest_seconds: float = spec(unit="s", ge=0.0, le=600.0)
-    """Time between the last motion and the window of rest after a retry."""

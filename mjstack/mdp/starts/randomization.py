@@ -2,7 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import ClassVar
 
@@ -45,11 +45,15 @@ def bounds(name: str, values: Sequence[float]) -> tuple[float, float]:
     """The smallest and largest value of a parameter that has both.
 
     Raises:
-        ParameterError: They are not positive, or not in order.
+        ParameterError: They are no two numbers, not positive, or not in order.
     """
-    if len(values) != 2 or not 0.0 < values[0] <= values[1] < math.inf:
-        raise ParameterError(name, list(values), "two positive numbers, the smaller one first")
-    return float(values[0]), float(values[1])
+    try:
+        low, high = map(float, () if isinstance(values, str | Mapping) else values)
+    except (TypeError, ValueError):
+        low = high = math.nan
+    if not 0.0 < low <= high < math.inf:
+        raise ParameterError(name, values, "two positive numbers, the smaller one first")
+    return low, high
 
 
 class Elements:

@@ -4,13 +4,19 @@ MJWarp's own.
 
 import dataclasses
 from functools import partial
+from typing import Any
 
 import mujoco
 
 from mjstack.sim.fused.launch import SHARED_BYTES, arguments, launch, padded_rows
+from mjstack.sim.graph import side_by_side
 from mjstack.sim.mujoco_warp import mjw, wp
 
 MAX_NV = 64
+_WARP_ROWS = 320  # room for so many: a warp does each world
+_FEW_ROWS = 128  # in a larger room a warp does worlds with so many, and a team those with more
+_TEAM = 4  # warps
+_TEAM_NV = 31  # a larger factorization is one warp's
 
 
 def why_not(m: mjw.Model, d: mjw.Data) -> str:
@@ -34,13 +40,27 @@ def why_not(m: mjw.Model, d: mjw.Data) -> str:
 
 def shared_bytes(nv: int, row: int, njmax: int) -> int:
     """Shared memory of a world [bytes]: the arrays at the head of newton.cpp."""
-    floats = (nv + 1) * (nv | 1) + 34 * row + 4 * nv + 5 * njmax
+    team, chunk = (_TEAM, 64) if nv <= _TEAM_NV else (1, 32)
+    floats = (nv + 1) * (nv | 1) + max((chunk + 2) * row, 512) + 4 * nv + 5 * njmax + 11 * team
     return 4 * floats + 8 * njmax
 
 
+def convex_pairs(m: mjw.Model) -> list[tuple[mjw.GeomType, mjw.GeomType]]:
+    """Pairs of types of geoms that the model has, and that are none of primitive shapes."""
+    table = mjw._src.collision_driver.MJ_COLLISION_TABLE
+    primitive = mjw._src.collision_primitive._PRIMITIVE_COLLISIONS
+    return [types for types in table if types not in primitive and _count(m, types)]
+
+
+def _count(m: mjw.Model, types: tuple[mjw.GeomType, mjw.GeomType]) -> int:
+    """Number of pairs of geoms of these types."""
+    first, second = (kind.value for kind in types)
+    return m.geom_pair_type_count[mjw._src.math.upper_trid_index(len(mjw.GeomType), first, second)]
+
+
 def collision(m: mjw.Model, d: mjw.Data) -> None:
-    """`mujoco_warp.collision`, the narrow phase of primitive shapes by blocks that go from pair to
-    pair.
+    """`mujoco_warp.collision`, kinds of pairs as parallel branches, the narrow phase of primitive
+    shapes by blocks that go from pair to pair.
 
     MJWarp launches a thread for each contact that the buffer has room for. The kernel's 255
     registers leave room for one block on a multiprocessor, and most blocks find nothing to do. The
@@ -59,24 +79,31 @@ def collision(m: mjw.Model, d: mjw.Data) -> None:
         mjw.collision(m, d)
         return
 
-    # All pairs, and those of convex shapes
-    source = mjw._src
-    context = source.collision_core.create_collision_context(d.naconmax)
+    context = broad_phase(m, d)
+    # Each kind of pairs has temporaries and counts of its own, and contacts are of no order
+    narrow = mjw._src.collision_convex.convex_narrowphase
+    works = [partial(narrow, m, d, context, [types]) for types in convex_pairs(m)]
+    works.append(partial(primitive_pairs, m, d, context))
+    side_by_side(wp.device_to_torch(d.qpos.device), *works)
+
+
+def broad_phase(m: mjw.Model, d: mjw.Data) -> Any:
+    """List pairs of geoms that may touch, in the context that is returned."""
+    context = mjw._src.collision_core.create_collision_context(d.naconmax)
     d.ncollision.zero_()
     d.nacon.zero_()
     simple = m.opt.broadphase == mjw.BroadphaseType.NXN
     (mjw.nxn_broadphase if simple else mjw.sap_broadphase)(m, d, context)
-    primitive = source.collision_primitive._PRIMITIVE_COLLISIONS
-    table = source.collision_driver.MJ_COLLISION_TABLE
-    convex = [types for types in table if types not in primitive]
-    source.collision_convex.convex_narrowphase(m, d, context, convex)
+    return context
 
-    # Those of primitive shapes, by a kernel for the types that the model has
-    place = partial(source.math.upper_trid_index, len(mjw.GeomType))
+
+def primitive_pairs(m: mjw.Model, d: mjw.Data, context: Any) -> None:
+    """Contacts of pairs of primitive shapes, by a kernel for the types that the model has."""
+    source = mjw._src
     functions = {
         types: function
-        for types, function in primitive.items()
-        if m.geom_pair_type_count[place(types[0].value, types[1].value)]
+        for types, function in source.collision_primitive._PRIMITIVE_COLLISIONS.items()
+        if _count(m, types)
     }
     kernel = source.collision_primitive._primitive_narrowphase([*functions], [*functions.values()])
     device = d.qpos.device
@@ -113,4 +140,12 @@ def solve(m: mjw.Model, d: mjw.Data) -> None:
     """`mujoco_warp.solve` in one launch, for models to which `why_not` has no objection: the same
     cost, tolerances, limits and outputs.
     """
-    launch(("newton",), m, d, fast_math=True)
+    device, most = d.qpos.device, padded_rows(d.njmax)
+    solver = partial(launch, ("newton",), m, d, fast_math=True)
+    if not device.is_cuda or m.nv > _TEAM_NV or most <= _WARP_ROWS:
+        solver()
+        return
+    # A step waits for its slowest world: those with many rows begin first
+    many = partial(solver, rows=(_FEW_ROWS, most), team=_TEAM)
+    few = partial(solver, rows=(-1, _FEW_ROWS), bounds=(32, 20))
+    side_by_side(wp.device_to_torch(device), many, few)

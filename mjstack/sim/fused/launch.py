@@ -50,14 +50,17 @@ def launch(
     warps: int | None = None,
     fast_math: bool = False,
     bounds: tuple[int, int] | None = None,
+    rows: tuple[int, int] | None = None,
+    team: int = 1,
 ) -> None:
     """Run a kernel, whose body is made up of the named C++ files, one after the other; the first
     launch for models of these sizes compiles it.
 
-    There is one warp for each world by default. ``bounds`` are the most threads of a block, and the
-    fewest blocks on a multiprocessor. With ``fast_math`` CUDA's division and roots may be good to
-    the last two bits alone. On a CPU fast math would assume that there is no NaN, so it has no
-    effect there.
+    There is one warp for each world by default, on CUDA a ``team`` of warps. ``bounds`` are the
+    most threads of a block, and the fewest blocks on a multiprocessor. Given ``rows``, the worlds
+    are those with more constraint rows than the first number, up to the second. With ``fast_math``
+    CUDA's division and roots may be good to the last two bits alone. On a CPU fast math would
+    assume that there is no NaN, so it has no effect there.
     """
     warps = warps or d.nworld
     arrays, constants = _names(texts)
@@ -66,14 +69,17 @@ def launch(
         (name, None, 0) if isinstance(value, int) else (name, value.dtype, value.ndim)
         for name, value in values.items()
     )
-    numbers = {**_CONSTANTS, **_sizes(m, d), "WARPS": warps}
-    used = tuple((name, int(number)) for name, number in numbers.items() if name in constants)
     device = d.qpos.device
+    threads = 32 * team if device.is_cuda else 32
+    fewer, most = rows or (-1, padded_rows(d.njmax))
+    numbers = {**_CONSTANTS, **_sizes(m, d), "WARPS": warps, "LANES": threads}
+    numbers |= {"FEWER": fewer, "NJ": most}
+    used = tuple((name, int(number)) for name, number in numbers.items() if name in constants)
     kernel, struct = _kernel(texts, kinds, used, fast_math and device.is_cuda, bounds)
     io = struct()
     for name, value in values.items():
         setattr(io, name, int(value) if isinstance(value, int) else value)
-    wp.launch_tiled(kernel, dim=warps, inputs=[io], block_dim=32, device=device)
+    wp.launch_tiled(kernel, dim=warps, inputs=[io], block_dim=threads, device=device)
 
 
 def find(name: str, m: mjw.Model, d: mjw.Data) -> Any:
@@ -122,7 +128,6 @@ def _sizes(m: mjw.Model, d: mjw.Data) -> dict[str, int]:
         "NT": m.ntendon,
         "BLOCK": largest_tree(m),
         "NVP": d.efc.J.shape[2],
-        "NJ": padded_rows(d.njmax),
         "ITERATIONS": m.opt.iterations,
         "LS_ITERATIONS": m.opt.ls_iterations,
         "WARMSTART": not m.opt.disableflags & mjw.DisableBit.WARMSTART,

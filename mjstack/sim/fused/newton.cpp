@@ -1,17 +1,19 @@
-// MuJoCo's Newton solver. A warp does a world.
+// MuJoCo's Newton solver. A warp does a world, or some warps do one with many rows.
 //
 // J stays where it is and is read through the L1 cache; all else of a world lies in shared memory.
 //
-// Constants: NV degrees of freedom, NVP columns of J with padding, NJ rows at most, ITERATIONS and
-// LS_ITERATIONS, WARMSTART.
+// Constants: NV degrees of freedom, NVP columns of J with padding; worlds with more than FEWER rows
+// are done, up to NJ; ITERATIONS and LS_ITERATIONS, WARMSTART.
 
 constexpr int LD = NV | 1;            // rows of h begin in different banks of shared memory
-constexpr int CHUNK = 32;             // rows of s
+constexpr int WIDTH = T < 32 ? T : 32;  // threads of a warp
+constexpr int TEAM = T / WIDTH;       // warps of a world
+constexpr int CHUNK = TEAM > 1 ? 64 : 32;  // rows of s
 constexpr int QUADS = NVP / 4;        // columns by fours
 constexpr int NB = (NV + 3) / 4;      // blocks of 4 x 4 along the Hessian's side
 constexpr int BLOCKS = NB * (NB + 1) / 2;
-constexpr int GROUPS = T > BLOCKS ? T / BLOCKS : 1;  // of threads, which share the rows
-constexpr int SHARE = (BLOCKS + T - 1) / T;            // blocks of a thread
+constexpr int GROUPS = WIDTH > BLOCKS ? WIDTH / BLOCKS : 1;  // of a warp's threads, which share rows
+constexpr int SHARE = (BLOCKS + WIDTH - 1) / WIDTH;            // blocks of a thread
 constexpr int SPLIT = T > QUADS ? T / QUADS : 1;     // of the rows, for J' force
 constexpr float NOISE = 8.0f * 1.1920929e-07f;       // of a sum of derivatives, relative
 
@@ -26,9 +28,13 @@ SHARED float qa[NJ], qb[NJ], qc[NJ];
 // A row's first row of its contact; contacts' first rows; rows with a weight
 SHARED unsigned short head[NJ], item[NJ], active[NJ];
 SHARED unsigned char state[NJ], dims[NJ];  // dims: rows of a row's contact, or 0
+SHARED float sums_of_warps[TEAM * 9];
+SHARED int counts[TEAM];
 
 const int world = warp;
 const int nefc = wp::min(io.efc_aref.shape[1], io.nefc.data[world]);
+if (nefc <= FEWER || nefc > NJ) return;  // of another launch
+const int thread = lane % WIDTH, member = lane / WIDTH;
 const int ne = wp::min(nefc, io.ne.data[world]);
 const int nf = io.nf.data[world];
 const int contacts = wp::min(nefc, ne + nf + io.nl.data[world]);  // where their rows begin
@@ -47,6 +53,19 @@ auto sum = [&](auto &values) {
 #ifdef __CUDA_ARCH__
   for (auto &value : values)
     for (int offset = 16; offset; offset >>= 1) value += __shfl_xor_sync(~0u, value, offset);
+  if constexpr (TEAM > 1) {
+    int k = 0;
+    if (thread == 0)
+      for (auto &value : values) sums_of_warps[member * 9 + k++] = value;
+    SYNC();
+    k = 0;
+    for (auto &value : values) {
+      value = 0.0f;
+      for (int other = 0; other < TEAM; ++other) value += sums_of_warps[other * 9 + k];
+      ++k;
+    }
+    SYNC();
+  }
 #endif
 };
 
@@ -58,8 +77,19 @@ auto compact = [&](int begin, int end, auto keep, unsigned short *list) {
     const bool listed = r < end && keep(r);
 #ifdef __CUDA_ARCH__
     const unsigned mask = __ballot_sync(~0u, listed);
-    if (listed) list[count + __popc(mask & ((1u << lane) - 1u))] = r;
-    count += __popc(mask);
+    int place = count + __popc(mask & ((1u << thread) - 1u));
+    if constexpr (TEAM > 1) {
+      if (thread == 0) counts[member] = __popc(mask);
+      SYNC();
+      for (int other = 0; other < TEAM; ++other) {
+        if (other < member) place += counts[other];
+        count += counts[other];
+      }
+      SYNC();
+    } else {
+      count += __popc(mask);
+    }
+    if (listed) list[place] = r;
 #else
     if (listed) list[count++] = r;
 #endif
@@ -249,10 +279,10 @@ auto weighted = [&](int r, int quad) {
 };
 
 // A thread's blocks of the Hessian's lower triangle: their first rows and columns
-const int group = GROUPS > 1 ? lane / BLOCKS : 0;
+const int group = GROUPS > 1 ? thread / BLOCKS : 0;
 int block_row[SHARE], block_col[SHARE];
 for (int o = 0; o < SHARE; ++o) {
-  const int block = GROUPS > 1 ? lane % BLOCKS : lane + o * T;
+  const int block = GROUPS > 1 ? thread % BLOCKS : thread + o * WIDTH;
   int i = 0;
   while ((i + 1) * (i + 2) / 2 <= block) ++i;
   block_row[o] = group < GROUPS && block < BLOCKS ? 4 * i : -1;
@@ -274,7 +304,7 @@ auto direction = [&]() {
     SYNC();
     for (int o = 0; o < SHARE; ++o) {
       if (block_row[o] >= 0) {
-        for (int r = group; r < n; r += GROUPS) {
+        for (int r = group + GROUPS * member; r < n; r += GROUPS * TEAM) {
           const float4 a4 = *reinterpret_cast<const float4 *>(s + r * NVP + block_row[o]);
           const float4 b4 = *reinterpret_cast<const float4 *>(s + r * NVP + block_col[o]);
           const float a[4] = {a4.x, a4.y, a4.z, a4.w};
@@ -286,17 +316,24 @@ auto direction = [&]() {
     }
     SYNC();
   }
-  // The first group adds the others' parts.
+  // The first group adds the others' parts, one warp after the other.
   for (int o = 0; o < SHARE; ++o)
     for (int p = 0; p < 4; ++p)
-      for (int q = 0; q < 4; ++q) {
-        float total = part[o][p][q];
-        for (int g = 1; g < GROUPS; ++g)
-          total += FROM(part[o][p][q], (lane + g * BLOCKS) % 32);
-        const int i = block_row[o] + p, j = block_col[o] + q;
-        if (group == 0 && block_row[o] >= 0 && j <= i && i < NV) h[i * LD + j] = total;
-      }
-  SYNC();
+      for (int q = 0; q < 4; ++q)
+        for (int g = 1; g < GROUPS; ++g) {
+          const float other = FROM(part[o][p][q], (thread + g * BLOCKS) % 32);
+          if (group == 0) part[o][p][q] += other;
+        }
+  for (int turn = 0; turn < TEAM; ++turn) {
+    for (int o = 0; o < SHARE; ++o)
+      for (int p = 0; p < 4; ++p)
+        for (int q = 0; q < 4; ++q) {
+          const int i = block_row[o] + p, j = block_col[o] + q;
+          if (turn == member && group == 0 && block_row[o] >= 0 && j <= i && i < NV)
+            h[i * LD + j] = turn ? h[i * LD + j] + part[o][p][q] : part[o][p][q];
+        }
+    SYNC();
+  }
   for (int e = lane; e < io.M_colind.shape[0]; e += T)
     h[io.M_hinit_i.data[e] * LD + io.M_colind.data[e]] += M[e];
   SYNC();
@@ -305,32 +342,34 @@ auto direction = [&]() {
   float *y = h + NV * LD;
 #ifdef __CUDA_ARCH__
   if constexpr (NV < 32) {
-    // A row per thread, in registers
-    float a[NV], inverse = 0.0f;
-    WP_PRAGMA_UNROLL
-    for (int k = 0; k < NV; ++k) a[k] = lane <= NV ? h[lane * LD + k] : 0.0f;
-    WP_PRAGMA_UNROLL
-    for (int j = 0; j < NV; ++j) {
-      const float scaled = rsqrtf(FROM(a[j], j));
-      if (lane == j) inverse = scaled;
-      a[j] *= scaled;
+    // A row per thread of the first warp, in registers
+    if (member == 0) {
+      float a[NV], inverse = 0.0f;
       WP_PRAGMA_UNROLL
-      for (int k = j + 1; k < NV; ++k) a[k] -= a[j] * FROM(a[j], k);
+      for (int k = 0; k < NV; ++k) a[k] = thread <= NV ? h[thread * LD + k] : 0.0f;
+      WP_PRAGMA_UNROLL
+      for (int j = 0; j < NV; ++j) {
+        const float scaled = rsqrtf(FROM(a[j], j));
+        if (thread == j) inverse = scaled;
+        a[j] *= scaled;
+        WP_PRAGMA_UNROLL
+        for (int k = j + 1; k < NV; ++k) a[k] -= a[j] * FROM(a[j], k);
+      }
+      WP_PRAGMA_UNROLL
+      for (int k = 0; k < NV; ++k)
+        if (thread <= NV) h[thread * LD + k] = a[k];
+      __syncwarp();
+      float rest = thread < NV ? y[thread] : 0.0f, x = 0.0f;
+      squares[1] = rest * rest;
+      WP_PRAGMA_UNROLL
+      for (int j = NV - 1; j >= 0; --j) {
+        const float solution = FROM(rest * inverse, j);
+        if (thread == j) x = solution;
+        if (thread < j) rest -= h[j * LD + thread] * solution;
+      }
+      if (thread < NV) search[thread] = -x;
+      squares[0] = x * x;
     }
-    WP_PRAGMA_UNROLL
-    for (int k = 0; k < NV; ++k)
-      if (lane <= NV) h[lane * LD + k] = a[k];
-    SYNC();
-    float rest = lane < NV ? y[lane] : 0.0f, x = 0.0f;
-    squares[1] = rest * rest;
-    WP_PRAGMA_UNROLL
-    for (int j = NV - 1; j >= 0; --j) {
-      const float solution = FROM(rest * inverse, j);
-      if (lane == j) x = solution;
-      if (lane < j) rest -= h[j * LD + lane] * solution;
-    }
-    if (lane < NV) search[lane] = -x;
-    squares[0] = x * x;
   } else
 #endif
   {
