@@ -76,8 +76,8 @@ class Jaws:
         members = jaw_bodies(model, jaws)
         collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
         geoms = [np.flatnonzero(collides & np.isin(model.geom_bodyid, m)) for m in members]
-        kept = [(part, bodies) for part, bodies in zip(geoms, members, strict=True) if part.size]
-        self._pads = [part for part, _ in kept]
+        solid = [(part, bodies) for part, bodies in zip(geoms, members, strict=True) if part.size]
+        self._pads = [part for part, _ in solid]
         owners = [[body in m for m in members] for body in model.site_bodyid[self._sites]]
         self.carry_sites = all(map(any, owners)) and owners[0] != owners[1]
 
@@ -98,9 +98,10 @@ class Jaws:
 
         # Pads are beside the jaw's own site, or else the grasp point between the open jaws
         self._measure([self.opened], self._breadth)
-        for k, (part, bodies) in enumerate(kept):
-            own = [site for site in self._sites if model.site_bodyid[site] in bodies]
-            point = self._data.site_xpos[own if self.carry_sites and own else self._sites].mean(0)
+        for k, (part, bodies) in enumerate(solid):
+            sites = [site for site in self._sites if model.site_bodyid[site] in bodies]
+            sites = sites if self.carry_sites and sites else self._sites
+            point = self._data.site_xpos[sites].mean(0)
             turns = self._data.geom_xmat[part].reshape(-1, 3, 3)
             local = np.einsum("nij,ni->nj", turns, point - self._data.geom_xpos[part])
             middle, half = model.geom_aabb[part].reshape(-1, 2, 3).swapaxes(0, 1)

@@ -68,9 +68,9 @@ class Posture:
         numbers = [m.joint(name).id for name in joints]
         self.commanded = m.jnt_qposadr[numbers]
         constant = (m.eq_obj2id < 0) | ~m.eq_data[:, 1:5].any(axis=1)
-        held = (m.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)) & m.eq_active0 & constant
+        pinned = (m.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)) & m.eq_active0 & constant
         for name, number in zip(joints, numbers, strict=True):
-            if number in m.eq_obj1id[held]:
+            if number in m.eq_obj1id[pinned]:
                 problem = (
                     f"joint {name} is held at one place by an equality, expected one that moves"
                 )

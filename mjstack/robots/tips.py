@@ -18,7 +18,7 @@ _DEPTHS = ((0.016, 0.013), (0.010, 0.013), (0.005, 0.013), (0.005, 0.004))
 _REACH = 0.018  # m that they may at most, which a jaw on a hinge changes as it opens
 _ROOM = 0.016  # m beside an object that is enough
 _EDGE = 0.002  # m from a tip's end at least
-_HELD = 0.012  # m of an object's side that the shorter tip touches
+_GRASPED = 0.012  # m of an object's side that the shorter tip touches
 _SPREAD = 0.015  # m that the jaws may be wider at the point than at an object's upper edge
 _SHALLOW = -0.010  # m for a depth then: jaws press it out, the less the higher they grasp it
 _PLATE = [0.004, 0.013, 0.0005]  # m: half sizes of the patch of a surface that counts
@@ -204,7 +204,7 @@ class Fingers:
             clouds = [self.points(side) @ frame for side in self._sides]
             tops = [cloud[:, 1].max() for cloud in clouds]
             high = 2.0 * self.model.geom_size[self._plate, 1] - _TIP  # of an object, over the point
-            level = min(min(tops) + max(high - _HELD, -_EDGE), max(tops) - depth)
+            level = min(min(tops) + max(high - _GRASPED, -_EDGE), max(tops) - depth)
             tips = [
                 c[c[:, 1] > min(level, top) - _EDGE] for c, top in zip(clouds, tops, strict=True)
             ]

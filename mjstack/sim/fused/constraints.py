@@ -146,6 +146,6 @@ def solve(m: mjw.Model, d: mjw.Data) -> None:
         solver()
         return
     # A step waits for its slowest world: those with many rows begin first
-    many = partial(solver, rows=(_FEW_ROWS, most), team=_TEAM)
-    few = partial(solver, rows=(-1, _FEW_ROWS), bounds=(32, 20))
-    side_by_side(wp.device_to_torch(device), many, few)
+    teams = partial(solver, rows=(_FEW_ROWS, most), team=_TEAM)
+    warps = partial(solver, rows=(-1, _FEW_ROWS), bounds=(32, 20))
+    side_by_side(wp.device_to_torch(device), teams, warps)
