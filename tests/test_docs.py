@@ -20,6 +20,7 @@ from mjstack import MjstackError, load_config
 from mjstack.cli import run
 
 DOCS = ROOT / "docs"
+NOTEBOOK = DOCS / "quickstart.ipynb"
 GUIDES = [page.name for page in PAGES[1:] if python_blocks(page.read_text(encoding="utf-8"))]
 COMMAND = r"(?:mjstack|python scripts/run\.py) "
 ITERATIONS = 24
@@ -85,8 +86,9 @@ def shown_commands() -> list[dict[str, str]]:
     its first job.
     """
     commands: list[dict[str, str]] = []
-    for page in PAGES:
+    for page in (*PAGES, NOTEBOOK):
         text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+        text = re.sub(r'(?m)^ *"!(.*?)(?:\\n)?",?$', r"$ \1", text)  # a line of a notebook
         lines = re.findall(rf"(?m)^\$ {COMMAND}(.*)$", text)
         for line in [*lines, *re.findall(rf"`{COMMAND}([^`]+)`", text)]:
             words = shlex.split(line, comments=True)
