@@ -42,7 +42,7 @@ def complete_terms(cfg: DictConfig, overrides: Sequence[str]) -> None:
         played = [
             name for name in cfg.gate if OmegaConf.select(cfg, f"gate.{name}.func") == EPISODES
         ]
-        gates = ["baseline", "capacity", *(name for name in played if cfg.gate[name].get("reset"))]
+        gates = ["baseline", *(name for name in played if cfg.gate[name].get("reset"))]
         lines = [line for name in gates for line in _complete_copy(cfg, name)]
         cfg.unused_terms = [*_choices(cfg, overrides), *lines, *_left_out(cfg), *_unseen(cfg)]
 
