@@ -32,9 +32,9 @@ CONFIG_FOLDER = next(
     for folder in (_PACKAGE.parent / "conf", _PACKAGE / "conf")
     if (folder / "config.yaml").is_file()
 )
-# Bytes of a file, and of what an npz file unpacks to
 MESHES = (".obj", ".stl", ".msh")  # suffixes
 
+# Bytes of a file, and of what an npz file unpacks to
 _MOST = {".json": 2**22, ".yaml": 2**20, ".npz": 2**29, ".safetensors": 2**30}
 _MOST_BYTES = 2**32  # of any other
 _MOST_ARRAYS = 1000  # of an npz file

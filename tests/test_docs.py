@@ -1,5 +1,6 @@
 """The pages in docs/: what they show in Python runs, offline and without a GPU."""
 
+import json
 import re
 import runpy
 import shlex
@@ -81,12 +82,14 @@ def test_python_blocks_run(name: str, folder: Path) -> None:
 
 
 def shown_commands() -> list[dict[str, str]]:
-    """Overrides of every command that the README and the pages show, by key; of a sweep, those of
+    """Overrides of every command that README, pages and notebook show, by key; of a sweep, those of
     its first job.
     """
     commands: list[dict[str, str]] = []
-    for page in PAGES:
-        text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+    texts = [page.read_text(encoding="utf-8") for page in PAGES]
+    cells = json.loads((DOCS / "quickstart.ipynb").read_text(encoding="utf-8"))["cells"]
+    texts += ["".join(cell["source"]).replace("!mjstack", "$ mjstack") for cell in cells]
+    for text in (text.replace("\\\n", " ") for text in texts):
         lines = re.findall(rf"(?m)^\$ {COMMAND}(.*)$", text)
         for line in [*lines, *re.findall(rf"`{COMMAND}([^`]+)`", text)]:
             words = shlex.split(line, comments=True)

@@ -43,6 +43,7 @@ COLLECT = (
     "controller=closed_loop",
 )
 ROWS = "meta/episodes/chunk-000/file-000.parquet"
+TASKS = "meta/tasks.parquet"
 Damage = Callable[[Path], object]
 
 
@@ -361,7 +362,7 @@ COLUMNS: dict[str, tuple[str, str, list[Any], str]] = {
     ),
     "no length": (ROWS, "length", [None, 150, 150], "row 0: length is None"),
     "task": (
-        "meta/tasks.parquet",
+        TASKS,
         "task_index",
         [None],
         "tasks.parquet: cannot be read (Val",
@@ -387,6 +388,21 @@ def test_no_dataset_and_others_terms_and_tasks(dataset: Path, tmp_path: Path) ->
     assert "has the task 'Bring the gripper over the red cube.'" in refusal_of(other)
     used = [f"job.dataset={dataset}", "job.test_seed=0"]
     assert "expected seeds that training does not use" in refusal_of(used)
+
+
+def test_a_task_without_instruction_has_its_name_in_a_dataset(
+    dataset: Path, tmp_path: Path
+) -> None:
+    folder = copied(dataset, tmp_path)
+    named = with_column(pq.read_table(folder / TASKS), "task", pa.array(["reach"]))
+    pq.write_table(named, folder / TASKS)
+    overrides = [f"job.dataset={folder}", "task.instruction=null"]
+    assert check_train(load_config([*TRAIN, *overrides])).title == "task reach, training"
+    assert "has the task 'reach', expected 'Bring" in refusal_of(overrides[:1])
+
+
+def test_a_source_that_does_not_exist_is_refused_without_a_dataset_too() -> None:
+    assert "job.source: func=mine.SOURCE: module 'mine'" in refusal_of(["job.source=mine.SOURCE"])
 
 
 def test_a_dataset_is_checked_before_anything_is_written(tmp_path: Path, refused: Refused) -> None:

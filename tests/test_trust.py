@@ -32,7 +32,7 @@ from mjstack.cli import run
 from mjstack.config.fields import Range, field_range
 from mjstack.config.fingerprint import config_content
 from mjstack.config.functions import find_object
-from mjstack.config.schema import Config, JobCfg
+from mjstack.config.schema import EPISODES, Config, JobCfg
 from mjstack.config.session import check_term, in_search_path, search_path
 from mjstack.errors import (
     ArgumentError,
@@ -124,6 +124,15 @@ def refused_call(call: Callable[[], object]) -> str:
 # Rules 2, 5 and 8: what a run's folder names. The last ones are not built for a replay.
 USED = ("reset.evil", "controller.action.arm", "gate.success.reset.evil", "task.check")
 UNUSED = ("observation.policy.terms.evil", "reward.evil", "termination.evil", "task.success")
+
+
+@pytest.mark.parametrize("name", ["hard", "hard-2"])
+def test_a_replay_runs_no_command_of_a_gate_of_its_folder(name: str, stranger: Path) -> None:
+    """Rule 5: a gate of the run may have any name."""
+    edit(stranger, f"gate.{name}", {"func": EPISODES, "reset": {"evil": SHELL}})
+    edit(stranger, "gates", [name])
+    says = f"gate.{name}.reset.evil.func={SHELL['func']}: expected one of the reset terms"
+    assert says in refused_call(lambda: replay(stranger))
 
 
 @pytest.mark.parametrize("key", [*USED, *UNUSED])

@@ -56,7 +56,7 @@ def _by_device(cuda: Any, cpu: Any, *, _root_: DictConfig) -> Any:
 _REPLAYED = {
     r"controller\.func": "driver",
     r"controller\.action\.": "action term",
-    r"(gate\.\w+\.)?reset\.": "reset term",
+    r"(?s)(gate\..+\.)?reset\.": "reset term",  # a gate's name may hold anything
     r"task\.check\.": "check",
 }
 

@@ -83,7 +83,7 @@ class LerobotDriver(Driver):
             raise ConfigError("policy", None, expected)
         loaded = load_lerobot(cfg.policy, resolve_backend(cfg)[1])
         self._policy, self._preprocess, self._postprocess = loaded
-        self._task = [cfg.task.instruction or cfg.task.name] * env.nworld
+        self._task = [cfg.task.words] * env.nworld
         config = self._policy.config
         inputs = {name: tuple(part.shape) for name, part in config.input_features.items()}
         group = replace(cfg.observation[GROUP], noise=False)

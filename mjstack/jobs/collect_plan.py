@@ -217,7 +217,7 @@ def make_spec(env: Env, cfg: Config, provenance: Mapping[str, Any]) -> DatasetSp
     return DatasetSpec(
         robot_type=(job.units == LEROBOT and cfg.robot.lerobot_type) or cfg.robot.name,
         fps=round(cfg.task.control_hz),
-        task=cfg.task.instruction or cfg.task.name,
+        task=cfg.task.words,
         features=features,
         videos=videos,
         config_sha256=config_hash(config),

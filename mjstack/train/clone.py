@@ -33,9 +33,10 @@ def check_clone(stage: Stage) -> range:
         _check_rounds(stage, job)
     if job.vision.cameras:
         _check_vision(stage, job)
+    source = find_instance("job.source", job.source, Source)
     widths = observed_widths(stage)
     if job.dataset is not None:
-        return find_instance("job.source", job.source, Source).check(stage, widths)
+        return source.check(stage, widths)
     least = 2 * stage.ranks.size
     if job.episodes < least:
         expected = f"at least {least}, because one of each rank's is for validation"

@@ -66,7 +66,7 @@ def read_demonstrations(stage: Stage, widths: dict[str, int]) -> Demonstrations:
     # Episodes of the task that succeeded
     ends = np.cumsum([row["length"] for row in stored.episodes])
     starts = np.concatenate([[0], ends[:-1]])
-    task = stored.tasks.index(str(stage.cfg.task.instruction))
+    task = stored.tasks.index(stage.cfg.task.words)
     usable = stored.frames("task_index")[ends - 1, 0] == task
     judged = _SUCCESS in stored.info["features"]
     if judged:
@@ -153,9 +153,9 @@ def _open(
     }
     used = {feature for numbers in places.values() for feature, _ in numbers}
     stored = reader.read_dataset(folder, used | ({_SUCCESS} & info["features"].keys()))
-    if cfg.task.instruction not in stored.tasks:
+    if cfg.task.words not in stored.tasks:
         tasks = ", ".join(map(repr, stored.tasks)) or "none"
-        problem = f"job.dataset={folder}: has the task {tasks}, expected {cfg.task.instruction!r}"
+        problem = f"job.dataset={folder}: has the task {tasks}, expected {cfg.task.words!r}"
         raise FolderError(problem, "Give another dataset, or set task")
     return stored, places
 

@@ -140,7 +140,7 @@ class LerobotVectorEnv(VectorEnv):
         fps = round(cfg.task.control_hz)
         self.metadata = {"autoreset_mode": AutoresetMode.DISABLED, "render_fps": fps}
         self.task = cfg.task.name
-        self.task_description = cfg.task.instruction or cfg.task.name
+        self.task_description = cfg.task.words
         self._max_episode_steps = cfg.task.episode_steps
 
     def reset(self, *, seed: Any = None, options: Info | None = None) -> tuple[Info, Info]:

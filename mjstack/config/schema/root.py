@@ -79,7 +79,7 @@ class Config:
     starts: str | None = spec(None)
     """reset=starts_file: an npz file with one row per world, from which all of them start."""
     policy: str | None = spec(None)
-    """controller=policy, job=play, job=export: the folder of a trained policy."""
+    """controller=policy, controller=lerobot, job=export: the folder of a trained policy."""
     run: str | None = spec(None, changes=("report",))
     """job=replay: the folder of an earlier run."""
     devices: str | None = spec(None, changes=("nothing",))

@@ -78,6 +78,11 @@ class TaskCfg:
     success: TermCfg | None = None
     """Term that is true where the task is achieved; null: it never is."""
 
+    @property
+    def words(self) -> str:
+        """The task in words."""
+        return self.instruction or self.name
+
 
 @dataclass(slots=True)
 class PhaseCfg:
