@@ -117,6 +117,7 @@ def gantry(
     world: str = "",
     root: str = "",
     ball: str = "",
+    link: str = "",
 ) -> str:
     """An MJCF file of three slides, a roll and two fingers; ``names`` are those of its joints and
     of some of its bodies.
@@ -131,7 +132,7 @@ def gantry(
       <body name="{bridge}">
         <joint name="{x}" type="slide" axis="1 0 0" range="-0.4 0.4"/>
         <joint name="{y}" type="slide" axis="0 1 0" range="-0.4 0.4"/><geom size="0.02"/>
-        <body><joint name="{z}" type="slide" axis="0 0 1" range="-0.45 0"/><geom size="0.02"/>
+        <body><joint name="{z}" type="slide" axis="0 0 1" range="-0.45 0"/><geom size="0.02"/>{link}
           <body name="{hand}"><joint name="{turn}" axis="0 0 1" {roll}/>
             <geom type="box" size="0.02 0.06 0.01" pos="0 0 -0.03"/>
             <body name="{one}"><joint name="{left}" type="slide" axis="0 1 0" range="0 0.04"/>
@@ -167,6 +168,20 @@ KINDS: dict[str, tuple[dict[str, str], dict[str, object]]] = {
     "a base that drives": (
         {"root": "<joint name='d' type='slide' axis='1 0 0'/><geom size='.05'/>"},
         {"root": "bridge", "arm_joints": ["x", "y", "z", "roll"]},
+    ),
+    "a torso with another arm": (
+        {
+            "root": "<joint name='torso' axis='0 0 1' range='-1 1'/><geom size='.05'/><body>"
+            "<joint name='other' axis='0 1 0' range='-1 1'/><geom size='.05'/></body>",
+            "right": SERVO + SERVO.format("torso") + SERVO.format("other"),
+        },
+        {"root": "bridge"},
+    ),
+    "a link beside the arm": (
+        {
+            "link": "<body pos='0 .1 0'><joint name='link' axis='0 1 0'/><geom size='.02'/></body>",
+        },
+        {"root": None},
     ),
 }
 
