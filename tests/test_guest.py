@@ -154,6 +154,8 @@ def test_where_it_stands_and_which_subtree_it_is(tmp_path: Path) -> None:
     cfg = changed(tmp_path, (ROOT, ROOT + FURNITURE), root=root)
     assert {"toy", "table"}.isdisjoint(b.name for b in robot_spec(cfg.robot, cfg.model).bodies)
     refusal(lambda: build_model(changed(tmp_path, root="left_finger")), "robot.root=left_finger")
+    elbow = mujoco.MjModel.from_xml_string(MJCF).body("outer_arm").name
+    refusal(lambda: build_model(changed(tmp_path, root=elbow)), f"robot.root={elbow}: joint")
     refusal(lambda: build_model(changed(tmp_path, root="nope")), "robot.root: body 'nope'")
 
 

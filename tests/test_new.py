@@ -117,6 +117,7 @@ def gantry(
     world: str = "",
     root: str = "",
     ball: str = "",
+    link: str = "",
 ) -> str:
     """An MJCF file of three slides, a roll and two fingers; ``names`` are those of its joints and
     of some of its bodies.
@@ -131,7 +132,7 @@ def gantry(
       <body name="{bridge}">
         <joint name="{x}" type="slide" axis="1 0 0" range="-0.4 0.4"/>
         <joint name="{y}" type="slide" axis="0 1 0" range="-0.4 0.4"/><geom size="0.02"/>
-        <body><joint name="{z}" type="slide" axis="0 0 1" range="-0.45 0"/><geom size="0.02"/>
+        <body><joint name="{z}" type="slide" axis="0 0 1" range="-0.45 0"/><geom size="0.02"/>{link}
           <body name="{hand}"><joint name="{turn}" axis="0 0 1" {roll}/>
             <geom type="box" size="0.02 0.06 0.01" pos="0 0 -0.03"/>
             <body name="{one}"><joint name="{left}" type="slide" axis="0 1 0" range="0 0.04"/>
@@ -168,6 +169,20 @@ KINDS: dict[str, tuple[dict[str, str], dict[str, object]]] = {
         {"root": "<joint name='d' type='slide' axis='1 0 0'/><geom size='.05'/>"},
         {"root": "bridge", "arm_joints": ["x", "y", "z", "roll"]},
     ),
+    "a torso with another arm": (
+        {
+            "root": "<joint name='torso' axis='0 0 1' range='-1 1'/><geom size='.05'/><body>"
+            "<joint name='other' axis='0 1 0' range='-1 1'/><geom size='.05'/></body>",
+            "right": SERVO + SERVO.format("torso") + SERVO.format("other"),
+        },
+        {"root": "bridge"},
+    ),
+    "a link beside the arm": (
+        {
+            "link": "<body pos='0 .1 0'><joint name='link' axis='0 1 0'/><geom size='.02'/></body>",
+        },
+        {"root": None},
+    ),
 }
 
 
@@ -191,6 +206,40 @@ def test_files_of_many_kinds_are_read(kind: str, here: Path) -> None:
     assert point == pytest.approx([0.0, 0.0, -0.084], abs=2e-4)  # 16 mm above the tips' ends
     center = robot["placements"]["stack"]["table_center"]
     assert center[2] == 0.012
+
+
+def urdf() -> str:
+    """The gantry as a URDF."""
+    axes = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1", "roll": "0 0 1"}
+    axes |= {"left": "0 1 0", "right": "0 -1 0"}
+    parents = ["base", "x", "y", "z", "roll", "roll"]
+    low = {"x": -0.4, "y": -0.4, "z": -0.45, "roll": -3.0}
+    high = {"x": 0.4, "y": 0.4, "roll": 3.0, "left": 0.04, "right": 0.04}
+    box = {"roll": ("0 0 -.03", ".04 .12 .02"), "left": ("0 .005 -.07", ".02 .01 .06")}
+    box["right"] = ("0 -.005 -.07", ".02 .01 .06")
+    text = "<link name='base'/>"
+    for (name, axis), parent in zip(axes.items(), parents, strict=True):
+        at, size = box.get(name, ("0 0 0", ".02 .02 .02"))
+        text += f"""<link name='{name}_link'>
+          <inertial><mass value='.1'/><inertia ixx='1e-4' iyy='1e-4' izz='1e-4' ixy='0' ixz='0'
+            iyz='0'/></inertial>
+          <collision><origin xyz='{at}'/><geometry><box size='{size}'/></geometry></collision>
+        </link><joint name='{name}' type='{"revolute" if name == "roll" else "prismatic"}'>
+          <parent link='{parent if parent == "base" else parent + "_link"}'/>
+          <child link='{name}_link'/><axis xyz='{axis}'/>
+          <origin xyz='0 0 {0.5 * (name == "x")}'/>
+          <limit lower='{low.get(name, 0.0)}' upper='{high.get(name, 0.0)}' effort='50'
+            velocity='1'/></joint>"""
+    return f"<robot name='gantry'>{text}</robot>"
+
+
+def test_a_urdf_is_read_as_an_mjcf_file(here: Path) -> None:
+    robot = guess(urdf())
+    assert robot["arm_joints"] == ["x", "y", "z", "roll"]
+    assert robot["gripper_joints"] == ["left", "right"]
+    assert robot["servos"].keys() == {"x", "y", "z", "roll", "left", "right"}
+    point = np.mean([robot["grasp_pos"][site] for site in robot["grasp_sites"]], axis=0)
+    assert point == pytest.approx([0.0, 0.0, -0.084], abs=2e-4)
 
 
 def test_servos_are_made_where_the_file_has_motors_or_none(here: Path) -> None:

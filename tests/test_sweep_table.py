@@ -199,7 +199,7 @@ def test_a_picture_names_its_keys_and_a_rate_ends_at_one(
         for n in (1, 2)
         for gap in (0.01, 0.02)
     ]
-    panels = {"rate": "success_rate", "speed": RATE}
+    panels = {"rate": {"": "success_rate"}, "speed": {"": RATE}}
     figures: list[Any] = []
     monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: figures.append(self))
     save_sweep(tmp_path / "p.png", Plot(title="T", over=over, lines=["gap"], panels=panels), rows)
@@ -282,7 +282,9 @@ def test_jobs_of_the_experiment() -> None:
     assert not mjwarp.gate.throughput.native_baseline
 
 
-PLOT = Plot(title="T", over="nworld", lines=["sim"], panels={"rate": RATE, "none": "missing"})
+PLOT = Plot(
+    title="T", over="nworld", lines=["sim"], panels={"rate": {"": RATE}, "none": {"": "missing"}}
+)
 
 
 def rates(values: dict[str, dict[int, float]]) -> list[Row]:

@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from compositions import refusal
 from environments import Capture, Patch, record_of, report_of
 
 import mjstack
 from mjstack.cli import run
 from mjstack.config import load_config
 from mjstack.config.load import load_saved
-from mjstack.config.schema import Config
+from mjstack.config.schema import EPISODES, Config
 from mjstack.config.session import search_path
 from mjstack.envs import build_env
 from mjstack.episodes.run import Run
@@ -201,6 +202,47 @@ def test_a_reset_that_does_not_act_is_named(
     lines = [text for text in cfg.unused_terms if text.startswith("reset.")]
     assert len(lines) == bool(line)
     assert line in "".join(lines)
+
+
+GATES = {
+    "site": "defaults: [/reset@reset: randomized, _self_]\nfunc: {}",
+    "plain": "func: {}",
+}
+
+
+def own_gates(conf: Path) -> Path:
+    (conf / "gate").mkdir()
+    for name, text in GATES.items():
+        (conf / "gate" / f"{name}.yaml").write_text(text.format(EPISODES))
+    return conf
+
+
+@pytest.mark.parametrize(
+    ("overrides", "lines"),
+    [
+        (["gates=[site,plain,batch]", "reset=jitter"], ["site: reset@gate.site.reset=jitter"]),
+        (
+            ["gates=[site,success]", "reset=jitter", "reset@gate.site.reset=jitter"],
+            ["success: reset@gate.success.reset=jitter"],
+        ),
+        (
+            ["gates=[site]", "looks=randomized"],
+            ["site: +looks@gate.site.reset=randomized"],
+        ),
+    ],
+)
+def test_a_choice_that_does_not_act_in_a_gate_is_named(
+    overrides: list[str], lines: list[str], turned: Path
+) -> None:
+    cfg = load_config(["sim=native", *overrides], config_dir=own_gates(turned))
+    said = [line.partition(" does not act in gate ")[2] for line in cfg.unused_terms]
+    assert said == [f"{line} chooses it there" for line in lines]
+
+
+def test_starts_of_a_gate_are_terms(turned: Path) -> None:
+    words = "gate.plain.reset=randomized: expected keys and values"
+    args = ["gates=[plain]", "gate.plain.reset=randomized"]
+    refusal(lambda: load_config(args, config_dir=own_gates(turned)), words)
 
 
 def test_the_same_function_takes_the_task_s_parameters(turned: Path) -> None:

@@ -40,11 +40,15 @@ def complete_terms(cfg: DictConfig, overrides: Sequence[str]) -> None:
             terms = {name: f"${{reset.{name}}}" for name in cfg.reset}
             cfg.gate.success.reset = terms | _written(cfg, _JUDGED)
         played = [
-            name for name in cfg.gate if OmegaConf.select(cfg, f"gate.{name}.func") == EPISODES
+            name
+            for name in cfg.gate
+            if OmegaConf.select(cfg, f"gate.{name}.func") == EPISODES
+            and isinstance(terms := cfg.gate[name].get("reset"), DictConfig)
+            and terms
         ]
-        gates = ["baseline", *(name for name in played if cfg.gate[name].get("reset"))]
-        lines = [line for name in gates for line in _complete_copy(cfg, name)]
-        cfg.unused_terms = [*_choices(cfg, overrides), *lines, *_left_out(cfg), *_unseen(cfg)]
+        lines = [line for name in ("baseline", *played) for line in _complete_copy(cfg, name)]
+        choices = _choices(cfg, overrides, played)
+        cfg.unused_terms = [*choices, *lines, *_left_out(cfg), *_unseen(cfg)]
 
 
 def _observe_task(cfg: DictConfig, overrides: Sequence[str]) -> None:
@@ -63,16 +67,21 @@ def _observe_task(cfg: DictConfig, overrides: Sequence[str]) -> None:
             OmegaConf.update(cfg, override.key_or_group, value, force_add=True)
 
 
-def _choices(cfg: DictConfig, overrides: Sequence[str]) -> Iterator[str]:
-    """A line for a choice of starts or looks on the command line, which gate *success* has not."""
-    judges = "success" in cfg.gates or cfg.job.name == "compare"
-    for override in overrides if judges and cfg.job.name != "train" else ():
-        group, _, name = override.partition("=")
-        key = f"{group}@{_JUDGED}="
-        missed = group in ("reset", "looks") and name not in ("starts_file", "null")
-        if missed and not any(o.lstrip("+").startswith(key) for o in overrides):
-            cure = f"{'+' * (group == 'looks')}{key}{name}"
-            yield f"{override} does not act in gate success: {cure} chooses it there"
+def _choices(cfg: DictConfig, overrides: Sequence[str], played: Sequence[str]) -> Iterator[str]:
+    """A line for a choice of starts or looks on the command line that a gate with starts of its own
+    has not.
+    """
+    compared = ["success"] * (cfg.job.name == "compare")
+    choices = [override.partition("=") for override in overrides if cfg.job.name != "train"]
+    missed = [
+        c for c in choices if c[0] in ("reset", "looks") and c[2] not in ("starts_file", "null")
+    ]
+    for gate in [name for name in played if name in (*cfg.gates, *compared)]:
+        for group, _, name in missed:
+            key = f"{group}@gate.{gate}.reset"
+            if not any(o.lstrip("+").startswith(f"{key}=") for o in overrides):
+                cure = f"{'+' * (key not in cfg.hydra.runtime.choices)}{key}={name}"
+                yield f"{group}={name} does not act in gate {gate}: {cure} chooses it there"
 
 
 def _complete_copy(cfg: DictConfig, gate: str) -> Iterator[str]:

@@ -211,9 +211,8 @@ def _strangers(spec: mujoco.MjSpec, robot: RobotCfg) -> list[Any]:
     else floors, lights, and bodies that are free or mocap; and keyframes, which fit no scene.
     """
     world = spec.worldbody
-    carriers = {name: spec.joint(name).parent for name in robot.joints}
     if not robot.root:
-        trees = {_tree(body).name for body in carriers.values()}
+        trees = {_tree(spec.joint(name).parent).name for name in robot.joints}
         free = [
             body
             for body in world.bodies
@@ -225,9 +224,8 @@ def _strangers(spec: mujoco.MjSpec, robot: RobotCfg) -> list[Any]:
     root = spec.body(robot.root)
     subtree = {body.name for body in (*_below(root), *_above(root))}
     outside = [b for b in spec.bodies if b.name not in subtree and b.parent.name in subtree]
-    missing = [name for name, body in carriers.items() if body.name not in subtree]
     known = [joint.name for joint in root.find_all("joint")]
-    require_names(f"robot.root={robot.root}: joint", missing, known)
+    require_names(f"robot.root={robot.root}: joint", robot.joints, known)
     carried = [joint for body in _above(root) for joint in body.joints]  # its base stands
     return [*spec.keys, *world.lights, *world.geoms, *outside, *carried]
 

@@ -28,7 +28,8 @@ class Hand:
         gripper: Joints of the gripper that a servo moves, or that no other joint moves.
         bodies: The moving bodies beyond the palm.
         one_finger: Whether the palm is one of the jaws.
-        outside: Joints between the world and the arm: of a base that drives or floats.
+        outside: Joints between the world and the arm: of a base that drives or floats, or that
+            carry another arm too.
     """
 
     palm: int
@@ -84,7 +85,9 @@ def _hand(
 ) -> Hand:
     path = _joints(model, [*ancestors(model, palm)])
     unbounded = (model.jnt_type < _SLIDE) | (model.jnt_type == _SLIDE) & (model.jnt_limited == 0)
-    bases = [int(model.jnt_bodyid[j]) for j in path if unbounded[j]]
+    others = driven - {*path, *_joints(model, bodies)}
+    carriers = {body for j in others for body in ancestors(model, model.jnt_bodyid[j])}
+    bases = {*model.jnt_bodyid[[j for j in path if unbounded[j]]].tolist()} | carriers
     last = max((path.index(j) for j in path if model.jnt_bodyid[j] in bases), default=-1)
     joints = [j for j in _joints(model, bodies) if model.jnt_type[j] >= _SLIDE]
     fingers = [j for j in joints if j in driven] or joints
@@ -118,13 +121,13 @@ def _joints(model: mujoco.MjModel, bodies: Sequence[int]) -> list[int]:
 
 
 def find_root(model: mujoco.MjModel, hand: Hand) -> int:
-    """The highest body at and below which there is no joint but the hand's and its arm's; 0, for
-    the whole file, if there is nothing else in it than what a scene leaves out by itself, and the
-    arm's base.
+    """The highest body at and below which no joint but the hand's and its arm's has a servo or
+    carries the arm; 0, for the whole file, if there is nothing else in it than what a scene leaves
+    out by itself, and the arm's base.
     """
-    arm_joints = {*hand.arm, *_joints(model, hand.bodies)}
+    others = {*hand.outside} | _driven(model) - {*hand.arm, *_joints(model, hand.bodies)}
     path = [*reversed([*ancestors(model, hand.palm)])]
-    root = next(b for b in path if {*_joints(model, subtree(model, b))} <= arm_joints)
+    root = next(b for b in path if others.isdisjoint(_joints(model, subtree(model, b))))
     tops = np.flatnonzero(model.body_parentid == 0)[1:]
     free = {t for t in tops if _FREE in model.jnt_type[_joints(model, [t])]}
     plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE

@@ -68,6 +68,7 @@ class Fingers:
         ``ranges`` are those of the gripper's joints [rad, m], shape ``(n, 2)``.
         """
         spec = spec.copy()
+        spec.compiler.discardvisual = False  # which a URDF sets; the plate does not collide
         plate = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=_PLATE)
         plate.contype = plate.conaffinity = 0
         plate.name = "plate/of/mjstack"
