@@ -33,9 +33,8 @@ from mjstack.version import __version__
 Facts = dict[str, Any]
 """Values in JSON's types, by name."""
 FORMAT = 5  # grows when an older mjstack could not read what is written
-_NAME_ANOTHER = (
-    f"Name one of job=train, such as outputs/mine/last, or {', or '.join(shipped_policies())}, or"
-    " LeRobot's with controller=lerobot"
+_NAME_ANOTHER = ", or ".join(
+    ["Name one, such as outputs/mine/last", *shipped_policies(), "LeRobot's: controller=lerobot"]
 )
 _FLOATS = (torch.float32, torch.float16)  # of weights in a file
 _MOST_STEPS = 1_000_000  # between two queries
