@@ -431,7 +431,7 @@ REFUSED = {
         "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>",
         "no body has fingers, or one jaw, at the end of joints",
     ),
-    "no gripper": (ROLL_ALONE, "its fingers open by 0 mm only"),
+    "no gripper": (ROLL_ALONE, "its fingers do not close on each other"),
     "sideways": (
         gantry().replace('pos="0 0 0.5"', 'pos="0 0 0.5" quat="1 1 0 0"'),
         "the hand of hand cannot point down over a table within the arm's reach",

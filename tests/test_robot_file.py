@@ -137,7 +137,7 @@ def test_a_run_finds_its_files_where_the_project_has_moved(
         text = saved.read_text().replace(str(tmp_path / "old"), str(tmp_path / "old/../elsewhere"))
         saved.write_text(text)
         refusal(partial(load_saved, saved), "expected a file beside a folder of the search path")
-    refusal(partial(load_saved, saved), "/old/conf'")  # where it was, as the folder says
+    refusal(partial(load_saved, saved), f"--config-dir {tmp_path}/old/conf")  # where it was
 
 
 @pytest.mark.full

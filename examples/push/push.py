@@ -41,8 +41,8 @@ class PushCheck(EpisodeCheck):
         slid = down & flat("puck", tilt_deg=t.tip_deg)
         there = at_place("puck", "goal", distance=t.within)
         self.there = there & lies
-        measured = [Figure("distance", unit="m", high=t.within), Figure("tilt", unit="deg")]
         at_goal = ("AT_GOAL", "puck not at goal", there, t.window)
+        measured = [Figure("distance", unit="m", high=t.within), Figure("tilt", unit="deg")]
         return [
             InWindow("FLAT", "puck does not lie flat", lies, t.window),
             InWindow(*at_goal, measure=self.trace, measured=measured),

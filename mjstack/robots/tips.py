@@ -158,6 +158,11 @@ class Fingers:
         nearly, closed = (centres(shut + share * (opened - shut)) for share in (0.15, 0.0))
         away = relative(nearly - closed)
         approach = self._approach(closed.mean(axis=0), _unit(away))
+        jaw = hand.gripper[0]
+        axis = self._data.xmat[hand.palm].reshape(3, 3).T @ self._data.xaxis[jaw]
+        hinge = self.model.jnt_type[jaw] == mujoco.mjtJoint.mjJNT_HINGE
+        if hand.one_finger and hinge and abs(axis @ approach) > 0.8:  # a wrist that rolls
+            raise ValueError("its fingers do not close on each other")
         closing = _unit(away - (away @ approach) * approach)
         self._frame = np.stack((np.cross(approach, closing), approach, closing), axis=1)
         self._sides = first, second

@@ -331,7 +331,8 @@ class EpisodeCheck(ABC):
             phases = rule.phases if result.phased and rule.phases else [()] * len(rule.texts)
             for name, figures, names in zip(rule.texts, rule.figures, phases, strict=True):
                 during = f" in {' and '.join(names)}" if names else ""
-                values = {f.key: float(result.values[f.key][0]) for f in figures}
+                keys = [figure.key for figure in (*figures, *rule.measured)]
+                values = {key: float(result.values[key][0]) for key in keys}
                 measured = EpisodeCheck.headline(self, values) or "see the values"
                 allowed = dict.fromkeys(f.allowed for f in figures if f.limits)
                 report[name] = (measured, (", ".join(allowed) or "see the thresholds") + during)
