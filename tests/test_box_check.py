@@ -504,7 +504,7 @@ def test_explained_rules_are_the_rules() -> None:
     assert {value for value, _ in check.summaries.values()} <= set(values)
     assert f"{1e3 * values['slot_err_red_m']:.1f} mm" in check.headline(values)
     assert ", over_box_red 1" in told["CARRY_RED"][0]
-    assert told["ORDER"] == ("too_early 0", "0")
+    assert told["ORDER"] == ("too_early 0", "at most 0")
     assert told["LIFT_BLUE"][1] == "at least 25 in lift_blue and carry_blue"
 
 

@@ -335,6 +335,6 @@ def test_a_batch_plays_the_worlds_of_a_file(
     np.savez(tmp_path / "worlds.npz", **plain_starts(configure()))
     args = "reset=starts_file starts=worlds.npz nworld=4 sim=native gates=[batch] hydra.run.dir=out"
     assert run([*args.split(), *at_double_speed()]) == 0
-    assert "4 of 4 worlds succeeded" in capsys.readouterr().out
+    assert "4 of 4 episodes succeeded" in capsys.readouterr().out
     record = np.load(next((tmp_path / "out").glob("batch_seed0.npz")))
     assert len(np.unique(record["qpos"], axis=0)) == N
