@@ -484,7 +484,7 @@ def test_parity_compares_images_here_and_elsewhere(tmp_path: Path) -> None:
     there = f"gate.parity.images={file}"
     size = "scene.cameras.front.size=[64,64]"
     for args, message in (
-        ([*overrides[:3], *small("front")], r"drawn with .*=\[128, 128\], expected none"),
+        ([*overrides[:3], *small("front")], r"drawn with .*top.* expected none"),
         ([*overrides, size], r"scene.cameras.front.size=\[128, 128\], expected \[64, 64\]"),
     ):
         with pytest.raises(FolderError, match=message):
