@@ -153,7 +153,7 @@ def test_other_cameras_are_refused(trained: Path, capsys: Capture) -> None:
         "gates=[batch]",
     ]
     for cameras, says in (
-        (["cameras=[]"], "with scene.cameras.front.size=[16, 24], and here it is missing"),
+        (["cameras=[]"], "with scene.cameras.front.pose.mount=table, and here it is missing"),
         ([], "was trained with scene.cameras.front.size=[16, 24], and here it is ["),
         ([*CAMERAS, "scene.cameras.wrist.size=[32,32]"], "wrist.size=[16, 16], and here it is"),
         ([*CAMERAS, "scene.cameras.front.fovy=50"], "front.fovy=45.0, and here it is 50.0"),

@@ -85,8 +85,8 @@ def _hand(
 ) -> Hand:
     path = _joints(model, [*ancestors(model, palm)])
     unbounded = (model.jnt_type < _SLIDE) | (model.jnt_type == _SLIDE) & (model.jnt_limited == 0)
-    others = driven - {*path, *_joints(model, bodies)}
-    carriers = {body for j in others for body in ancestors(model, model.jnt_bodyid[j])}
+    siblings = driven - {*path, *_joints(model, bodies)}
+    carriers = {body for j in siblings for body in ancestors(model, model.jnt_bodyid[j])}
     bases = {*model.jnt_bodyid[[j for j in path if unbounded[j]]].tolist()} | carriers
     last = max((path.index(j) for j in path if model.jnt_bodyid[j] in bases), default=-1)
     joints = [j for j in _joints(model, bodies) if model.jnt_type[j] >= _SLIDE]
@@ -125,9 +125,9 @@ def find_root(model: mujoco.MjModel, hand: Hand) -> int:
     carries the arm; 0, for the whole file, if there is nothing else in it than what a scene leaves
     out by itself, and the arm's base.
     """
-    others = {*hand.outside} | _driven(model) - {*hand.arm, *_joints(model, hand.bodies)}
+    siblings = {*hand.outside} | _driven(model) - {*hand.arm, *_joints(model, hand.bodies)}
     path = [*reversed([*ancestors(model, hand.palm)])]
-    root = next(b for b in path if others.isdisjoint(_joints(model, subtree(model, b))))
+    root = next(b for b in path if siblings.isdisjoint(_joints(model, subtree(model, b))))
     tops = np.flatnonzero(model.body_parentid == 0)[1:]
     free = {t for t in tops if _FREE in model.jnt_type[_joints(model, [t])]}
     plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
