@@ -49,7 +49,7 @@ def test_a_name_is_a_shipped_policy_unless_there_is_such_a_folder(folder: Path) 
 
 def test_an_unknown_name_says_which_there_are(refused: Refused) -> None:
     text = refused("controller=policy", "policy=so101_stak")
-    assert f"such as outputs/mine/last, or {', or '.join(NAMES)}." in text
+    assert f"such as outputs/mine/last, or {', or '.join(NAMES)}, or LeRobot's: controller" in text
 
 
 def test_the_list_has_a_line_of_each_card(capsys: Capture) -> None:
