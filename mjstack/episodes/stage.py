@@ -129,7 +129,7 @@ class Stage:
 
     @property
     def policy(self) -> Policy | None:
-        """The policy that drives, with action terms of its own; None of any other driver."""
+        """The policy that drives, with its action terms; None of any other driver."""
         return self.driver_class.trained_policy(self.assets)
 
     @property

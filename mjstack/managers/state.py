@@ -22,7 +22,7 @@ _values: ContextVar[dict[Any, Any] | None] = ContextVar("_values", default=None)
 
 
 def in_one_pass(work: Callable[[], Result], known: dict[Any, Any] | None = None) -> Result:
-    """The result of work in a pass of its own, which starts with ``known`` values and adds to them.
+    """The result of work in a separate pass, which starts with ``known`` values and adds to them.
 
     The values belong to a context, which Python leaves however the work ends: a ``finally`` clause
     that Ctrl-C cuts short would leave old values to later steps.

@@ -80,7 +80,7 @@ def collision(m: mjw.Model, d: mjw.Data) -> None:
         return
 
     context = broad_phase(m, d)
-    # Each kind of pairs has temporaries and counts of its own, and contacts are of no order
+    # Each kind of pairs has separate temporaries and counts, and contacts are of no order
     narrow = mjw._src.collision_convex.convex_narrowphase
     works = [partial(narrow, m, d, context, [types]) for types in convex_pairs(m)]
     works.append(partial(primitive_pairs, m, d, context))
