@@ -41,13 +41,8 @@ class ObjectRoles(NamedTuple):
 
 def find_roles(cfg: Config, phases: Sequence[Phase]) -> list[ObjectRoles]:
     """The objects that a configuration's phases move, in the order in which they do; a ConfigError
-    if they do nothing that a state tells, or commands are late: a state does not have those that
-    are still to come.
+    if they do nothing that a state tells.
     """
-    for key in ("command_delay", "random_delay"):
-        if delay := getattr(cfg.timing, key):
-            expected = f"0 with controller={cfg.controller.name}, which does not command ahead"
-            raise ConfigError(f"timing.{key}", delay, expected, _FIX)
     names = source_names(cfg.scene)
     moves = [k for k, phase in enumerate(phases) if phase.target is not None]
     moved: dict[str, ObjectRoles] = {}

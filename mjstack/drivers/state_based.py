@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from mjstack.drivers.feedback import STAY, FeedbackDriver, State, servo_lag
+from mjstack.drivers.feedback import STAY, FeedbackDriver, ServoInverse, State, servo_lag
 from mjstack.drivers.roles import Role, find_roles
 from mjstack.managers.view import EnvView, offers
 from mjstack.math import atan2, norm, quat_to_matrix
@@ -146,6 +146,10 @@ class StateBasedDriver(FeedbackDriver):
         lag = servo_lag(env.sim.model, env.index.ctrl[: self._n_arm].tolist())
         # A servo that lags has to be led by more than it is to move in a step.
         self._lead = 1.0 / (1.0 - math.exp(-cfg.timing.step_dt / lag))
+        self._servos: ServoInverse | None = None
+        if "dof_frictionloss" in env.sim.fields or cfg.robot.backlash:
+            self._servos = ServoInverse(env)
+            self._lead = 1.0
         self._always = torch.ones((env.nworld, len(things)), dtype=torch.bool, device=device)
 
     @override
@@ -172,6 +176,8 @@ class StateBasedDriver(FeedbackDriver):
             start = torch.where(flipped, self._nominal[phase], start)
             start[:, self._roll_column] = roll
         change = self._solve(start, target, phase, approach)[0] - q
+        if self._servos is not None:
+            change = self._servos.lead(change, holds=due.role == Role.close)
         largest = change.abs().amax(1, keepdim=True)
         command = q + change * (_JOINT / largest.clamp(min=1e-6)).clamp(max=1.0)
 
@@ -179,7 +185,7 @@ class StateBasedDriver(FeedbackDriver):
         now = q[:, self._n_arm :]
         grip = (self._grip[phase] - now).clamp(-self._grip_lead, self._grip_lead)
         command[:, self._n_arm :] = now + grip
-        return self._keep_finite(command)
+        return self._as_read(self._keep_finite(command))
 
     def _decide(self, state: State) -> _Due:
         """The next thing to do in every world."""
