@@ -147,7 +147,7 @@ class StateBasedDriver(FeedbackDriver):
         # A servo that lags has to be led by more than it is to move in a step.
         self._lead = 1.0 / (1.0 - math.exp(-cfg.timing.step_dt / lag))
         self._servos: ServoInverse | None = None
-        if "dof_frictionloss" in env.sim.fields or cfg.robot.backlash:
+        if cfg.robot.servos or cfg.robot.backlash or "dof_frictionloss" in env.sim.fields:
             self._servos = ServoInverse(env)
             self._lead = 1.0
         self._always = torch.ones((env.nworld, len(things)), dtype=torch.bool, device=device)
@@ -177,7 +177,7 @@ class StateBasedDriver(FeedbackDriver):
             start[:, self._roll_column] = roll
         change = self._solve(start, target, phase, approach)[0] - q
         if self._servos is not None:
-            change = self._servos.lead(change, holds=due.role == Role.close)
+            change = self._servos.lead(change, state, holds=due.role == Role.close)
         largest = change.abs().amax(1, keepdim=True)
         command = q + change * (_JOINT / largest.clamp(min=1e-6)).clamp(max=1.0)
 
