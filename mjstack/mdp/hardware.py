@@ -127,7 +127,9 @@ class ObjectSize:
 
     def __init__(self, env: EnvView, *, edge: NotNegative) -> None:
         """Take the half-width of the change of an edge's length [m]."""
-        boxes = [n for n, thing in env.cfg.scene.free.items() if thing.shape == "box" and not thing.file]
+        boxes = [
+            n for n, thing in env.cfg.scene.free.items() if thing.shape == "box" and not thing.file
+        ]
         if not boxes:
             raise ParameterError("edge", edge, "0, or a scene with a box that moves")
         geoms = [env.index.geoms[name][0] for name in boxes]
