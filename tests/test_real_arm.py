@@ -156,7 +156,7 @@ def test_grip_cubes_and_base_differ_as_said(backend: str) -> None:
     for _ in range(20):  # cubes of each size come to rest on the table
         env.step(hold)
     height = env.sim.qpos[:, z] - env.cfg.scene.table_top
-    assert torch.allclose(height, size[:, 2].to(height), atol=1e-4)
+    assert torch.allclose(height, size[:, 2].to(height), atol=2e-4)
 
     body = m.body("base").id
     rise = field["body_pos"][:, body, 2] - m.body_pos[body, 2]
@@ -180,7 +180,7 @@ def test_the_servos_inverse_holds_the_arm_up() -> None:
     data = mujoco.MjData(m)
     for world in range(env.nworld):
         data.qpos[:] = env.sim.qpos[world]
-        data.qpos[env.index.robot_qpos] += zeros(env)[world]
+        data.qpos[env.index.robot_qpos] += zeros(env)[world].numpy()
         mujoco.mj_forward(m, data)
         bias = data.qfrc_bias[env.index.robot_qvel]
         assert np.allclose(torques[world], bias, atol=2e-3), world
@@ -189,7 +189,7 @@ def test_the_servos_inverse_holds_the_arm_up() -> None:
 
 @pytest.mark.parametrize("known", [True, False])
 def test_the_expert_knows_where_the_arm_is(known: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It stacks under all differences at once; where it takes what joints read for true it fails."""
+    """It stacks under all differences at once, and fails where it takes what joints read for true."""
     if not known:
         monkeypatch.setattr(feedback, "zeros", lambda _: None)
     names = ("servos", "zeros", "delay", "backlash", "grip", "objects", "table")
@@ -232,4 +232,4 @@ def test_relative_targets_need_joints_that_are_seen() -> None:
     assert _measured(cfg, widths) == ([0, 1, 2, 3, 4, 5], cfg.robot.home)
     cfg.observation["policy"].terms["joint_pos"].scale = 2.0
     message = refusal(lambda: _measured(cfg, widths))
-    assert message.startswith("job.relative=True: expected false, because the policy sees no")
+    assert message.startswith("job.relative=true: expected false, because the policy sees no")

@@ -1,5 +1,5 @@
-"""Commands as they reach the joints: late, as ``timing.command_delay`` and ``random_delay`` say, and
-through the play of ``robot.backlash``.
+"""Commands as they reach the joints: late, as ``timing.command_delay`` and ``random_delay`` say,
+and through the play of ``robot.backlash``.
 """
 
 from collections.abc import Iterator

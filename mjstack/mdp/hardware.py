@@ -119,8 +119,8 @@ class GripForce(Randomized):
 
 @uses_fields("geom_size", "geom_aabb", "geom_rbound")
 class ObjectSize:
-    """Makes each box larger or smaller, by as much along each of its edges. Mass and height stay, so
-    that it starts half as much in or over its table, and checks judge the nominal size.
+    """Makes each box larger or smaller, by as much along each of its edges. Mass and height stay,
+    so that it starts half as much in or over its table, and checks judge the nominal size.
     """
 
     label = "reset.size"

@@ -160,8 +160,8 @@ def last_action(env: EnvView) -> Tensor:
 
 @_by_joint
 def joint_zeros(env: EnvView) -> Tensor:
-    """How far each joint truly is from where its servo believes it to be [rad, m], which no real arm
-    knows, shape ``(nworld, n)``.
+    """How far each joint truly is from where its servo believes it to be [rad, m], which no real
+    arm knows, shape ``(nworld, n)``.
     """
     off = zeros(env)
     return torch.zeros_like(joint_pos(env)) if off is None else off.to(env.sim.qpos.dtype)
