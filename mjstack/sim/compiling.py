@@ -74,7 +74,7 @@ def _compilers_at_once(turn: Lock) -> Iterator[None]:
     Warp's decorators hand out the newest function of a name: of two threads that declare kernels,
     one gets a kernel that calls the other's function.
     """
-    source = wp._src.build
+    source = wp._src.build  # type: ignore[attr-defined]
     compilers = {name: getattr(source, name) for name in ("build_cpu", "build_cuda")}
 
     def compile_aside(compiler: Callable[..., object], *args: Any, **options: Any) -> object:
