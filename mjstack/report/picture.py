@@ -316,18 +316,3 @@ def save_trajectories(
             axes.grid(alpha=0.3)
             axes.margins(0.1)
         height.legend(frameon=False)
-
-
-def save_images(
-    path: Path, rows: Mapping[str, Sequence[np.ndarray]], columns: Sequence[str]
-) -> None:
-    """Save images, each of shape ``(height, width, 3)``, uint8, in named rows and columns."""
-    size = (2.6 * len(columns), 2.6 * len(rows))
-    with figure(path, "", len(columns), len(rows), figsize=size, squeeze=False) as (_, axes):
-        for line, (name, images) in zip(axes, rows.items(), strict=True):
-            line[0].set_ylabel(name)
-            for axis, image in zip(line, images, strict=True):
-                axis.imshow(image)
-                axis.set(xticks=[], yticks=[])
-        for axis, name in zip(axes[0], columns, strict=True):
-            axis.set_title(name)
