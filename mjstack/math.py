@@ -164,16 +164,3 @@ def rate_interval(name: str, successes: int, trials: int) -> dict[str, float]:
     """A success rate and its 95 % interval: ``NAME``, ``NAME_low95`` and ``NAME_high95``."""
     low, high = wilson_interval(successes, trials)
     return {name: successes / trials, f"{name}_low95": low, f"{name}_high95": high}
-
-
-def mcnemar_p_value(only_a: int, only_b: int) -> float:
-    """Two-sided p-value of McNemar's exact test, by the pairs that either side alone won: how
-    probable it is that they are split so unevenly or more, if it wins each with probability 1/2.
-    """
-    pairs = only_a + only_b
-    ways = 1  # binomial coefficient of the pairs; integers are exact
-    tail = 1
-    for won in range(min(only_a, only_b)):
-        ways = ways * (pairs - won) // (won + 1)
-        tail += ways
-    return min(1.0, 2 * tail / 2**pairs)

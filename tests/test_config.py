@@ -263,10 +263,6 @@ BAD = [
     (["sim.device=[a]"], "sim.device=[a]: expected text."),
     (["gates={a:1}"], "gates={a:1}: expected a list of names."),
     (["gates=batch"], "gates=batch: expected a list of names. Write 'gates=[batch]'."),
-    (
-        ["job=compare", 'job.against="policy=a"'],
-        "expected a list of names. Write 'job.against=[\"policy=a\"]'.",
-    ),
     (["job=[gates,play]"], "job=[gates,play]: expected one choice, no list."),
     (["robot={homes:[1]}"], "Did you mean 'robot.home'?"),
     (["nworld=range(1,4)"], "'nworld=range(1,4)': several values are a sweep. Add -m"),
@@ -275,9 +271,9 @@ BAD = [
     (["reset@gate.success.reset=null"], "Config group override must be a string"),
     (["nworld=int(a)"], "cannot be read: expected key=value"),
     (
-        ["job=compare", "job.against=policy=a"],
+        ["policy=run(1"],
         "one of = , : ; # & ! < > ^ ~ ` needs double quotes inside of single ones:"
-        " 'policy=\"run (1)\"', or in a list 'job.against=[\"policy=DIR\"]'.",
+        " 'policy=\"run (1)\"'.",
     ),
     (["+nworld=4"], "An item is already at 'nworld'."),
     (["~nworld"], "~nworld: expected a term of"),
@@ -300,7 +296,6 @@ STARTS = [
     ([], "randomized", []),
     (["reset@gate.success.reset=jitter"], "jitter", []),
     (["gates=[success]", "reset=jitter"], "randomized", ["reset=jitter"]),
-    (["job=compare", "reset=nominal"], "randomized", ["reset=nominal"]),
     (["gates=[batch,success]", "cameras=front", "looks=randomized"], "randomized", ["looks=rand"]),
     (
         ["gates=[success]", "cameras=front", "+looks@gate.success.reset=randomized"],
@@ -458,7 +453,7 @@ def test_every_field_says_what_it_means() -> None:
 def test_the_reference_has_every_group_and_job() -> None:
     hooks = CONFIG_FOLDER.parent / "docs" / "hooks.py"
     text = runpy.run_path(str(hooks))["reference_markdown"]()
-    for key in ("nworld", "gate.batch.seeds", "controller.phases.NAME.gripper", "job.against"):
+    for key in ("nworld", "gate.batch.seeds", "controller.phases.NAME.gripper", "job.folder"):
         assert f"| `{key}` |" in text, key
     assert "| a number above 0 and at most 1 [s] | Duration of one physics step. |" in text
 

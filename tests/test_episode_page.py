@@ -393,7 +393,7 @@ def test_sixty_four_worlds_are_shared_by_the_gates() -> None:
         {"baseline": some("a", 1), "batch": some("b", 64), "success": some("c", 9)}
     )
     labels = [world.label for world in chosen]
-    assert labels == [*(f"b{n}" for n in range(30)), *(f"c{n}" for n in range(9)), "a0"]
+    assert labels == [*(f"b{n}" for n in range(31)), *(f"c{n}" for n in range(9)), "a0"]
     assert len(choose_worlds({"batch": some("b", 64)})) == 64
     assert choose_worlds({}) == []
 

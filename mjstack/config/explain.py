@@ -73,7 +73,7 @@ def parse(override: str) -> Override:
             f"override {shorten(override, 60)!r} cannot be read: expected key=value without spaces"
             " around the sign. A value with a bracket, a quote, a letter beyond ASCII or"
             " one of = , : ; # & ! < > ^ ~ ` needs double quotes inside of single ones:"
-            " 'policy=\"run (1)\"', or in a list 'job.against=[\"policy=DIR\"]'."
+            " 'policy=\"run (1)\"'."
         ) from error
 
 

@@ -71,12 +71,11 @@ def _choices(cfg: DictConfig, overrides: Sequence[str], played: Sequence[str]) -
     """A line for a choice of starts or looks on the command line that a gate with starts of its own
     has not.
     """
-    compared = ["success"] * (cfg.job.name == "compare")
     choices = [override.partition("=") for override in overrides if cfg.job.name != "train"]
     missed = [
         c for c in choices if c[0] in ("reset", "looks") and c[2] not in ("starts_file", "null")
     ]
-    for gate in [name for name in played if name in (*cfg.gates, *compared)]:
+    for gate in [name for name in played if name in cfg.gates]:
         for group, _, name in missed:
             key = f"{group}@gate.{gate}.reset"
             if not any(o.lstrip("+").startswith(f"{key}=") for o in overrides):
@@ -108,7 +107,7 @@ def _left_out(cfg: DictConfig) -> Iterator[str]:
     """A line for each group of which a job leaves out written terms."""
     job = cfg.job.name
     taught = OmegaConf.get_type(cfg.job) is CloneJobCfg
-    driven = taught or job in ("gates", "collect", "play", "compare")
+    driven = taught or job in ("gates", "collect", "play")
     where = " but gate throughput" if job == "gates" else ""
     for group, place in _LEFT_OUT.items():
         names = [f"{group}.{name}" for name, term in _written(cfg, group).items() if term]

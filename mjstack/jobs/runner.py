@@ -58,13 +58,11 @@ class Job:
         check: Raises a `MjstackError` for what cannot be done here, before anything is written.
             Returns the job ready to run, with the scene and the plan that the check built.
         keys: Top-level keys and groups that its command line may set; None for all.
-        overrides: Whether its check takes the command line's overrides too.
         views: Values of ``view`` that it can show worlds in; ``video`` goes with ``true``.
     """
 
-    check: Callable[..., "CheckedJob"]
+    check: Callable[[Config], "CheckedJob"]
     keys: tuple[str, ...] | None = None
-    overrides: bool = False
     views: tuple[str, ...] = ("false",)
 
 
@@ -284,7 +282,7 @@ def check_job(cfg: Config, overrides: Sequence[str] = ()) -> CheckedJob:
         raise ConfigError("view", cfg.view, expected, "Leave it out")
     if cfg.video and "true" not in job.views:
         raise ConfigError("video", True, f"false with job={cfg.job.name}", "Leave it out")
-    return job.check(cfg, overrides) if job.overrides else job.check(cfg)
+    return job.check(cfg)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

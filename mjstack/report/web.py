@@ -194,8 +194,7 @@ def choose_worlds(parts: Mapping[str, Sequence[World]]) -> list[World]:
     alone = [part[0] for part in parts.values() if len(part) == 1][:MOST_WORLDS]
     batches = [part for part in parts.values() if len(part) > 1]
     share = (MOST_WORLDS - len(alone)) // max(1, len(batches))
-    # An even number, and the others at the end: worlds of a comparison stand in pairs.
-    return [*(world for part in batches for world in part[: share - share % 2]), *alone]
+    return [*(world for part in batches for world in part[:share]), *alone]
 
 
 def not_shown(model: mujoco.MjModel, worlds: Sequence[World]) -> list[str]:
@@ -361,10 +360,7 @@ def _fill(world: World, worlds: Sequence[World]) -> np.ndarray:
 
 
 def _grid(count: int, size: np.ndarray) -> np.ndarray:
-    """Places of worlds of a size in x and y [m], shape ``(count, 2)``; an even number of columns,
-    so that the worlds of a comparison stand in pairs.
-    """
-    columns = math.ceil(math.sqrt(count * size[0] / size[1]))
-    columns = min(count, columns + columns % 2)
+    """Positions of worlds of a size in x and y [m], shape ``(count, 2)``."""
+    columns = min(count, math.ceil(math.sqrt(count * size[0] / size[1])))
     number = np.arange(count)
     return np.column_stack((-size[0] * (number // columns), size[1] * (number % columns)))
