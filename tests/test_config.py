@@ -227,7 +227,7 @@ BAD = [
     ),
     (["=3"], "=3: "),
     (["nworld"], "override 'nworld' cannot be read: expected key=value"),
-    (["lst"], "expected key=value, or a command. Did you mean 'list'?"),
+    (["lst"], "override 'lst' cannot be read: expected key=value"),
     (
         ["~reward.progres"],
         "~reward.progres: there is none to leave out. Did you mean 'reward.progress'?",
