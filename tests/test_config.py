@@ -196,7 +196,7 @@ BAD_VALUES = [
     ("gate.capacity.margin=inf", "gate.capacity.margin="),
     ("gate.success.rate=1.01", "gate.success.rate=1.01: expected a number from 0 to 1"),
     ("gate.success.seeds=0", "gate.success.seeds=0: expected an integer from 1 to 100000"),
-    ("gate.success.region=[-0.01,0.1]", "gate.success.region"),
+    ("gate.success.rate=-0.01", "gate.success.rate"),
 ]
 
 

@@ -270,9 +270,3 @@ def _gates(cfg: Config) -> Checks:
         from_file = bool(t.reset) and reads_starts_file(gate_reset(cfg, name))
         expected = "1, because with reset=starts_file worlds start alike under every seed"
         yield f"gate.{name}.seeds", from_file and t.seeds > 1, expected
-        # Looks at functions, which load torch, only where there is a region.
-        wrong = t.region is not None and (
-            from_file or not any(map(places_objects, t.reset.values()))
-        )
-        expected = f"null, because no reset term of the {name} gate has a region"
-        yield f"gate.{name}.region", wrong, expected

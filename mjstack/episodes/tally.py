@@ -186,10 +186,9 @@ class EpisodeTally:
         passed: bool,
         figures: Sequence[Figure],
         rate: float = -math.inf,
-        tables: Sequence[Table] = (),
     ) -> GateResult:
         """The episodes as the gate's result, in words (``parts``) before failures and problems;
-        with a problem it has failed. Figures and tables add to those of the tally and the check.
+        with a problem it has failed. Figures add to those of the tally and the check.
         ``rate`` is the least success rate that is wanted.
         """
         bits = self.array("failed")
@@ -221,7 +220,7 @@ class EpisodeTally:
             beyond=beyond,
             notes=self.notes,
             details=named + self.details,
-            tables=[*self.tables(), *tables],
+            tables=self.tables(),
         )
 
     def _name(self, episodes: Sequence[int] | np.ndarray, limit: int) -> str:
