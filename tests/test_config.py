@@ -238,7 +238,7 @@ BAD = [
     (["gate=batch"], "gates=[...]"),
     (
         ["job=play_schema"],
-        "Did you mean 'play'? Available: collect, compare, export, gates, play, replay, train.",
+        "Did you mean 'play'? Available: collect, export, gates, play, replay, train.",
     ),
     (["nworlds=3"], "nworld'?"),
     (["reward.porgress.weight=3"], "Did you mean 'reward.progress'?"),

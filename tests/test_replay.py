@@ -110,7 +110,7 @@ def test_failing_world_fails_again_bit_for_bit(
         facts = [int(held[name]) for name in ("seed", "world", "failed")]
         assert facts == [0, 2, RULES["STACKED"]]
     names = ".hydra episode.html replayed_config.yaml report.html report.json report.md run.log"
-    names += f"{' scene.png' if has_gl() else ''} trajectories.png trajectory.npz"
+    names += f"{' scene.png' if has_gl() else ''} trajectory.npz"
     assert sorted(path.name for path in out.iterdir()) == names.split()
 
 

@@ -43,7 +43,7 @@ Examples:
   mjstack controller=policy policy=outputs/mine/last 'gates=[success]'
     the policy in the expert's place, in any gate
   mjstack job=play controller=policy policy=outputs/mine/last
-    four worlds of the policy as a video; view=true: in MuJoCo's viewer
+    four worlds of the policy as a video; view=web: in a browser
 
 Groups, to be set as group=choice, and their choices, the default first:
 {groups}

@@ -110,8 +110,7 @@ def play_batches(
             episode = play_episode(
                 env,
                 driver(plan, env) if driver else stage.driver(env),
-                # Once each: the live view may be both
-                [*dict.fromkeys((recorder, *observers(plan), *stage.observers))],
+                [recorder, *observers(plan), *stage.observers],
                 advance=stage.progress.advance,
                 label=f"steps, seed {plan.seed}",
             )

@@ -161,11 +161,9 @@ class Stage:
 
     def driven(self, reset: Reset) -> Config:
         """The configuration of a driven episode. Of a driver that needs no phases it has success in
-        every step, and that of the live view rewards too.
+        every step.
         """
         cfg = driven_config(self.cfg, reset, self.action)
-        if self.cfg.view == "web":
-            cfg = replace(cfg, reward=self.cfg.reward, task=self.cfg.task)
         if not self.driver_class.needs_phases:
             graph = "off" if self.driver_class.on_host else cfg.graph
             cfg = replace(cfg, task=self.cfg.task, graph=graph)

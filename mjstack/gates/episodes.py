@@ -34,7 +34,6 @@ from mjstack.report.record import GateResult
 from mjstack.report.text import format_percent
 
 log = logging.getLogger(__name__)
-_MOST_SEEN = 4  # worlds on the page with what their driver saw
 
 
 def gate_config(cfg: Config, gate: str) -> Config:
@@ -147,7 +146,7 @@ def _play(run: Run, tally: EpisodeTally) -> int | None:
                         chosen = np.argsort(record.succeeded[: qpos.shape[1]], kind="stable")
                         labels = {row: str(row) for row in chosen[:MOST_WORLDS].tolist()}
                         run.page.worlds3d[run.gate] = moving_worlds(
-                            stage, batch.env, qpos, record.failed, labels, _MOST_SEEN
+                            stage, batch.env, qpos, record.failed, labels
                         )
                 tally.add(record)
                 if t.seeds > 1:

@@ -57,7 +57,7 @@ def _compare(run: Run, mjwarp: Simulation) -> GateResult:
         problems += [] if equal else [line]
 
     world = WorldRecorder()
-    episode = run.stage.play(mjwarp, run.cfg.gate.baseline.reset, [*run.viewers, world])
+    episode = run.stage.play(mjwarp, run.cfg.gate.baseline.reset, [*run.stage.observers, world])
     judged, headline = run.judge_one("parity", episode)
     result.beyond = judged.beyond
     problems += [judged.reason] if judged.reason else []

@@ -1,4 +1,4 @@
-"""Job *play*: worlds with a policy or the expert, in MuJoCo's viewer or in a video."""
+"""Job *play*: worlds with a policy or the expert, in a video or in a browser."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import closing
@@ -11,7 +11,7 @@ import torch
 from mjstack.config.schema import Config, PlayJobCfg
 from mjstack.drivers.driver import find_driver
 from mjstack.episodes.batches import BatchPlan, play_batches
-from mjstack.episodes.motion import draw_seen, world_fields
+from mjstack.episodes.motion import world_fields
 from mjstack.episodes.recorder import WorldRecorder
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
@@ -65,7 +65,6 @@ def play_worlds(run: Run) -> list[GateResult]:
     """
     stage = run.stage
     cfg = stage.cfg
-    job: PlayJobCfg = cfg.job
     judged = cfg.task.check is not None
     recorder = WorldRecorder()
     worlds: list[World] = []
@@ -76,7 +75,7 @@ def play_worlds(run: Run) -> list[GateResult]:
         stage,
         [BatchPlan(cfg.seed, [world]) for world in range(cfg.nworld)],
         alone=stage.backend,
-        observers=lambda plan: [recorder, *run.viewers],
+        observers=lambda plan: [recorder],
     ):
         world = batch.plan.worlds[0]
         sim = batch.env.sim
@@ -86,9 +85,8 @@ def play_worlds(run: Run) -> list[GateResult]:
             succeeded += played.status is Status.passed
             outcome = played.reason or f"succeeded, {headline}"
         qpos = recorder.qpos
-        seen = draw_seen(stage, qpos, sim) if cfg.video and job.camera is None else {}
         (fields,) = world_fields(stage, batch.env, [0])
-        worlds.append(World(label=str(world), qpos=qpos, images=seen, fields=fields))
+        worlds.append(World(label=str(world), qpos=qpos, fields=fields))
         looks.append({name: value.clone() for name, value in sim.fields.items()})
         run.show_world(f"{NAME}_{world}", str(world), qpos, batch.episode, batch.env)
         result.details.append(f"world {world}: {outcome}")

@@ -224,7 +224,7 @@ def _replay(
     check = stage.check
     monitors = [FailureMonitor()] if stage.cfg.gate[plan.gate].reset else []
     trace = WorldTrace()
-    observers = [trace, *(run.viewers if first else []), *monitors]
+    observers = [trace, *monitors]
     facts = {"seed": plan.seed, "world": plan.world}
     plans = [BatchPlan(plan.seed, [plan.world])]
     batches = play_batches(stage, plans, alone=(backend, device), observers=lambda _: observers)

@@ -47,7 +47,7 @@ from mjstack.sim.build import cuda_driver, cuda_uuid
 
 log = logging.getLogger(__name__)
 
-VIEWS = ("false", "true", "web")  # of a job that shows worlds
+VIEWS = ("view", "video")  # keys of a job that shows worlds
 
 
 @dataclass(frozen=True)
@@ -58,12 +58,12 @@ class Job:
         check: Raises a `MjstackError` for what cannot be done here, before anything is written.
             Returns the job ready to run, with the scene and the plan that the check built.
         keys: Top-level keys and groups that its command line may set; None for all.
-        views: Values of ``view`` that it can show worlds in; ``video`` goes with ``true``.
+        views: Keys with which it shows worlds, some of `VIEWS`.
     """
 
     check: Callable[[Config], "CheckedJob"]
     keys: tuple[str, ...] | None = None
-    views: tuple[str, ...] = ("false",)
+    views: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,13 +173,12 @@ class CheckedJob:
                 folder=folder,
                 begin=begin,
                 record=record,
-                viewers=[live] if live else showing.find_viewers(self.stage),
                 page=page,
             )
             self.work(run, folder)
         report.conclude()
         write_formats(report, page)
-        showing.draw_episode(self.stage, folder, run.artifacts.pictured, page, run.draw)
+        showing.draw_episode(self.stage, folder, run.artifacts.pictured, run.draw)
         showing.save_page(self.stage, folder, page)
 
     def _load(self, *, warp: bool) -> None:
@@ -277,11 +276,9 @@ def check_job(cfg: Config, overrides: Sequence[str] = ()) -> CheckedJob:
         if job.keys is not None and re.split(r"[.@/]", key)[0] not in job.keys:
             expected = f"only {', '.join(job.keys[1:])} beside job={cfg.job.name}"
             raise ConfigError(key, value, expected, "Leave it out")
-    if cfg.view not in job.views:
-        expected = f"{' or '.join(job.views)} with job={cfg.job.name}"
-        raise ConfigError("view", cfg.view, expected, "Leave it out")
-    if cfg.video and "true" not in job.views:
-        raise ConfigError("video", True, f"false with job={cfg.job.name}", "Leave it out")
+    for key in VIEWS:
+        if (value := str(getattr(cfg, key)).lower()) != "false" and key not in job.views:
+            raise ConfigError(key, value, f"false with job={cfg.job.name}", "Leave it out")
     return job.check(cfg)
 
 

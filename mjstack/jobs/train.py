@@ -148,4 +148,4 @@ def _train(trainer: Trainer, folder: Path, run: Run) -> list[GateResult]:
     ]
 
 
-JOB = Job(check_train, views=("false", "web"))
+JOB = Job(check_train, views=("view",))

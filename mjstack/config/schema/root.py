@@ -69,11 +69,11 @@ class Config:
     graph: str = spec(choices=("auto", "require", "off"), changes=("report",))
     """Capture the step as a CUDA graph: auto, require or off. Ignored on native MuJoCo; on Warp's
     CPU device, of physics alone."""
-    view: str = spec(choices=("false", "true", "web"), changes=("report",))
-    """true: MuJoCo's viewer on the parity world, or without that gate the baseline world; job=play:
-    every world. web: the same, worlds of batch and success, and training, in a browser."""
+    view: str = spec(choices=("false", "web"), changes=("report",))
+    """web: worlds of the gates, of replay and play, and training, in a browser."""
     video: bool = spec(changes=("report",))
-    """Write a video of the same; job=play without view does so."""
+    """Write a video of the parity world, or without that gate of the baseline world; job=play
+    without view does so of every world."""
     web: WebCfg = spec(WebCfg, changes=("nothing",))
     """Worlds in a browser."""
     starts: str | None = spec(None)
