@@ -170,7 +170,6 @@ def claim_folder(
     *,
     marker: str = "",
     numbered: bool = False,
-    shared: bool = False,
     key: str = _KEY,
 ) -> Iterator[Path]:
     """Make a run's folder, and keep other runs out of it until the block ends. If that fails before
@@ -181,7 +180,6 @@ def claim_folder(
         job: As of `check_unused`.
         marker: As of `check_unused`.
         numbered: Where the folder is there, make another: its name and ``-2``, ``-3``, ...
-        shared: Let in other runs that share it.
         key: As of `check_unused`.
 
     Yields:
@@ -204,7 +202,7 @@ def claim_folder(
                 if not numbered:
                     raise
             folder = folder.with_name(f"{name}-{number}")
-        handle = lock_folder(folder, shared=shared)
+        handle = lock_folder(folder)
         before = {*folder.iterdir()}
         check_unused(folder, job, marker=marker, key=key)
         yield folder
@@ -297,30 +295,21 @@ def made_by(folder: Path) -> str:
     return ""
 
 
-def lock_folder(folder: Path, *, shared: bool = False) -> int:
-    """A descriptor that keeps other writers out until it is closed, also by the end of the process;
-    or, if it is shared, those that would have the folder alone. A FolderError if another writer
-    has it, an OSError if it cannot be opened.
+def lock_folder(folder: Path) -> int:
+    """A descriptor that keeps other writers out until it is closed, also by the end of the process.
+    A FolderError if another writer has it, an OSError if it cannot be opened. A file system without
+    locks keeps nobody out.
     """
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    if not lock(handle, shared=shared):
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
         os.close(handle)
         problem = f"{folder} is open in another writer, expected one at a time"
-        raise FolderError(problem, "Wait, or give another folder")
-    return handle
-
-
-def lock(handle: int, *, shared: bool = False) -> bool:
-    """Lock an open file or folder until it is closed, and return whether that could be done. A file
-    system without locks lets it.
-    """
-    try:
-        fcntl.flock(handle, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
+        raise FolderError(problem, "Wait, or give another folder") from error
     except OSError:
         pass
-    return True
+    return handle
 
 
 def to_csv(rows: Sequence[Mapping[str, object]], columns: Sequence[str] = ()) -> str:
