@@ -78,6 +78,7 @@ def play_batches(
     alone: tuple[Backend, str] | None = None,
     driver: Callable[[BatchPlan, Env], Driver] | None = None,
     observers: Callable[[BatchPlan], Sequence[Observer]] = lambda plan: (),
+    label: str = "steps",
 ) -> Generator[Batch, None, None]:
     """Play and judge batch after batch. A plan is taken when the batch before it has been used, so
     it may depend on that. Close the iterator to give the worlds back early.
@@ -90,6 +91,7 @@ def play_batches(
         alone: Backend and device on which the worlds play without the rest of their batch.
         driver: Makes the driver of worlds that have started, if not the configured one.
         observers: More observers of a batch.
+        label: Name of the steps in the progress, before the seed.
     """
     cfg = cfg or stage.driven(stage.cfg.reset)
     sim: Simulation | None = None
@@ -112,7 +114,7 @@ def play_batches(
                 driver(plan, env) if driver else stage.driver(env),
                 [recorder, *observers(plan), *stage.observers],
                 advance=stage.progress.advance,
-                label=f"steps, seed {plan.seed}",
+                label=f"{label}, seed {plan.seed}",
             )
             yield Batch(plan, env, episode, recorder.rows)
             recorder.rows.clear()
