@@ -163,8 +163,8 @@ def _compose_one(overrides: list[str]) -> tuple[DictConfig, "CheckedJob"]:
 def _check_spreads(checked: "CheckedJob") -> None:
     if not checked.spreads:
         raise MjstackError(
-            "torchrun, devices: expected a job whose worlds ranks share: gates, train, collect, or"
-            " replay of world=failing. Run this job in one process."
+            "torchrun, devices: expected a job whose worlds ranks share: gates, train or collect."
+            " Run this job in one process."
         )
 
 

@@ -230,14 +230,14 @@ class Stage:
             sizes=sizes,
         )
 
-    def simulate_alone(self, backend: Backend, device: str, nworld: int = 1) -> Simulation:
-        """Worlds of the batch without the others. In its batch a world could take more than its
-        share of the contact pool, so it gets some more.
+    def simulate_alone(self, backend: Backend, device: str) -> Simulation:
+        """A world of the batch without the others. In its batch it could take more than its share
+        of the contact pool, so it gets some more.
         """
         sizes = resolve_sizes(self.cfg)
         nconmax = min(_SHARES, self.cfg.nworld) * sizes.nconmax
         sizes = replace(sizes, nconmax=nconmax, nccdmax=None)
-        return self.simulation(nworld, backend, device, sizes=sizes)
+        return self.simulation(1, backend, device, sizes=sizes)
 
     @property
     def sizes(self) -> BatchSizes:

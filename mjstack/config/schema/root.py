@@ -86,7 +86,7 @@ class Config:
     """GPUs that share the job's worlds, a process for each: all, or how many. null: as torchrun
     has it, or one."""
     world: str | None = spec(None, changes=("report",))
-    """job=replay: 17; of seed 3, 3:17; success:3:17 where batch ran too; failing: all those."""
+    """job=replay: 17; of seed 3, 3:17; success:3:17 where batch ran too."""
     unused_terms: list[str] = spec([], changes=("nothing",))
     """Terms of the task that this job does not use, a line each; mjstack fills it in."""
 
