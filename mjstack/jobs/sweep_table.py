@@ -11,10 +11,10 @@ from mjstack.config.explain import parse
 from mjstack.errors import is_out_of_memory
 from mjstack.files import to_csv, write_atomic
 from mjstack.jobs.sweep import LOG, list_jobs
+from mjstack.report.curves import Plot, Row, save_curves
 from mjstack.report.formats import to_markdown
 from mjstack.report.record import Report, Status
 from mjstack.report.sections import Part, Section
-from mjstack.report.sweep_picture import Plot, Row, save_sweep
 from mjstack.report.table import Table
 from mjstack.report.write import safely_write
 
@@ -49,17 +49,17 @@ def write_summary(
     swept = _swept(rows)
     title = f"sweep of {len(rows)} job{'s' if len(rows) > 1 else ''}"
     table = Table.of(_columns(rows, swept), rows)
-    over = next(iter(swept), "")
+    numbers = [key for key in swept if all(type(row.get(key)) in (int, float) for row in rows)]
     plot = Plot(
         title=title,
-        over=over,
-        lines=swept[1:],
+        over=next(iter(numbers), ""),
+        lines=[key for key in swept if key not in numbers[:1]],
         panels={name: {"": name} for name in _headlines(rows)[:_PANELS]},
     )
     picture = folder / "summary.png"
     problem = ""
-    if draw and any(row["status"] != _NOT_RUN for row in rows) and plot.shows(rows):
-        problem = safely_write(picture, save_sweep, plot, rows, stops=False)
+    if draw and plot.over and plot.shows(rows):
+        problem = safely_write(picture, save_curves, plot, rows, stops=False)
     notes = []
     for key, name in (("backend", "hardware"), ("git_commit", "commit")):
         values = sorted({str(row[key]) for row in rows if row.get(key)})

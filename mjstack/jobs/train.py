@@ -24,9 +24,9 @@ from mjstack.gates.runner import run_guarded
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import CheckedJob, Job
 from mjstack.jobs.showing import check_showing
+from mjstack.report.curves import Plot, save_curves
 from mjstack.report.figure import Figure
 from mjstack.report.record import GateResult, Status
-from mjstack.report.sweep_picture import Plot, save_sweep
 from mjstack.report.table import Table
 from mjstack.train.trainer import FAILED, LAST, Trainer, whole_starts
 
@@ -125,7 +125,7 @@ def _train(trainer: Trainer, folder: Path, run: Run) -> list[GateResult]:
         plot = Plot(
             title=title, over=trained.abscissa, lines=[], panels={"": curves}, log=trained.log
         )
-        run.draw(f"{NAME}.png", save_sweep, plot, rows)
+        run.draw(f"{NAME}.png", save_curves, plot, rows)
     seconds = time.perf_counter() - began
     reached = ", ".join(f"{words[name]} {last[name]:.4g}" for name in trained.lines)
     rules = {name.removeprefix(FAILED): name for name in last if name.startswith(FAILED)}

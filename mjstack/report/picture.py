@@ -1,10 +1,9 @@
-"""Pictures of a run: the final scene, a video, and the frame of plots."""
+"""Pictures of a run: the final scene, and a video."""
 
 import copy
 import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -22,30 +21,6 @@ from mjstack.report.page import World, frame_stride
 
 Draw = Callable[[np.ndarray], Iterable[np.ndarray]]
 Write = Callable[[Path, Iterator[Image.Image], int, float], None]
-
-
-@contextmanager
-def figure(
-    path: Path,
-    title: str,
-    columns: int = 1,
-    rows: int = 1,
-    *,
-    figsize: tuple[float, float],
-    **options: Any,
-) -> Iterator[tuple[Any, Any]]:
-    """Make a figure with panels by options of ``Figure.subplots``, and save it when the block ends.
-
-    Yields:
-        The figure, and its axes: an array unless there is one panel.
-    """
-    from matplotlib.figure import Figure  # takes a while to load
-
-    picture = Figure(figsize, layout="constrained")
-    yield picture, picture.subplots(rows, columns, **options)
-    if title:
-        picture.suptitle(title, wrap=True)
-    picture.savefig(path, dpi=100)
 
 
 def _render(
