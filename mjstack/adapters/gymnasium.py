@@ -94,7 +94,7 @@ class GymnasiumVectorEnv(VectorEnv):
             raise ArgumentError("render_mode", repr(render_mode), "None or rgb_array")
         self.metadata = {
             "autoreset_mode": AutoresetMode.SAME_STEP,
-            "render_modes": _MODES,
+            "render_modes": _MODES if self._film else [],
             "render_fps": round(1.0 / env.cfg.timing.decision_dt),
         }
         boxes: dict[str, spaces.Space] = {
