@@ -147,9 +147,9 @@ def _run_one(hydra: Any, overrides: list[str]) -> int:
     from mjstack.jobs import check_ranks
 
     with joined() as ranks:
-        cfg, checked = ranks.alike(lambda: _compose_one(overrides))
-        ranks.alike(lambda: _check_spreads(checked))
-        ranks.alike(lambda: check_ranks(checked.stage))
+        cfg, checked = ranks.on_all_ranks(lambda: _compose_one(overrides))
+        ranks.on_all_ranks(lambda: _check_spreads(checked))
+        ranks.on_all_ranks(lambda: check_ranks(checked.stage))
         return _run_checked(hydra, cfg, checked, overrides)
 
 

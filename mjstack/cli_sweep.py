@@ -21,7 +21,9 @@ def expand(master: DictConfig, overrides: Sequence[str]) -> list[list[str]]:
     params = OmegaConf.select(master, "hydra.sweeper.params") or {}
     texts = [*(f"{key}={value}" for key, value in params.items()), *own_overrides(overrides)]
     parsed = list(map(parse, texts))
-    if any(part.is_sweep_override() and not part.is_discrete_sweep() for part in parsed):
+    if any(
+        override.is_sweep_override() and not override.is_discrete_sweep() for override in parsed
+    ):
         raise MjstackError(f"{' '.join(overrides)}: expected a list of values.")
     (jobs,) = BasicSweeper.split_arguments(parsed, None)
     if not jobs:

@@ -203,13 +203,13 @@ def claim_folder(
                     raise
             folder = folder.with_name(f"{name}-{number}")
         handle = lock_folder(folder)
-        before = {*folder.iterdir()}
+        existing = {*folder.iterdir()}
         check_unused(folder, job, marker=marker, key=key)
         yield folder
     except BaseException as error:
         if handle is not None:  # else it is another process's
             with suppress(OSError):  # something stays
-                new = {*folder.iterdir()} - before
+                new = {*folder.iterdir()} - existing
                 if all(path.name == ".hydra" or path.suffix == ".log" for path in new):  # Hydra's
                     for path in new:
                         (shutil.rmtree if path.name == ".hydra" else os.remove)(path)
@@ -240,13 +240,13 @@ def move_aside(folder: Path) -> Path:
     files, which may be open; an OSError if it cannot be made or a file cannot be moved.
     """
     for number in itertools.count(1):
-        aside = folder.with_name(f"{folder.name}-earlier-{number}")
+        moved_folder = folder.with_name(f"{folder.name}-earlier-{number}")
         with suppress(FileExistsError):
-            aside.mkdir()
+            moved_folder.mkdir()
             break
     for path in _run_files(folder):
-        path.rename(aside / path.name)
-    return aside
+        path.rename(moved_folder / path.name)
+    return moved_folder
 
 
 def check_unused(folder: Path, job: str = "", *, marker: str = "", key: str = _KEY) -> None:
@@ -317,8 +317,8 @@ def to_csv(rows: Sequence[Mapping[str, object]], columns: Sequence[str] = ()) ->
     first columns may be given; other keys of the rows follow, in order of appearance.
     """
     columns = list(dict.fromkeys([*columns, *(name for row in rows for name in row)]))
-    out = io.StringIO()
-    writer = csv.DictWriter(out, columns, lineterminator="\n")
+    text_buffer = io.StringIO()
+    writer = csv.DictWriter(text_buffer, columns, lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    return out.getvalue()
+    return text_buffer.getvalue()

@@ -426,7 +426,7 @@ def test_a_name_may_have_dots() -> None:
 def test_every_field_says_what_it_means() -> None:
     keys = list(list_keys(load_config()))
     assert len(keys) > 150
-    bare = [key.name for key in keys if not key.words]
+    bare = [key.name for key in keys if not key.meaning]
     assert bare == []
     rate = next(key for key in keys if key.name == "gate.success.rate")
     assert (rate.value, rate.accepts) == ("0.99", "a number from 0 to 1")

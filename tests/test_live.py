@@ -441,10 +441,10 @@ def test_jobs_serve_the_live_view(job: str, tmp_path: Path, port: int, monkeypat
 
     def look(self: LiveView, step: int) -> None:
         after_step(self, step)
-        if self._part not in looked:
+        if self._section not in looked:
             with urlopen(f"http://127.0.0.1:{port}/?token={tokens[0]}", timeout=60) as page:
                 assert b"<html" in page.read()
-            looked[self._part] = self._status.value
+            looked[self._section] = self._status.value
 
     after_step = LiveView.after_step
     monkeypatch.setattr(LiveView, "after_step", look)

@@ -408,7 +408,7 @@ def test_steps_with_the_tracker_are_one_graph(robot: str, new_run: NewRun, tmp_p
     failed = episode.result.failed != 0
     assert int(failed.sum()) <= 3
     assert not bool(((watch.sign != 0) & ~failed).sum() > 3)
-    assert int(watch._now) == episode.timing.steps
+    assert int(watch._count) == episode.timing.steps
     sim.close()
     assert play(new_run(*device, robot=robot), tmp_path).metrics["succeeded"] >= 61
 

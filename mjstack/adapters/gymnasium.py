@@ -168,7 +168,7 @@ class GymnasiumVectorEnv(VectorEnv):
                 info = {"success": bool(success[world])}
                 last = {"final_obs": _row(final, world), "final_info": info}
                 infos = self._add_info(infos, last, world)
-        rewards, ends, cuts = (part.cpu().numpy() for part in (reward, terminated, truncated))
+        rewards, ends, cuts = (tensor.cpu().numpy() for tensor in (reward, terminated, truncated))
         return _numpy(obs, self.group), rewards, ends, cuts, infos
 
     def render(self) -> tuple[ndarray, ...]:
@@ -250,14 +250,14 @@ class GymnasiumEnv(gymnasium.Env):
             raise ArgumentError("env", value, "reset() first", "Call env.reset()")
         actions = _array(action, self.action_space)[None]
         sim = self.inner.sim
-        before = sim.qpos.clone(), {name: field.clone() for name, field in sim.fields.items()}
+        last_state = sim.qpos.clone(), {name: field.clone() for name, field in sim.fields.items()}
         self._worlds.seen = None
         obs, reward, terminated, truncated, infos = self._worlds.step(actions)
         seen = _row(obs, 0)
         if "final_obs" in infos:
             self._first = obs
             seen = infos["final_obs"][0]
-            self._worlds.seen = before
+            self._worlds.seen = last_state
         info = {"success": bool(infos["success"])}
         return seen, float(reward[0]), bool(terminated), bool(truncated), info
 
@@ -292,10 +292,10 @@ def make(
     Raises:
         MjstackError: An override or an option cannot be used.
     """
-    words = [*choices, *overrides, f"nworld={1 if num_envs is None else num_envs}"]
-    cfg = filmed = load_config(words, config_dir=config_dir)
+    all_overrides = [*choices, *overrides, f"nworld={1 if num_envs is None else num_envs}"]
+    cfg = filmed = load_config(all_overrides, config_dir=config_dir)
     if options.get("render_mode") and not cfg.scene.cameras:
-        filmed = load_config([*words, "cameras=front"], config_dir=config_dir)
+        filmed = load_config([*all_overrides, "cameras=front"], config_dir=config_dir)
     env = build_env(cfg, model=build_model(filmed))  # with what pictures need
     kind = GymnasiumEnv if num_envs is None else GymnasiumVectorEnv
     return kind(env, cameras=filmed.scene.cameras, **options)

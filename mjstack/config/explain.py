@@ -139,8 +139,8 @@ def _explain(error: Exception, overrides: Sequence[str]) -> MjstackError:
     key = getattr(cause, "full_key", None) or ""
     if deleted := re.match(r"Could not delete from config\. '([^']+)'", text):
         key = deleted[1]
-        beside = _beside(key, _keys(o for o in overrides if not o.startswith("~")))
-        return MjstackError(f"~{key}: there is none to leave out. {suggest(key, beside)}")
+        siblings = _siblings(key, _keys(o for o in overrides if not o.startswith("~")))
+        return MjstackError(f"~{key}: there is none to leave out. {suggest(key, siblings)}")
     if key and isinstance(cause, ConfigKeyError | AttributeError):
         return _unknown_key(key, _field_names(getattr(cause, "object_type", None)), overrides)
     value = re.match("Value '(.*)' of type", text)
@@ -169,11 +169,11 @@ def _unknown_key(key: str, known: Iterable[str], overrides: Sequence[str]) -> Mj
     if key.partition(".")[0] in TERM_GROUPS or parent == "robot.servos":
         problem = f"'{key}' is not in the configuration.{hint} To add it, write +{key}=..."
         return MjstackError(problem)
-    hint = hint or f" {suggest(key, _beside(key, keys))}"
+    hint = hint or f" {suggest(key, _siblings(key, keys))}"
     return MjstackError(f"configuration key '{key}' does not exist.{hint}")
 
 
-def _beside(key: str, keys: Iterable[str]) -> set[str]:
+def _siblings(key: str, keys: Iterable[str]) -> set[str]:
     return {name for name in keys if name.rpartition(".")[0] == key.rpartition(".")[0]}
 
 

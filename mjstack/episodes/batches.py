@@ -54,12 +54,12 @@ class Batch:
 
     def finite(self) -> Tensor:
         """Whether all that was recorded of each world is finite, shape ``(nworld,)``, bool."""
-        parts = [
+        finite_rows = [
             rows.isfinite().reshape(*rows.shape[:2], -1).all(2).all(0)
             for rows in self.rows.values()
             if rows.is_floating_point()
         ]
-        return torch.stack(parts).all(0)
+        return torch.stack(finite_rows).all(0)
 
     def select(self, name: str, worlds: Tensor) -> Tensor:
         """A channel's rows in some worlds, shape ``(worlds, rows, ...)``; ``worlds`` are numbers or

@@ -39,8 +39,10 @@ def world_fields(stage: Stage, env: Env, worlds: Sequence[int]) -> list[Fields]:
     with visuals.
     """
     sim = env.sim
-    places = env.cfg.scene.places.items()
-    centers = {name: place_xy(env, name) for name, place in places if any(place.random_xy)}
+    place_cfgs = env.cfg.scene.places.items()
+    centers = {
+        name: place_xy(env, name) for name, place_cfg in place_cfgs if any(place_cfg.random_xy)
+    }
     fields = {name: values for name, values in sim.fields.items() if is_visible(name)}
     if not centers and not fields:
         return [{}] * len(worlds)

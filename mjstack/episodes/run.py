@@ -127,8 +127,8 @@ class Run:
         sent = Hook(keep)
         viewers = () if "parity" in self.cfg.gates else stage.observers
         episode = stage.play(sim, reset, [*viewers, world, snapshots, sent])
-        late = int(sent.env.command_delay.steps[0])  # physics has seen these commands
-        seen = {step: max(0, step - late) for step in snapshots.states}
+        delay = int(sent.env.command_delay.steps[0])  # physics has seen these commands
+        seen = {step: max(0, step - delay) for step in snapshots.states}
         states = {k: state._replace(ctrl=ctrl[seen[k]]) for k, state in snapshots.states.items()}
         modes = [(t.params.get("joints"), t.params.get("mode")) for t in stage.action.values()]
         absolute = modes == [("arm", "absolute"), ("gripper", "absolute")]
@@ -170,13 +170,13 @@ class Run:
         """
         check = self.stage.check
         broken, beyond = check.why(episode.failed, episode.values)
-        words = ", ".join(f"{check.rules.texts[rule]}{why}" for rule, why in broken.items())
+        failures = ", ".join(f"{check.rules.texts[rule]}{why}" for rule, why in broken.items())
         values = {key: float(values[0]) for key, values in episode.values.items()}
         measured = [replace(check.figures[key], value=value) for key, value in values.items()]
         result = GateResult(
             name=name,
             status=Status.failed if broken else Status.passed,
-            reason=f"failed: {words}" if words else "",
+            reason=f"failed: {failures}" if failures else "",
             figures=[*check.thresholds(), *measured],
             beyond=beyond,
         )

@@ -71,7 +71,7 @@ def judge_episodes(run: Run) -> list[GateResult]:
         Figure("distinct_fraction", high=t.distinct_fraction),
         Figure("episode", tally.seconds, "s"),
     ]
-    words = [f"{tally.summary}, {format_percent(t.rate)} wanted"]
+    sentences = [f"{tally.summary}, {format_percent(t.rate)} wanted"]
     if succeeded.all():  # worlds that fail have no speed
         steps = sum(record.steps for record in tally.records)
         measured.append(Figure("world_steps", steps / tally.seconds, "/s"))
@@ -95,9 +95,9 @@ def judge_episodes(run: Run) -> list[GateResult]:
         )
         tally.notes["starts"] = _describe_start(cfg, run.gate)
         if retried:
-            words.append(f"{retried} retried, {retried_succeeded} of them succeeded")
+            sentences.append(f"{retried} retried, {retried_succeeded} of them succeeded")
         tally.details += find_doubts(distinct, tally.episodes, tally.successes, lost or 0, t.rate)
-    return [tally.result(words, passed=rate >= t.rate, figures=measured, rate=t.rate)]
+    return [tally.result(sentences, passed=rate >= t.rate, figures=measured, rate=t.rate)]
 
 
 def _play(run: Run, tally: EpisodeTally) -> int | None:
@@ -127,8 +127,8 @@ def _play(run: Run, tally: EpisodeTally) -> int | None:
     try:
         with closing(play_batches(stage, plans, observers=observe)) as batches:
             for batch in batches:
-                part = EpisodeRecord.from_batch(ranks, batch, monitor)
-                record = EpisodeRecord.join(ranks.gather(part))
+                rank_record = EpisodeRecord.from_batch(ranks, batch, monitor)
+                record = EpisodeRecord.join(ranks.gather(rank_record))
                 # Before the next one can break or be stopped. A full disk takes no result back.
                 tally.write(record_name(run.gate, record.seed), write_npz, record.arrays())
                 if t.reset:

@@ -43,7 +43,7 @@ class LiveView(Observer):
         self._nworld = 0
         self._numbers = [0]  # of the worlds in the picture
         self._content: tuple[list[int], list[bytes]] = ([], [])  # these worlds and their fields
-        self._part = ""
+        self._section = ""
         self._choice = ""  # of worlds in the last picture
         self.paused = False
 
@@ -60,14 +60,14 @@ class LiveView(Observer):
 
     def begin(self, part: str) -> None:
         """Name the part of the run that follows."""
-        self._part = part
+        self._section = part
 
     @override
     def start(self, env: Env, driver: Driver) -> None:
         super().start(env, driver)
         self.aside = 0.0
         self._last = -np.inf
-        self._due = time.perf_counter()
+        self._next_frame = time.perf_counter()
         if env.nworld != self._nworld:
             self._nworld = env.nworld
             self._worlds.value = f"0-{min(_FIRST, env.nworld) - 1}" if env.nworld > 1 else "0"
@@ -77,13 +77,13 @@ class LiveView(Observer):
 
     @override
     def after_step(self, step: int) -> None:
-        now = time.perf_counter()
+        clock = time.perf_counter()
         real = self._pace.value == _REAL
-        if not (self.paused or real) and now - self._last < 1.0 / _RATE:
+        if not (self.paused or real) and clock - self._last < 1.0 / _RATE:
             return
         watched = self.paused or bool(self._server.get_clients())
         if not (watched or real):
-            self._last = now
+            self._last = clock
             return
         self.env.sim.synchronize()  # what was queued is the episode's time
         began = time.perf_counter()
@@ -102,8 +102,10 @@ class LiveView(Observer):
             if self._choice != self._worlds.value[:_TEXT]:
                 self._show(step + 1)
         if real and not self.paused:
-            self._due = max(self._due + self.env.cfg.timing.step_dt, time.perf_counter() - 0.2)
-            time.sleep(max(0.0, self._due - time.perf_counter()))
+            self._next_frame = max(
+                self._next_frame + self.env.cfg.timing.step_dt, time.perf_counter() - 0.2
+            )
+            time.sleep(max(0.0, self._next_frame - time.perf_counter()))
         self.aside += time.perf_counter() - began
 
     def _toggle(self) -> None:
@@ -135,7 +137,7 @@ class LiveView(Observer):
             worlds = [World(label=str(n), qpos=frames, fields=values) for n, frames, values in rows]
             self._view = SceneView(self._server, self._stage.assets.visual_model, worlds)
         self._view.update(np.nan_to_num(qpos))
-        title = f"{self._part}, step {step:,}, {env.nworld:,} worlds"
+        title = f"{self._section}, step {step:,}, {env.nworld:,} worlds"
         world = self._numbers[0]
         lines = [title, f"world {world}: {self._describe(world)}", *problem]
         self._status.value = "\n".join(line[: 2 * _TEXT] for line in lines)
@@ -145,17 +147,17 @@ class LiveView(Observer):
         env = self.env
         rewards = env.reward_manager
         ends = env.termination_manager
-        words = [f"step {int(env.episode_step[world])} of its episode"]
+        texts = [f"step {int(env.episode_step[world])} of its episode"]
         if self.driver.phases:
-            words.append(f"phase {self.driver.phases[int(self.driver.phase[world])].name}")
+            texts.append(f"phase {self.driver.phases[int(self.driver.phase[world])].name}")
         if rewards.names:
             values = zip(rewards.names, rewards.values[world].tolist(), strict=True)
-            words.append(f"reward {', '.join(f'{name} {value:.3g}' for name, value in values)}")
-            words.append(f"success {'yes' if env.success[world] else 'no'}")
+            texts.append(f"reward {', '.join(f'{name} {value:.3g}' for name, value in values)}")
+            texts.append(f"success {'yes' if env.success[world] else 'no'}")
         if ends.names:
             flags = zip(ends.names, ends.values[world].tolist(), strict=True)
-            words.append(f"ends: {', '.join(name for name, flag in flags if flag) or 'no'}")
-        return ", ".join(words)
+            texts.append(f"ends: {', '.join(name for name, flag in flags if flag) or 'no'}")
+        return ", ".join(texts)
 
 
 def read_worlds(text: str, count: int) -> list[int]:

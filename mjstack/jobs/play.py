@@ -68,7 +68,7 @@ def play_worlds(run: Run) -> list[GateResult]:
     judged = cfg.task.check is not None
     recorder = WorldRecorder()
     worlds: list[World] = []
-    looks = []
+    model_fields = []
     result = GateResult(name=NAME, status=Status.passed)
     succeeded = 0
     for batch in play_batches(
@@ -87,7 +87,7 @@ def play_worlds(run: Run) -> list[GateResult]:
         qpos = recorder.qpos
         (fields,) = world_fields(stage, batch.env, [0])
         worlds.append(World(label=str(world), qpos=qpos, fields=fields))
-        looks.append({name: value.clone() for name, value in sim.fields.items()})
+        model_fields.append({name: value.clone() for name, value in sim.fields.items()})
         run.show_world(f"{NAME}_{world}", str(world), qpos, batch.episode, batch.env)
         result.details.append(f"world {world}: {outcome}")
         result.notes["backend"] = sim.description
@@ -95,7 +95,7 @@ def play_worlds(run: Run) -> list[GateResult]:
     result.reason = f"{succeeded} of {cfg.nworld} worlds succeeded" if judged else outcome
     result.figures = figures(worlds=cfg.nworld, **({"succeeded": succeeded} if judged else {}))
     if cfg.video:
-        _save(run, worlds, looks, result)
+        _save(run, worlds, model_fields, result)
     return [result]
 
 
@@ -121,10 +121,14 @@ def _save(
         if job.camera is None:
             save()
             return
-        looks = {field: torch.cat([world[field] for world in fields]) for field in fields[0]}
+        model_fields = {field: torch.cat([world[field] for world in fields]) for field in fields[0]}
         name = f"images.{job.camera}"
-        with closing(stage.color_renderer(len(worlds), list(looks), [job.camera])) as renderer:
-            save(draw=lambda q: renderer.draw(torch.from_numpy(q), looks)[name].cpu().numpy())
+        with closing(
+            stage.color_renderer(len(worlds), list(model_fields), [job.camera])
+        ) as renderer:
+            save(
+                draw=lambda q: renderer.draw(torch.from_numpy(q), model_fields)[name].cpu().numpy()
+            )
 
     if problem := safely_write(path, write):
         result.status = Status.failed

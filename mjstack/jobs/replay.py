@@ -30,7 +30,7 @@ from mjstack.report.figure import figures
 from mjstack.report.record import GateResult, Status
 from mjstack.sim import resolve_backend, resolve_device
 
-_FACTS = {  # besides versions, on which a result or its last bits depend
+_COMPARED = {  # besides versions, on which a result or its last bits depend
     "git_commit": "mjstack's commit",
     "cpu": "the processor",
     "policy": "the policy",
@@ -132,12 +132,12 @@ def _check_start(plan: _Plan) -> None:
             stage.start(sim, stage.cfg.reset, seed=plan.seed, worlds=[plan.world])
             start = sim.qpos[0].cpu().numpy()
             same = start.shape == recorded.shape
-            off = float(np.abs(start - recorded).max()) if same else math.inf
-        if off <= _SAME_START:
+            distance = float(np.abs(start - recorded).max()) if same else math.inf
+        if distance <= _SAME_START:
             return
     raise FolderError(
-        f"run={plan.run.folder}: world {plan.world} of seed {plan.seed} would start up to {off:.3g}"
-        " (m, rad) from where it did, expected its own start",
+        f"run={plan.run.folder}: world {plan.world} of seed {plan.seed} would start up to"
+        f" {distance:.3g} (m, rad) from where it did, expected its own start",
         f"Use mjstack at {plan.run.provenance.get('git_commit')}",
     )
 
@@ -167,14 +167,14 @@ def _replay_all(plan: _Plan, run: Run, folder: Path) -> None:
 
 def _changes(recorded: dict, current: dict) -> list[str]:
     """Facts that differ from the earlier run's and could change a result, or its last bits."""
-    before, now = (
-        facts["versions"] | {words: facts.get(key) for key, words in _FACTS.items()}
+    original, replayed = (
+        facts["versions"] | {meaning: facts.get(key) for key, meaning in _COMPARED.items()}
         for facts in (recorded, current)
     )
     return [
-        f"{name} was {shorten(str(before[name]), 100)} in that run and is {value} now"
-        for name, value in now.items()
-        if name in before and before[name] != value
+        f"{name} was {shorten(str(original[name]), 100)} in that run and is {value} now"
+        for name, value in replayed.items()
+        if name in original and original[name] != value
     ]
 
 
@@ -235,8 +235,8 @@ def _compare(
     record = plan.record
     rules = run.stage.check.rules
     bits = int(record.failed[plan.world])
-    now = int(episode.failed[0])
-    same = bits == now
+    replayed = int(episode.failed[0])
+    same = bits == replayed
     result = "the same result" if same else rules.describe(bits) or "succeeded"
     if record.backend != backend:
         prefix = "" if same else "another result: "
@@ -248,14 +248,14 @@ def _compare(
 
     possible_reasons = {  # why it need not end bit for bit where it did
         "runs on CUDA agree to rounding only": "cuda" in device + record.device,
-        "a world alone shares no contact pool": (bits | now) & rules["OVERFLOW"],
+        "a world alone shares no contact pool": (bits | replayed) & rules["OVERFLOW"],
         "not all is as it was in that run": changes,
     }
     reasons = [reason for reason, applies in possible_reasons.items() if applies]
     ends = "it ends bit for bit where it did"
     if not exact:
-        apart = end - recorded_end
-        most = max(float(np.linalg.norm(apart[a : a + 3])) for a in run.stage.index.object_qpos)
+        offset = end - recorded_end
+        most = max(float(np.linalg.norm(offset[a : a + 3])) for a in run.stage.index.object_qpos)
         ends = f"its objects end {1e3 * most:.3g} mm from where they did"
         if not reasons:
             ends += ", expected bit for bit there"

@@ -94,11 +94,11 @@ class CheckedJob:
             Exception: The work has failed.
         """
         self.stage.progress = Progress(advance=lambda what, done, total: check_interrupt())
-        self.stage.ranks.gather(self._place())
+        self.stage.ranks.gather(self._host())
         self.work(Run(self.stage, begin=lambda name: check_interrupt()), folder)
         check_interrupt()
 
-    def _place(self) -> str:
+    def _host(self) -> str:
         """Where this rank plays."""
         return f"{socket.gethostname()}, {_device_name(*self.stage.backend)}"
 
@@ -147,8 +147,8 @@ class CheckedJob:
             log.warning("%s", line)
         report.provenance = run_provenance(self.stage)
         if self.stage.ranks.size > 1:
-            places = self.stage.ranks.gather(self._place())
-            report.provenance["ranks"] = [f"rank {r}: {p}" for r, p in enumerate(places)]
+            hosts = self.stage.ranks.gather(self._host())
+            report.provenance["ranks"] = [f"rank {r}: {p}" for r, p in enumerate(hosts)]
         write_formats(report, page)
 
         def record(result: GateResult) -> None:
@@ -220,12 +220,12 @@ def count_devices(cfg: Config) -> int:
         return 1
     backend, device = resolve_backend(cfg)
     on_cuda = device.startswith("cuda")
-    there = torch.cuda.device_count() if on_cuda else available_cores()
-    all_of_them = there if on_cuda else 1  # one process uses all cores
+    available = torch.cuda.device_count() if on_cuda else available_cores()
+    all_of_them = available if on_cuda else 1  # one process uses all cores
     count = all_of_them if cfg.devices == "all" else int(cfg.devices)
-    if count > there:
+    if count > available:
         kind = "CUDA devices" if on_cuda else "cores"
-        expected = f"at most {there}, the {kind} that this machine has for sim={backend}"
+        expected = f"at most {available}, the {kind} that this machine has for sim={backend}"
         raise ConfigError("devices", cfg.devices, expected)
     _check_share(cfg, count)
     return count
@@ -248,17 +248,19 @@ def check_ranks(stage: Stage) -> None:
     cfg = stage.cfg
     _, device = stage.backend
     host = socket.gethostname()
-    facts = collect_provenance()
-    equal = {key: facts[key] for key in ("versions", "git_commit")} | config_content(cfg)
+    provenance = collect_provenance()
+    equal = {key: provenance[key] for key in ("versions", "git_commit")} | config_content(cfg)
     gpu = cuda_uuid(device) if device.startswith("cuda") else ""
     gathered = ranks.gather((host, equal, gpu))
     holders: dict[tuple[str, str], int] = {}
-    for rank, (place, values, unit) in enumerate(gathered):
+    for rank, (host_name, values, unit) in enumerate(gathered):
         if changes := differences(values, gathered[0][1]):
-            problem = f"rank {rank} ({place}) has {changes} as in rank 0 ({gathered[0][0]})"
+            problem = f"rank {rank} ({host_name}) has {changes} as in rank 0 ({gathered[0][0]})"
             raise MjstackError(problem, "Install and start the same everywhere")
-        if unit and (holder := holders.setdefault((place, unit), rank)) != rank:
-            problem = f"ranks {holder} and {rank} ({place}) have one GPU, {unit}, expected one each"
+        if unit and (holder := holders.setdefault((host_name, unit), rank)) != rank:
+            problem = (
+                f"ranks {holder} and {rank} ({host_name}) have one GPU, {unit}, expected one each"
+            )
             fix = "Start as many ranks as there are GPUs, with sim.device=auto"
             raise MjstackError(problem, fix)
     _check_share(cfg, ranks.size)

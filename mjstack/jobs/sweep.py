@@ -69,7 +69,7 @@ def add_jobs(folder: Path, jobs: Sequence[SweepJob]) -> None:
             files than those of its run.
     """
     listed = {job.number: job for job in list_jobs(folder)}
-    before = set(listed)
+    known = set(listed)
     for job in jobs:
         earlier = listed.setdefault(job.number, job).overrides
         if earlier != job.overrides:
@@ -79,9 +79,9 @@ def add_jobs(folder: Path, jobs: Sequence[SweepJob]) -> None:
                 " folder"
             )
         refuse_links([job.folder], "Remove it, or set hydra.sweep.dir to another folder")
-        if job.number not in before or job.report() is None:
+        if job.number not in known or job.report() is None:
             check_unused(job.folder, key="hydra.sweep.dir")
-    if len(listed) > len(before) or not (folder / SWEEP).exists():
+    if len(listed) > len(known) or not (folder / SWEEP).exists():
         folder.mkdir(parents=True, exist_ok=True)
         entries = {number: (job.folder.name, job.overrides) for number, job in listed.items()}
         write_atomic(folder / SWEEP, json.dumps(entries, indent=1) + "\n")
@@ -159,15 +159,15 @@ def run_jobs(
                         reports[job.number] = done
                         continue
                     running[gpu] = (job, _start(job, gpu))
-                    place = f" on GPU {gpu}" if gpu else ""
-                    show(f"job {job.number}{place}: {' '.join(job.overrides)}")
+                    device = f" on GPU {gpu}" if gpu else ""
+                    show(f"job {job.number}{device}: {' '.join(job.overrides)}")
             for gpu, (job, child) in list(running.items()):
-                late = child.poll() is None and child.seconds > limit
-                if late:
+                timed_out = child.poll() is None and child.seconds > limit
+                if timed_out:
                     stop_all([child])
                 if (code := child.poll()) is not None:
                     del running[gpu]
-                    report = reports[job.number] = _conclude(job, child, code, late=late)
+                    report = reports[job.number] = _conclude(job, child, code, late=timed_out)
                     show(f"job {job.number}: {report.status} ({child.seconds:.0f} s)")
                     finish(reports)
             time.sleep(POLL)
@@ -185,19 +185,19 @@ def _start(job: SweepJob, gpu: str) -> Child:
         return Child(args, log, env={"CUDA_VISIBLE_DEVICES": gpu} if gpu else {})
 
 
-def _conclude(job: SweepJob, child: Child, code: int, *, late: bool) -> Report:
+def _conclude(job: SweepJob, child: Child, code: int, *, timed_out: bool) -> Report:
     """The report of a job whose process has ended."""
     if (report := job.result()) is not None:
         return report
     path = job.folder / LOG
     lines = path.read_text(errors="replace").splitlines()
     end = f"killed by signal {-code}" if code < 0 else f"exit status {code}"
-    if late:
+    if timed_out:
         end = f"not done after {child.seconds:.0f} s (hydra.launcher.minutes)"
     cause = next((f": {line}" for line in reversed(lines) if line.startswith("mjstack: ")), "")
     return Report(
         folder=job.folder,
         overrides=list(job.overrides),
-        status=Status.interrupted if code == 130 and not late else Status.failed,
+        status=Status.interrupted if code == 130 and not timed_out else Status.failed,
         gates=[GateResult(name="job", status=Status.failed, reason=f"{end}{cause} ({path})")],
     )

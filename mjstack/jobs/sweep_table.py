@@ -65,8 +65,8 @@ def write_summary(
         values = sorted({str(row[key]) for row in rows if row.get(key)})
         notes += [f"{name}: {value}" for value in values]
     write_atomic(folder / "summary.csv", to_csv(rows))
-    parts: list[Part] = [table, *([picture] if picture.exists() else []), notes]
-    write_atomic(folder / "summary.md", to_markdown([Section(title=title, parts=parts, level=1)]))
+    blocks: list[Part] = [table, *([picture] if picture.exists() else []), notes]
+    write_atomic(folder / "summary.md", to_markdown([Section(title=title, parts=blocks, level=1)]))
     rows_shown = [[_first_words(cell) for cell in row] for row in table.rows]
     return replace(table, title=title, rows=rows_shown), problem
 
@@ -124,8 +124,8 @@ def _swept(rows: Sequence[Row]) -> list[str]:
 
 def _columns(rows: Sequence[Row], swept: Sequence[str]) -> dict[str, str]:
     """The columns of the table by their titles: what differs, and the gates' results."""
-    words = [key for row in rows for key, value in row.items() if _is_result(value)]
-    return {name: name for name in ("job", *swept, *words, *_headlines(rows), "status")}
+    result_keys = [key for row in rows for key, value in row.items() if _is_result(value)]
+    return {name: name for name in ("job", *swept, *result_keys, *_headlines(rows), "status")}
 
 
 def _is_result(value: object) -> bool:

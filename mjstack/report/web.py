@@ -166,10 +166,10 @@ class Stage:
 
 def choose_worlds(parts: Mapping[str, Sequence[World]]) -> list[World]:
     """At most 64 worlds of a run's parts: those alone, and equal shares of the rest."""
-    alone = [part[0] for part in parts.values() if len(part) == 1][:MOST_WORLDS]
+    single = [part[0] for part in parts.values() if len(part) == 1][:MOST_WORLDS]
     batches = [part for part in parts.values() if len(part) > 1]
-    share = (MOST_WORLDS - len(alone)) // max(1, len(batches))
-    return [*(world for part in batches for world in part[:share]), *alone]
+    share = (MOST_WORLDS - len(single)) // max(1, len(batches))
+    return [*(world for part in batches for world in part[:share]), *single]
 
 
 def not_shown(model: mujoco.MjModel, worlds: Sequence[World]) -> list[str]:

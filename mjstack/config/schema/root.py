@@ -99,5 +99,8 @@ class Config:
     def files(self) -> dict[str, str]:
         """Paths of its MJCF files, by key."""
         named = {"robot.file": self.robot.file}
-        named |= {f"scene.objects.{n}.file": thing.file for n, thing in self.scene.objects.items()}
+        named |= {
+            f"scene.objects.{n}.file": object_cfg.file
+            for n, object_cfg in self.scene.objects.items()
+        }
         return {key: path for key, path in named.items() if path is not None}
