@@ -45,7 +45,7 @@ def add(writer: DatasetWriter, *episodes: EpisodeData, commit: bool = True) -> S
         frame = writer.frames
         for number, episode in enumerate(episodes, len(writer.committed)):
             part.write(episode, number, frame)
-            frame += part.part.rows[-1]["length"]
+            frame += part.files.rows[-1]["length"]
         complete = part.complete()
     if commit:
         writer.commit([complete])

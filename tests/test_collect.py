@@ -547,7 +547,7 @@ def test_finished_batches_are_kept(
     write = PartWriter.write
 
     def broken(self: PartWriter, episode: Any, *args: Any) -> None:
-        if episode.row["seed"] == 1 and len(self.part.rows) == 1:
+        if episode.row["seed"] == 1 and len(self.files.rows) == 1:
             raise error
         write(self, episode, *args)
 

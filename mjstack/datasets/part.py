@@ -42,7 +42,7 @@ class PartWriter:
     images until they are encoded.
 
     Attributes:
-        part: What is written so far.
+        files: What is written so far.
     """
 
     def __init__(self, folder: Path, spec: DatasetSpec, name: str, images_gib: float) -> None:
