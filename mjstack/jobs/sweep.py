@@ -167,7 +167,7 @@ def run_jobs(
                     stop_all([child])
                 if (code := child.poll()) is not None:
                     del running[gpu]
-                    report = reports[job.number] = _conclude(job, child, code, late=timed_out)
+                    report = reports[job.number] = _conclude(job, child, code, timed_out=timed_out)
                     show(f"job {job.number}: {report.status} ({child.seconds:.0f} s)")
                     finish(reports)
             time.sleep(POLL)
