@@ -25,7 +25,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mjstack.cli_sweep import check_jobs, claim_sweep, expand, hydra_path, print_sweep
 from mjstack.config.explain import own_overrides
-from mjstack.config.help import help_text, key_help, list_text
+from mjstack.config.help import help_text, key_help
 from mjstack.config.load import compose, extended_search_path, to_config
 from mjstack.config.session import (
     CONFIG_NAME,
@@ -87,18 +87,10 @@ def run(args: list[str]) -> int:
 
 def _dispatch(flags: Namespace, overrides: list[str]) -> int:
     """Do what the flags ask for, on the current search path."""
-    command = overrides[0] if overrides else ""
     with hydra_session() as hydra:
-        if command == "list":
-            print(list_text(overrides[1:]), flush=True)
-        elif command == "new":
+        if overrides[:1] == ["new"]:
             return _write_new(overrides[1:], flags.arm)
-        elif command == "doctor":
-            from mjstack.jobs.doctor import findings  # it loads Warp
-
-            for name, words in findings(overrides[1:]):
-                print(f"{name:<14} {words}", flush=True)
-        elif flags.help:
+        if flags.help:
             _print_help(overrides)
         elif flags.hydra_help:
             hydra.hydra_help(CONFIG_NAME, args_parser=get_args_parser(), args=flags)
@@ -155,9 +147,9 @@ def _run_one(hydra: Any, overrides: list[str]) -> int:
     from mjstack.jobs import check_ranks
 
     with joined() as ranks:
-        cfg, checked = ranks.alike(lambda: _compose_one(overrides))
-        ranks.alike(lambda: _check_spreads(checked))
-        ranks.alike(lambda: check_ranks(checked.stage))
+        cfg, checked = ranks.on_all_ranks(lambda: _compose_one(overrides))
+        ranks.on_all_ranks(lambda: _check_spreads(checked))
+        ranks.on_all_ranks(lambda: check_ranks(checked.stage))
         return _run_checked(hydra, cfg, checked, overrides)
 
 
@@ -171,8 +163,8 @@ def _compose_one(overrides: list[str]) -> tuple[DictConfig, "CheckedJob"]:
 def _check_spreads(checked: "CheckedJob") -> None:
     if not checked.spreads:
         raise MjstackError(
-            "torchrun, devices: expected a job whose worlds ranks share: gates, train, collect, or"
-            " replay of world=failing. Run this job in one process."
+            "torchrun, devices: expected a job whose worlds ranks share: gates, train or collect."
+            " Run this job in one process."
         )
 
 

@@ -55,10 +55,9 @@ def policy_folder(name: str | Path) -> Path:
     return shipped if is_shipped else Path(name)
 
 
-def shipped_policies() -> dict[str, str]:
-    """The policies that come with mjstack: the first sentence of each card, by name."""
-    cards = {path.parent.name: path.read_text() for path in sorted(SHIPPED.glob("*/card.md"))}
-    return {name: text.splitlines()[2] for name, text in cards.items()}
+def shipped_policies() -> list[str]:
+    """Names of the policies that come with mjstack."""
+    return sorted(path.parent.name for path in SHIPPED.glob("*/card.md"))
 
 
 def config_hash(config: Mapping[str, Any]) -> str:
@@ -70,14 +69,14 @@ def differences(earlier: Mapping[str, Any], current: Mapping[str, Any]) -> str:
     """The first keys in which two configurations differ, such as ``seed=1, expected 2``, and how
     many more do; empty if they are equal.
     """
-    before, now = (
+    old_values, new_values = (
         {k: value for k, value in list_items(config) if value == {} or not isinstance(value, dict)}
         for config in (earlier, current)
     )
     different = [
-        f"{key}={before.get(key, 'missing')}, expected {now.get(key, 'none')}"
-        for key in before | now
-        if before.get(key) != now.get(key)
+        f"{key}={old_values.get(key, 'missing')}, expected {new_values.get(key, 'none')}"
+        for key in old_values | new_values
+        if old_values.get(key) != new_values.get(key)
     ]
     more = f", and {len(different) - 3} more keys" if len(different) > 3 else ""
     return "; ".join(different[:3]) + more

@@ -3,38 +3,29 @@
 Groups and choices are those of the search path; units, ranges and words are those of the fields.
 """
 
-import inspect
 import json
 import re
 import textwrap
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
-from importlib import import_module
 from typing import Any, NamedTuple
 
 from mjstack.config.complete import typed
 from mjstack.config.fields import CHANGES, accepted, field_docs, field_range
-from mjstack.config.fingerprint import shipped_policies
-from mjstack.config.functions import find_object, offered
+from mjstack.config.functions import offered
 from mjstack.config.schema import Config
-from mjstack.config.session import CONFIG_FOLDER, config_folders, list_choices
-from mjstack.errors import UnknownName, require_names
+from mjstack.config.session import CONFIG_FOLDER, list_choices
+from mjstack.errors import UnknownName
 
 _GROUP = re.compile(r"^  - (\w+): (\[.*\]|\S+) # (.+)$", re.MULTILINE)  # name, default, words
-_LISTED = ("tasks", "robots", "terms", "conditions", "gates", "trainers", "policies")
-_FUNCTIONS = ("terms", "conditions")  # the others are groups
-_TERMS = ("action", "observation", "reward", "reset", "termination", "looks")
-_RANGE = re.compile(r"(?:typing\.)?Annotated\[(\w+), Range\(.*?\)\]")
-_PLAIN = re.compile(r"collections\.abc\.|mjstack\.\w+\.\w+\.|torch\.(?=Tensor)| = <.+>$")
 _TEXT = """\
 mjstack: a task of a robot arm, from native MuJoCo to thousands of MuJoCo Warp worlds,\
  verified in gates.
 
 Usage: mjstack [group=choice ...] [key=value ...] [flags]
-       mjstack list [tasks|robots|terms|conditions|gates|trainers|policies]
        mjstack experiment=demo    16 worlds stack by a shipped policy: see episode.html
        mjstack new task|driver|action|robot NAME [FILE.xml]    your own folder
-In a checkout: python scripts/run.py ...  What this machine has: mjstack doctor
+In a checkout: python scripts/run.py ...  Functions of terms: python -m pydoc mjstack.mdp.reward
 
 Examples:
   mjstack robot=rebot nworld=64
@@ -52,7 +43,7 @@ Examples:
   mjstack controller=policy policy=outputs/mine/last 'gates=[success]'
     the policy in the expert's place, in any gate
   mjstack job=play controller=policy policy=outputs/mine/last
-    four worlds of the policy as a video; view=true: in MuJoCo's viewer
+    four worlds of the policy as a video; view=web: in a browser
 
 Groups, to be set as group=choice, and their choices, the default first:
 {groups}
@@ -85,7 +76,7 @@ class Key(NamedTuple):
     name: str
     value: str
     accepts: str
-    words: str
+    meaning: str
     effect: str = ""
 
 
@@ -96,10 +87,10 @@ def list_groups() -> dict[str, tuple[list[str], str]]:
     choices = list_choices()
     text = (CONFIG_FOLDER / "config.yaml").read_text(encoding="utf-8")
     groups = dict.fromkeys(choices, ("", "added by the search path"))
-    known = {name: (default, words) for name, default, words in _GROUP.findall(text)}
+    known = {name: (default, meaning) for name, default, meaning in _GROUP.findall(text)}
     return {
-        name: (sorted(choices[name], key=default.__ne__), words)
-        for name, (default, words) in (known | groups | known).items()
+        name: (sorted(choices[name], key=default.__ne__), meaning)
+        for name, (default, meaning) in (known | groups | known).items()
     }
 
 
@@ -113,17 +104,17 @@ def list_keys(
     """
     docs = field_docs(value.__class__)
     for item in fields(value) if is_dataclass(value) else ():
-        part = getattr(value, item.name)
+        child = getattr(value, item.name)
         key = f"{name}.{item.name}".lstrip(".")
         changes = field_range(item).changes or inherited
-        if is_dataclass(part):
-            yield from list_keys(part, key, named=named, inherited=changes)
-        elif isinstance(part, dict) and any(map(is_dataclass, part.values())):
-            for entry in part if named else list(part)[:1]:
+        if is_dataclass(child):
+            yield from list_keys(child, key, named=named, inherited=changes)
+        elif isinstance(child, dict) and any(map(is_dataclass, child.values())):
+            for entry in child if named else list(child)[:1]:
                 path = f"{key}.{entry if named else 'NAME'}"
-                yield from list_keys(part[entry], path, named=named, inherited=changes)
+                yield from list_keys(child[entry], path, named=named, inherited=changes)
         else:
-            text = "" if ".NAME" in key else _yaml(part)
+            text = "" if ".NAME" in key else _yaml(child)
             effect = " ".join(filter(None, map(CHANGES.get, changes)))
             yield Key(key, text, accepted(type(value), item), docs.get(item.name, ""), effect)
 
@@ -146,13 +137,13 @@ def key_help(cfg: Config, prefix: str, width: int) -> str:
     if not matching:
         parent = prefix.rpartition(".")[0]
         depth = prefix.count(".") + 1
-        beside = [key.name.split(".") for key in keys if f".{key.name}".startswith(f".{parent}")]
-        raise UnknownName("key", prefix, {".".join(names[:depth]) for names in beside})
+        siblings = [key.name.split(".") for key in keys if f".{key.name}".startswith(f".{parent}")]
+        raise UnknownName("key", prefix, {".".join(names[:depth]) for names in siblings})
     lines = []
     for key in matching:
-        text = f"{key.words} Accepts {key.accepts}. {key.effect}"
-        words = textwrap.wrap(text.strip(), width - 2)
-        lines += [f"{key.name}={key.value}", *(f"  {line}" for line in words)]
+        text = f"{key.meaning} Accepts {key.accepts}. {key.effect}"
+        meaning = textwrap.wrap(text.strip(), width - 2)
+        lines += [f"{key.name}={key.value}", *(f"  {line}" for line in meaning)]
     return "\n".join(lines)
 
 
@@ -171,9 +162,11 @@ def _declared_keys(key: str, node: dict[str, Any], attribute: str) -> Iterator[K
 def help_text(cfg: Config, width: int) -> str:
     """The whole text with a configuration's values, in lines of at most ``width``."""
     groups = {
-        name: f"{words}: {', '.join(names)}" for name, (names, words) in list_groups().items()
+        name: f"{meaning}: {', '.join(names)}" for name, (names, meaning) in list_groups().items()
     }
-    keys = {key.name: f"{key.words} ({key.value})" for key in list_keys(cfg) if "." not in key.name}
+    keys = {
+        key.name: f"{key.meaning} ({key.value})" for key in list_keys(cfg) if "." not in key.name
+    }
     for name in (*groups, "unused_terms"):  # which mjstack fills in
         keys.pop(name, None)
     text = _TEXT.format(groups=_table(groups), keys=_table(keys))
@@ -195,53 +188,4 @@ def _yaml(value: object) -> str:
 def _table(rows: Mapping[str, str]) -> str:
     """Two columns, a line for each row."""
     indent = max(map(len, rows)) + 4
-    return "\n".join(f"  {name}".ljust(indent) + words for name, words in rows.items())
-
-
-def list_text(kinds: Sequence[str]) -> str:
-    """List the choices of mjstack and of the search path, a line each; terms alone with their
-    parameters. Without kinds, list all of them; an unknown one is an UnknownName.
-    """
-    require_names("list", kinds, _LISTED)
-    lines = []
-    for kind in kinds or _LISTED:
-        named: Iterable[tuple[str, str]] = shipped_policies().items()
-        if kind != "policies":
-            one_kind = len(kinds) == 1
-            named = _functions(kind, one_kind) if kind in _FUNCTIONS else _files(kind[:-1])
-        lines += [f"{kind}:", *(f"  {name:<12} {words}".rstrip() for name, words in named)]
-    return "\n".join(lines)
-
-
-def _files(group: str) -> Iterator[tuple[str, str]]:
-    """Choices of a group, and the comments that their files begin with."""
-    for folder in (CONFIG_FOLDER, *config_folders()):
-        for path in sorted(folder.glob(f"{group}/*.yaml")):
-            comment = re.search("(?m)^# (?!@)(.+)", path.read_text("utf-8"))
-            yield path.stem, comment[1] if comment else ""
-
-
-def _functions(kind: str, with_parameters: bool) -> Iterator[tuple[str, str]]:
-    """Terms or conditions by their dotted names, and what their docstrings begin with."""
-    modules = ["mjstack.tasks.parts"]
-    text = ""
-    if kind == "terms":  # also those that the search path's files name
-        modules = [f"mjstack.mdp.{name}" for name in _TERMS]
-        paths = [path for folder in config_folders() for path in sorted(folder.rglob("*.yaml"))]
-        text = "".join(path.read_text("utf-8") for path in paths)
-    names = [f"{m}.{name}" for m in modules for name in vars(import_module(m)) if name[0] != "_"]
-    for name in dict.fromkeys([*names, *re.findall(r"func: ([\w.]+)", text)]):
-        func: Any = find_object("list", name)
-        if getattr(func, "__module__", "") != name.rpartition(".")[0] or not callable(func):
-            continue
-        options = inspect.signature(func).parameters
-        if kind == "conditions" and next(iter(options), "") == "step":  # a helper of conditions
-            continue
-        doc = inspect.getdoc(func) or ""
-        yield name, " ".join(doc.partition("\n\n")[0].split()).partition(". ")[0]
-        called = func.__init__ if inspect.isclass(func) else func
-        notes = dict(re.findall(r"(?m)^ +(\w+): (.+)$", inspect.getdoc(called) or ""))
-        for option in options.values() if with_parameters else ():
-            if option.kind is option.KEYWORD_ONLY:
-                text = _PLAIN.sub("", _RANGE.sub(r"\1", str(option)))
-                yield "", f"{text}. {notes.get(option.name, '')}"
+    return "\n".join(f"  {name}".ljust(indent) + meaning for name, meaning in rows.items())

@@ -8,7 +8,6 @@ from operator import mul
 
 from mjstack.config.fields import FITS, spec
 
-SEEN = (*FITS, "images")  # what a policy sees
 OUTPUTS = ("rgb", "depth", "segmentation")
 _ROUND = (2, "radius and half length")
 SHAPES = {  # and the sizes of each
@@ -234,11 +233,11 @@ class CameraPoseCfg:
 class CameraCfg:
     """A camera, whose images are observations. Vertical field of view and size give its rays."""
 
-    pose: CameraPoseCfg | None = spec(None, changes=SEEN)
+    pose: CameraPoseCfg | None = spec(None, changes=FITS)
     """Its pose. null: ``robot.wrist_camera``, on the gripper."""
-    size: list[int] = spec([128, 128], unit="pixels", length=2, ge=1, le=4096, changes=SEEN)
+    size: list[int] = spec([128, 128], unit="pixels", length=2, ge=1, le=4096, changes=FITS)
     """Height and width of the image."""
-    fovy: float = spec(45.0, unit="deg", ge=1.0, le=170.0, changes=SEEN)
+    fovy: float = spec(45.0, unit="deg", ge=1.0, le=170.0, changes=FITS)
     """Vertical field of view."""
     rate: float | None = spec(None, unit="Hz", gt=0.0)
     """Images per second. null: one in every control step."""
@@ -252,7 +251,7 @@ class CameraCfg:
 class SceneCfg:
     """A table, and objects and places on it."""
 
-    name: str = spec(changes=("episodes", "images"))
+    name: str = spec()
     """Its name, which selects the robot's ``placements``."""
     table_center: list[float] = spec(unit="m", length=3)
     """Centre of the table, a box."""
@@ -279,7 +278,9 @@ class SceneCfg:
     @property
     def free(self) -> dict[str, ObjectCfg]:
         """The objects that move."""
-        return {name: thing for name, thing in self.objects.items() if not thing.fixed}
+        return {
+            name: object_cfg for name, object_cfg in self.objects.items() if not object_cfg.fixed
+        }
 
     @property
     def table_top(self) -> float:
