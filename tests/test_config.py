@@ -215,7 +215,7 @@ BAD = [
     (["trainer=ppo", "job.chunk=3"], "configuration key 'job.chunk' does not exist. "),
     (["=3"], "=3: "),
     (["nworld"], "override 'nworld' cannot be read: expected key=value"),
-    (["lst"], "override 'lst' cannot be read: expected key=value"),
+    (["lst"], "expected key=value, or a command. Did you mean 'list'?"),
     (
         ["~reward.progres"],
         "~reward.progres: there is none to leave out. Did you mean 'reward.progress'?",
