@@ -23,6 +23,7 @@ from mjstack.errors import FolderError
 from mjstack.gates.episodes import gate_config
 from mjstack.math import norm
 from mjstack.mdp.geometry import robot, zeros
+from mjstack.mdp.starts.starts_file import start_arrays
 from mjstack.policy import load_policy, save_policy
 from mjstack.policy.network import PolicyNetwork
 from mjstack.scene.build import build_model
@@ -87,6 +88,9 @@ def test_servos_are_one_model_each_and_off_from_it_joint_by_joint(backend: str) 
             assert np.ptp(factors) > 0.02
         assert not np.allclose(gain, dry, atol=0.01)
     assert drawn == {0, 1}
+    starts = start_arrays(env)  # which gate success writes
+    assert not any(name.endswith("_mass") for name in starts)
+    assert starts["gain_gripper"].min() < 0.1
     env.close()
 
 
@@ -189,7 +193,9 @@ def test_the_servos_inverse_holds_the_arm_up() -> None:
 
 @pytest.mark.parametrize("known", [True, False])
 def test_the_expert_knows_where_the_arm_is(known: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It stacks under all differences at once, and fails where it takes what joints read for true."""
+    """It stacks under all differences at once, and fails where it takes a joint's reading for
+    true.
+    """
     if not known:
         monkeypatch.setattr(feedback, "zeros", lambda _: None)
     names = ("servos", "zeros", "delay", "backlash", "grip", "objects", "table")
