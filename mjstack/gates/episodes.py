@@ -127,7 +127,7 @@ def _play(run: Run, tally: EpisodeTally) -> int | None:
     try:
         with closing(play_batches(stage, plans, observers=observe)) as batches:
             for batch in batches:
-                rank_record = EpisodeRecord.from_batch(ranks, batch, monitor)
+                rank_record = EpisodeRecord.from_batch(batch, monitor)
                 record = EpisodeRecord.join(ranks.gather(rank_record))
                 # Before the next one can break or be stopped. A full disk takes no result back.
                 tally.write(record_name(run.gate, record.seed), write_npz, record.arrays())
