@@ -25,7 +25,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mjstack.cli_sweep import check_jobs, claim_sweep, expand, hydra_path, print_sweep
 from mjstack.config.explain import own_overrides
-from mjstack.config.help import help_text, key_help
+from mjstack.config.help import help_text, key_help, list_text
 from mjstack.config.load import compose, extended_search_path, to_config
 from mjstack.config.session import (
     CONFIG_NAME,
@@ -87,10 +87,18 @@ def run(args: list[str]) -> int:
 
 def _dispatch(flags: Namespace, overrides: list[str]) -> int:
     """Do what the flags ask for, on the current search path."""
+    command = overrides[0] if overrides else ""
     with hydra_session() as hydra:
-        if overrides[:1] == ["new"]:
+        if command == "list":
+            print(list_text(overrides[1:]), flush=True)
+        elif command == "new":
             return _write_new(overrides[1:], flags.arm)
-        if flags.help:
+        elif command == "doctor":
+            from mjstack.jobs.doctor import findings  # it loads Warp
+
+            for name, words in findings(overrides[1:]):
+                print(f"{name:<14} {words}", flush=True)
+        elif flags.help:
             _print_help(overrides)
         elif flags.hydra_help:
             hydra.hydra_help(CONFIG_NAME, args_parser=get_args_parser(), args=flags)

@@ -25,12 +25,15 @@ from mjstack.distributed import Ranks
 from mjstack.envs import Env, build_env, driven_config
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
-from mjstack.errors import ArgumentError, ConfigError
+from mjstack.errors import ArgumentError, ConfigError, FolderError
+from mjstack.gates import images as gate_images
 from mjstack.gates.capacity import run_capacity
+from mjstack.gates.images import agree, compare_images
+from mjstack.gates.parity import run_parity
 from mjstack.gates.throughput import run_throughput
 from mjstack.jobs import gates
 from mjstack.jobs.runner import check_job
-from mjstack.report.record import Status
+from mjstack.report.record import GateResult, Status
 from mjstack.scene import build_model
 from mjstack.sim import StateRenderer
 from mjstack.sim import cameras as sim_cameras
@@ -387,6 +390,110 @@ def test_states_are_drawn_later_as_they_were(make: Make, backend: str) -> None:
 # Gates
 
 
+def painted(offset: int, color: int) -> dict[str, np.ndarray]:
+    """Two images of a 20 x 20 thing on another, at an offset and of a colour."""
+    things = np.zeros((2, 64, 64), np.int32)
+    things[:, 20:40, 20 + offset : 40 + offset] = 1
+    colors = np.where(things[..., None] == 1, color, 50).repeat(3, -1).astype(np.uint8)
+    depth = things[..., None].astype(np.float32)
+    return {"images.c": colors, "depth.c": depth, "segmentation.c": things}
+
+
+def test_agreement_of_images() -> None:
+    labels = ["floor", "cube"]
+    same = agree("c", painted(0, 200), painted(0, 200), labels, 100)
+    assert (same.same, same.color, same.depth) == (1.0, 0.0, 0.0)
+    assert same.iou == {"floor": 1.0, "cube": 1.0}
+    moved = agree("c", painted(0, 200), painted(1, 200), labels, 100)
+    assert moved.iou["cube"] == pytest.approx(19 / 21)
+    assert moved.color == 0.0  # where both show the same thing
+    assert moved.same == pytest.approx(1 - 40 / 4096)
+    darker = agree("c", painted(0, 200), painted(0, 190), labels, 100)
+    assert darker.color == pytest.approx(10 * 400 / 4096)
+    small = agree("c", painted(0, 200), painted(1, 200), labels, 841)
+    assert (list(small.iou), small.left_out) == (["floor"], ["cube"])
+    other = painted(0, 200)
+    other["segmentation.c"] = other["segmentation.c"] + 2
+    assert agree("c", painted(0, 200), other, labels, 100).color == np.inf
+
+
+def test_images_that_compare_too_little_fail(monkeypatch: Patch) -> None:
+    """A cube wholly elsewhere, of too few pixels for an intersection over union: with nothing else
+    to compare but the background, and beside a robot that agrees.
+    """
+    labels = ["table", "red", "gripper"]
+
+    def images(size: int, cube: int, robot: int) -> dict[str, np.ndarray]:
+        things = np.zeros((12, size, size), np.int32)
+        things[:, cube : cube + 3, :3] = 1
+        things[:, :robot, size - robot :] = 2
+        return {
+            "segmentation.front": things,
+            "images.front": np.zeros((*things.shape, 3), np.uint8),
+            "depth.front": np.zeros((*things.shape, 1), np.float32),
+        }
+
+    monkeypatch.setattr(gate_images, "require_offscreen", lambda model: None)
+    stage = Stage(load_config(["cameras=front", "gate.parity.images=x.npz"]))
+    elsewhere = Run(stage)
+    for size, robot, says in (
+        (8, 0, ["nothing but the background has gate.parity.image_pixels=1000 ", "is 0.7188"]),
+        (64, 40, ["front: same thing is 0.9956, expected at least"]),
+    ):
+        mjwarp = images(size, 0, robot)
+        native = images(size, size - 3, robot)
+        monkeypatch.setattr(gate_images, "load_images", lambda cfg, m=mjwarp: (np.zeros(1), m))
+        monkeypatch.setattr(gate_images, "_draw_states", lambda *args, n=native: (n, labels))
+        result = GateResult(name="parity", status=Status.passed)
+        problems = compare_images(elsewhere, result)
+        assert len(problems) == len(says)
+        assert all(says[k] in problem for k, problem in enumerate(problems))
+        assert "image_pixels=1000 pixels: " in result.details[0]
+        assert "red" in result.details[0]
+
+
+@GL
+@pytest.mark.full
+def test_parity_compares_images_here_and_elsewhere(tmp_path: Path) -> None:
+    overrides = ["gates=[parity]", "sim=mjwarp", "sim.device=cpu"]
+    overrides += [*at_double_speed(), *small("front", "top", "wrist", size=128)]
+    (result,) = run_parity(Run(Stage(load_config(overrides)), folder=tmp_path))
+    assert result.status is Status.passed
+    assert result.metrics["images.front.iou.red"] > 0.99
+    assert 0.0 < result.metrics["images.wrist.color_of_255"] < 3.0
+    assert (tmp_path / "parity_images.png").stat().st_size > 10_000
+    # The same file on another machine, and one that shows something else
+    file = tmp_path / "parity_images.npz"
+    cfg = load_config([*overrides, f"gate.parity.images={file}"])
+    stage = Stage(cfg)
+    elsewhere = Run(stage)
+    apart = GateResult(name="parity", status=Status.passed)
+    assert compare_images(elsewhere, apart) == []
+    for name in ("images.front.iou.red", "images.wrist.color_of_255"):
+        assert apart.metrics[name] == result.metrics[name]
+    with np.load(file) as saved:
+        arrays = dict(saved)
+    arrays["images.top"] += 20
+    arrays["segmentation.front"] = np.roll(arrays["segmentation.front"], 3, axis=2)
+    np.savez(file, **arrays)
+    other = GateResult(name="parity", status=Status.passed)
+    problems = compare_images(elsewhere, other)
+    assert any(problem.startswith("images, front, iou: red is 0.") for problem in problems)
+    assert any(problem.startswith("images, top: color of 255 is") for problem in problems)
+    # Files that cannot be compared are one line, before anything is written.
+    there = f"gate.parity.images={file}"
+    size = "scene.cameras.front.size=[64,64]"
+    for args, message in (
+        ([*overrides[:3], *small("front")], r"drawn with .*top.* expected none"),
+        ([*overrides, size], r"scene.cameras.front.size=\[128, 128\], expected \[64, 64\]"),
+    ):
+        with pytest.raises(FolderError, match=message):
+            check_job(load_config([*args, there]))
+    file.write_bytes(b"nothing")
+    with pytest.raises(FolderError, match=r"parity_images\.npz: cannot be read"):
+        check_job(load_config([*overrides, there]))
+
+
 @GL
 @pytest.mark.full
 def test_throughput_and_capacity_count_images() -> None:
@@ -461,6 +568,7 @@ def test_rsl_rl_gets_images_and_keeps_them(make: Make) -> None:
         ("robot.wrist_camera=null", "scene.cameras.wrist.pose=null: expected a pose"),
         ("robot.wrist_camera.mount=lid", "scene.cameras.wrist.pose.mount: body 'lid'"),
         ("cameras=side", "'side' does not exist. Available: front, top, wrist"),
+        ("cameras=[] gate.parity.images=x.npz", "gate.parity.images=x.npz: expected null, because"),
     ],
 )
 def test_a_bad_value_is_one_line(overrides: str, message: str) -> None:

@@ -215,7 +215,7 @@ BAD = [
     (["trainer=ppo", "job.chunk=3"], "configuration key 'job.chunk' does not exist. "),
     (["=3"], "=3: "),
     (["nworld"], "override 'nworld' cannot be read: expected key=value"),
-    (["lst"], "override 'lst' cannot be read: expected key=value"),
+    (["lst"], "expected key=value, or a command. Did you mean 'list'?"),
     (
         ["~reward.progres"],
         "~reward.progres: there is none to leave out. Did you mean 'reward.progress'?",
@@ -390,7 +390,7 @@ def test_the_next_composition_is_not_touched(tmp_path: Path) -> None:
     assert seen[1] == seen[3] == "mjstack.mdp.action.JointPosition"
 
 
-RESULTS = ("report", "training", "episodes", "policy")  # as of `fields.CHANGES`
+RESULTS = ("report", "training", "episodes", "policy", "images")  # as of `fields.CHANGES`
 EFFECTS = {
     "web.port=9000": "",
     "graph=off": "report",
@@ -403,7 +403,7 @@ EFFECTS = {
     "scene.cameras.front.rate=10": "episodes",
     "robot.home=[0,0,0.5,1.1,1.5,0.7]": "episodes policy",
     "scene.objects.red.size=[0.02,0.02,0.02]": "episodes policy",
-    "scene.cameras.front.fovy=50": "episodes policy",
+    "scene.cameras.front.fovy=50": "episodes policy images",
 }
 
 

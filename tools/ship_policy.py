@@ -79,7 +79,7 @@ def judge(folder: Path, reset: str, seeds: int, nworld: int, rate: float) -> Gat
 def write_card(
     training: Path, which: str, name: str, policy: Policy, judged: dict[str, GateResult]
 ) -> str:
-    """The card in Markdown."""
+    """The card in Markdown; its third line is what ``mjstack list policies`` prints."""
     made = json.loads((training / "report.json").read_text())["provenance"]
     here = collect_provenance()
     overrides = (training / ".hydra" / "overrides.yaml").read_text().splitlines()

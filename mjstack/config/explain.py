@@ -25,6 +25,7 @@ from mjstack.config.fields import accepted, find_field
 from mjstack.config.schema import Config, GateCfg
 from mjstack.errors import MjstackError, UnknownName, first_line, shorten, suggest
 
+COMMANDS = ("doctor", "list", "new")  # first words of a command line
 LISTS = ("cameras", "experiment")  # groups of which several may be chosen
 TERM_GROUPS = ("action", "observation", "reset", "termination", "reward")
 
@@ -61,15 +62,19 @@ def parse(override: str) -> Override:
     try:
         return OverridesParser.create().parse_override(override)
     except HydraException as error:
-        fix = (
-            "A value with a bracket, a quote, a letter beyond ASCII or one of = , : ; # & ! < > ^ ~"
-            " ` needs double quotes inside of single ones: 'policy=\"run (1)\"'"
-        )
-        for group, names in session.list_choices().items():
-            if override in names:
-                fix = f"Write {group}={override}"
-        problem = f"override {shorten(override, 60)!r} cannot be read: expected key=value without"
-        raise MjstackError(f"{problem} spaces around the sign", fix) from error
+        if override.isidentifier():
+            problem = f"override {override!r} cannot be read: expected key=value, or a command"
+            advice = suggest(override, COMMANDS)
+            for group, names in session.list_choices().items():
+                if override in names:
+                    advice = f"Write {group}={override}."
+            raise MjstackError(f"{problem}. {advice}") from error
+        raise MjstackError(
+            f"override {shorten(override, 60)!r} cannot be read: expected key=value without spaces"
+            " around the sign. A value with a bracket, a quote, a letter beyond ASCII or"
+            " one of = , : ; # & ! < > ^ ~ ` needs double quotes inside of single ones:"
+            " 'policy=\"run (1)\"'."
+        ) from error
 
 
 def assign(key: str, value: object) -> str:

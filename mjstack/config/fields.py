@@ -36,6 +36,7 @@ CHANGES = {
     "report": "It changes no episode.",
     "nothing": "It changes no result.",
     "policy": "A policy fits the value of its training alone.",
+    "images": "",  # states drawn by a camera
 }
 FITS = ("episodes", "policy")
 _SPEC = "mjstack"  # key of a field's metadata

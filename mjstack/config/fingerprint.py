@@ -55,9 +55,10 @@ def policy_folder(name: str | Path) -> Path:
     return shipped if is_shipped else Path(name)
 
 
-def shipped_policies() -> list[str]:
-    """Names of the policies that come with mjstack."""
-    return sorted(path.parent.name for path in SHIPPED.glob("*/card.md"))
+def shipped_policies() -> dict[str, str]:
+    """The policies that come with mjstack: the first sentence of each card, by name."""
+    cards = {path.parent.name: path.read_text() for path in sorted(SHIPPED.glob("*/card.md"))}
+    return {name: text.splitlines()[2] for name, text in cards.items()}
 
 
 def config_hash(config: Mapping[str, Any]) -> str:

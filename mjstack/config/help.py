@@ -3,29 +3,38 @@
 Groups and choices are those of the search path; units, ranges and words are those of the fields.
 """
 
+import inspect
 import json
 import re
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
+from importlib import import_module
 from typing import Any, NamedTuple
 
 from mjstack.config.complete import typed
 from mjstack.config.fields import CHANGES, accepted, field_docs, field_range
-from mjstack.config.functions import offered
+from mjstack.config.fingerprint import shipped_policies
+from mjstack.config.functions import find_object, offered
 from mjstack.config.schema import Config
-from mjstack.config.session import CONFIG_FOLDER, list_choices
-from mjstack.errors import UnknownName
+from mjstack.config.session import CONFIG_FOLDER, config_folders, list_choices
+from mjstack.errors import UnknownName, require_names
 
 _GROUP = re.compile(r"^  - (\w+): (\[.*\]|\S+) # (.+)$", re.MULTILINE)  # name, default, words
+_LISTED = ("tasks", "robots", "terms", "conditions", "gates", "trainers", "policies")
+_FUNCTIONS = ("terms", "conditions")  # the others are groups
+_TERMS = ("action", "observation", "reward", "reset", "termination", "looks")
+_RANGE = re.compile(r"(?:typing\.)?Annotated\[(\w+), Range\(.*?\)\]")
+_PLAIN = re.compile(r"collections\.abc\.|mjstack\.\w+\.\w+\.|torch\.(?=Tensor)| = <.+>$")
 _TEXT = """\
 mjstack: a task of a robot arm, from native MuJoCo to thousands of MuJoCo Warp worlds,\
  verified in gates.
 
 Usage: mjstack [group=choice ...] [key=value ...] [flags]
+       mjstack list [tasks|robots|terms|conditions|gates|trainers|policies]
        mjstack experiment=demo    16 worlds stack by a shipped policy: see episode.html
        mjstack new task|driver|action|robot NAME [FILE.xml]    your own folder
-In a checkout: python scripts/run.py ...  Functions of terms: python -m pydoc mjstack.mdp.reward
+In a checkout: python scripts/run.py ...  What this machine has: mjstack doctor
 
 Examples:
   mjstack robot=rebot nworld=64
@@ -189,3 +198,52 @@ def _table(rows: Mapping[str, str]) -> str:
     """Two columns, a line for each row."""
     indent = max(map(len, rows)) + 4
     return "\n".join(f"  {name}".ljust(indent) + meaning for name, meaning in rows.items())
+
+
+def list_text(kinds: Sequence[str]) -> str:
+    """List the choices of mjstack and of the search path, a line each; terms alone with their
+    parameters. Without kinds, list all of them; an unknown one is an UnknownName.
+    """
+    require_names("list", kinds, _LISTED)
+    lines = []
+    for kind in kinds or _LISTED:
+        named: Iterable[tuple[str, str]] = shipped_policies().items()
+        if kind != "policies":
+            one_kind = len(kinds) == 1
+            named = _functions(kind, one_kind) if kind in _FUNCTIONS else _files(kind[:-1])
+        lines += [f"{kind}:", *(f"  {name:<12} {words}".rstrip() for name, words in named)]
+    return "\n".join(lines)
+
+
+def _files(group: str) -> Iterator[tuple[str, str]]:
+    """Choices of a group, and the comments that their files begin with."""
+    for folder in (CONFIG_FOLDER, *config_folders()):
+        for path in sorted(folder.glob(f"{group}/*.yaml")):
+            comment = re.search("(?m)^# (?!@)(.+)", path.read_text("utf-8"))
+            yield path.stem, comment[1] if comment else ""
+
+
+def _functions(kind: str, with_parameters: bool) -> Iterator[tuple[str, str]]:
+    """Terms or conditions by their dotted names, and what their docstrings begin with."""
+    modules = ["mjstack.tasks.parts"]
+    text = ""
+    if kind == "terms":  # also those that the search path's files name
+        modules = [f"mjstack.mdp.{name}" for name in _TERMS]
+        paths = [path for folder in config_folders() for path in sorted(folder.rglob("*.yaml"))]
+        text = "".join(path.read_text("utf-8") for path in paths)
+    names = [f"{m}.{name}" for m in modules for name in vars(import_module(m)) if name[0] != "_"]
+    for name in dict.fromkeys([*names, *re.findall(r"func: ([\w.]+)", text)]):
+        func: Any = find_object("list", name)
+        if getattr(func, "__module__", "") != name.rpartition(".")[0] or not callable(func):
+            continue
+        options = inspect.signature(func).parameters
+        if kind == "conditions" and next(iter(options), "") == "step":  # a helper of conditions
+            continue
+        doc = inspect.getdoc(func) or ""
+        yield name, " ".join(doc.partition("\n\n")[0].split()).partition(". ")[0]
+        called = func.__init__ if inspect.isclass(func) else func
+        notes = dict(re.findall(r"(?m)^ +(\w+): (.+)$", inspect.getdoc(called) or ""))
+        for option in options.values() if with_parameters else ():
+            if option.kind is option.KEYWORD_ONLY:
+                text = _PLAIN.sub("", _RANGE.sub(r"\1", str(option)))
+                yield "", f"{text}. {notes.get(option.name, '')}"

@@ -16,6 +16,7 @@ from mjstack.config.schema import Backend
 from mjstack.episodes.recorder import WorldRecorder
 from mjstack.episodes.rollout import State, restore
 from mjstack.episodes.run import Run, needs_episode
+from mjstack.gates.images import compare_images
 from mjstack.gates.parity_states import SWUNG, compared_states
 from mjstack.managers.episode import required_fields
 from mjstack.math import quat_angle, quat_to_matrix
@@ -70,10 +71,15 @@ def _compare(run: Run, mjwarp: Simulation) -> GateResult:
     result.figures += [*judged.figures, *peaks, Figure("episode", episode.timing.seconds, "s")]
     deviations, ends = _compare_ends(run, world.qpos[-1], result, rounded=not problems)
     problems += deviations
+    if run.cfg.scene.cameras:
+        problems += compare_images(run, result)
 
     run.print_line(f"{run.cfg.task.name} check: {headline} ({mjwarp.description})")
     run.show_world("parity", "parity, MJWarp", world.qpos, episode, world.env, "parity world")
-    result.reason = "; ".join(problems or [headline, *ends])
+    summary = "; ".join([headline, *ends])
+    if "images" in result.notes:
+        summary += "; images were not compared"
+    result.reason = "; ".join(problems) or summary
     result.status = Status.failed if problems else Status.passed
     return result
 

@@ -10,6 +10,7 @@ from mjstack.envs import driven_config
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError, MjstackError, Unreachable, renamed_keys
 from mjstack.gates.episodes import gate_config
+from mjstack.gates.images import load_images
 from mjstack.gates.runner import find_gates, run_gates
 from mjstack.jobs.runner import VIEWS, CheckedJob, Job, count_devices
 from mjstack.jobs.showing import check_showing
@@ -40,6 +41,9 @@ def check_machine(cfg: Config) -> Stage:
             expected = f"a gate that shows worlds: {', '.join(names)}"
             raise ConfigError(key, value, expected, "Add one of them to gates")
     check_showing(cfg)
+    if "parity" in cfg.gates and cfg.gate.parity.images is not None:
+        load_images(cfg)
+        require_offscreen(stage.model)
     _check_starts(stage)
     batch = cfg.episode_gates or "throughput" in cfg.gates
     if batch and stage.backend[0] is Backend.native:

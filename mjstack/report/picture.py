@@ -3,7 +3,7 @@
 import copy
 import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageDraw
 
 from mjstack.errors import MissingExtra
 from mjstack.interrupt import check_interrupt
@@ -176,3 +176,18 @@ def _write_loop(path: Path, frames: Iterator[Image.Image], count: int, dt: float
         loop=0,
         **_LOOPS[path.suffix],
     )
+
+
+def save_images(
+    path: Path, rows: Mapping[str, Sequence[np.ndarray]], columns: Sequence[str]
+) -> None:
+    """Save images, each of shape ``(height, width, 3)``, uint8, in named rows and columns."""
+    side = 256
+    picture = Image.new("RGB", (side * len(columns), side * len(rows)))
+    draw = ImageDraw.Draw(picture)
+    for i, (name, images) in enumerate(rows.items()):
+        for j, (column, image) in enumerate(zip(columns, images, strict=True)):
+            at = (side * j, side * i)
+            picture.paste(Image.fromarray(image).resize((side, side)), at)
+            draw.text(at, f" {name}, {column}", stroke_width=1, stroke_fill="black")
+    picture.save(path)

@@ -101,8 +101,9 @@ def torch_stream_scope(device: wp.Device) -> AbstractContextManager[object]:
 
 
 wp.config.log_level = wp.LOG_ERROR  # it would greet on every run
+CACHE_PROBLEM = ""  # a sentence; empty if kernels are kept for later runs
 if wp.config.kernel_cache_dir is None:  # else the caller has set it, or has used Warp
-    wp.config.kernel_cache_dir, _ = _kernel_cache()
+    wp.config.kernel_cache_dir, CACHE_PROBLEM = _kernel_cache()
 if not _has_driver():
     with suppress(OSError):  # of a closed error output, which shows nothing anyway
         _init_without_driver()

@@ -13,7 +13,7 @@ from mjstack.config.schema.scene import CameraPoseCfg
 class ModelCfg:
     """Source of the robot's MJCF file."""
 
-    source: str = spec(choices=("builtin", "menagerie"))
+    source: str = spec(choices=("builtin", "menagerie"), changes=("episodes", "images"))
     """``builtin``: ``robot.file``, or mjstack's own file. ``menagerie``: MuJoCo Menagerie's."""
 
 
@@ -80,7 +80,7 @@ class RobotCfg:
     Every joint named here has a position servo, and a range. Joint values are rad, or m for slides.
     """
 
-    name: str = spec(changes=FITS)
+    name: str = spec(changes=(*FITS, "images"))
     """The robot's name."""
     title: str = ""
     """The name in tables and reports. Empty: ``name``."""

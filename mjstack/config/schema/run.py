@@ -137,6 +137,22 @@ class ParityCfg(GateFuncCfg):
     """Largest difference of an object's position after the whole task."""
     object_rotation_deg: float = spec(unit="deg", ge=0.0)
     """Largest difference of an object's orientation after the whole task."""
+    images: str | None = None
+    """With cameras: ``parity_images.npz`` of a run elsewhere, whose images are compared with native
+    MuJoCo's instead of images that MJWarp draws here."""
+    image_states: int = spec(unit="states", ge=1, le=10_000)
+    """With cameras: states of the reference episode that both backends draw."""
+    image_same: float = spec(ge=0.0, le=1.0)
+    """Smallest share of the pixels in which both backends show the same thing."""
+    image_iou: float = spec(ge=0.0, le=1.0)
+    """Smallest intersection over union of a thing in the images of both backends."""
+    image_pixels: int = spec(unit="pixels", ge=1, le=MOST_COUNT)
+    """Things with fewer pixels in all images of a camera are not compared. A camera in which only
+    the background has as many fails."""
+    image_color: float = spec(unit="of 255", ge=0.0)
+    """Largest mean difference of colours, where both show the same thing."""
+    image_depth: float = spec(unit="m", ge=0.0)
+    """Largest median difference of depths, where both show the same thing."""
 
 
 @dataclass(slots=True)

@@ -8,6 +8,7 @@ from operator import mul
 
 from mjstack.config.fields import FITS, spec
 
+SEEN = (*FITS, "images")  # what a policy sees
 OUTPUTS = ("rgb", "depth", "segmentation")
 _ROUND = (2, "radius and half length")
 SHAPES = {  # and the sizes of each
@@ -233,11 +234,11 @@ class CameraPoseCfg:
 class CameraCfg:
     """A camera, whose images are observations. Vertical field of view and size give its rays."""
 
-    pose: CameraPoseCfg | None = spec(None, changes=FITS)
+    pose: CameraPoseCfg | None = spec(None, changes=SEEN)
     """Its pose. null: ``robot.wrist_camera``, on the gripper."""
-    size: list[int] = spec([128, 128], unit="pixels", length=2, ge=1, le=4096, changes=FITS)
+    size: list[int] = spec([128, 128], unit="pixels", length=2, ge=1, le=4096, changes=SEEN)
     """Height and width of the image."""
-    fovy: float = spec(45.0, unit="deg", ge=1.0, le=170.0, changes=FITS)
+    fovy: float = spec(45.0, unit="deg", ge=1.0, le=170.0, changes=SEEN)
     """Vertical field of view."""
     rate: float | None = spec(None, unit="Hz", gt=0.0)
     """Images per second. null: one in every control step."""
@@ -251,7 +252,7 @@ class CameraCfg:
 class SceneCfg:
     """A table, and objects and places on it."""
 
-    name: str = spec()
+    name: str = spec(changes=("episodes", "images"))
     """Its name, which selects the robot's ``placements``."""
     table_center: list[float] = spec(unit="m", length=3)
     """Centre of the table, a box."""

@@ -1,21 +1,61 @@
-"""The folder of compiled kernels, and what Warp writes while it starts."""
+"""``mjstack doctor``: one page on a machine."""
 
 import os
 import re
 import subprocess
 import sys
 import tempfile
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import pytest
-from environments import Patch
+import torch
+from compositions import load_config
+from environments import Capture, Patch, Refused
 
-from mjstack.sim import warp_setup
+import mjstack
+import mjstack.jobs.doctor as doctor
+from mjstack.cli import run
+from mjstack.errors import MjstackError
+from mjstack.sim import resolve_sizes, warp_setup
 from mjstack.sim.warp_setup import wp
 
 CACHE = "WARP_CACHE_PATH"
 CAPTURED: Any = {"capture_output": True, "text": True, "timeout": 120}
+
+
+def test_a_page_on_this_machine(capsys: Capture, monkeypatch: Patch, refused: Refused) -> None:
+    """What fails here says what to do; the page goes on below it."""
+
+    def fails(model: object) -> None:
+        raise MjstackError("offscreen rendering fails", "Set MUJOCO_GL=egl or osmesa")
+
+    monkeypatch.setattr(doctor, "require_offscreen", fails)
+    monkeypatch.setitem(doctor._EXTRAS, "odd", "no-such-package")
+    assert run(["doctor", "robot=rebot", "nworld=3", "sim=native"]) == 0
+    text = capsys.readouterr().out
+    lines = dict(re.findall(r"(?m)^(\S[\w ]*?)  +(.+)$", text))
+    assert lines["mjstack"].startswith(f"{mjstack.__version__}, commit ")
+    for package in ("mujoco", "mujoco-warp", "warp-lang", "mink"):
+        assert f"{package} {metadata.version(package)}" in lines["packages"]
+    assert "odd: no-such-package is not installed" in lines["extras"]
+    assert f"{os.cpu_count()} cores" in lines["processor"]
+    assert torch.__version__ in lines["torch"]
+    assert lines["OpenGL"].endswith("rendering fails. Set MUJOCO_GL=egl or osmesa.")
+    sizes = resolve_sizes(load_config(["robot=rebot"]))
+    assert "rebot, task stack, 3 worlds: " in lines["buffers"]
+    assert lines["backend"] == "native on cpu"
+    assert f"batch.nconmax={sizes.nconmax}" in lines["buffers"]
+    assert "'robt' does not exist. Did you mean 'robot'?" in refused("doctor", "robt=so101")
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a CUDA device is here")
+def test_no_gpu_has_a_reason(capsys: Capture) -> None:
+    assert run(["doctor", "sim.device=cuda:0"]) == 0
+    text = capsys.readouterr().out
+    assert re.search(r"(?m)^GPU +none that torch can use \(driver: ", text)
+    assert re.search(r"(?m)^backend +none: .*cuda:0", text)
 
 
 IMPORT = "from mjstack.sim.warp_setup import wp; print(wp.config.kernel_cache_dir)"
@@ -84,20 +124,26 @@ def test_kernels_of_a_cache_that_is_read_alone(monkeypatch: Patch, tmp_path: Pat
     assert "Permission denied" in problem
 
 
-def test_no_folder_for_kernels_is_one_line(tmp_path: Path) -> None:
+def test_the_page_ends_where_no_folder_can_be_written(tmp_path: Path) -> None:
     """Not even a temporary one; in a process of its own, which has not loaded Warp."""
     script = (
         "import sys, tempfile\n"
         "def none(*args, **kwargs): raise FileNotFoundError(2, 'No usable temporary directory')\n"
         "tempfile.mkdtemp = none\n"
-        "import mjstack.sim.warp_setup"
+        "from mjstack.cli import run\n"
+        "sys.exit(run(['doctor', 'nworld=3']))"
     )
     env = os.environ | {CACHE: "/dev/null/cache"}
     done = subprocess.run([sys.executable, "-c", script], env=env, **CAPTURED)
-    assert done.stderr.splitlines()[-1].endswith(
-        "kernel cache /dev/null/cache: cannot be written (Not a directory), and there is no"
+    assert done.returncode == 0, done.stderr
+    lines = dict(re.findall(r"(?m)^(\S[\w ]*?)  +(.+)$", done.stdout))
+    assert lines["kernel cache"] == (
+        "none: kernel cache /dev/null/cache: cannot be written (Not a directory), and there is no"
         " temporary folder. Set WARP_CACHE_PATH to a folder of yours."
     )
+    assert lines["OpenGL"]
+    assert lines["buffers"].startswith("none: kernel cache /dev/null/cache: ")
+    assert list(lines)[-1] == "backend"
 
 
 @pytest.mark.skipif(warp_setup._has_driver(), reason="a CUDA driver is here")
