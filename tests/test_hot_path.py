@@ -67,7 +67,7 @@ PATHS: dict[str, dict[str, str] | None] = {
             "clear value pose pos center quat velocity turn height bounds speed corner_speed "
             "pressed tilt in_hand untouched narrowest supported judged _judged _of_each _sensed"
         ),
-        "AllOf": "__call__ apart __and__",
+        "AllOf": "__call__ by_part __and__",
     },
     "tasks/parts.py": {
         "": "airborne in_hand on_top offset on_table upright in_zone released on_top_of",
@@ -81,7 +81,7 @@ PATHS: dict[str, dict[str, str] | None] = {
         "StackSuccess": "_record_step _replace_oldest __call__",
     },
     "tasks/box.py": {
-        "BoxCheck": "airborne outside over placed goals",
+        "BoxCheck": "airborne outside over_box placed goals",
         "_CarriedOver _Release _Settled _Order": "update",
         "_Drop": "update holds",
         "BoxSuccess": "__init__",
