@@ -18,9 +18,9 @@ _SHAPES = range(mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_MESH + 1)
 _HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 _BEYOND = {_HINGE: 0.1, _SLIDE: 0.005}  # rad, m: a range is a soft limit
 _CLEAR = 5e-4  # m between surfaces, at least
-_FAR = 100.0  # m
 _DEEP = 3  # joints between two geoms; of more there are too many postures
 _POSTURES = 2500  # of a pair, at most
+_known: dict[tuple[bytes, ...], ndarray] = {}
 
 
 def apart(model: mujoco.MjModel, pairs: ndarray) -> ndarray:
@@ -29,10 +29,14 @@ def apart(model: mujoco.MjModel, pairs: ndarray) -> ndarray:
 
     A proof, not a sample. A hinge that turns by an angle moves no point of a geom farther than that
     angle times the largest distance of the geom from the hinge. So a distance in one posture is
-    enough for all postures nearby, and ranges are halved until all postures are covered.
+    enough for all postures nearby, and ranges are halved until all are covered. Once in a process.
     """
-    data = mujoco.MjData(model)
-    return np.array([_proved(model, data, int(a), int(b)) for a, b in pairs], dtype=bool)
+    read = [getattr(model, name) for name in (*sorted(PROVED_BY), "geom_type", "mesh_vert")]
+    key = tuple(array.tobytes() for array in (*read, pairs))
+    if key not in _known:
+        data = mujoco.MjData(model)
+        _known[key] = np.array([_proved(model, data, int(a), int(b)) for a, b in pairs], dtype=bool)
+    return _known[key]
 
 
 def _proved(model: mujoco.MjModel, data: mujoco.MjData, *geoms: int) -> bool:
@@ -98,11 +102,12 @@ class _Search:
         self.left -= 1
         self.data.qpos[self.addresses] = middle
         mujoco.mj_kinematics(self.model, self.data)
-        distance = mujoco.mj_geomDistance(self.model, self.data, *self.geoms, _FAR, None)
         moved = half * self.speeds
-        if distance - self.clear > moved.sum():
+        enough = self.clear + float(moved.sum())  # it searches no farther
+        distance = mujoco.mj_geomDistance(self.model, self.data, *self.geoms, enough, None)
+        if distance >= enough:
             return True
-        if distance <= self.clear or not self.left or len(half) > _DEEP:
+        if distance <= self.clear or self.left <= 0 or len(half) > _DEEP:
             return False
         widest = np.arange(len(half)) == moved.argmax()
         half = np.where(widest, 0.5 * half, half)
