@@ -83,9 +83,8 @@ def change_collision(spec: mujoco.MjSpec, robot: RobotCfg) -> list[str]:
         boxes = kinds.count(mujoco.mjtGeom.mjGEOM_BOX)
         apart = _exclude_neighbours(spec, robot, _touching(model, robot))
         return [
-            f"{len(shapes)} meshes collide as {boxes} boxes and {len(shapes) - boxes} capsules around"
-            f" them (robot.collision=primitives); {apart} pairs of bodies that overlap at home"
-            " do not collide"
+            f"{boxes} meshes collide as boxes and {len(shapes) - boxes} as capsules around them"
+            f" (robot.collision=primitives); {apart} pairs of bodies that overlap at home do not"
         ]
     return []
 
