@@ -1,5 +1,6 @@
 """Pairs of geoms that no posture lets touch: a proof by the ranges of joints."""
 
+import hashlib
 from dataclasses import dataclass
 
 import mujoco
@@ -20,7 +21,7 @@ _BEYOND = {_HINGE: 0.1, _SLIDE: 0.005}  # rad, m: a range is a soft limit
 _CLEAR = 5e-4  # m between surfaces, at least
 _DEEP = 3  # joints between two geoms; of more there are too many postures
 _POSTURES = 2500  # of a pair, at most
-_known: dict[tuple[bytes, ...], ndarray] = {}
+_known: dict[bytes, ndarray] = {}
 
 
 def apart(model: mujoco.MjModel, pairs: ndarray) -> ndarray:
@@ -31,8 +32,9 @@ def apart(model: mujoco.MjModel, pairs: ndarray) -> ndarray:
     angle times the largest distance of the geom from the hinge. So a distance in one posture is
     enough for all postures nearby, and ranges are halved until all are covered. Once in a process.
     """
-    read = [getattr(model, name) for name in (*sorted(PROVED_BY), "geom_type", "mesh_vert")]
-    key = tuple(array.tobytes() for array in (*read, pairs))
+    content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, content)
+    key = hashlib.sha256(content).digest() + pairs.tobytes()
     if key not in _known:
         data = mujoco.MjData(model)
         _known[key] = np.array([_proved(model, data, int(a), int(b)) for a, b in pairs], dtype=bool)
