@@ -5,8 +5,9 @@
 An arm is a robot of mjstack, or a folder that ``mjstack new robot`` has written. For each and each
 ``--collision`` a process with an empty kernel cache runs the gates: its wall time is the first run.
 Another one then times the physics step in buffers of the sizes that *capacity* recommended there,
-as tools/bench_physics.py does. A cell has a dash where a gate failed, and the last column says why,
-and which part of a step is MJWarp's. ``--warm`` keeps the kernel cache.
+as tools/bench_physics.py does. A cell has a dash where a gate failed or is not one of ``--gates``,
+and the last column says why, and which part of a step is MJWarp's. ``--warm`` keeps the kernel
+cache.
 """
 
 import argparse
@@ -27,10 +28,8 @@ from common import count, make_parser, spread
 
 from mjstack.config import load_config
 from mjstack.episodes.stage import Stage
-from mjstack.report.table import Console, Table
 from mjstack.scene import build_model
 
-_GATES = "baseline,parity,capacity,batch,throughput"
 _ROOM = 1.25
 _CONTACTS = 128  # of a world, where *capacity* failed
 _COLUMNS = (
@@ -44,19 +43,17 @@ def main() -> None:
     parser = make_parser(__doc__)
     words = "values of robot.collision (default: each arm's own)"
     parser.add_argument("--collision", nargs="+", default=[""], help=words)
+    parser.add_argument("--gates", default="baseline,parity,capacity,batch,throughput")
     parser.add_argument("--warm", action="store_true", help="keep the kernel cache")
     parser.add_argument("--steps", type=count, default=20, help="control steps per repetition")
     parser.add_argument("--repetitions", type=count, default=3)
     args = parser.parse_intermixed_args()
     arms = [text for text in args.overrides if "=" not in text]
     options = [text for text in args.overrides if "=" in text]
-    rows = []
     print(f"| {' | '.join(_COLUMNS)} |\n|{' --- |' * len(_COLUMNS)}", flush=True)
     for arm in arms:
         for collision in args.collision:
-            rows.append(measure(arm, collision, options, args))
-            print(f"| {' | '.join(rows[-1])} |", flush=True)
-    Console(soft_wrap=True).print(Table(title="", header=[*_COLUMNS], rows=rows).to_console())
+            print(f"| {' | '.join(measure(arm, collision, options, args))} |", flush=True)
 
 
 def measure(arm: str, collision: str, options: list[str], args: argparse.Namespace) -> list[str]:
@@ -68,7 +65,9 @@ def measure(arm: str, collision: str, options: list[str], args: argparse.Namespa
     with tempfile.TemporaryDirectory() as place:
         if not args.warm:
             os.environ["WARP_CACHE_PATH"] = f"{place}/kernels"  # also of the second process
-        gates, seconds = run_gates(overrides, config_dir, Path(place) / "run")
+        gates, seconds = run_gates(
+            [*overrides, f"gates=[{args.gates}]"], config_dir, Path(place) / "run"
+        )
         found = {gate["name"]: gate for gate in gates}
         metrics = {name: gate["metrics"] for name, gate in found.items()}
         reasons = [
@@ -88,8 +87,11 @@ def measure(arm: str, collision: str, options: list[str], args: argparse.Namespa
                 work = (overrides + sized, config_dir, random, args.steps, args.repetitions)
                 ratios.append(pool.submit(_ratio, *work).result())
     cuda = metrics.get("throughput_cuda", {})
-    backend = found.get("throughput_cuda", {}).get("notes", {}).get("backend", "")
-    step = backend.rpartition(", ")[2]
+    notes = [gate.get("notes", {}) for gate in gates]
+    step = next(
+        (note["backend"] for note in notes[::-1] if "MuJoCo Warp" in note.get("backend", "")), ""
+    )
+    step = step.rpartition(", ")[2]
     gripper, used = _description(overrides, config_dir)
     return [
         *(folder.name, gripper, used),
@@ -112,7 +114,7 @@ def run_gates(
         "mjstack",
         *(["--config-dir", config_dir] if config_dir else []),
     ]
-    command += [*overrides, f"gates=[{_GATES}]", "web.episode=false", f"hydra.run.dir={folder}"]
+    command += [*overrides, "web.episode=false", f"hydra.run.dir={folder}"]
     began = time.perf_counter()
     done = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     seconds = time.perf_counter() - began

@@ -51,7 +51,8 @@ def measure(args: argparse.Namespace, cfg: Config, advance: Advance) -> Iterator
         advance("samples", number + 1, len(samples))
     native.close()
     sim.close()
-    table = {name: quantiles(np.concatenate(parts)) for name, parts in errors.items()}
+    joined = {name: np.concatenate(parts) for name, parts in errors.items()}
+    table = {name: quantiles(part) if len(part) else np.array([]) for name, part in joined.items()}
     states = len(samples) * sim.nworld
     yield Table(
         title=f"{cfg.robot.title}, {cfg.task.name}: {states:,} states, {void} void,"
