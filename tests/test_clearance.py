@@ -10,7 +10,7 @@ from environments import configure
 from mjstack.config.schema import Backend
 from mjstack.scene import build_model
 from mjstack.sim import make_simulation
-from mjstack.sim.clearance import apart
+from mjstack.sim.clearance import find_separate
 from mjstack.sim.mjwarp import MjwarpSimulation
 from mjstack.sim.sizes import resolve_sizes
 
@@ -23,7 +23,7 @@ BAR = """<mujoco><compiler angle="radian"/><worldbody>
 
 def far_apart(up: str = "0", **words: str) -> bool:
     model = mujoco.MjModel.from_xml_string(BAR.format(up=up, **words))
-    return bool(apart(model, np.array([[0, 1]]))[0])
+    return bool(find_separate(model, np.array([[0, 1]]))[0])
 
 
 @pytest.mark.parametrize("bar", ["", 'range="-1 1.9"'])
@@ -70,7 +70,7 @@ def test_no_posture_of_a_robot_touches_what_is_left_out(robot: str) -> None:
     """In 300 postures, at the ends of the ranges and beyond them among others."""
     model = build_model(configure(robot=robot))
     pairs = np.array([*itertools.combinations(range(model.ngeom), 2)])
-    out = {tuple(pair) for pair in pairs[apart(model, pairs)].tolist()}
+    out = {tuple(pair) for pair in pairs[find_separate(model, pairs)].tolist()}
     data = mujoco.MjData(model)
     rng = np.random.default_rng(0)
     single = model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE)
@@ -100,13 +100,17 @@ def test_the_worlds_list_what_is_left() -> None:
             sizes=resolve_sizes(cfg),
         )
         assert isinstance(sim, MjwarpSimulation)
-        pairs = sim._near.nxn_geom_pair_filtered.numpy()
+        pairs = sim._stepped.nxn_geom_pair_filtered.numpy()
         assert (
-            len(sim._near.nxn_pairid_filtered) == len(pairs) == sum(sim._near.geom_pair_type_count)
+            len(sim._stepped.nxn_pairid_filtered)
+            == len(pairs)
+            == sum(sim._stepped.geom_pair_type_count)
         )
         left.append(len(pairs))
         every = sim._m.nxn_geom_pair_filtered.numpy()
         assert (
-            len(pairs) == (~apart(model, every)).sum() if fields != ("geom_size",) else len(every)
+            len(pairs) == (~find_separate(model, every)).sum()
+            if fields != ("geom_size",)
+            else len(every)
         )
     assert left[0] == left[1] < left[2]

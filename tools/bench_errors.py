@@ -83,7 +83,7 @@ def forward(sim: MjwarpSimulation, sample: Sample, *, stock: bool) -> dict[str, 
             prepare_stock(sim._m, d)
             mjw.forward(sim._m, d)
         else:
-            rearranged_forward(sim._near, d, sim.device, sim.plan, sensors=False)
+            rearranged_forward(sim._stepped, d, sim.device, sim.plan, sensors=False)
     pool = torch.maximum(wp.to_torch(d.nacon), wp.to_torch(d.ncollision))
     nefc = wp.to_torch(d.nefc)
     lost = ((overflow & LOST_PHYSICS) != 0) | (nefc > d.njmax) | (pool > d.naconmax)

@@ -32,32 +32,32 @@ def change_collision(spec: mujoco.MjSpec, robot: RobotCfg) -> list[str]:
     Raises:
         ConfigError: ``robot.collision`` is none of its values.
     """
-    wanted = str(robot.collision)
-    number = re.fullmatch(r"hull (\d+)", wanted)
-    most = int(number[1]) if number else 0
-    if wanted not in ("file", "primitives") and most < _FEWEST:
+    value = str(robot.collision)
+    number = re.fullmatch(r"hull (\d+)", value)
+    limit = int(number[1]) if number else 0
+    if value not in ("file", "primitives") and limit < _FEWEST:
         expected = f"file, primitives, or hull N with {_FEWEST} vertices or more, such as hull 64"
         raise ConfigError("robot.collision", robot.collision, expected)
-    named = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
+    paired = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
     geoms = [
         (number, geom)
         for number, geom in enumerate(spec.geoms)
-        if geom.type == _MESH and (geom.contype or geom.conaffinity or {geom.name} & named)
+        if geom.type == _MESH and (geom.contype or geom.conaffinity or {geom.name} & paired)
     ]
-    if wanted == "file" or not geoms:
+    if value == "file" or not geoms:
         return []
     model, ids = _compile(spec)
     points = {
         mesh: _hull_points(model, mesh) for mesh in {model.geom_dataid[ids[n]] for n, _ in geoms}
     }
-    lost = {}
+    losses = {}
     shapes: dict[int, dict[str, Any]] = {}
     for mesh, hull in points.items():
-        if not most:
+        if not limit:
             shapes[mesh] = _primitive(hull)
-        elif len(hull) > most:
-            nearest, lost[mesh] = _nearest(hull, most)
-            name = f"{model.mesh(mesh).name}_{wanted}"
+        elif len(hull) > limit:
+            nearest, losses[mesh] = _nearest(hull, limit)
+            name = f"{model.mesh(mesh).name}_{value}"
             spec.add_mesh(name=name, uservert=nearest.ravel())
             shapes[mesh] = {"type": _MESH, "meshname": name}
     for n, geom in geoms:
@@ -71,20 +71,20 @@ def change_collision(spec: mujoco.MjSpec, robot: RobotCfg) -> list[str]:
         geom.contype = geom.conaffinity = 0
         place = {"pos": pos + offset, "quat": quat, "mass": 0.0, "group": _HIDDEN}
         geom.parent.add_geom(name=name, **shape, **place, **contact)
-    if lost:
-        count = max(len(points[mesh]) for mesh in lost)
+    if losses:
+        count = max(len(points[mesh]) for mesh in losses)
         return [
-            f"{len(lost)} meshes collide as hulls of {most} vertices, not of up to {count:,}:"
-            f" surfaces are up to {1e3 * max(lost.values()):.1f} mm inside the file's"
-            f" (robot.collision={wanted})"
+            f"{len(losses)} meshes collide as hulls of {limit} vertices, not of up to {count:,}:"
+            f" surfaces are up to {1e3 * max(losses.values()):.1f} mm inside the file's"
+            f" (robot.collision={value})"
         ]
-    if not most:
+    if not limit:
         kinds = [shape["type"] for shape in shapes.values()]
         boxes = kinds.count(mujoco.mjtGeom.mjGEOM_BOX)
-        apart = _exclude_neighbours(spec, robot, _touching(model, robot))
+        excluded = _exclude_neighbours(spec, robot, _touching(model, robot))
         return [
             f"{boxes} meshes collide as boxes and {len(shapes) - boxes} as capsules around them"
-            f" (robot.collision=primitives); {apart} pairs of bodies that overlap at home do not"
+            f" (robot.collision=primitives); {excluded} pairs of bodies that overlap at home do not"
         ]
     return []
 
@@ -104,7 +104,7 @@ def _hull_points(model: mujoco.MjModel, mesh: int) -> ndarray:
     return model.mesh_vert[model.mesh_vertadr[mesh] + numbers].astype(float)
 
 
-def _nearest(points: ndarray, most: int) -> tuple[ndarray, float]:
+def _nearest(points: ndarray, limit: int) -> tuple[ndarray, float]:
     """Those of a hull's vertices whose hull is nearest to it, one after the other, and how far it
     is inside [m].
     """
@@ -113,7 +113,7 @@ def _nearest(points: ndarray, most: int) -> tuple[ndarray, float]:
     top = heights.max(axis=1)
     chosen = [int(farthest[0])]
     reached = heights[:, chosen[0]].copy()
-    while len(chosen) < most and (top - reached).max() > 0.0:
+    while len(chosen) < limit and (top - reached).max() > 0.0:
         chosen.append(int(farthest[(top - reached).argmax()]))
         np.maximum(reached, heights[:, chosen[-1]], out=reached)
     return points[chosen], float((top - reached).max())
@@ -124,10 +124,10 @@ def _primitive(points: ndarray) -> dict[str, Any]:
     low, high = points.min(axis=0), points.max(axis=0)
     center, half = 0.5 * (low + high), np.maximum(0.5 * (high - low), _THIN)
     axis = np.eye(3)[half.argmax()]
-    along = (points - center) @ axis
-    across = np.linalg.norm(points - center - along[:, None] * axis, axis=1)
-    radius = max(float(across.max()), _THIN)
-    length = float(np.max(np.abs(along) - np.sqrt(radius**2 - across**2), initial=_THIN))
+    axial = (points - center) @ axis
+    radial = np.linalg.norm(points - center - axial[:, None] * axis, axis=1)
+    radius = max(float(radial.max()), _THIN)
+    length = float(np.max(np.abs(axial) - np.sqrt(radius**2 - radial**2), initial=_THIN))
     if np.pi * radius**2 * (2.0 * length + 4.0 / 3.0 * radius) >= 8.0 * half.prod():
         return {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": half, "center": center}
     mujoco.mju_quatZ2Vec(turn := np.zeros(4), axis)
@@ -145,9 +145,9 @@ def _touching(model: mujoco.MjModel, robot: RobotCfg) -> set[frozenset[str]]:
     return {frozenset(model.body(b).name for b in pair) for pair in bodies if pair.all()}
 
 
-def _exclude_neighbours(spec: mujoco.MjSpec, robot: RobotCfg, before: set[frozenset[str]]) -> int:
+def _exclude_neighbours(spec: mujoco.MjSpec, robot: RobotCfg, contacts: set[frozenset[str]]) -> int:
     """Exclude pairs of bodies that touch at home, and did not before; returns their number."""
-    new = _touching(_compile(spec)[0], robot) - before
+    new = _touching(_compile(spec)[0], robot) - contacts
     for first, second in sorted(map(sorted, new)):
         spec.add_exclude(bodyname1=first, bodyname2=second)
     return len(new)

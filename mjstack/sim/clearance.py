@@ -24,7 +24,7 @@ _POSTURES = 2500  # of a pair, at most
 _known: dict[bytes, ndarray] = {}
 
 
-def apart(model: mujoco.MjModel, pairs: ndarray) -> ndarray:
+def find_separate(model: mujoco.MjModel, pairs: ndarray) -> ndarray:
     """Whether two geoms are apart in every posture that the ranges of joints allow, and somewhat
     beyond; shape ``(n,)``, bool, for pairs of shape ``(n, 2)``.
 
@@ -62,8 +62,8 @@ def _proved(model: mujoco.MjModel, data: mujoco.MjData, *geoms: int) -> bool:
                 reach += float(np.linalg.norm(arm))
                 speeds[joint], point, hinges = reach, data.xanchor[joint].copy(), hinges + 1
             elif kind == _SLIDE and model.jnt_limited[joint]:
-                way = model.jnt_range[joint] - model.qpos0[model.jnt_qposadr[joint]]
-                reach += float(np.abs(way).max()) + _BEYOND[_SLIDE]
+                travel = model.jnt_range[joint] - model.qpos0[model.jnt_qposadr[joint]]
+                reach += float(np.abs(travel).max()) + _BEYOND[_SLIDE]
                 speeds[joint] = 1.0
             else:
                 return False
@@ -97,19 +97,19 @@ class _Search:
     addresses: ndarray
     speeds: ndarray
     clear: float
-    left: int = _POSTURES
+    budget: int = _POSTURES
 
     def covers(self, middle: ndarray, half: ndarray) -> bool:
         """Whether they are apart wherever each joint is at most ``half`` from ``middle``."""
-        self.left -= 1
+        self.budget -= 1
         self.data.qpos[self.addresses] = middle
         mujoco.mj_kinematics(self.model, self.data)
         moved = half * self.speeds
-        enough = self.clear + float(moved.sum())  # it searches no farther
-        distance = mujoco.mj_geomDistance(self.model, self.data, *self.geoms, enough, None)
-        if distance >= enough:
+        horizon = self.clear + float(moved.sum())  # it searches no farther
+        distance = mujoco.mj_geomDistance(self.model, self.data, *self.geoms, horizon, None)
+        if distance >= horizon:
             return True
-        if distance <= self.clear or self.left <= 0 or len(half) > _DEEP:
+        if distance <= self.clear or self.budget <= 0 or len(half) > _DEEP:
             return False
         widest = np.arange(len(half)) == moved.argmax()
         half = np.where(widest, 0.5 * half, half)

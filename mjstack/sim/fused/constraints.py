@@ -9,7 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjstack.sim.clearance import apart
+from mjstack.sim.clearance import find_separate
 from mjstack.sim.fused.launch import SHARED_BYTES, arguments, launch, padded_rows
 from mjstack.sim.graph import side_by_side
 from mjstack.sim.mujoco_warp import mjw, wp
@@ -52,16 +52,16 @@ def without_far_pairs(model: mujoco.MjModel, m: mjw.Model) -> mjw.Model:
     pairs, numbers = m.nxn_geom_pair_filtered.numpy(), m.nxn_pairid_filtered.numpy()
     if m.opt.broadphase != mjw.BroadphaseType.NXN or m.opt.disableflags & mjw.DisableBit.LIMIT:
         return m
-    near = (numbers != -1).any(axis=1)  # a pair of the file, or of a sensor
-    near[~near] = ~apart(model, pairs[~near])
-    kinds = np.sort(model.geom_type[pairs[near]], axis=1)
+    kept = (numbers != -1).any(axis=1)  # a pair of the file, or of a sensor
+    kept[~kept] = ~find_separate(model, pairs[~kept])
+    kinds = np.sort(model.geom_type[pairs[kept]], axis=1)
     count = np.zeros(len(m.geom_pair_type_count), dtype=int)
     index = [mjw._src.math.upper_trid_index(len(mjw.GeomType), *kind) for kind in kinds.tolist()]
     np.add.at(count, index, 1)
     return dataclasses.replace(
         m,
-        nxn_geom_pair_filtered=wp.array(pairs[near], dtype=wp.vec2i),
-        nxn_pairid_filtered=wp.array(numbers[near], dtype=wp.vec2i),
+        nxn_geom_pair_filtered=wp.array(pairs[kept], dtype=wp.vec2i),
+        nxn_pairid_filtered=wp.array(numbers[kept], dtype=wp.vec2i),
         geom_pair_type_count=tuple(count.tolist()),
     )
 
