@@ -126,12 +126,12 @@ def join_ranks(results_of: list[list[GateResult]]) -> list[GateResult]:
         rates = {}
         for figure in [f for f in result.figures if f.unit == "/s" and f.column == "median"]:
             if all(figure.key in part.metrics for part in later):
-                each = [part.metrics[figure.key] for part in (result, *later)]
+                values = [part.metrics[figure.key] for part in (result, *later)]
                 group = f"all_ranks.{figure.group}"
-                result.figures.append(replace(figure, value=sum(each), group=group))
+                result.figures.append(replace(figure, value=sum(values), group=group))
                 unit = f"{figure.name.replace('_', '-')}/s"
-                slowest = f"rank {each.index(min(each))}, the slowest, {min(each):,.0f}"
-                rates[figure.group] = f"{figure.group} {sum(each):,.0f} {unit} ({slowest})"
+                slowest = f"rank {values.index(min(values))}, the slowest, {min(values):,.0f}"
+                rates[figure.group] = f"{figure.group} {sum(values):,.0f} {unit} ({slowest})"
         if rates and result.status is not Status.failed:
             result.reason = f"{size} ranks: {'; '.join(rates.values())}; rank 0: {result.reason}"
     return results

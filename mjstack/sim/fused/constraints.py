@@ -52,16 +52,16 @@ def without_far_pairs(model: mujoco.MjModel, m: mjw.Model) -> mjw.Model:
     pairs, numbers = m.nxn_geom_pair_filtered.numpy(), m.nxn_pairid_filtered.numpy()
     if m.opt.broadphase != mjw.BroadphaseType.NXN or m.opt.disableflags & mjw.DisableBit.LIMIT:
         return m
-    kept = (numbers != -1).any(axis=1)  # a pair of the file, or of a sensor
-    kept[~kept] = ~find_separate(model, pairs[~kept])
-    kinds = np.sort(model.geom_type[pairs[kept]], axis=1)
+    listed = (numbers != -1).any(axis=1)  # a pair of the file, or of a sensor
+    listed[~listed] = ~find_separate(model, pairs[~listed])
+    kinds = np.sort(model.geom_type[pairs[listed]], axis=1)
     count = np.zeros(len(m.geom_pair_type_count), dtype=int)
     index = [mjw._src.math.upper_trid_index(len(mjw.GeomType), *kind) for kind in kinds.tolist()]
     np.add.at(count, index, 1)
     return dataclasses.replace(
         m,
-        nxn_geom_pair_filtered=wp.array(pairs[kept], dtype=wp.vec2i),
-        nxn_pairid_filtered=wp.array(numbers[kept], dtype=wp.vec2i),
+        nxn_geom_pair_filtered=wp.array(pairs[listed], dtype=wp.vec2i),
+        nxn_pairid_filtered=wp.array(numbers[listed], dtype=wp.vec2i),
         geom_pair_type_count=tuple(count.tolist()),
     )
 
