@@ -34,7 +34,7 @@ def find_separate(model: mujoco.MjModel, pairs: ndarray) -> ndarray:
     """
     content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, content)
-    key = hashlib.sha256(content).digest() + pairs.tobytes()
+    key = hashlib.sha256(content.tobytes()).digest() + pairs.tobytes()
     if key not in _known:
         data = mujoco.MjData(model)
         _known[key] = np.array([_proved(model, data, int(a), int(b)) for a, b in pairs], dtype=bool)
