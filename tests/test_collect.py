@@ -547,7 +547,7 @@ def test_finished_batches_are_kept(
     write = PartWriter.write
 
     def broken(self: PartWriter, episode: Any, *args: Any) -> None:
-        if episode.row["seed"] == 1 and len(self.part.rows) == 1:
+        if episode.row["seed"] == 1 and len(self.files.rows) == 1:
             raise error
         write(self, episode, *args)
 
@@ -610,10 +610,10 @@ def test_the_buffer_bounds_the_worlds() -> None:
     with native_env(cfg) as env:
         for buffer, worlds in ((1.5, 1), (3.5, 3), (7.5, 7), (2**30 / world, 100)):
             cfg.job.buffer_gib = buffer * world / 2**30  # type: ignore[attr-defined]
-            assert CollectPlan.of(stage, Path(), env).most == worlds
+            assert CollectPlan.from_stage(stage, Path(), env).most == worlds
         cfg.job.buffer_gib = 0.9 * world / 2**30  # type: ignore[attr-defined]
         with pytest.raises(ConfigError, match=r"job.buffer_gib"):
-            CollectPlan.of(stage, Path(), env)
+            CollectPlan.from_stage(stage, Path(), env)
 
 
 def test_steps_come_to_the_host_in_chunks(monkeypatch: Patch) -> None:

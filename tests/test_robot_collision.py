@@ -4,12 +4,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjstack.config.mjcf import directions
+from mjstack.config.mjcf import unit_vectors
 from mjstack.config.schema import RobotCfg
 from mjstack.errors import ConfigError
 from mjstack.robots.collision import change_collision
 
-_BALL = 0.03 * directions(200)  # m
+_BALL = 0.03 * unit_vectors(200)  # m
 _LONG = np.array([[x, y, z] for x in (0, 0.2) for y in (0, 0.02) for z in (0, 0.03)])
 
 
@@ -71,7 +71,7 @@ def assert_same_dynamics(before: mujoco.MjModel, after: mujoco.MjModel) -> None:
 def test_a_hull_has_its_vertices_and_lies_where_the_mesh_does() -> None:
     before, after, (line,) = changed("hull 40")
     assert_same_dynamics(before, after)
-    along = directions(500)
+    along = unit_vectors(500)
     lost = heights(before, "geom0", along) - heights(after, "geom0", along)
     assert after.mesh_vertnum[after.geom_dataid[after.geom("geom0").id]] == 40
     assert lost.min() > -1e-6
@@ -88,7 +88,7 @@ def test_a_hull_has_its_vertices_and_lies_where_the_mesh_does() -> None:
 def test_primitives_are_around_their_meshes() -> None:
     before, after, (line,) = changed("primitives")
     assert_same_dynamics(before, after)
-    along = directions(200)
+    along = unit_vectors(200)
     data = mujoco.MjData(after)
     mujoco.mj_kinematics(after, data)
     for number, kind in enumerate((mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX)):

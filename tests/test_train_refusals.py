@@ -42,7 +42,7 @@ BAD: dict[tuple[str, ...], list[tuple[list[str], str]]] = {
             ["+job.observation.policy.terms.joint_pos.params.foo=1"],
             "job.observation.policy.terms.joint_pos: parameter 'foo' does not exist",
         ),
-        (["job.batch_size=3"], "job.batch_size is a key of trainer=dagger and trainer=clone"),
+        (["job.batch_size=3"], "configuration key 'job.batch_size' does not exist. "),
         (
             ["reset=expert_states", "reset.expert.params.path=/nowhere"],
             "a file of states; it cannot",

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 from numpy import ndarray
 
-from mjstack.config.mjcf import compile_scene, directions
+from mjstack.config.mjcf import compile_scene, unit_vectors
 from mjstack.config.schema import RobotCfg
 from mjstack.errors import ConfigError
 
@@ -108,7 +108,7 @@ def _nearest(points: ndarray, limit: int) -> tuple[ndarray, float]:
     """Those of a hull's vertices whose hull is nearest to it, one after the other, and how far it
     is inside [m].
     """
-    heights = directions(_DIRECTIONS) @ points.T
+    heights = unit_vectors(_DIRECTIONS) @ points.T
     farthest = heights.argmax(axis=1)
     top = heights.max(axis=1)
     chosen = [int(farthest[0])]
