@@ -36,6 +36,8 @@ from mjstack.errors import ArgumentError, ConfigError, MjstackError
 from mjstack.gates import runner
 from mjstack.gates.runner import log_error
 from mjstack.jobs import check_ranks, count_devices
+from mjstack.report.figure import Figure
+from mjstack.report.record import GateResult, Status
 
 SHORT = ["sim=native", "gates=[batch]", *one_second_episode()]
 PLAIN = [*SHORT, "web.episode=false"]
@@ -119,6 +121,27 @@ def assert_same_episodes(one: Path, other: Path) -> None:
                 np.testing.assert_array_equal(ours[key], theirs[key], err_msg=f"{name}: {key}")
     for path in one.glob("*.csv"):
         assert path.read_bytes() == (other / path.name).read_bytes()
+
+
+def test_a_line_has_the_sum_and_the_slowest_of_all_ranks() -> None:
+    def rank(rate: float, status: Status = Status.passed) -> list[GateResult]:
+        rates = {"world_steps": 10.0 * rate, "env_steps": rate}
+        figures = [
+            Figure(name, value, "/s", column="median", group="env_step")
+            for name, value in rates.items()
+        ]
+        line = f"env_step: {rate:g} env-steps/s"
+        return [GateResult(name="throughput", status=status, reason=line, figures=figures)]
+
+    (joined,) = runner.join_ranks([rank(3000.0), rank(1000.0), rank(2000.0)])
+    assert joined.reason == (
+        "3 ranks: env_step 6,000 env-steps/s (rank 1, the slowest, 1,000);"
+        " rank 0: env_step: 3000 env-steps/s"
+    )
+    assert joined.metrics["all_ranks.env_step.world_steps_per_s.median"] == 60_000.0
+    (broken,) = runner.join_ranks([rank(3000.0), rank(1000.0, Status.failed)])
+    assert broken.status is Status.failed
+    assert broken.reason == "rank 1: env_step: 1000 env-steps/s"
 
 
 @pytest.mark.full

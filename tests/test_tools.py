@@ -122,6 +122,11 @@ CAMERA = ["cameras=top", "scene.cameras.top.size=[32,32]"]
             "aten::convolution_backward",
         ),
         ("bench_solver", [*SMALL[:3], "batch.njmax=200", "--states", "40"], "100.000 %"),
+        (
+            "bench_errors",
+            [*SMALL[:3], "batch.njmax=200", "--states", "40", "--converge"],
+            "0 void, 0 with another number of rows; fused step",
+        ),
     ],
 )
 def test_a_benchmark_prints_its_table(
@@ -140,10 +145,32 @@ def test_a_benchmark_prints_its_table(
             f"policy={hold_above_red(tmp_path)}",
             "task=reach",
         ]
-    short = one_second_episode() if name in ("bench_physics", "bench_solver") else ()
+    short = (
+        one_second_episode() if name in ("bench_physics", "bench_solver", "bench_errors") else ()
+    )
     monkeypatch.setattr(sys, "argv", [name, *options, *short])
     runpy.run_path(str(TOOLS / f"{name}.py"), run_name="__main__")
     assert expected in capsys.readouterr().out
+
+
+@pytest.mark.long
+def test_an_arm_has_a_row_with_its_ratios_and_what_failed(tmp_path: Path) -> None:
+    command = [sys.executable, str(TOOLS / "bench_arms.py"), "so101", *SMALL[:3], "batch.njmax=200"]
+    options = ["--gates", "batch", "--warm", "--steps", "2", "--repetitions", "1"]
+    done = subprocess.run(
+        [*command, *one_second_episode(), *options, "--collision", "primitives"],
+        check=True,
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+    )
+    header, _, row = done.stdout.splitlines()
+    cells = [cell.strip() for cell in row.strip("|").split("|")]
+    assert len(cells) == header.count("|") - 1 == 10
+    assert cells[:3] == ["so101", "1 joints", "no meshes"]
+    assert float(cells[4].split()[0]) > 1.0
+    assert float(cells[5].split()[0]) > 1.0
+    assert cells[-1].startswith("batch: ")
 
 
 def test_random_actions_for_a_while() -> None:
@@ -172,6 +199,6 @@ def test_equal_runs_have_equal_verdicts(tmp_path: Path) -> None:
 def test_the_fused_step_is_twice_as_fast_as_a_bare_one() -> None:
     stage = Stage(load_config(["sim=mjwarp", "nworld=2048"]))
     for random in (False, True):
-        times = bench_physics._measure_plans(stage, 5, 3, random)
+        times = bench_physics.measure_plans(stage, 5, 3, random)
         ratios = [a / b for a, b in zip(times[bench_physics.BARE], times["fused"], strict=True)]
         assert np.median(ratios) > 2.0  # other tests beside it slow a repetition down
