@@ -1,60 +1,54 @@
-"""Seeded command lines, and damaged folders of policies, runs and datasets.
+"""Odd command lines, and damaged folders of policies, runs and datasets, drawn by a number.
 
-The check of each passes, or ends in one line and exit status 2. Then nothing is written. Nothing
-in the home folder changes, and no process is left. A tenth of the command lines that pass
-are run to the end.
-
-The cases run in forked children of a process of their own, whose modules are loaded already:
-``python tests/test_fuzz.py commands 17 200-220`` runs these cases and prints what they say.
+The check of each passes, or ends in one line and exit status 2; then nothing is written. Nothing in
+the home folder changes, and no process is left. A tenth of the command lines that pass are run to
+the end. ``python tests/test_fuzz.py commands 17 200-220`` tries these cases and prints the lines.
 """
 
-import copy
-import gc
-import hashlib
-import importlib
+import json
 import os
-import pkgutil
 import random
 import re
 import resource
 import shlex
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
 import time
-import traceback
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import chdir, suppress
+from dataclasses import asdict
+from hashlib import sha256
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import mjstack.cli  # before mujoco, which decides at its import how it draws
+from helpers.forked import PASSED, SECONDS, Child, content, fork, is_alive, kill, preload
 
 # isort: split
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
-import torch
-from fuzz_cases import CHOSEN, QUICK, Make, command_lines, damaged_folders, is_short
-from fuzz_datasets import damaged_datasets
+import yaml
+from dataset_checker import with_column
+from environments import configure, one_second_episode
+from policies import write_policy
+from safetensors.numpy import load_file as load_numpy
+from safetensors.numpy import save
 
-from mjstack.config.load import compose
-from mjstack.config.session import hydra_session
+from mjstack import load_config
+from mjstack.cli import run
 
 # `make fuzz` tries 1,000, 500 and 200
 COUNTS = {"commands": 30, "folders": 40, "datasets": 10}
-CASES = {
-    "commands": command_lines,
-    "folders": damaged_folders,
-    "datasets": damaged_datasets,
-}
 UNTOUCHED = ("policy", "run")  # what is only read
-PASSED = 77  # exit status of a child whose check has passed
 ENDS = {PASSED: "passed", 0: "shown, or run", 2: "one line"}
-SECONDS = 20  # of processor time that a check may take; the slowest of them takes three
 MEGABYTES = 1024  # of memory that a check may take beside the modules
 AT_ONCE = 3  # the process that forks works too
+Make = Callable[[int, Path], list[str]]
+"""Puts a case's files into its folder and returns its arguments."""
 
 
 @pytest.mark.full
@@ -67,244 +61,352 @@ def test_a_check_passes_or_says_one_line() -> None:
         assert f"{kind}: {count} cases" in done.stdout
 
 
-class Outcome(NamedTuple):
-    """How a child ended."""
-
-    status: int
-    out: str
-    err: str
-    changed: list[str]
-    left: bool
-    megabytes: float
-
-    def problem(self, *, ran: bool = False) -> str:
-        """Why that is not one of the answers that are allowed; empty if it is."""
-        if "Traceback" in self.out + self.err:
-            return "a traceback"
-        if self.left:
-            return "a process is left"
-        if self.megabytes > MEGABYTES and not ran:
-            return f"{self.megabytes:.0f} MB"
-        goes_on = self.status in (0, 1, PASSED)
-        allowed = re.compile(rf"cwd/(?!({'|'.join(UNTOUCHED)})(/|$))")
-        if wrote := [name for name in self.changed if not (goes_on and allowed.match(name))]:
-            return f"wrote {', '.join(wrote[:3])}"
-        if self.status == 2:
-            lines = [line for line in self.err.splitlines() if line.strip()]
-            # Warp's own, in a process that loads it where there is no CUDA
-            lines = [line for line in lines if not line.startswith("Warp CUDA warning")]
-            if len(lines) != 1 or not lines[0].startswith("mjstack: "):
-                return f"{len(lines)} lines on stderr"
-            if len(lines[0]) > 300:
-                return f"a line of {len(lines[0])} letters"
-            if re.search(r"[\x00-\x08\x0b-\x1f\x7f]", lines[0]):
-                return "control characters"
-            return "" if not self.out.strip() else "exit 2 with output"
-        if self.status in ((0, 1) if ran else (0, PASSED)):
-            return ""
-        return "too slow" if self.status < 0 else f"exit status {self.status}"
-
-    def lines(self) -> str:
-        """The first lines of what it said."""
-        text = (self.err.strip() or self.out.strip()).splitlines()
-        return " / ".join([*text[:1], *text[-1:]])[:300]
-
-
-@dataclass
-class Child:
-    """A forked case."""
-
-    case: int
-    ran: bool
-    args: list[str]
-    home: Path
-    before: dict[str, str]
-    pid: int = 0
-    began: float = field(default_factory=time.monotonic)
-
-
-# The process that forks
-
-
 def main(kind: str = "", *numbers: str) -> int:
-    """Run all cases of each kind, those of one kind, or some of them."""
-    _preload()
+    """Try all cases of each kind, those of one kind, or some of them."""
+    sys.path.insert(0, str(Path(__file__).parent))
+    preload([[choice, *more] for choice in CHOSEN for more in ([], QUICK[1:2])])
     spans = [[int(end) for end in number.split("-")] for number in numbers]
     cases = [case for span in spans for case in range(span[0], span[-1] + 1)]
     return max([judge_cases(name, cases) for name in ([kind] if kind else COUNTS)])
 
 
 def judge_cases(kind: str, cases: Sequence[int]) -> int:
-    """Run cases of a kind, or as many as the test tries; 1 if one of them ends badly."""
+    """Try cases of a kind, or as many as the test tries; 1 if one of them ends badly."""
     began = time.monotonic()
-    with tempfile.TemporaryDirectory() as temporary:
-        fixture = Path(temporary)
-        make = CASES[kind](fixture)
-        gc.collect()
-        gc.freeze()
-        cases = cases or list(range(COUNTS[kind]))
-        talks = len(cases) < 30
-        counts: Counter[str] = Counter()
+    cases = cases or range(COUNTS[kind])
+    verbose = len(cases) < 30
+    counts: Counter[str] = Counter()
+    with tempfile.TemporaryDirectory() as folder:
+        make = KINDS[kind](Path(folder))
 
-        def judge(numbers: Sequence[int], *, run: bool = False) -> list[int]:
+        def judge(numbers: Sequence[int], run: bool) -> list[int]:
             """Count how cases end, and return those that pass and are short."""
             passed = []
-            for child, outcome in _fork_all(numbers, make, fixture, run=run):
-                problem = outcome.problem(ran=run)
+            for case, child, status, megabytes in _ended(numbers, make, Path(folder), run):
+                out, err = ((child.home / n).read_text(errors="replace") for n in ("out", "err"))
+                problem = find_problem(child, status, out, err, 0.0 if run else megabytes, run)
+                shutil.rmtree(child.home, ignore_errors=True)
                 counts["bad"] += bool(problem)
-                counts[problem or ENDS.get(outcome.status, f"status {outcome.status}")] += 1
-                if problem or talks:
-                    line = f"{kind} {child.case}{', run' * run}: {shlex.join(child.args)}"
-                    print(f"{line}\n  {problem}: {outcome.lines()}", flush=True)
-                if outcome.status == PASSED and is_short(child.args):
-                    passed.append(child.case)
+                counts[problem or ENDS.get(status, f"status {status}")] += 1
+                if problem or verbose:
+                    says = (err.strip() or out.strip())[:300]
+                    print(f"{kind} {case}{', run' * run}: {shlex.join(child.args)}", flush=True)
+                    print(f"  {problem}: {says}", flush=True)
+                if status == PASSED and is_short(child.args):
+                    passed.append(case)
             return passed
 
-        passed = judge(cases)
+        passed = judge(cases, False)
         if kind == "commands":
             tenth = min(counts["passed"] // 10 + 1, len(passed))
-            judge(passed if talks else random.Random(kind).sample(passed, tenth), run=True)
-    print(
-        f"{kind}: {len(cases)} cases: {dict(counts)}; {time.monotonic() - began:.0f} s", flush=True
-    )
+            judge(passed if verbose else random.Random(kind).sample(passed, tenth), True)
+    seconds = time.monotonic() - began
+    print(f"{kind}: {len(cases)} cases: {dict(counts)}; {seconds:.0f} s", flush=True)
     return min(counts["bad"], 1)
 
 
-def _fork_all(
-    cases: Sequence[int], make: Make, fixture: Path, *, run: bool = False
-) -> Iterator[tuple[Child, Outcome]]:
-    """Fork a child per case, some at a time."""
-    running: dict[int, Child] = {}
+def _ended(
+    cases: Sequence[int], make: Make, folder: Path, run: bool
+) -> Iterator[tuple[int, Child, int, float]]:
+    """Fork a child per case, some at a time: the case, its child, exit status and memory [MB]."""
+    running: dict[int, tuple[int, Child]] = {}
     waiting = iter(cases)
     while True:
         while len(running) < AT_ONCE and (case := next(waiting, None)) is not None:
-            child = _fork(case, make, fixture, run)
-            running[child.pid] = child
+            child = fork(lambda cwd, case=case: make(case, cwd), folder, run=run)  # type: ignore[misc]
+            running[child.pid] = case, child
         if not running:
             return
         pid, status, used = os.wait4(-1, os.WNOHANG)
         if pid in running:
-            more = (used.ru_maxrss - resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) / 1024
-            yield running[pid], _outcome(running.pop(pid), os.waitstatus_to_exitcode(status), more)
+            more = used.ru_maxrss - resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+            yield *running.pop(pid), os.waitstatus_to_exitcode(status), more / 1024
         elif not pid:
             time.sleep(0.005)
-            for child in running.values():
+            for _, child in running.values():
                 if time.monotonic() - child.began > 20 * SECONDS:
-                    os.killpg(child.pid, signal.SIGKILL)
+                    kill(child)
 
 
-def _fork(case: int, make: Make, fixture: Path, run: bool) -> Child:
-    home = Path(tempfile.mkdtemp(dir=fixture))
-    (home / "cwd").mkdir()
-    for name in (".bashrc", "notes.txt", "policy/policy.json", "run/report.json"):
-        (home / "user" / name).parent.mkdir(parents=True, exist_ok=True)
-        (home / "user" / name).write_text("the user's")
-    args = make(case, home / "cwd")
-    child = Child(case, run, args, home, _content(home))
-    child.pid = os.fork()
-    if not child.pid:
-        _be_the_command(child)
-    return child
+def find_problem(child: Child, status: int, out: str, err: str, megabytes: float, run: bool) -> str:
+    """Why an end is not one of those that are allowed; empty if it is."""
+    now = content(child.home)
+    paths = [p for p in now | child.before if now.get(p) != child.before.get(p)]
+    allowed = re.compile(rf"cwd/(?!({'|'.join(UNTOUCHED)})(/|$))")
+    goes_on = status in (0, 1, PASSED)
+    wrote = [p for p in paths if p not in ("out", "err") and not (goes_on and allowed.match(p))]
+    # Warp's own, in a process that loads it where there is no CUDA
+    lines = [s for s in err.splitlines() if s.strip() and not s.startswith("Warp CUDA warning")]
+    refusal = lines[0] if status == 2 and len(lines) == 1 else "mjstack: "
+    problems = {
+        "a traceback": "Traceback" in out + err,
+        "a process is left": is_alive(child),
+        f"{megabytes:.0f} MB": megabytes > MEGABYTES,
+        f"wrote {', '.join(wrote[:3])}": bool(wrote),
+        f"{len(lines)} lines on stderr": status == 2 and len(lines) != 1,
+        f"the line {refusal[:20]}": not refusal.startswith("mjstack: "),
+        f"a line of {len(refusal)} letters": len(refusal) > 300,
+        "control characters": bool(re.search(r"[\x00-\x08\x0b-\x1f\x7f]", refusal)),
+        "exit 2 with output": status == 2 and bool(out.strip()),
+        "too slow": status < 0,
+        f"exit status {status}": status not in (2, *((0, 1) if run else (0, PASSED))),
+    }
+    return next((problem for problem, found in problems.items() if found), "")
 
 
-def _be_the_command(child: Child) -> None:
-    """Become the command line, in a folder that is empty but for what the case put there."""
-    status = 1
-    try:
-        os.setsid()
-        gc.disable()  # a child lives for a second
-        os.chdir(child.home / "cwd")
-        for number, name in ((0, os.devnull), (1, child.home / "out"), (2, child.home / "err")):
-            file = os.open(name, os.O_RDWR | os.O_CREAT | os.O_TRUNC)
-            os.dup2(file, number)
-        resource.setrlimit(resource.RLIMIT_CPU, (3 * SECONDS if child.ran else SECONDS,) * 2)
-        resource.setrlimit(resource.RLIMIT_AS, (2**34, 2**34))
-        caches = Path.home()  # of matplotlib and Warp
-        os.environ |= {
-            f"XDG_{name.upper()}_HOME": f"{caches}/.{name}" for name in ("cache", "config")
-        }
-        os.environ["HOME"] = str(child.home / "user")
-        if not child.ran:
-            from hydra._internal.hydra import Hydra
-
-            Hydra.run = Hydra.multirun = _pass  # type: ignore[method-assign, assignment]
-        sys.argv = ["mjstack", *child.args]
-        from mjstack.__main__ import main as command
-
-        command()
-    except SystemExit as stop:
-        status = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
-    except BaseException:
-        traceback.print_exc()
-    finally:
-        for stream in (sys.stdout, sys.stderr):
-            stream.flush()
-        os._exit(status)
+# Command lines
 
 
-def _pass(*_: object, **__: object) -> None:
-    """The check has passed, and Hydra would make the folder now."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(PASSED)
+QUICK = ["nworld=2", "sim=native", "gates=[baseline]"]
+SHORT = [*QUICK[:2], *one_second_episode()]
+CHOSEN = ["task=stack", "task=box", "task=reach", "job=collect", "job=replay", "job=train"]
+ODD = r"""
+-1 0 2 0.5 1e-30 1e308 1e999 10000000000000000000000 007 1_000 nan -inf true null None '' x [] {}
+[1,2] [nan,0] [[1]] {a:{b:[1]}} {func:math.sqrt} ??? ${nope} ${oc.env:HOME} ${now:%Y} ${..name} 1,2
+, = a=b [/] %s \\ ../x /proc/x /dev/null . ~ * `id` é☃ 🤖 range(3,1) choice() glob(*) int(2.5)
+"""
+TEXT = ["a b", "'a b'", "a\tb", "a\nb", "\x1b[31m", "\u202e", "x" * 3000, "[" * 200]
+FUNCS = """
+mjstack.mdp.reward.reach mjstack.mdp.reward.nope mjstack.mdp mjstack.mdp.termination.time_out
+mjstack.mdp.action.JointPosition mjstack.tasks.box.BoxCheck mjstack.tasks.progress.Progress
+mjstack.cli.run mjstack.cli.os.getcwd mjstack.gates.episodes.judge_episodes mjstack.envs.Env
+mjstack.__main__.main builtins.print builtins.None sys.exit math.sqrt torch.zeros this antigravity.x
+nope.nope nope..nope .nope mjstack..cli é.☃ '' 3 null [x]
+"""
+MORE = """
+--help -h --cfg=job --cfg=nope --version --info=config --hydra-help --resolve -p=gate.x -m
+--config-dir=nope --config-dir --config-name=x --config-path=x --run -x - --- --experimental-rerun=x
+task@x=stack +robot=rebot ~model /scene=box robot:so101 timing=Stack model=[] action=../stack
+job=replay,run=. job=replay,run=nope,world=-1 job=export,run=/dev/null job=train,run=x job=collect
+hydra.run.dir=x hydra.run.dir=. hydra.run.dir=/proc/x hydra.run.dir=null hydra.run.dir=${nope}
+hydra.sweep.subdir= hydra.job.chdir=true hydra/job_logging=nope hydra/sweeper=x hydra/launcher=nope
+hydra.verbose=[x] hydra.output_subdir=null hydra.output_subdir=/proc/x hydra.mode=MULTIRUN hydra=x
+hydra.searchpath=[pkg://nope] ~hydra.run +hydra.callbacks.x={_target_:nope.nope} hydra.callbacks=3
+"""
 
 
-def _outcome(child: Child, status: int, megabytes: float) -> Outcome:
-    out, err = ((child.home / name).read_text(errors="replace") for name in ("out", "err"))
-    now = _content(child.home)
-    changed = sorted(
-        name
-        for name in now | child.before
-        if now.get(name) != child.before.get(name) and name not in ("out", "err")
+def command_lines(folder: Path) -> Make:
+    """Changed command lines; an experiment in the folder makes episodes of a second."""
+    phases = [o.split("=") for o in one_second_episode() if o.startswith("controller")]
+    short = {"phases": {key.split(".")[2]: {"seconds": float(value)} for key, value in phases}}
+    (folder / "conf" / "experiment").mkdir(parents=True)
+    text = yaml.dump({"controller": short, "task": {"check": {"window": 5}}})
+    (folder / "conf" / "experiment" / "tiny.yaml").write_text(f"# @package _global_\n{text}")
+    load_config(["experiment=tiny"], config_dir=folder / "conf")  # composed before the children
+    sys.path.remove(str(folder))
+    keys = {chosen: dict(_flat(asdict(configure(chosen)))) for chosen in CHOSEN}
+
+    def make(case: int, cwd: Path) -> list[str]:
+        draw = random.Random(f"command {case}")
+        chosen = draw.choice(["task=stack"] * 6 + list(keys))
+        args = [f"--config-dir={folder}/conf", *QUICK, "experiment=tiny"]
+        if chosen != "task=stack":
+            args = [*QUICK[: draw.randrange(4)], chosen]
+        for _ in range(draw.choice((1, 1, 1, 1, 2, 3))):
+            more, anywhere = _change(draw, args, keys[chosen])
+            at = draw.randrange(len(args) + 1) if anywhere else len(args)
+            args = [*args[:at], *more, *args[at:]]
+        return [arg.replace("\0", "") for arg in args]
+
+    return make
+
+
+def _flat(node: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted keys and their values."""
+    if isinstance(node, dict) and key.count(".") < 5:
+        for name, value in node.items():
+            yield from _flat(value, f"{key}.{name}" if key else str(name))
+    if key:
+        yield key, node
+
+
+def _change(draw: random.Random, args: list[str], keys: dict[str, Any]) -> tuple[list[str], bool]:
+    """More arguments, and whether they may stand anywhere. A character more is put into one."""
+    key, usual = draw.choice(list(keys.items()))
+    kind = draw.choice(("value", "value", "key", "func", "more", "text", "text"))
+    at = draw.randrange(len(key))
+    if kind == "value":
+        value = draw.choice([*ODD.split(), *TEXT, str(usual).replace(" ", "")])
+        if isinstance(usual, int | float) and draw.random() < 0.7:
+            value = str(type(usual)(usual * draw.choice((0.5, 1, 1, 2, 10, -1))))
+        return [f"{draw.choice(('', '', '', '', '+', '++'))}{key}={value}"], False
+    if kind == "key":
+        wrong = (key[:at] + key[at + 1 :], f"{key[:at]}é{key[at:]}", f"{key}[0]", key.upper(), "")
+        forms = (f"~{key}", f"~{key}=1", "{}=1", "+{}=1", "~{}", "{}")
+        return [draw.choice(forms).replace("{}", draw.choice(wrong))], False
+    if kind == "func":
+        named = draw.choice([key for key in keys if key.endswith(".func")])
+        params = draw.choice(("", ",params:{x:1}", ",weight:1", ",weight:1,params:3"))
+        section = draw.choice(("reward", "termination", "reset", "observation.policy.terms"))
+        func = draw.choice(FUNCS.split())
+        return [draw.choice((f"{named}={func}", f"+{section}.x={{func:{func}{params}}}"))], False
+    if kind == "more":
+        return draw.choice(MORE.split()).split(","), True
+    letters = "=+~[]{}'\",:$ \\\t\n.@/-xé3"
+    if draw.random() < 0.5:
+        return ["".join(draw.choices(letters, k=draw.randrange(12)))], True
+    arg = args.pop(draw.randrange(len(args)))
+    at = draw.randrange(len(arg) + 1)
+    return [arg[:at] + draw.choice(letters) + arg[at:]], True
+
+
+def is_short(args: list[str]) -> bool:
+    """Whether a command line that passed its check can be run to its end."""
+    long = (
+        r"seconds|seeds|repetitions|steps|iterations|physics_dt|decimation|scaling|solver|timing"
+        r"|video|view|minutes|launcher|range|/proc|nworld=(?![12]\b)"
     )
-    shutil.rmtree(child.home, ignore_errors=True)
-    left = True
-    try:
-        os.killpg(child.pid, 0)
-    except ProcessLookupError:
-        left = False
-    return Outcome(status, out, err, changed, left, megabytes)
+    return set(QUICK) <= set(args) and not re.search(long, " ".join(args))
 
 
-def _content(folder: Path) -> dict[str, str]:
-    """Every path below a folder, with the hash of a file and the target of a link."""
-
-    def digest(path: Path) -> str:
-        if path.is_symlink():
-            return os.readlink(path)
-        return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
-
-    return {str(path.relative_to(folder)): digest(path) for path in folder.rglob("*")}
+# Damaged folders
 
 
-def _preload(chosen: Sequence[str] = CHOSEN) -> None:
-    """Load what a command line loads, and keep what it and some choices read of YAML."""
-    import matplotlib
-    import yaml
+COLLECT = [
+    *("job=collect", *SHORT, "observation=state", "+observation.policy.noise=false"),
+    *("job.keep_failures=true", "job.folder=set"),
+]
+COMMANDS = {
+    "policy": ["controller=policy", "policy=policy", "gates=[batch]", *SHORT],
+    "run": ["job=replay", "run=run", "world=failing"],
+    "set": [*COLLECT, "job.episodes=3"],
+}
+TRAIN = [
+    *("job=train", "trainer=clone", "job.dataset=set/dataset", *SHORT, "job.folder=trained"),
+    *("job.batches=2", "job.batch_size=16", "job.hidden=[8]"),
+]
+TEXTS = (
+    b"", b"\0", b"null", b"[]", b"{}", b"3", b"a: [", b"\xff\xfe\x00", b"PK\x03\x04", b"PAR1PAR1",
+    b"[" * 100_000, b'{"a":' * 100_000, b"!!python/object:os.system {}", b"x: 1" + b":00" * 30_000,
+)  # fmt: skip
+VALUES: tuple[Any, ...] = (
+    None, True, -1, 3, -0.5, 1e308, float("nan"), 10**30, 2**63, "x", "é" * 1000, [], {}, [1], [[]],
+    [1] * 4000, {"a": 1}, "../x", "/etc/passwd", "${oc.env:HOME}", "os.getpid", "\x1b[31mx", "[/]",
+    "x" * 10**6, {f"k{n}": [] for n in range(30_000)},
+)  # fmt: skip
 
-    matplotlib.use("Agg")
-    torch.set_num_threads(1)  # a forked child waits for ever for OpenMP's threads of its parent
-    for module in pkgutil.walk_packages(mjstack.__path__, "mjstack.", onerror=lambda name: None):
-        if not re.search(r"__main__|adapters|bench", module.name):
-            importlib.import_module(module.name)
-    read = yaml.load
-    known: dict[str, Any] = {}
 
-    def load(stream: Any, Loader: Any) -> Any:
-        if not hasattr(stream, "seek"):
-            return read(stream, Loader=Loader)
-        text = stream.read()
-        if text not in known:
-            stream.seek(0)
-            known[text] = read(stream, Loader=Loader)
-        return copy.deepcopy(known[text])
+def damaged_folders(folder: Path) -> Make:
+    """Policies that gate *batch* is to play, and runs whose worlds are to be played again."""
+    with chdir(folder):
+        write_policy(Path("policy"), load_config(["sim=native"]))
+        assert run(["gates=[batch]", *SHORT, "hydra.run.dir=run"]) == 1
+    return _damaged(folder, UNTOUCHED)
 
-    yaml.load = load
-    with hydra_session():
-        for choice in [[], *([choice] for choice in chosen)]:
-            for more in [[], QUICK[1:2]]:
-                compose(choice + more)
 
+def damaged_datasets(folder: Path) -> Make:
+    """Datasets that *collect* is to go on with, or a clone to learn from."""
+    with chdir(folder):
+        assert run([*COLLECT, "job.episodes=2"]) == 0
+    return _damaged(folder, ("set",))
+
+
+def _damaged(folder: Path, names: Sequence[str]) -> Make:
+    for picture in folder.rglob("*.png"):
+        picture.unlink()
+
+    def make(case: int, cwd: Path) -> list[str]:
+        draw = random.Random(f"{names} {case}")
+        name = names[case % len(names)]
+        shutil.copytree(folder / name, cwd / name)
+        for _ in range(draw.choice((1, 1, 1, 2))):
+            read = {".json", ".yaml", ".npz", ".safetensors", ".parquet"}
+            paths = [p for p in sorted((cwd / name).rglob("*")) if not p.is_symlink()]
+            damage(draw, draw.choice([p for p in paths if p.suffix in read or p.is_dir()]))
+        return TRAIN if name == "set" and draw.random() < 0.5 else COMMANDS[name]
+
+    return make
+
+
+def damage(draw: random.Random, path: Path) -> None:
+    """Cut, replace, remove or redirect a file or a folder, or change a value in it."""
+    kind = draw.choice(("cut", "text", "text", "gone", "link", "other", *["value"] * 6))
+    if path.is_dir() and kind in ("cut", "text", "value"):
+        kind = draw.choice(("gone", "link", "other"))
+    if kind == "cut":
+        content = path.read_bytes()
+        path.write_bytes(content[: draw.randrange(len(content) + 1)])
+    elif kind == "text":
+        path.write_bytes(draw.choice(TEXTS))
+    elif kind == "value":
+        with suppress(Exception):  # it may be damaged already
+            CHANGES[path.suffix](draw, path)
+    else:
+        moved = path.with_name("moved")
+        path.rename(moved)
+        if kind == "link":
+            path.symlink_to(draw.choice(("moved", "/dev/null", "/dev/zero", path.name, "nope")))
+        elif kind == "other":
+            draw.choice((path.mkdir, lambda: os.mkfifo(path), lambda: path.write_text("x")))()
+
+
+def _change_text(draw: random.Random, path: Path) -> None:
+    """Another value, or none, for a key of JSON or YAML."""
+    is_json = path.suffix == ".json"
+    node = data = json.loads(path.read_text()) if is_json else yaml.safe_load(path.read_text())
+    while True:
+        name = draw.choice(list(node) if isinstance(node, dict) else range(len(node)))
+        if not isinstance(node[name], dict | list) or not node[name] or draw.random() < 0.2:
+            break
+        node = node[name]
+    if draw.random() < 0.3 and isinstance(node, dict):
+        del node[name]
+    else:
+        node[name] = draw.choice(VALUES)
+    path.write_text(json.dumps(data) if is_json else yaml.safe_dump(data))
+
+
+def _change_arrays(draw: random.Random, path: Path) -> None:
+    """Another array in a record, or a tensor in a policy, whose policy.json knows its file."""
+    is_npz = path.suffix == ".npz"
+    data = dict(np.load(path)) if is_npz else load_numpy(path)
+    name = draw.choice(sorted(data))
+    first = data[name].ravel()[:1]
+    arrays = [first, data[name] * np.nan if first.dtype.kind == "f" else first, np.zeros((0, 3))]
+    data[name] = draw.choice([*arrays, *([np.array("evil"), np.array(3.0)] if is_npz else [])])
+    if is_npz:
+        return np.savez(path, **data)
+    content = save(data)
+    path.unlink()
+    digest = sha256(content).hexdigest()
+    (path.parent / f"weights-{digest[:12]}.safetensors").write_bytes(content)
+    facts = json.loads((path.parent / "policy.json").read_text())
+    (path.parent / "policy.json").write_text(json.dumps(facts | {"weights_sha256": digest}))
+    return None
+
+
+def _change_table(draw: random.Random, path: Path) -> None:
+    """Another value in a column, other rows, or a table that unpacks to far more than its size."""
+    table = pq.read_table(path)
+    name = draw.choice(table.column_names)
+    values = table[name].to_pylist()
+    row = draw.randrange(len(values))
+    kind = draw.choice(("value", "value", "order", "rows", "column", "large"))
+    if kind == "rows":
+        table = table.take(draw.choice(([*range(row)], [*range(len(values)), row])))
+    elif kind == "column":
+        table = draw.choice((table.drop_columns([name]), table.append_column("x", table[name])))
+    elif kind == "large":
+        rows = min(draw.choice((10**4, 10**6)), 2 * 10**8 * len(values) // table.nbytes)
+        table = table.take(np.full(rows, row))
+    else:
+        values[row] = draw.choice((*VALUES, [values[row]], str(values[row])))
+        values = values[::-1] if kind == "order" else values
+        try:
+            table = with_column(table, name, pa.array(values))
+        except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError):
+            table = with_column(table, name, pa.array([str(value)[:9999] for value in values]))
+    pq.write_table(table, path)
+
+
+CHANGES = {
+    ".json": _change_text,
+    ".yaml": _change_text,
+    ".npz": _change_arrays,
+    ".safetensors": _change_arrays,
+    ".parquet": _change_table,
+}
+KINDS = {"commands": command_lines, "folders": damaged_folders, "datasets": damaged_datasets}
 
 if __name__ == "__main__":
     raise SystemExit(main(*sys.argv[1:]))

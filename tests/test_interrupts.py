@@ -19,9 +19,11 @@ import warnings
 from collections import Counter
 from pathlib import Path
 
+from helpers.forked import fork, preload
+
+# isort: split
 import pyarrow.parquet as pq
 import pytest
-import test_fuzz as fuzz
 import torch
 from compositions import make_env
 from environments import one_second_episode
@@ -128,7 +130,7 @@ def interrupt_steps(count: int) -> Counter[str]:
 def main(kind: str, count: str) -> int:
     """Interrupt commands of a kind, or of all, and print how each ended."""
     signal.signal(signal.SIGINT, signal.default_int_handler)  # it may be ignored where tests run
-    fuzz._preload(chosen=())
+    preload()
     warnings.simplefilter("ignore")  # of a machine that cannot draw
     return max([interrupt_kind(name, int(count)) for name in COMMANDS if kind in (name, "all")])
 
@@ -157,7 +159,7 @@ def interrupt_command(kind: str, fixture: Path, delay: float | None) -> tuple[st
     and the processor time from then on.
     """
     args = [*COMMANDS[kind], "nworld=2", "sim=native", *one_second_episode()]
-    child = fuzz._fork(0, lambda case, folder: args, fixture, True)
+    child = fork(lambda folder: args, fixture, run=True)
     before = 0.0
     if delay is not None:
         while (before := used_by(child.pid)) < delay:

@@ -101,12 +101,6 @@ def edit(folder: Path, key: str, value: Any) -> None:
     path.write_text(OmegaConf.to_yaml(cfg))
 
 
-def edit_json(path: Path, change: Callable[[Any], object]) -> None:
-    facts = json.loads(path.read_text())
-    change(facts)
-    path.write_text(json.dumps(facts))
-
-
 def replay(folder: Path) -> None:
     """All of job=replay that comes before it writes."""
     cfg = load_config(["job=replay"])
@@ -121,30 +115,31 @@ def refused_call(call: Callable[[], object]) -> str:
     return line
 
 
-# Rules 2, 5 and 8: what a run's folder names. The last ones are not built for a replay.
-USED = ("reset.evil", "controller.action.arm", "gate.success.reset.evil", "task.check")
-UNUSED = ("observation.policy.terms.evil", "reward.evil", "termination.evil", "task.success")
+SHELLS = {  # the key that names a shell's command, and what it has to name
+    "reset.evil": "reset terms",
+    "controller.action.arm": "action terms",
+    "task.check": "checks",
+    "gate.hard-2.reset.evil": "reset terms",
+    "observation.policy.terms.evil": "",  # a replay builds none of these
+    "reward.evil": "",
+    "task.success": "",
+}
 
 
-@pytest.mark.parametrize("name", ["hard", "hard-2"])
-def test_a_replay_runs_no_command_of_a_gate_of_its_folder(name: str, stranger: Path) -> None:
-    """Rule 5: a gate of the run may have any name."""
-    edit(stranger, f"gate.{name}", {"func": EPISODES, "reset": {"evil": SHELL}})
-    edit(stranger, "gates", [name])
-    says = f"gate.{name}.reset.evil.func={SHELL['func']}: expected one of the reset terms"
-    assert says in refused_call(lambda: replay(stranger))
-
-
-@pytest.mark.parametrize("key", [*USED, *UNUSED])
-def test_a_replay_runs_no_command_of_its_folder(key: str, stranger: Path) -> None:
+@pytest.mark.parametrize(("key", "kind"), SHELLS.items())
+def test_a_replay_runs_no_command_of_its_folder(key: str, kind: str, stranger: Path) -> None:
+    """Rules 2, 5 and 8; a gate of the run may have any name."""
+    if "hard" in key:
+        edit(stranger, "gate.hard-2", {"func": EPISODES, "reset": {}})
+        edit(stranger, "gates", ["hard-2"])
     edit(stranger, key, SHELL | ({"weight": 1.0} if key.startswith("reward") else {}))
-    if key in UNUSED:
+    if kind:
+        line = refused_call(lambda: replay(stranger))
+        assert f"{key}.func=pydoc.pipepager: expected one of the {kind}" in line
+        assert line.endswith("add --config-dir DIR.")
+    else:
         replay(stranger)
         assert not Path("PWNED").exists()
-        return
-    line = refused_call(lambda: replay(stranger))
-    assert f"{key}.func=pydoc.pipepager: expected one of the" in line
-    assert line.endswith("add --config-dir DIR.")
 
 
 def test_no_run_brings_a_policy_of_lerobots(stranger: Path) -> None:
@@ -154,31 +149,23 @@ def test_no_run_brings_a_policy_of_lerobots(stranger: Path) -> None:
     assert "LerobotDriver: expected one of the drivers of" in line
 
 
-# Each takes env first: they write, play or call what their parameters say.
-DOERS = {
-    "mjstack.mdp.starts.starts_file.write_starts": {"path": "victim"},
-    "mjstack.episodes.rollout.rollout": {"driver": "victim"},
-    "mjstack.mdp.starts.expert_states.ExpertStates": {"path": "victim"},
-}
+# Both take env first: they write or play what their parameters say.
+DOERS = ("mjstack.mdp.starts.starts_file.write_starts", "mjstack.episodes.rollout.rollout")
 
 
 @pytest.mark.parametrize("name", DOERS)
 def test_folders_name_terms_alone(name: str, policy: Path, stranger: Path) -> None:
-    """Rules 4 and 5; those of a run include reset terms."""
-    victim = Path("victim")
-    victim.write_text("precious")
+    """Rules 4 and 5."""
     content = (policy / "policy.json").read_text()
     for part in ("observation", "action"):
         facts = json.loads(content)
         terms = facts[part]["terms"] or facts["config"]["controller"]["action"]
-        terms[next(iter(terms))].update({"func": name, "params": DOERS[name]})
+        terms[next(iter(terms))].update({"func": name, "params": {"path": "PWNED"}})
         (policy / "policy.json").write_text(json.dumps(facts))
         says = f"func={name}: expected one of the {part} terms"
         assert says in refused_call(lambda: load_policy(policy))
-    if "Expert" not in name:
-        edit(stranger, "reset.evil-2", {"func": name, "params": DOERS[name]})
-        assert f"reset.evil-2.func={name}: expected" in refused_call(lambda: replay(stranger))
-    assert victim.read_text() == "precious"
+    edit(stranger, "reset.evil", {"func": name, "params": {"path": "PWNED"}})
+    assert f"reset.evil.func={name}: expected" in refused_call(lambda: replay(stranger))
 
 
 def test_each_kind_of_term_is_listed(tmp_path: Path) -> None:
@@ -206,11 +193,9 @@ def test_only_what_declares_itself_is_called(name: str, refused: Refused) -> Non
     assert "first parameter is named run" in line
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("key", ["reset.evil", "controller", "task.check"])
 @pytest.mark.parametrize("given", ["", "conf", "beside"])
 def test_no_module_of_the_folder_is_imported(
-    key: str, given: str, stranger: Path, monkeypatch: Patch
+    given: str, stranger: Path, monkeypatch: Patch
 ) -> None:
     """Rule 9: neither from the working folder, nor where a search path makes that importable."""
     (stranger / "payload.py").write_text(PAYLOAD)
@@ -219,60 +204,52 @@ def test_no_module_of_the_folder_is_imported(
     sys.path.insert(0, str(Path.cwd()))
     monkeypatch.delitem(sys.modules, "beside", raising=False)
     # The second is the user's own module, whose import runs nothing, with another's function.
-    func = "beside.rmtree" if given == "beside" else "stranger.payload.X"
-    edit(stranger, *((f"{key}.func", func) if key == "controller" else (key, {"func": func})))
+    edit(
+        stranger, "task.check.func", "beside.rmtree" if given == "beside" else "stranger.payload.X"
+    )
     with search_path(["conf"] if given else []):
-        line = refused_call(lambda: replay(stranger))
+        assert "task.check.func=" in refused_call(lambda: replay(stranger))
         assert not given or in_search_path("beside.X", stranger)
-    assert f"{key}.func=" in line
     assert "stranger.payload" not in sys.modules
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("way", ["link", "two places"])
-def test_a_package_that_the_folder_lies_in_is_not_trusted(way: str, stranger: Path) -> None:
+@pytest.mark.parametrize("is_link", [True, False])
+def test_a_package_that_the_folder_lies_in_is_not_trusted(is_link: bool, stranger: Path) -> None:
     """Rule 9: nor where its configuration is a link that leads elsewhere, or where the package has
     a second place beside the search path.
     """
-    home = Path("home")
-    (home / "conf" / "task").mkdir(parents=True)
-    (home / "outputs").mkdir()
-    saved = stranger / CONFIG
-    if way == "link":
-        inside = home / "outputs" / "run" / ".hydra"
-        inside.mkdir(parents=True)
-        (inside / "config.yaml").symlink_to(saved.resolve())
-        saved = inside / "config.yaml"
+    (Path("home") / "conf" / "task").mkdir(parents=True)
+    (Path("home") / "outputs").mkdir()
+    saved = Path("home" if is_link else ".") / "outputs" / "run" / "config.yaml"
+    saved.parent.mkdir(parents=True)
+    if is_link:
+        saved.symlink_to((stranger / CONFIG).resolve())
     else:
-        saved = Path("outputs") / "run" / "config.yaml"
-        saved.parent.mkdir(parents=True)
         saved.touch()
         sys.path.insert(0, str(Path.cwd()))
-    sys.path.insert(0, str(home.resolve()))
-    with search_path([str(home / "conf")]):
+    sys.path.insert(0, str(Path("home").resolve()))
+    with search_path(["home/conf"]):
         assert not in_search_path("outputs.run.payload.f", saved)
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("start", ["-m mjstack", "a job of a sweep"])
+@pytest.mark.parametrize("sweep", [False, True])
 def test_the_working_folder_is_not_imported_from(
-    start: str, tmp_path: Path, monkeypatch: Patch
+    sweep: bool, tmp_path: Path, monkeypatch: Patch
 ) -> None:
-    """Rule 9."""
+    """Rule 9, also by a job of a sweep."""
     monkeypatch.chdir(tmp_path)
     for name in ("hydra", "omegaconf", "rich", "json", "difflib", "pathlib", "platform"):
         Path(f"{name}.py").write_text(PAYLOAD)
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     args = ["--cfg", "job", "-p", "nworld"]
-    if start == "a job of a sweep":
-        with Path("output.log").open("wb") as output:
+    with Path("output.log").open("wb") as output:
+        if sweep:
             Child(args, output).wait()
-        text = Path("output.log").read_text()
-    else:
-        command = [sys.executable, *start.split(), *args]
-        text = subprocess.run(command, capture_output=True, text=True).stdout
+        else:
+            subprocess.run([sys.executable, "-m", "mjstack", *args], stdout=output)
     assert not Path("PWNED").exists()
-    assert text.split()[-1] == "256"
+    assert Path("output.log").read_text().split()[-1] == "256"
 
 
 FOLLOWED = {
@@ -322,47 +299,27 @@ def test_only_regular_files_are_read(kind: str, policy: Path, stranger: Path) ->
     assert says in refused_call(lambda: config_content(load_config(starts)))
 
 
-def put_array(name: str, shape: tuple[int, ...], times: int = 1) -> Callable[[Path], object]:
-    """An array in the run's record, as its header claims it to be."""
-
-    def put(folder: Path) -> None:
-        header = io.BytesIO()
-        claim = {"descr": "<U0" if shape[0] > 1 else "<f8", "fortran_order": False, "shape": shape}
-        np.lib.format.write_array_header_1_0(header, claim)
-        with zipfile.ZipFile(folder / "batch_seed0.npz", "a", zipfile.ZIP_DEFLATED) as file:
-            for number in range(times):
-                data = header.getvalue() + bytes(8 * (shape[0] == 1))
-                file.writestr(f"{name}{number if times > 1 else ''}.npy", data)
-
-    return put
-
-
-def add_yaml(text: str) -> Callable[[Path], object]:
-    """More keys in the run's configuration."""
-    return lambda folder: (folder / CONFIG).open("a").write(f"{text}\n")
-
-
-def write(name: str, content: bytes) -> Callable[[Path], object]:
-    return lambda folder: (folder / name).write_bytes(content)
+def put_array(folder: Path, name: str, rows: int, times: int = 1) -> None:
+    """Arrays in the run's record, with as many rows as their header claims."""
+    header = io.BytesIO()
+    claim = {"descr": "<U0", "fortran_order": False, "shape": (rows,)}
+    np.lib.format.write_array_header_1_0(header, claim)
+    with zipfile.ZipFile(folder / "batch_seed0.npz", "a", zipfile.ZIP_DEFLATED) as file:
+        for number in range(times):
+            file.writestr(f"{name}{number if times > 1 else ''}.npy", header.getvalue())
 
 
 def put_zeros(folder: Path) -> None:
     np.savez_compressed(folder / "batch_seed0.npz", zeros=np.zeros(2**20))
-    assert (folder / "batch_seed0.npz").stat().st_size < 2**14
 
 
-def put_versions(folder: Path) -> None:
-    many = {f"v{n}": [] for n in range(5000)}
-    edit_json(folder / "report.json", lambda facts: facts["provenance"].update(versions=many))
+def add_yaml(text: str) -> Callable[[Path], object]:
+    return lambda folder: (folder / CONFIG).open("a").write(f"{text}\n")
 
 
-def change_record(**changes: Any) -> Callable[[Path], object]:
-    def apply(folder: Path) -> None:
-        path = folder / "batch_seed0.npz"
-        with np.load(path) as held:
-            np.savez(path, **dict(held) | changes)
-
-    return apply
+def change_device(folder: Path) -> None:
+    with np.load(folder / "batch_seed0.npz") as held:
+        np.savez(folder / "batch_seed0.npz", **dict(held) | {"device": "cuda:x"})
 
 
 VALUES = "it has more than 5000 values, or 3000 letters in one"
@@ -373,16 +330,13 @@ RUNS: dict[str, tuple[Callable[[Path], object], str]] = {
     "long value": (add_yaml("x: 0x" + "f" * 500_000), VALUES),
     "many values": (add_yaml("".join(f"k{n}: 1\n" for n in range(50_000))), VALUES),
     "long text": (add_yaml("#" * 2**20), "more than 1048576"),
-    "many versions": (put_versions, VALUES),
-    "arrays": (put_array("value.x", (1,), times=1000), "more than 1000 arrays"),
-    "rows": (put_array("object_names", (30_000_000,)), "more than 1048576 rows"),
+    "arrays": (lambda run: put_array(run, "value.x", 1, times=1000), "more than 1000 arrays"),
+    "rows": (lambda run: put_array(run, "object_names", 30_000_000), "more than 1048576 rows"),
     "zeros": (put_zeros, "its arrays have 8388736 bytes, more than 4194304"),
     # Damage
-    "deep report": (write("report.json", b"[" * 10_000), "report.json: cannot be read (Recursion"),
-    "no report": (write("report.json", b'{"provenance": []}'), "report.json: cannot be read"),
-    "bytes": (write(CONFIG, bytes(range(256))), "config.yaml: cannot be read"),
-    "a scalar": (change_record(failed=np.int32(0)), "batch_seed0.npz: cannot be read"),
-    "a device": (change_record(device="cuda:x"), "batch_seed0.npz: cannot be read"),
+    "report": (lambda run: (run / "report.json").write_text("[" * 10_000), "cannot be read (Recur"),
+    "bytes": (lambda run: (run / CONFIG).write_bytes(bytes(range(256))), "yaml: cannot be read"),
+    "device": (change_device, "batch_seed0.npz: cannot be read"),
 }
 
 
@@ -395,42 +349,28 @@ def test_a_damaged_run_is_one_line(name: str, stranger: Path, monkeypatch: Patch
     assert says in refused_call(lambda: replay(stranger))
 
 
-def set_action(**params: Any) -> Callable[[Any], None]:
-    term = {"func": "mjstack.mdp.action.EndEffectorDelta", "params": params}
-    return lambda facts: facts["action"]["terms"].update(evil=term)
-
-
-POLICIES: dict[str, tuple[Callable[[Any], object], str]] = {
-    "clip": (
-        lambda facts: next(iter(facts["observation"]["terms"].values())).update(clip=[True, True]),
-        ".clip=[True, True]: expected a list of 2 numbers",
-    ),
-    "an integer": (
-        set_action(scale=0.1, iterations=10**9),
-        "iterations=1000000000: expected an integer from 1",
-    ),
-    "a list": (set_action(scale=0.1, x=["shoulder_pan"] * 100_000), VALUES),
-}
-
-
 @pytest.mark.usefixtures("soon")
-@pytest.mark.parametrize("name", POLICIES)
-def test_a_policy_cannot_claim_more_than_it_is(name: str, policy: Path) -> None:
+@pytest.mark.parametrize(
+    ("params", "says"),
+    [
+        ({"scale": 0.1, "iterations": 10**9}, "=1000000000: expected an integer from 1"),
+        ({"scale": 0.1, "x": ["shoulder_pan"] * 100_000}, VALUES),
+    ],
+)
+def test_a_policy_cannot_claim_more_than_it_is(
+    params: dict[str, Any], says: str, policy: Path
+) -> None:
     """Weights that are a hole of gigabytes are in test_policy.py."""
-    change, says = POLICIES[name]
-    edit_json(policy / "policy.json", change)
+    facts = json.loads((policy / "policy.json").read_text())
+    term = {"func": "mjstack.mdp.action.EndEffectorDelta", "params": params}
+    facts["action"]["terms"]["evil"] = term
+    (policy / "policy.json").write_text(json.dumps(facts))
     overrides = ["controller=policy", f"policy={policy}", "gates=[success]", "sim=native"]
     assert says in refused_call(lambda: check_job(load_config([*overrides, "nworld=1"])))
 
 
 @pytest.mark.usefixtures("soon")
 def test_damaged_weights_and_states_are_one_line(policy: Path, tmp_path: Path) -> None:
-    """A digest with escapes is read as it is: policy.json need not have it letter by letter."""
-    path = policy / "policy.json"
-    digest = json.loads(path.read_text())["weights_sha256"]
-    escaped = digest[:30] + f"\\u{ord(digest[30]):04x}" + digest[31:]
-    path.write_text(path.read_text().replace(digest, escaped))
-    load_policy(policy)
     weights = next(policy.glob("weights-*"))
     weights.write_bytes(weights.read_bytes()[:-1] + b"x")
     assert "its content is not that of policy.json" in refused_call(lambda: load_policy(policy))
@@ -470,7 +410,7 @@ def integers(hint: Any) -> Iterator[Range]:
 
 
 def test_each_integer_that_a_folder_may_set_has_an_upper_end() -> None:
-    """Of the parameters of terms, the thresholds of checks, and a run's configuration."""
+    """Rule 10: of the parameters of terms, the thresholds of checks, and a run's configuration."""
     ranges: dict[str, Range] = {}
     models = [Config]
     for line in NAMEABLE:
@@ -493,31 +433,29 @@ def test_each_integer_that_a_folder_may_set_has_an_upper_end() -> None:
 
 
 LONG = "x" * 10**6
-LINES: dict[str, Callable[[], Exception]] = {
-    "value": lambda: ConfigError("task.name", LONG, "a name", "Set another"),
-    "key": lambda: ConfigError(LONG, 3, "a name", "Set another"),
-    "argument": lambda: ArgumentError("name", [LONG], "a name", "Set another"),
-    "names": lambda: UnknownName("object", "re", [f"red{n}" for n in range(200_000)]),
-    "fix": lambda: FolderError("no", LONG),
-    "library": lambda: KeyError(LONG),
+LINES: dict[str, tuple[Exception, str]] = {
+    "value": (
+        ConfigError("task.name", LONG, "a name", "Set another"),
+        "expected a name. Set another.",
+    ),
+    "key": (ConfigError(LONG, 3, "a name", "Set another"), ""),
+    "argument": (ArgumentError("name", [LONG], "a name", "Set another"), "a name. Set another."),
+    "names": (UnknownName("object", "re", [f"red{n}" for n in range(10**5)]), "and 99993 more."),
+    "fix": (FolderError("no", LONG), ""),
+    "library": (KeyError(LONG), ""),
 }
 
 
-@pytest.mark.usefixtures("soon")
 @pytest.mark.parametrize("name", LINES)
 def test_a_line_is_short(name: str) -> None:
-    """It begins with the key and ends with what to do."""
-    error = LINES[name]()
-    line = describe_error(error)
-    assert 2 < len(line) <= 290
-    if name in ("value", "argument"):
-        assert line.startswith(("task.name=", "name: found"))
-        assert line.endswith("expected a name. Set another.")
+    """Rule 10: it begins with the key and ends with what to do."""
+    error, end = LINES[name]
+    assert 2 < len(describe_error(error)) <= 290
+    assert describe_error(error).endswith(end)
     if isinstance(error, KeyedError):
         error.move("the.key")
         assert str(error).startswith("the.key")
         assert len(str(error)) <= 290
-    assert name != "names" or line.endswith("and 199993 more.")
 
 
 def test_a_line_of_some_length_is_whole() -> None:
@@ -529,8 +467,9 @@ def test_a_line_of_some_length_is_whole() -> None:
 
 @pytest.mark.full
 def test_no_control_character_reaches_the_terminal(stranger: Path, capsys: Capture) -> None:
-    commit = "\x1b]0;PWNED\x07\x9b2J\u202e\u2066"
-    edit_json(stranger / "report.json", lambda facts: facts["provenance"].update(git_commit=commit))
+    facts = json.loads((stranger / "report.json").read_text())
+    facts["provenance"]["git_commit"] = "\x1b]0;PWNED\x07\x9b2J\u202e\u2066"
+    (stranger / "report.json").write_text(json.dumps(facts))
     edit(stranger, "robot.title", "\x1b[8m[/]")
     assert run(["job=replay", f"run={stranger}", "world=1", "hydra.run.dir=out"]) in (0, 1)
     text = "".join(capsys.readouterr())
