@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from compositions import load_config
 
-from mjstack.config import load_config
 from mjstack.drivers.driver import Driver
 from mjstack.episodes.rollout import play_episode
 from mjstack.episodes.stage import Stage

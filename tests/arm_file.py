@@ -5,7 +5,8 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-from mjstack import load_config
+from compositions import load_config
+
 from mjstack.config.schema import Config
 
 SCARA = Path(__file__).parents[1] / "examples" / "scara"
@@ -17,7 +18,7 @@ SERVOS = {m[1]: m[0] for m in re.finditer(r'<position name="(\w+)"[^>]*/>', MJCF
 @cache
 def scara(*overrides: str) -> Config:
     """Its configuration, for reading only."""
-    return load_config([f"hydra.searchpath=[file://{SCARA}/conf]", "robot=scara", *overrides])
+    return load_config(["robot=scara", *overrides], SCARA / "conf")
 
 
 def write_arm(folder: Path, *pairs: tuple[str, str]) -> Path:

@@ -2,11 +2,10 @@
 it asks for, and the success of a step asks for the same.
 """
 
-from collections.abc import Callable
-
 import pytest
 import torch
 from altered import Altered, judge_held, judge_let_go, raised, turned
+from environments import REBOT_LATER
 
 from mjstack.managers.view import EnvView
 from mjstack.mdp.geometry import place_xy, pose_w
@@ -160,10 +159,9 @@ def hole(env: EnvView) -> torch.Tensor:
 
 
 TASKS = {"slot": ("peg", slot, SLOT), "push": ("puck", goal, PUSH), "peg": ("peg", hole, HOLE)}
-Anchor = Callable[[EnvView], torch.Tensor]
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@REBOT_LATER
 @pytest.mark.parametrize("task", TASKS)
 def test_a_state_is_judged_by_what_the_rules_are_called(task: str, robot: str) -> None:
     """60 episodes of slot and push. A step is a success where no rule of the window is broken."""

@@ -32,7 +32,7 @@ RUN = ["sim=native", "nworld=1", "gates=[baseline]", "web.episode=false"]
 
 
 def scara(*overrides: str) -> Config:
-    return mjstack.load_config([*CONFIG, *overrides])
+    return load_config([*CONFIG, *overrides])
 
 
 def baseline(*overrides: str, arm: Path | None = None) -> GateResult:
@@ -80,34 +80,26 @@ def ghost(model: mujoco.MjModel) -> None:
 
 ALTERATIONS: dict[str, tuple[Callable[[mujoco.MjModel], None], str]] = {
     "gravity": (option("gravity", [0, 0, 0]), "option gravity 0 0 0, configured 0 0 -9.81"),
-    "side": (option("gravity", [0.01, 0, -9.81]), "option gravity 0.01 0 -9.81, configured 0 0"),
     "mass": (
         body("red", "mass", 0.0808),
         r"red body_mass 0.0808, configured 0.08 (scene.objects.red.mass)",
     ),
-    "light": (body("blue", "mass", 0.04), "blue body_mass 0.04, configured 0.08"),
     "inertia": (
         body("red", "inertia", 3e-5),
         "red body_inertia 3e-05 3e-05 3e-05, configured 2.58",
     ),
-    "turn": (body("blue", "inertia", [2.6e-5, 2.58e-5, 2.58e-5]), "blue body_inertia 2.6e-05"),
     "friction": (
         geom("red", "friction", [0.9, 0.005, 0.0005]),
         "red geom_friction 0.9 0.005 0.0005, configured 1.2 0.005 0.0005"
         " (scene.objects.red.friction)",
     ),
-    "table": (geom("table", "friction", [0.9, 0.005, 0.0005]), "table geom_friction 0.9"),
-    "torsion": (geom("blue", "friction", [1.2, 0.1, 0.0005]), "blue geom_friction 1.2 0.1"),
     "size": (
         geom("red", "size", [0.03, 0.022, 0.022]),
         "red geom_size 0.03 0.022 0.022, configured 0.022 0.022 0.022 (scene.objects.red.size)",
     ),
-    "top": (geom("table", "size", [0.1, 0.2, 0.012]), "table geom_size 0.1 0.2 0.012, configured"),
     "flags": (option("disableflags", 1 << 4), "option disableflags 16, configured 0"),
-    "contype": (geom("red", "conaffinity", 0), "red geom_conaffinity 0, configured 1"),
     "ghost": (ghost, "blue has 0 geom for collisions, configured 1"),
     "damping": (joint("red", "damping", 0.01), "red dof_damping 0.01"),
-    "armature": (joint("blue", "armature", 0.01), "blue dof_armature 0.01"),
     "fluid": (option("density", 1.2), "option density 1.2, configured 0"),
     "gravcomp": (body("red", "gravcomp", 1.0), "red body_gravcomp 1, configured 0"),
     "solref": (geom("table", "solref", [0.01, 1.0]), "table geom_solref 0.01 1, configured 0.02 1"),
@@ -128,13 +120,15 @@ def altered_baseline(alter: Callable[[mujoco.MjModel], None], monkeypatch: Patch
     return baseline()
 
 
-@pytest.mark.parametrize("name", ALTERATIONS)
-def test_a_scene_that_is_changed_behind_its_back_fails(name: str, monkeypatch: Patch) -> None:
-    alter, message = ALTERATIONS[name]
-    result = altered_baseline(alter, monkeypatch)
+def test_a_scene_that_is_changed_behind_its_back_fails(monkeypatch: Patch) -> None:
+    cfg = scara()
+    for name, (alter, message) in ALTERATIONS.items():
+        model = build_model(cfg)
+        alter(model)
+        assert message in "; ".join(scene_faults(cfg, model)), name
+    result = altered_baseline(ALTERATIONS["ghost"][0], monkeypatch)
     assert result.status == "fail"
-    assert result.reason.startswith("the compiled scene is not as configured: ")
-    assert message in result.reason
+    assert result.reason.startswith("the compiled scene is not as configured: blue has 0 geom")
 
 
 def test_a_fall_shows_a_cause_that_no_field_has() -> None:

@@ -227,26 +227,6 @@ def test_damaged_record_is_one_line(tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.full
-def test_no_trajectory_is_kept(new_run: NewRun, tmp_path: Path) -> None:
-    """A trajectory of qpos alone would take 48 kB a world on the host. The 3-D page has its own
-    bound, of 64 worlds.
-    """
-
-    def peak(nworld: int) -> int:
-        run = new_run("sim=native", f"nworld={nworld}", "web.episode=false", *at_double_speed())
-        assert run.stage.model.nq * 8 * 300 == 48_000
-        tracemalloc.start()
-        play(run, tmp_path)
-        try:
-            return tracemalloc.get_traced_memory()[1]
-        finally:
-            tracemalloc.stop()
-
-    peak(2)  # whatever is made once
-    assert (peak(12) - peak(2)) / 10 < 15_000
-
-
 def test_a_further_seed_keeps_its_record_without_final_positions(new_run: NewRun) -> None:
     """The record's other arrays, and 8 bytes a world for the hash of its final positions."""
     check = new_run("sim=native").stage.check

@@ -177,61 +177,6 @@ def test_reaches_what_mink_reaches(
             assert away.mean() <= mink_away.mean() + 0.001
 
 
-@pytest.mark.full
-def test_an_approach_gain_tilts_less_than_mink(
-    get_stage: GetStage, get_arm: Callable[[str], Arm], by_mink: Callable
-) -> None:
-    """What SO-101's gain is for: above the table its gripper is nowhere more tilted than where mink
-    is drawn home.
-    """
-    arm = get_arm("so101")
-    mink = by_mink("so101")[TABLE]
-    ik = arm.solver(MINK, iterations=40, **shipped(get_stage("so101")))
-    command, _ = results(ik, arm.at_home(MINK), mink.targets)
-    tilt, mink_tilt = (
-        np.degrees(np.arccos(np.clip(-arm.directions(c[mink.reached])[1][:, 2], -1.0, 1.0)))
-        for c in (command, mink.commands)
-    )
-    assert (tilt <= mink_tilt + 1.0).all()
-    assert tilt.mean() < mink_tilt.mean() - 5.0
-
-
-@pytest.mark.full
-def test_follows_minks_way_as_shipped(
-    robot: str, get_stage: GetStage, arm: Arm, by_mink: Callable
-) -> None:
-    """With the controller's iterations per step and its gains, along the way from home to each of
-    mink's solutions.
-
-    Above the table all of it is followed. Elsewhere SO-101 is lost at times where the way comes as
-    near to the base's axis as the arm can, 26 mm: there no joint moves the grasp_point in or out,
-    the base may turn either way, and on to its limit.
-    """
-    data = mujoco.MjData(arm.model)
-    steps = 200
-    mujoco.mj_kinematics(arm.model, data)
-    axis = data.joint(arm.names[0]).xanchor[:2]
-    stage = get_stage(robot)
-    ik = arm.solver(MINK, iterations=stage.cfg.controller.step_iterations, **shipped(stage))
-    for where, mink in by_mink(robot).items():
-        goal = mink.commands.copy()
-        goal[:, len(arm.robot.arm_joints) :] = arm.robot.gripper_open
-        command = torch.as_tensor(arm.at_home(MINK))
-        worst = np.zeros(MINK)
-        radius = np.full(MINK, np.inf)
-        for u in np.arange(1, steps + 1) / steps:
-            way = torch.as_tensor(arm.home + u * u * (3.0 - 2.0 * u) * (goal - arm.home))
-            target = ik.forward(way)[0].clone()
-            command, left = (out.clone() for out in ik.solve(command, target))
-            worst = np.maximum(worst, left.numpy())
-            radius = np.minimum(radius, np.linalg.norm(target.numpy()[:, :2] - axis, axis=1))
-        lost = mink.reached & ~(worst <= TOLERANCE)
-        assert (radius[lost] < 0.03).all()
-        if where == TABLE:
-            assert not lost.any()
-        assert lost.mean() < 0.03
-
-
 GAINS = [(0.3, 0.0), (0.0, 0.3), (0.1, 0.3)]
 
 

@@ -8,8 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from box_checker import lowest_geometry
-from check_cases import Recording, limits
+from check_cases import limits
 from compositions import checked, load_config, make_env, refusal
 
 from mjstack.config.schema import Config
@@ -159,31 +158,6 @@ def test_home_is_the_first_approach_and_clear_of_everything(robot: str) -> None:
     assert at == pytest.approx([*cfg.scene.objects["red"].xy, TOP[robot] + 0.19], abs=5e-6)
 
 
-@pytest.mark.full
-def test_a_home_of_ones_own_counts() -> None:
-    home = [0.5, -0.4, 0.1, 0.8, 1.584, 0.6]
-    assert load_config(["task=box", f"robot.home={home}"]).robot.home == home
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("reset", ["nominal", "jitter", "randomized"])
-def test_random_actions_from_every_start(robot: str, reset: str) -> None:
-    env = small_env(f"reset={reset}", robot=robot, nworld=2)
-    scene = env.cfg.scene
-    spread = {"nominal": (0.0, 0.0), "jitter": (0.002, 0.002), "randomized": scene.random_xy}[reset]
-    for name, place in ((RED, scene.objects["red"].xy), (BLUE, scene.objects["blue"].xy)):
-        address, _ = env.index.objects[name]
-        off = np.abs(env.sim.qpos[:, address : address + 2].numpy() - place)
-        assert (off <= np.array(spread) + 1e-9).all()
-    generator = torch.Generator().manual_seed(0)
-    for _ in range(15):
-        action = torch.rand((env.nworld, env.action_manager.action_dim), generator=generator)
-        obs, reward, _, _, _ = env.step(2.0 * action - 1.0)
-    assert set(obs) == {"policy", "privileged"}
-    assert all(bool(torch.isfinite(x).all()) for x in (*obs.values(), reward))
-    env.close()
-
-
 # Rewards
 
 
@@ -286,26 +260,6 @@ def test_matrix_of_a_quaternion() -> None:
         wanted = np.empty(9)
         mujoco.mju_quat2Mat(wanted, q)
         np.testing.assert_allclose(matrix.ravel(), wanted, atol=1e-12)
-
-
-@pytest.mark.full
-def test_lowest_point_of_the_jaws(robot: str) -> None:
-    cfg = configured(robot)
-    model = build_model(cfg)
-    index = SceneIndex(model, cfg.robot, cfg.scene)
-    data = mujoco.MjData(model)
-    low = index.robot_range[:, 0]
-    high = index.robot_range[:, 1]
-    draw = np.random.default_rng(0)
-    empty = np.zeros((0, 2, 0))
-    for _ in range(30):
-        data.qpos[index.robot_qpos] = draw.uniform(low, high)
-        mujoco.mj_kinematics(model, data)
-        recording = Recording(*[empty] * 6, data.xpos, data.xquat, 0)
-        wanted = lowest_geometry(recording, cfg.robot.jaw_bodies, model)
-        pose = (torch.tensor(data.xpos)[None], torch.tensor(data.xquat)[None])
-        got = lowest_height(model, cfg.robot.jaw_bodies, *pose)
-        assert float(got[0]) == pytest.approx(wanted, abs=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["cylinder", "mesh"])

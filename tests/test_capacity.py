@@ -441,27 +441,6 @@ def test_few_worlds_act_at_random_for_an_episode(
 
 
 @pytest.mark.full
-def test_the_gate_recommends_nothing_from_motion_that_lost_physics(
-    new_run: NewRun, monkeypatch: Patch
-) -> None:
-    said: list[str] = []
-    run = new_run("sim=mjwarp", "sim.device=cpu", "nworld=2", "batch=auto")
-    run.stage.progress = Progress(said.append)
-    lost = workload(overflow=np.array([0, int(Overflow.NEFC)]))
-    made_up(monkeypatch, lambda driven: workload() if driven else lost)
-    (result,) = run_capacity(run)
-    assert result.status is Status.failed
-    assert result.reason.startswith(
-        "environments: NEFC overflow in 1 of 2 worlds (1) even with batch.nconmax=128"
-    )
-    assert "task" in run.stage.measured
-    assert "env" not in run.stage.measured
-    assert said[1].endswith("not known, physics was lost")
-    assert "recommended.njmax" in result.metrics
-    assert "recommended_env.njmax" not in result.metrics
-
-
-@pytest.mark.full
 def test_contacts_and_convex_pairs_are_held_against_their_keys() -> None:
     cfg = load_config(["nworld=4", "batch.nconmax=15", "batch.nccdmax=3"])
     seen = peaks(nworld=4, contacts=20, ccd_pairs=40)
@@ -517,19 +496,6 @@ def test_a_probe_that_lost_physics_makes_no_environment(monkeypatch: Patch) -> N
         mjstack.make_env(overrides, nworld=1, device="cpu")
     assert len(made) == 4
     assert not [ref for ref in made if ref() is not None]
-
-
-@pytest.mark.full
-def test_gates_get_no_sizes_from_a_task_that_lost_physics(
-    new_run: NewRun, monkeypatch: Patch
-) -> None:
-    lost = workload(overflow=np.array([int(Overflow.NEFC), 0]))
-    made_up(monkeypatch, lambda driven: lost)
-    run = new_run("sim=mjwarp", "sim.device=cpu", "nworld=2", "batch=auto")
-    message = "measured by the driven task: NEFC overflow in 1 of 2 worlds"
-    with pytest.raises(FaultError, match=message):
-        run.stage.sizes  # noqa: B018
-    assert "task" not in run.stage.measured
 
 
 @pytest.mark.full

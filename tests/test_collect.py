@@ -22,10 +22,8 @@ from environments import Capture, Patch, Refused, at_double_speed, on_cuda, repo
 from stubs import episodes_of, fake_batches, pairs
 
 from mjstack.cli import run
-from mjstack.config.check import validate
 from mjstack.config.fingerprint import config_hash, differences
 from mjstack.config.schema import Backend, Config
-from mjstack.datasets.part import PartWriter
 from mjstack.datasets.spec import INDICES, DatasetSpec, Feature
 from mjstack.datasets.writer import DatasetWriter
 from mjstack.envs import Env, build_env, demonstration_config
@@ -34,7 +32,7 @@ from mjstack.episodes.recorder import Channels, Recorder, read_commands
 from mjstack.episodes.rollout import Episode
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError
-from mjstack.jobs import CheckedJob, check_job
+from mjstack.jobs import CheckedJob
 from mjstack.jobs import collect as job
 from mjstack.jobs.collect import run_collect
 from mjstack.jobs.collect_episodes import EpisodeSource
@@ -343,13 +341,6 @@ def test_bad_input_is_one_line(args: list[str], words: str, folder: Path, refuse
     assert words in refused(*COMMAND, *args)
 
 
-def test_a_value_that_the_job_does_not_take() -> None:
-    with pytest.raises(ConfigError, match=r"job\.episodes=0"):
-        validate(put(load_config(COMMAND), "job.episodes=0"))
-    with pytest.raises(ConfigError, match="video=true: expected false with job=collect"):
-        check_job(put(load_config(COMMAND), "video=true"))
-
-
 @pytest.mark.full
 def test_what_the_hash_is_of() -> None:
     def home(*values: str, choices: Sequence[str] = ()) -> Path:
@@ -470,16 +461,6 @@ def test_a_layout_counts_by_its_content(
 
 
 @pytest.mark.full
-def test_a_layout_that_only_the_term_names_counts_too(folder: Path) -> None:
-    homes = set()
-    for path, red_x in (("a.npz", 0.31), ("b.npz", 0.31), ("b.npz", 0.32)):
-        write_two_starts(Path(path), red_x)
-        starts = ["reset=starts_file", f"reset.starts.params.path={path}"]
-        homes.add(collect_folder(load_config(["job=collect", *starts])))
-    assert len(homes) == 2
-
-
-@pytest.mark.full
 def test_failures_are_kept_and_marked(folder: Path, play_nothing: PlayNothing) -> None:
     def break_two(seed: int, values: torch.Tensor) -> None:
         values[3, 2:3] = torch.nan  # a world that diverged: of no use
@@ -524,48 +505,6 @@ def test_seeds_without_an_episode_are_given_up(
 
 
 @pytest.mark.full
-@pytest.mark.parametrize(
-    ("error", "status", "code"),
-    [
-        (KeyboardInterrupt(), "interrupted", 130),
-        (OSError(28, "No space left on device"), "fail", 1),
-    ],
-    ids=["Ctrl-C", "full disk"],
-)
-def test_finished_batches_are_kept(
-    error: BaseException,
-    status: str,
-    code: int,
-    folder: Path,
-    play_nothing: PlayNothing,
-    monkeypatch: Patch,
-    capsys: Capture,
-) -> None:
-    """The second batch ends in the middle of its episodes. What goes on is in
-    test_collect_resume.py.
-    """
-    write = PartWriter.write
-
-    def broken(self: PartWriter, episode: Any, *args: Any) -> None:
-        if episode.row["seed"] == 1 and len(self.part.rows) == 1:
-            raise error
-        write(self, episode, *args)
-
-    play_nothing()
-    monkeypatch.setattr(PartWriter, "write", broken)
-    assert collect("nworld=2", "job.episodes=5") == code
-    assert pairs(folder / "dataset") == [(0, 0), (0, 1)]
-    report = report_of(folder)
-    assert report["status"] == status
-    if code == 1:
-        (line,) = capsys.readouterr().err.splitlines()
-        assert "No space left on device" in line
-        assert "2 committed episodes are kept" in line
-    else:
-        assert report["gates"][0]["reason"].startswith("interrupted; 2 episodes, 5 asked for")
-
-
-@pytest.mark.full
 def test_a_full_device_is_one_line(
     folder: Path, monkeypatch: Patch, error_line: Callable[[], str]
 ) -> None:
@@ -576,18 +515,6 @@ def test_a_full_device_is_one_line(
     assert collect("nworld=2", "job.episodes=2") == 1
     assert error_line().startswith("mjstack: out of memory (")
     assert report_of(folder)["status"] == "fail"
-
-
-@pytest.mark.full
-def test_brackets_in_names_are_printed(
-    folder: Path, play_nothing: PlayNothing, capsys: Capture
-) -> None:
-    play_nothing()
-    names = ("robot.title='Arm [/b]'", "job.folder='outputs/[b]'")
-    assert collect("nworld=2", "job.episodes=2", *names) == 0
-    out = capsys.readouterr().out
-    assert "Arm [/b], " in out
-    assert "dataset: outputs/[b]/dataset\n" in out
 
 
 @pytest.mark.full

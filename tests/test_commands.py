@@ -63,12 +63,9 @@ def test_a_composition_has_the_folder(name: str, tmp_path: Path) -> None:
         assert compose(words[3:]).run == f"/tmp/{name}"
 
 
-@pytest.mark.parametrize("name", ["Copy (1)", "epoch=3,  'v2' \"zoë\" [b]$HOME\\"])
-def test_the_printed_replay_runs(
-    name: str, tmp_path: Path, monkeypatch: Patch, capsys: Capture
-) -> None:
-    """Pasted into a shell, in a project's folder with a name like that; the page has it too."""
-    project = tmp_path / name
+def test_the_printed_replay_runs(tmp_path: Path, monkeypatch: Patch, capsys: Capture) -> None:
+    """Pasted into a shell, in a project's folder with an odd name; the page has it too."""
+    project = tmp_path / "epoch=3,  'v2' \"zoë\" [b]$HOME\\"
     (project / "conf" / "experiment").mkdir(parents=True)
     strict = "# @package _global_\ntask:\n  check:\n    xy_err: 0.0001\n"
     (project / "conf" / "experiment" / "strict.yaml").write_text(strict)

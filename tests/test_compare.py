@@ -146,6 +146,7 @@ def test_other_sides_are_refused_in_one_line(overrides: list[str], problem: str)
     refusal(lambda: check_job(load_config(args), args), problem)
 
 
+@FULL
 def test_starts_that_turn_out_unequal_fail(tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.setattr(compare, "_start_of_first_world", lambda stage: {"start": np.zeros(1)})
     region = ['job.against=["gate.success.region=[0.01,0.01]"]']
@@ -154,6 +155,7 @@ def test_starts_that_turn_out_unequal_fail(tmp_path: Path, monkeypatch: Patch) -
     assert "a and b did not start alike" in report(tmp_path / "out")["compare"]["reason"]
 
 
+@FULL
 @pytest.mark.parametrize(("device", "code"), [("cpu", 1), ("cuda:0", 0)])
 def test_starts_may_differ_by_rounding_on_another_device(
     device: str, code: int, tmp_path: Path, monkeypatch: Patch

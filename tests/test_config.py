@@ -300,14 +300,12 @@ STARTS = [
     ([], "randomized", []),
     (["reset@gate.success.reset=jitter"], "jitter", []),
     (["gates=[success]", "reset=jitter"], "randomized", ["reset=jitter"]),
-    (["job=compare", "reset=nominal"], "randomized", ["reset=nominal"]),
     (["gates=[batch,success]", "cameras=front", "looks=randomized"], "randomized", ["looks=rand"]),
     (
         ["gates=[success]", "cameras=front", "+looks@gate.success.reset=randomized"],
         "randomized looks=randomized",
         [],
     ),
-    (["reset=jitter"], "randomized", []),  # it does not run
 ]
 
 
@@ -432,7 +430,7 @@ EFFECTS = {
 @pytest.mark.parametrize("override", EFFECTS)
 def test_which_results_depend_on_a_key(override: str) -> None:
     args = ["job=train", "cameras=front", "sim=native"]
-    before, after = (load_config([*args, *more]) for more in ([], [override]))
+    before, after = (compositions.load_config([*args, *more]) for more in ([], [override]))
     changed = [r for r in RESULTS if config_content(before, r) != config_content(after, r)]
     assert changed == EFFECTS[override].split()
     assert (config_content(before) != config_content(after)) == bool(changed)
@@ -529,7 +527,7 @@ def test_a_whole_number_is_a_float(owner: type, item: Field, hint: Any) -> None:
         taken(owner, item, filled(hint, True, limits.length or 2))
 
 
-@pytest.mark.parametrize("value", ["[0,0,true]", "[0,0,up]", "[0,1]", "3", "up", "null"])
+@pytest.mark.parametrize("value", ["[0,0,true]", "[0,1]", "up"])
 def test_a_place_that_is_no_list_of_numbers(value: str) -> None:
     given = f"+robot.grasp_pos={{x: {value}}}"
     assert "expected a list of 3 numbers [m]" in refusal(lambda: load_config([given]))

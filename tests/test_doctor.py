@@ -59,12 +59,12 @@ def test_no_gpu_has_a_reason(capsys: Capture) -> None:
 
 
 IMPORT = "from mjstack.sim.warp_setup import wp; print(wp.config.kernel_cache_dir)"
+UNWRITABLE = r"kernel cache /\S+: cannot be written \(.+\), so that .* Set WARP_CACHE_"
 
 
 @pytest.mark.parametrize(
     "variables",
     [
-        {"HOME": "/dev/null"},
         {"HOME": "/proc"},
         {"HOME": "/dev/null", "XDG_CACHE_HOME": "/proc/1/none"},
         {"WARP_CACHE_PATH": "/dev/null/cache"},
@@ -72,18 +72,26 @@ IMPORT = "from mjstack.sim.warp_setup import wp; print(wp.config.kernel_cache_di
     ids=str,
 )
 def test_a_kernel_cache_that_cannot_be_written_is_a_temporary_folder(
-    variables: dict[str, str], tmp_path: Path
+    variables: dict[str, str], tmp_path: Path, monkeypatch: Patch
 ) -> None:
     """In its place; what is wrong is one line, with the variable that mends it."""
-    env = {k: v for k, v in os.environ.items() if k not in ("XDG_CACHE_HOME", CACHE)} | variables
-    command = [sys.executable, "-c", IMPORT]
-    done = subprocess.run(command, env=env | {"TMPDIR": str(tmp_path)}, **CAPTURED)
+    for name, value in ({"XDG_CACHE_HOME": "", CACHE: ""} | variables).items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    folder, problem = warp_setup._kernel_cache()
+    assert folder.startswith(f"{tmp_path}/mjstack-kernels-")
+    assert re.match(UNWRITABLE, problem)
+
+
+@pytest.mark.full
+def test_a_temporary_kernel_cache_ends_with_its_process(tmp_path: Path) -> None:
+    env = {k: v for k, v in os.environ.items() if k not in ("XDG_CACHE_HOME", CACHE)}
+    env |= {"HOME": "/dev/null", "TMPDIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", IMPORT], env=env, **CAPTURED)
     assert done.stdout.startswith(f"{tmp_path}/mjstack-kernels-")
-    assert not list(tmp_path.iterdir())  # it ends with the process
+    assert not list(tmp_path.iterdir())
     (line,) = done.stderr.splitlines()
-    assert re.match(
-        r"kernel cache /\S+: cannot be written \(.+\), so that .* Set WARP_CACHE_", line
-    )
+    assert re.match(UNWRITABLE, line)
 
 
 def test_a_kernel_cache_without_a_home(monkeypatch: Patch, tmp_path: Path) -> None:
@@ -124,6 +132,7 @@ def test_kernels_of_a_cache_that_is_read_alone(monkeypatch: Patch, tmp_path: Pat
     assert "Permission denied" in problem
 
 
+@pytest.mark.full
 def test_the_page_ends_where_no_folder_can_be_written(tmp_path: Path) -> None:
     """Not even a temporary one; in a process of its own, which has not loaded Warp."""
     script = (
@@ -146,6 +155,7 @@ def test_the_page_ends_where_no_folder_can_be_written(tmp_path: Path) -> None:
     assert list(lines)[-1] == "backend"
 
 
+@pytest.mark.full
 @pytest.mark.skipif(warp_setup._has_driver(), reason="a CUDA driver is here")
 def test_warp_has_no_line_about_a_driver_that_is_not_there() -> None:
     """What else it writes while it starts stays."""

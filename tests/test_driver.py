@@ -119,6 +119,7 @@ def test_a_file_of_its_name_chooses_it(conf: Path) -> None:
     assert mjstack.load_config(overrides, config_dir=conf).controller.params == {"offset": 0.01}
 
 
+@pytest.mark.full
 def test_its_worlds_are_replayed_on_the_users_search_path_alone(conf: Path) -> None:
     flags = ["--config-dir", str(conf)]
     assert run([*flags, *HOLD, "gates=[batch]", "web.episode=false", "hydra.run.dir=run"]) == 0

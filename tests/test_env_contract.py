@@ -571,17 +571,6 @@ def test_end_by_what_happened(
     assert_ends(ended, term, [world])
 
 
-def test_time_out_at_exactly_its_step(backend: str) -> None:
-    env = on_shared_sim(backend, 3, randomized("stack", "so101", steps=5))
-    env.reset(seed=0)
-    for step in range(1, 12):
-        if step == 3:
-            env.reset(mask=mask_of(env, 1))  # after two steps
-        _, _, terminated, truncated, _ = env.step(zeros(env))
-        assert not terminated.any()
-        assert truncated.tolist() == [step in (5, 10), step == 7, step in (5, 10)]
-
-
 def test_statistics_are_those_of_the_episodes_that_ended(backend: str) -> None:
     cfg = randomized("reach", "so101", steps=4)
     env = on_shared_sim(backend, 3, cfg)

@@ -15,12 +15,12 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
+from compositions import load_config
 from environments import NOMINAL, Patch, configure, has_gl
 from policies import make_policy, write_policy
 
 import mjstack
 from mjstack.cli import run
-from mjstack.config import load_config
 from mjstack.config.schema import Config
 from mjstack.config.session import search_path
 from mjstack.drivers.policy import PolicyDriver

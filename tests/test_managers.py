@@ -148,29 +148,6 @@ def test_tables_show_settings_and_the_environment_shows_all_tables() -> None:
     assert "height=0.04" in row
 
 
-@pytest.mark.full
-def test_overrides_change_exactly_what_they_name() -> None:
-    changes = "action=ee_delta reset=nominal ~reward.joint_vel reward.progress.weight=3"
-    env = make_env(["sim=native", *changes.split()], nworld=2, seed=5)
-    expected = configure("sim=native")
-    expected.nworld = 2
-    expected.seed = 5
-    expected.action = configure("action=ee_delta").action
-    expected.reset = configure("reset=nominal").reset
-    expected.reward.pop("joint_vel")
-    expected.reward["progress"].weight = 3.0
-    assert env.cfg == expected
-    assert env.cfg.action != configure("sim=native").action
-    assert list(env.action_manager.terms) == ["arm", "gripper"]
-    assert type(env.action_manager.terms["arm"]).__name__ == "EndEffectorDelta"
-    assert env.action_manager.action_dim == 4
-    assert env.reward_manager.names == ["progress", "success", "action_rate"]
-    rows = str(env.reward_manager).splitlines()
-    assert "3.0" in next(row for row in rows if "progress" in row)
-    assert (env.nworld, env.seed) == (2, 5)
-    env.close()
-
-
 def test_a_control_step_makes_few_torch_calls() -> None:
     """Each costs microseconds of one thread while the physics waits, on CUDA a kernel. There were
     289 without views before terms shared the state of a step.

@@ -7,14 +7,14 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from compositions import refusal
+from compositions import load_config, make_env, refusal
 
-from mjstack import make_env, verify
-from mjstack.config import load_config
+from mjstack import verify
 from mjstack.envs import Env
 from mjstack.math import lowest_point
 from mjstack.mdp.geometry import above_table, pose_w
 from mjstack.mdp.observation import fixture_pos, fixture_vel
+from mjstack.mdp.reset import FixtureJoints
 from mjstack.mdp.starts.starts_file import write_starts
 from mjstack.robots.guest import object_left_behind
 from mjstack.scene import build_model
@@ -264,23 +264,15 @@ def test_starts_of_a_fixture_are_drawn_and_come_back_from_a_file(tmp_path: Path)
     file = f"starts={tmp_path}/starts.npz"
     again = build(path, "reset=starts_file", file, keys=", fixed: true", nworld=8)
     assert torch.equal(again.sim.qpos, env.sim.qpos)
-    for wrong in ("[0.6, 0.2]", "[0.0, 1.6]", "[0.1]", "3", "[a, b]", "ab", "{a: 1, b: 2}"):
-        bad = term.replace("[0.2, 0.6]", wrong)
+    for wrong in ([0.6, 0.2], [0.0, 1.6], [0.1], 3, ["a", "b"], "ab", {"a": 1, "b": 2}):
         message = "expected two numbers in 0 to 1.5708"
-        refusal(partial(build, path, f"+reset.door={bad}", keys=", fixed: true"), message)
-    bad = term.replace("thing_hinge", "0")  # it would be the first joint of the model
-    message = "joint of a fixture '0' does not exist"
-    refusal(partial(build, path, f"+reset.door={bad}", keys=", fixed: true"), message)
+        refusal(partial(FixtureJoints, env, joints={"thing_hinge": wrong}), message)
+    message = "joint of a fixture '0' does not exist"  # it would be the first joint of the model
+    refusal(partial(FixtureJoints, env, joints={"0": [0.2, 0.6]}), message)
+    for wrong in ({}, None, [1], 3):
+        refusal(partial(FixtureJoints, env, joints=wrong), "expected a mapping")
     env.close()
     again.close()
-
-
-@pytest.mark.parametrize("joints", ["{}", "null", "[1]", "3"])
-def test_starts_of_fixtures_are_a_mapping(tmp_path: Path, joints: str) -> None:
-    term = f"{{func: mjstack.mdp.reset.FixtureJoints, params: {{joints: {joints}}}}}"
-    path = written(tmp_path, DOOR)
-    message = f"reset.door.params.joints={joints}: expected a mapping"
-    refusal(partial(build, path, f"+reset.door={term}", keys=", fixed: true"), message)
 
 
 @pytest.mark.parametrize(("ends", "start"), [([0.5, 0.9], 0.5), ([-0.9, -0.5], -0.5)])

@@ -9,11 +9,9 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from compositions import refusal
+from compositions import load_config, make_env, refusal
 from environments import mask_of
 
-from mjstack import make_env
-from mjstack.config import load_config
 from mjstack.config.schema import Config, ObjectCfg
 from mjstack.drivers.closed_loop import make_expert
 from mjstack.drivers.open_loop import OpenLoopPlanner
@@ -393,40 +391,6 @@ def test_a_scene_that_cannot_be(
 ) -> None:
     conf = folder(PUCK.replace(*change))
     refusal(lambda: load_config(["task=mine"], config_dir=conf), message)
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("task", ["stack", "box"])
-def test_starts_and_commands_are_those_of_before(robot: str, task: str) -> None:
-    """Recorded at commit 3e08f6d, which knew two cubes only: starts, joint targets of drivers."""
-    with np.load(Path(__file__).parent / "data" / "commit_3e08f6d.npz") as file:
-        names = ("start", "nominal", "closed_loop", "open_loop")
-        recorded = {name: file[f"{task}.{robot}.{name}"] for name in names}
-    driven = [f"task={task}", f"robot={robot}", "action=joint_absolute", "sim=native"]
-    env = make_env([*driven, "reset=randomized"], nworld=2)
-    env.reset(seed=0)
-    if task == "box":  # cubes that do not fit as first drawn start elsewhere since
-        env.sim.qpos[:] = torch.from_numpy(recorded["start"])
-        env.sim.kinematics()
-    np.testing.assert_allclose(env.sim.qpos.numpy(), recorded["start"], rtol=0.0, atol=1e-15)
-    driver = make_expert(env)
-    np.testing.assert_allclose(driver._nominal.numpy(), recorded["nominal"], atol=1e-6)
-    commands = []
-    for _ in range(61):
-        commands.append(driver.command().numpy().copy())
-        env.step(driver._command)
-    closed_loop = np.stack(commands[::15])
-    np.testing.assert_allclose(closed_loop, recorded["closed_loop"], rtol=0.0, atol=1e-5)
-    env.close()
-    jitter = make_env([*driven, "reset=jitter"], nworld=2)
-    jitter.reset(seed=0)
-    planner = OpenLoopPlanner(jitter.cfg)
-    trajectory = planner.plan(source_xy(jitter).double().numpy())
-    for number, phase in enumerate(planner.phases):
-        targets = trajectory.command(phase.stop - 1).numpy()
-        expected = recorded["open_loop"][:, number]
-        np.testing.assert_allclose(targets, expected, rtol=0.0, atol=0.01)  # mink's, then
-    jitter.close()
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,6 @@ import torch
 from compositions import load_config
 from doc_blocks import ROOT, write_files
 
-import mjstack
 from mjstack.config.schema import Backend
 from mjstack.episodes.rollout import State
 from mjstack.episodes.run import Run
@@ -47,7 +46,7 @@ def played(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     write_files((ROOT / "docs" / "own_tasks.md").read_text(encoding="utf-8"), folder)
     task = SCENES[request.param]
     home = ROOT / "examples" / "peg" if task == "peg" else folder / "lift"
-    cfg = mjstack.load_config([f"task={task}"], config_dir=home / "conf")
+    cfg = load_config([f"task={task}"], config_dir=home / "conf")
     run = Run(Stage(cfg))
     _ = run.nominal
     return run
@@ -103,10 +102,7 @@ def faster(model: mujoco.MjModel, objects: list[int]) -> None:
     [
         (lambda model, objects: None, None),
         (heavier, r"swung, 1 steps: qvel of "),
-        (
-            smoother,
-            rf"in_motion, 1 steps: \w+ of {OBJECT} .*look first at {OBJECT}: its shape",
-        ),
+        (smoother, rf"in_motion, 1 steps: \w+ of {OBJECT} .*look first at {OBJECT}: its shape"),
         (undamped, r"in_motion, 1 steps: qvel of \w+ .*look first at \w+: its servo, damping"),
         (
             apart,
@@ -129,7 +125,7 @@ def test_what_differs_is_caught_on_a_box_and_on_a_cylinder(
 @pytest.mark.full
 def test_contacts_that_float32_misses_by_chance_pass_and_lost_ones_do_not() -> None:
     """Of a puck that just touches the table, and of a table that touches no object."""
-    run = Run(Stage(mjstack.load_config(["task=push"], config_dir=ROOT / "examples/push/conf")))
+    run = Run(Stage(load_config(["task=push"], config_dir=ROOT / "examples/push/conf")))
     result = GateResult(name="parity", status=Status.passed)
     with closing(make_simulation(run.stage.model, run.cfg, 1, backend=Backend.mjwarp)) as mjwarp:
         assert compare_states(run, mjwarp, result) == []
@@ -330,7 +326,7 @@ def test_a_stranger_s_linkage_passes_and_its_faults_show(tmp_path: Path) -> None
     file = Path(package.origin).parent / "mujoco/robots/assets/droid/model.xml"
     (tmp_path / "robot").mkdir()
     (tmp_path / "robot/droid.yaml").write_text(f"{LINKAGE}file: {file}\n", encoding="utf-8")
-    run = Run(Stage(mjstack.load_config(["robot=droid"], config_dir=tmp_path)))
+    run = Run(Stage(load_config(["robot=droid"], config_dir=tmp_path)))
     with closing(make_simulation(run.stage.model, run.cfg, 1, backend=Backend.mjwarp)) as mjwarp:
         assert isinstance(mjwarp, MjwarpSimulation)
         arm = Uploaded(run, mjwarp)
@@ -382,7 +378,7 @@ def test_ends_of_all_joints_but_the_robots_are_compared(
 ) -> None:
     """Also of a fixture, by the limits of objects: position of slides, rotation of hinges."""
     model = mujoco.MjModel.from_xml_string(JOINTS)
-    cfg = mjstack.load_config(["task=reach"])
+    cfg = load_config(["task=reach"])
     cfg.robot.arm_joints, cfg.robot.gripper_joints = ["arm"], []
     cfg.scene.objects["can"] = next(iter(cfg.scene.objects.values()))
     change = np.zeros(model.nv)
@@ -402,7 +398,7 @@ def test_ends_of_all_joints_but_the_robots_are_compared(
 
 def test_an_end_that_native_mujoco_reaches_by_rounding_passes() -> None:
     model = mujoco.MjModel.from_xml_string(JOINTS)
-    cfg = mjstack.load_config(["task=reach"])
+    cfg = load_config(["task=reach"])
     drawer = int(model.joint("drawer").qposadr[0])
     end, near = model.qpos0.copy(), model.qpos0.copy()
     end[drawer], near[drawer] = 0.005, 0.004

@@ -19,9 +19,6 @@ from policies import interrupted, report, same
 from mjstack.cli import run
 from mjstack.config.schema import CloneJobCfg, VisionCfg
 from mjstack.drivers.policy import PolicyDriver
-from mjstack.envs import Env
-from mjstack.episodes.motion import draw_seen
-from mjstack.episodes.recorder import Channels, Read, Recorder, start_and_every_step
 from mjstack.episodes.stage import Stage
 from mjstack.errors import FolderError
 from mjstack.policy import load_policy
@@ -95,28 +92,6 @@ def test_the_driver_sees_what_the_environment_draws(trained: Path) -> None:
         assert torch.allclose(command, expected[torch.arange(4), slot], atol=1e-5), step
         env.step(command)
     env.close()
-
-
-@pytest.mark.full
-def test_what_a_policy_saw_is_drawn_again(trained: Path) -> None:
-    """From the positions of a world alone, in its own looks."""
-    chosen = ["controller=policy", f"policy={trained}/last", "looks=randomized", "nworld=2"]
-    cfg = load_config([*SMALL, *chosen])
-    stage = Stage(cfg)
-
-    def bind(env: Env, driver: PolicyDriver) -> Read:
-        images = driver.query_images.images
-        return lambda: {"qpos": env.sim.qpos.double(), **images}
-
-    recorder = Recorder(Channels(bind, start_and_every_step))
-    with closing(stage.batch_simulation(2)) as sim:
-        stage.play(sim, cfg.reset, [recorder])
-        drawn = draw_seen(stage, recorder.rows["qpos"][:-1, 1].numpy(), sim, 1)
-    assert list(drawn) == ["front", "wrist"]
-    for name, images in drawn.items():
-        seen = recorder.rows[name][1:, 1].numpy()  # a row after the step that has queried
-        assert np.array_equal(images, seen)
-        assert (seen[0] != seen[-1]).any()
 
 
 @pytest.mark.full

@@ -12,10 +12,9 @@ import pytest
 import torch
 from arm_file import MJCF, SCARA, changed, scara, write_arm
 from arms import model_of
-from compositions import refusal
+from compositions import load_config, make_env, refusal
 from ik_arm import Arm
 
-from mjstack import load_config, make_env
 from mjstack.config.schema import Config
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError
@@ -247,9 +246,7 @@ def test_a_servo_without_a_command_holds_its_joint(actuator: str, tmp_path: Path
     tendon = '<tendon><fixed name="t"><joint joint="spare" coef="1"/></fixed></tendon>'
     key = "<keyframe><key name='home' qpos='0 0 0 0 0 0 1.0'/></keyframe>"
     cfg = changed(
-        tmp_path,
-        ("</worldbody>", SPARE),
-        ("</actuator>", f"{actuator}</actuator>{tendon}{key}"),
+        tmp_path, ("</worldbody>", SPARE), ("</actuator>", f"{actuator}</actuator>{tendon}{key}")
     )
     search = f"hydra.searchpath=[file://{SCARA}/conf]"
     overrides = ["robot=scara", f"robot.file={cfg.robot.file}", "sim=native", "nworld=1"]
@@ -388,9 +385,7 @@ def test_widths_of_the_grip_need_no_sites_on_the_fingers(sites: str, tmp_path: P
 
 
 @pytest.mark.parametrize("ends", [(0.0, 0.05), (0.0, 0.03), (0.004, 0.06)])
-def test_joint_targets_follow_from_the_jaws_where_none_are_given(
-    ends: tuple[float, float],
-) -> None:
+def test_joint_targets_follow_from_the_jaws_where_none_are_given(ends: tuple[float, float]) -> None:
     """The jaws press with 20 N on each object, and open as far as joints and servos can."""
     robot = replace(scara().robot, gripper_open=None, gripper_closed=None)
     model = build_model(scara())

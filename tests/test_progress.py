@@ -19,7 +19,6 @@ import torch
 from compositions import load_config
 from environments import REBOT_LATER, at_double_speed
 
-import mjstack
 from mjstack.config.schema import Backend, Config
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env, build_env
@@ -81,7 +80,7 @@ class JudgeWithoutPhases(Observer):
 def configure(task: str, robot: str) -> Config:
     chosen = [f"task={task}", f"robot={robot}", "sim=native"]
     if task in ("push", "tower"):
-        return mjstack.load_config(chosen, config_dir=EXAMPLES / task / "conf")
+        return load_config(chosen, config_dir=EXAMPLES / task / "conf")
     faster = at_double_speed(robot, task) if task == "box" else ()
     return load_config([*chosen, *(v for v in faster if "settle" not in v)])
 
@@ -194,6 +193,6 @@ def test_success_needs_a_release() -> None:
 
 
 def test_a_check_without_goals_is_named() -> None:
-    cfg = mjstack.load_config(["task=push", "reward=stack"], config_dir=EXAMPLES / "push" / "conf")
+    cfg = load_config(["task=push", "reward=stack"], config_dir=EXAMPLES / "push" / "conf")
     with pytest.raises(ConfigError, match="PushCheck: expected a check with goals"):
         build_env(replace(cfg, nworld=1), backend=Backend.native)

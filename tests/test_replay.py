@@ -18,7 +18,6 @@ from compositions import load_config, put, refusal
 from environments import (
     NewRun,
     Patch,
-    Refused,
     at_double_speed,
     has_gl,
     on_cuda,
@@ -441,33 +440,12 @@ def test_values_that_name_no_world(values: list[str], says: str, earlier: Path) 
     assert says in refusal_of(*(value.format(run=earlier) for value in values))
 
 
-BAD = [
-    (["run={run}", "world=1", "~reset.cubes"], "reset.cubes"),
-    (["run=somewhere"], "job=replay"),
-    (["world=3"], "job=replay"),
-    (["run={run}", "world=1", "sim=native", "sim.device=cuda:0"], "cuda:0"),
-]
-
-
-@pytest.mark.full
-@pytest.mark.parametrize(("args", "says"), BAD, ids=[" ".join(args) for args, _ in BAD])
-def test_bad_input_is_one_line_and_writes_nothing(
-    args: list[str], says: str, earlier: Path, refused: Refused
-) -> None:
-    job = ["job=replay"] if len(args) > 1 else []  # keys of replay belong to replay
-    assert says in refused(*job, *(arg.format(run=earlier) for arg in args))
-
-
 REPORT = "report.json"
 CONFIG = ".hydra/config.yaml"
 # By name: the file, its new content or a part of it and what takes its place, and the line.
 # None removes the file.
 DAMAGE: dict[str, tuple[str, str | tuple[str, str] | None, str]] = {
     "no report": (REPORT, None, "has no report.json"),
-    "no JSON": (REPORT, "{", "report.json: cannot be read"),
-    "another report": (REPORT, "[]", "report.json: cannot be read"),
-    "no YAML": (CONFIG, "a: [1", "config.yaml: cannot be read"),
-    "empty": (CONFIG, "", "is missing, expected every key of this version"),
     "another tool's": (CONFIG, "model: resnet\n", "config.yaml: cannot be read"),
     "a key too many": (CONFIG, ("nworld: 5\n", "nworld: 5\ncolour: red\n"), "colour"),
     "another version": (

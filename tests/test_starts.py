@@ -11,10 +11,7 @@ import numpy as np
 import pytest
 import torch
 from box_checker import corners_of
-from environments import (
-    configure,
-    on_shared_sim,
-)
+from environments import configure, on_shared_sim
 
 import mjstack
 from mjstack.config.schema import Backend, Config

@@ -14,7 +14,6 @@ from compositions import refusal
 from environments import (
     Capture,
     Patch,
-    Refused,
     at_double_speed,
     configure,
     mask_of,
@@ -309,22 +308,6 @@ def test_values_within_the_configured_ranges_alone(tmp_path: Path) -> None:
     cfg.reset["starts"].params["mass"] = [0.5, 1.5]
     env = started("native", cfg)
     assert float(env.sim.fields["body_mass"][0, env.index.bodies["red"]]) == 0.05
-
-
-@pytest.mark.full
-@pytest.mark.parametrize(
-    ("args", "message"),
-    [
-        ("starts=worlds.npz", "Add reset=starts_file"),
-        ("reset=starts_file", "starts=null: expected a file with one row per world"),
-        ("reset=starts_file starts=worlds.npz nworld=5", "at least 5 worlds, it has 4. Add rows,"),
-    ],
-)
-def test_the_command_line_refuses_before_anything_is_written(
-    args: str, message: str, tmp_path: Path, refused: Refused
-) -> None:
-    np.savez(tmp_path / "worlds.npz", **plain_starts(configure()))
-    assert message in refused(*args.split(), "gates=[batch]", "sim=native")
 
 
 @pytest.mark.full

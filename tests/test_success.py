@@ -101,16 +101,6 @@ def test_small_region_passes(passed: Path) -> None:
         assert record["phase_names"].tolist() == PHASES
 
 
-@pytest.mark.full
-def test_rebot_passes(new_run: NewRun, tmp_path: Path) -> None:
-    run = new_run("sim=native", "nworld=4", *at_double_speed("rebot"), robot="rebot")
-    result = play(run, tmp_path)
-    assert result.status is Status.passed
-    assert counts(result.metrics, "succeeded", "episodes", "distinct_starts") == [4] * 3
-    assert not (tmp_path / FAILING).exists()
-    assert run.cfg.reset == load_config(["robot=rebot"]).reset  # other gates start as they did
-
-
 def test_broken_controller_fails_by_rule_and_phase(tmp_path: Path) -> None:
     """A gripper that never closes: the grasp is empty, is tried again, and is empty again."""
     folder = tmp_path / "broken"

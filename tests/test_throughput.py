@@ -139,8 +139,7 @@ def episode_of(seconds: float) -> Episode:
 
 
 @pytest.mark.parametrize(
-    ("backend", "repetitions", "played"),
-    [("mjwarp", 3, 2), ("native", 3, 2), ("native", 1, 0)],
+    ("backend", "repetitions", "played"), [("mjwarp", 3, 2), ("native", 3, 2), ("native", 1, 0)]
 )
 def test_the_batch_gates_episode_is_the_first_repetition(
     backend: str, repetitions: int, played: int, new_run: NewRun, monkeypatch: Patch
@@ -176,20 +175,6 @@ def test_repetitions_end_where_the_range_is_narrow(
 ) -> None:
     cfg = load_config([f"gate.throughput.precision={precision}"])
     assert timing.settled(cfg, times) is narrow
-
-
-def test_two_episodes_that_agree_are_enough(new_run: NewRun, monkeypatch: Patch) -> None:
-    sim, _ = worlds(monkeypatch, "cpu")
-    sim.backend = "mjwarp"
-    sim.description = "some"
-    first = episode_of(1.0)
-
-    monkeypatch.setattr(Stage, "play", lambda *_: episode_of(1.005))
-    for before, precision, played in ((first, 0.01, 2), (None, 0.01, 2), (first, 0, 3)):
-        choices = [f"gate.throughput.precision={precision}", "gate.throughput.cpu_max_seconds=100"]
-        run = new_run("sim=native", "nworld=4", *choices)
-        measured = episode.measure_episode(run.stage, sim, before)
-        assert facts(measured)["repetitions"] == played
 
 
 @pytest.mark.full
@@ -234,17 +219,6 @@ def test_eager_work_is_void_where_it_should_be_captured(
         "capture_s": 0.0,
         "captured": captured,
     }
-
-
-@pytest.mark.full
-def test_worlds_that_fail_void_every_figure(new_run: NewRun) -> None:
-    tight = ("gate.throughput.repetitions=1", "task.check.xy_err=1e-7")
-    result = measure(new_run, *NATIVE, *tight)
-    assert result.status is Status.failed
-    assert "2 of 2 worlds (0, 1) failed the check" in result.reason
-    assert result.reason.count("no figure") == 3
-    assert speeds(result) == []
-    assert result.metrics.get("episode.succeeded", 0) == 0
 
 
 @pytest.mark.full
@@ -302,26 +276,6 @@ def test_broken_episode_does_not_verify_the_task(new_run: NewRun, monkeypatch: P
         run.artifacts.results["batch"] = GateResult(name="batch", status=status, reason="")
         result, _ = run_throughput(run)
         assert ("the task was not verified" not in result.reason) is verified
-
-
-@pytest.mark.full
-def test_a_task_without_a_check_is_not_asked_for_batch(new_run: NewRun) -> None:
-    overrides = ["task=reach", "task.check=null", "task.success=null", "sim=native", "nworld=1"]
-    result = measure(new_run, *overrides, *FEW)
-    assert result.status is Status.passed
-    assert "episode: not measured: task reach has no check" in result.reason
-    assert "verified" not in result.reason
-
-
-@pytest.mark.full
-def test_no_time_for_an_episode_is_said(new_run: NewRun) -> None:
-    result = measure(new_run, *NATIVE, "gate.throughput.cpu_max_seconds=1e-4")
-    assert result.status is Status.passed
-    assert "episode: not measured: an episode would take about" in result.reason
-    assert "the task was not verified in this run" in result.reason
-    assert result.metrics["physics.steps_per_repetition"] == 1
-    assert result.metrics["env_step.steps_per_repetition"] == 1
-    assert speeds(result, "episode") == []
 
 
 @pytest.mark.full

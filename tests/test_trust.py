@@ -184,7 +184,7 @@ def test_each_kind_of_term_is_listed(tmp_path: Path) -> None:
     assert named == {*NAMEABLE}
 
 
-@pytest.mark.parametrize("name", ["pydoc.pipepager", "builtins.max", "torch.save"])
+@pytest.mark.parametrize("name", ["pydoc.pipepager", "builtins.max"])
 def test_only_what_declares_itself_is_called(name: str, refused: Refused) -> None:
     """Rule 7, also on the command line."""
     line = refused(f"+reward.evil={{func: {name}, params: {{cmd: 'id > PWNED'}}, weight: 1}}")
