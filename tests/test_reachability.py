@@ -54,15 +54,6 @@ def test_what_mink_reaches_is_reached(get_stage: GetStage, robot: str, grip: str
 
 
 @pytest.mark.full
-def test_other_starts_reach_what_home_does_not(get_stage: GetStage) -> None:
-    cfg = get_stage("so101").cfg
-    points = np.random.default_rng(0).uniform([-0.1, -0.4, 0.0], [0.6, 0.4, 0.4], (2000, 3))
-    _, distances = find_reach(get_stage("so101").model, cfg.robot, points, cfg.robot.gripper_open)
-    reached = distances < 5e-4
-    assert float(reached.any(0).double().mean()) > float(reached[0].double().mean()) + 0.01
-
-
-@pytest.mark.full
 def test_the_tilt_is_the_smallest(get_stage: GetStage, robot: str) -> None:
     cfg = get_stage(robot).cfg
     model = get_stage(robot).model
@@ -280,14 +271,6 @@ def test_all_of_the_region_is_drawn_from(robot: str, get_stage: GetStage) -> Non
             assert bool(placement.choose(draws)[1].all()), (task, cube)
 
 
-@pytest.mark.full
-def test_a_wall_that_leaves_no_room_is_said() -> None:
-    cfg = configure("reset=randomized")
-    model = with_wall(cfg, tuple(cfg.scene.objects["red"].xy), (0.1, 0.1))
-    with pytest.raises(ParameterError, match="found none in 20000 of 20000 trials"):
-        placement_of(cfg, model).require_room([0.05, 0.05], 16)
-
-
 def test_a_region_with_room_is_tried_once_and_one_without_each_time(monkeypatch: Patch) -> None:
     tried = []
     monkeypatch.setattr("mjstack.mdp.starts.placement._ROOMY", set())
@@ -311,51 +294,6 @@ def test_a_region_with_room_is_tried_once_and_one_without_each_time(monkeypatch:
         with pytest.raises(ParameterError, match="found none in"):
             tries(cfg, wall)
     assert tries(cfg) == 0
-
-
-@pytest.mark.full
-def test_cubes_that_are_close_find_a_pair_that_fits() -> None:
-    """Three of four pairs of free positions are too close."""
-    red, blue = "scene.objects.red.xy=[0.29,-0.13]", "scene.objects.blue.xy=[0.37,-0.13]"
-    cfg = configure("reset=randomized", red, blue, "scene.random_xy=[0.03,0.03]")
-    cfg.reset["cubes"].params["gap"] = 0.04
-    placement = placement_of(cfg, region=(0.03, 0.03), gap=0.04)
-    placement.require_room([0.03, 0.03], 64)
-    offsets, free = placement.choose(random_draws())
-    nominal = [cfg.scene.objects[name].xy for name in ("red", "blue")]
-    places = offsets + torch.tensor(nominal, dtype=torch.float64)
-    apart = torch.linalg.vector_norm(places[:, 0] - places[:, 1], dim=1)
-    assert free.all()
-    assert float(apart.min()) >= 2.0 * math.sqrt(2.0) * 0.022 + 0.04
-
-
-@pytest.mark.full
-def test_regions_stay_inside_what_is_reached() -> None:
-    cfg = load_config()
-    scene = cfg.scene
-    x0, y0 = scene.objects["red"].xy
-    spaced = [center + np.arange(-0.2, 0.2001, 0.005) for center in scene.table_center[:2]]
-    points = np.stack(np.meshgrid(*spaced), axis=-1).reshape(-1, 2)
-    x, y = points.T
-
-    def region(reached: np.ndarray) -> tuple[bool, float, tuple[float, float]]:
-        return reachability.find_region(cfg, points, reached, "red", 0.005, 0.01)
-
-    # From the last point that is reached, a step short of the first that is not: a margin less.
-    half_plane = (x <= x0 + 0.08 + 1e-9) & (y >= y0 - 0.09 - 1e-9)
-    fits, square, largest = region(half_plane)
-    assert fits
-    assert square == pytest.approx(0.07, abs=0.005)
-    assert 0.0 <= 0.07 - largest[0] <= 0.005
-    assert 0.0 <= 0.08 - largest[1] <= 0.005
-    assert not region(half_plane & (x <= x0 + 0.055))[0]
-    assert region(x < x0 - 0.05) == (False, 0.0, (0.0, 0.0))
-    cfg.scene.table_half[:2] = [0.18, 0.19]
-    _, _, largest = region(x < 9.0)
-    for k in (0, 1):  # the table's edge ends it, for a cube of any yaw
-        off_center = abs((x0, y0)[k] - scene.table_center[k])
-        edge = scene.table_half[k] - off_center - math.sqrt(2.0) * scene.objects["red"].half_height
-        assert 0.0 <= edge - largest[k] <= 0.001
 
 
 @pytest.mark.full

@@ -12,9 +12,6 @@ import pytest
 import torch
 from compositions import refusal
 from environments import (
-    Capture,
-    Patch,
-    at_double_speed,
     configure,
     mask_of,
     on_cuda,
@@ -23,7 +20,6 @@ from environments import (
     stack_starts,
 )
 
-from mjstack.cli import run
 from mjstack.config.schema import Config
 from mjstack.envs import Env
 from mjstack.errors import ArgumentError, ConfigError
@@ -209,14 +205,8 @@ BAD: dict[str, dict[str, Any]] = {
     ", red_xy: expected numbers of shape (4, 2), not float64 of shape (4, 3).": {
         "red_xy": np.zeros((N, 3))
     },
-    ", red_friction: expected numbers of shape (4,), not float64 of shape (3,).": {
-        "red_friction": np.ones(N - 1)
-    },
     ", world 2, red_xy: expected 0.19 to 0.51, it is nan. Correct it;": {"red_xy": {2: np.nan}},
     f", world 1, red_quat: {UPRIGHT} [0.8 0.6": {"red_quat": {1: [0.8, 0.6, 0.0, 0.0]}},
-    ", world 3, blue_xy: expected -0.3 to 0.22, it is 0.3. Correct it; ranges of mass,": {
-        "blue_xy": {3: [0.33, 0.3]}
-    },
     ", world 1, red_xy: expected all of red above the table, 21.1 mm are not. Move it.": {
         "red_xy": {1: [0.2, -0.13]},
         "red_quat": {1: quats(np.array(0.785))},
@@ -231,9 +221,6 @@ BAD: dict[str, dict[str, Any]] = {
     },
     ", world 1, red_mass_kg: expected 0.056 to 0.104, it is 0.05.": {
         "red_mass_kg": [0.08, 0.05, 0.08, 0.08]
-    },
-    ", world 0, joint_elbow_flex: expected -1.69 to 1.69, it is 1.8.": {
-        "joint_elbow_flex": [1.8] * N
     },
 }
 
@@ -308,16 +295,3 @@ def test_values_within_the_configured_ranges_alone(tmp_path: Path) -> None:
     cfg.reset["starts"].params["mass"] = [0.5, 1.5]
     env = started("native", cfg)
     assert float(env.sim.fields["body_mass"][0, env.index.bodies["red"]]) == 0.05
-
-
-@pytest.mark.full
-def test_a_batch_plays_the_worlds_of_a_file(
-    tmp_path: Path, monkeypatch: Patch, capsys: Capture
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    np.savez(tmp_path / "worlds.npz", **plain_starts(configure()))
-    args = "reset=starts_file starts=worlds.npz nworld=4 sim=native gates=[batch] hydra.run.dir=out"
-    assert run([*args.split(), *at_double_speed()]) == 0
-    assert "4 of 4 episodes succeeded" in capsys.readouterr().out
-    record = np.load(next((tmp_path / "out").glob("batch_seed0.npz")))
-    assert len(np.unique(record["qpos"], axis=0)) == N
