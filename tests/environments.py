@@ -3,7 +3,7 @@ time.
 """
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache, reduce
 from pathlib import Path
@@ -87,6 +87,16 @@ def judge(run: Run, gate: str = "batch") -> GateResult:
     run.gate = gate
     (result,) = judge_episodes(run)
     return result
+
+
+def few(cases: Iterable[Any], n: int) -> list[Any]:
+    """Every n-th case of a test; the others are for test-rest alone."""
+    out = []
+    for number, case in enumerate(cases):
+        values = case if isinstance(case, tuple) else (case,)
+        is_first = number % n == 0 or hasattr(case, "marks")
+        out.append(case if is_first else pytest.param(*values, marks=pytest.mark.full))
+    return out
 
 
 @contextmanager

@@ -20,6 +20,7 @@ import torch
 import yaml
 from arm_file import MJCF, SERVOS, changed, scara
 from compositions import load_config, refusal
+from environments import few
 
 from mjstack.config.schema import Config
 from mjstack.config.schema.robot import BasePoseCfg
@@ -430,7 +431,7 @@ def agree(found: Any, right: Any, where: str) -> None:
         np.testing.assert_allclose(*np.transpose(pairs), rtol=1e-6, atol=1e-7, err_msg=where)
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", few(CASES, 2))
 def test_a_file_of_this_kind_is_right_or_refused(
     name: str, tmp_path: Path, monkeypatch: Any
 ) -> None:

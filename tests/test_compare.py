@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from compositions import load_config, refusal
-from environments import Patch
+from environments import Patch, few
 from policies import report
 
 import mjstack.jobs.compare as compare
@@ -45,10 +45,10 @@ def test_mcnemar_of_known_pairs(only_a: int, only_b: int, p_value: float) -> Non
 
 def test_mcnemar_is_the_exact_binomial() -> None:
     for pairs in (7, 40, 180):
-        for few in range(pairs // 2):
-            tail = sum(math.comb(pairs, won) for won in range(few + 1))
+        for wins in range(pairs // 2):
+            tail = sum(math.comb(pairs, won) for won in range(wins + 1))
             exact = float(Fraction(2 * tail, 2**pairs))
-            assert mcnemar_p_value(few, pairs - few) == exact
+            assert mcnemar_p_value(wins, pairs - wins) == exact
 
 
 class Faulty(Driver):
@@ -120,26 +120,29 @@ def test_equal_sides(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("overrides", "problem"),
-    [
-        ([], "job.against=[]: expected what the second side changes"),
-        (["job.against=[policy]"], "override 'policy' cannot be read: expected key=value"),
-        (['job.against=["polcy=x"]'], "'polcy' does not exist. Did you mean 'policy'?"),
-        (
-            ['job.against=["seed=1"]'],
-            "expected the same robot, task, worlds and seeds (seed=1, expected 0)",
-        ),
-        *(
-            pytest.param([f'job.against=["{side}"]'], f"({side}, expected {value})", marks=FULL)
-            for side, value in (
-                ("robot=rebot", "so101"),
-                ("gate.success.seeds=3", "2"),
-                ("task.check.distance=0.5", "0.02"),
-            )
-        ),
-        (['job.against=["gate.success.region=[0.01,0.01]"]'], "expected equal starts, which"),
-        (['job.against=["controller=policy","policy=nowhere/last"]'], "nowhere/last"),
-        (['job.against=["graph=off"]', "view=web"], "expected false with job=compare"),
-    ],
+    few(
+        [
+            ([], "job.against=[]: expected what the second side changes"),
+            (["job.against=[policy]"], "override 'policy' cannot be read: expected key=value"),
+            (['job.against=["polcy=x"]'], "'polcy' does not exist. Did you mean 'policy'?"),
+            (
+                ['job.against=["seed=1"]'],
+                "expected the same robot, task, worlds and seeds (seed=1, expected 0)",
+            ),
+            *(
+                pytest.param([f'job.against=["{side}"]'], f"({side}, expected {value})", marks=FULL)
+                for side, value in (
+                    ("robot=rebot", "so101"),
+                    ("gate.success.seeds=3", "2"),
+                    ("task.check.distance=0.5", "0.02"),
+                )
+            ),
+            (['job.against=["gate.success.region=[0.01,0.01]"]'], "expected equal starts, which"),
+            (['job.against=["controller=policy","policy=nowhere/last"]'], "nowhere/last"),
+            (['job.against=["graph=off"]', "view=web"], "expected false with job=compare"),
+        ],
+        2,
+    ),
 )
 def test_other_sides_are_refused_in_one_line(overrides: list[str], problem: str) -> None:
     args = [*TINY, *overrides]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from compositions import refusal
-from environments import Patch
+from environments import Patch, few
 
 import mjstack
 from mjstack.cli import run
@@ -153,7 +153,7 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("name", REFUSED)
+@pytest.mark.parametrize("name", few(REFUSED, 3))
 def test_a_wrong_one_is_refused_before_anything_is_written(
     name: str, conf: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

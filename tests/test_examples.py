@@ -67,7 +67,7 @@ def play_gates(example: str, robot: str, folder: Path, *overrides: str) -> dict[
         pytest.param("tower", "rebot", "baseline,parity,batch", marks=pytest.mark.full),
         ("push", "so101", "baseline,batch"),
         pytest.param("push", "rebot", "baseline,parity,batch", marks=pytest.mark.full),
-        ("scara", "scara", "baseline,batch,success"),
+        pytest.param("scara", "scara", "baseline,batch,success", marks=pytest.mark.full),
         pytest.param("slot", "so101", "batch", marks=pytest.mark.full),
         pytest.param("slot", "rebot", "baseline,batch", marks=pytest.mark.full),
         pytest.param("peg", "so101", "batch", marks=pytest.mark.full),
@@ -109,7 +109,7 @@ def test_a_dataset_and_a_replay(tmp_path: Path) -> None:
     ("example", "threshold", "rules"),
     [
         ("push", "within=1e-6", ["AT_GOAL"]),
-        ("drawer", "open=0.08", ["OPEN"]),
+        pytest.param("drawer", "open=0.08", ["OPEN"], marks=pytest.mark.full),
         pytest.param("drawer", "stop=0.05", ["ON_RAIL"], marks=pytest.mark.full),
         pytest.param("tower", "xy_err=1e-6", ["RED", "GREEN"], marks=pytest.mark.full),
         pytest.param("slot", "depth=0.05", ["DEPTH"], marks=pytest.mark.full),

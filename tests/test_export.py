@@ -16,7 +16,7 @@ import onnxruntime
 import pytest
 import torch
 from compositions import load_config
-from environments import NOMINAL, Patch, configure, has_gl
+from environments import NOMINAL, Patch, configure, few, has_gl
 from policies import make_policy, write_policy
 
 import mjstack
@@ -179,6 +179,7 @@ def test_onnxruntime_sees_as_torch_does(sees: tuple[Path, list[str]]) -> None:
 
 
 @pytest.mark.skipif(not has_gl(), reason="MuJoCo does not draw offscreen here")
+@pytest.mark.full
 def test_the_example_sees_as_the_driver_does(sees: tuple[Path, list[str]], tmp_path: Path) -> None:
     policy, args = sees
     assert export(policy, tmp_path / "out", *args) == 0
@@ -201,7 +202,7 @@ def test_actions_of_a_policys_own_are_described(tmp_path: Path) -> None:
     assert len(facts["columns"]["names"]) == sum(policy.widths.values())
 
 
-@pytest.mark.parametrize("job", ["export", "play"])
+@pytest.mark.parametrize("job", few(["export", "play"], 2))
 def test_a_task_that_brings_a_controller_takes_a_policy(
     job: str, tmp_path: Path, monkeypatch: Patch
 ) -> None:
@@ -232,6 +233,7 @@ def test_bad_input_is_one_line(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.full
 def test_a_full_disk_leaves_neither_file(
     exported: Path, tmp_path: Path, monkeypatch: Patch
 ) -> None:

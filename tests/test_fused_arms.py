@@ -11,7 +11,7 @@ import pytest
 import torch
 import warp as wp
 from arms import XMLS, model_of
-from environments import Patch, configure
+from environments import Patch, configure, few
 
 from mjstack.config.schema import Backend
 from mjstack.sim import make_simulation
@@ -57,7 +57,7 @@ def controls(model: mujoco.MjModel, generator: torch.Generator) -> torch.Tensor:
     return (low + (high - low) * random).float()
 
 
-@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("name", few(ARMS, 2))
 @pytest.mark.parametrize("step", ["arranged", "fused"])
 def test_a_step_ends_where_mjwarps_own_does(step: str, name: str, device: str) -> None:
     """Arranged on the CPU device bit for bit over many steps; else each from the same state."""

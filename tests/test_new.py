@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from doc_blocks import ROOT
-from environments import Capture, Patch, Refused
+from environments import Capture, Patch, Refused, few
 from omegaconf import OmegaConf
 
 import mjstack
@@ -192,7 +192,7 @@ def guess(text: str, arm: str = "") -> dict[str, Any]:
     return written
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", few(KINDS, 3))
 def test_files_of_many_kinds_are_read(kind: str, here: Path) -> None:
     options, expected = KINDS[kind]
     robot = guess(gantry(**options))
@@ -268,7 +268,7 @@ def altered(text: str, pairs: dict[str, str]) -> str:
 
 @pytest.mark.parametrize(
     ("text", "joints", "efforts"),
-    [
+    few([
         (altered(gantry(), {SERVO.format("x"): MOTOR.format("x"), **WEAK}), "x left right", {90.0}),
         (altered(gantry(), {f: FINGER.format(n) for n in ("left", "right")
          if (f := SERVO.format(n))}), "left right", {40.0}),
@@ -277,7 +277,7 @@ def altered(text: str, pairs: dict[str, str]) -> str:
          "left right", {20.0}),
         (TENDON_ONLY.replace("gainprm", "dyntype='filter' dynprm='0.05' gainprm"), "left right",
          set()),
-    ],
+    ], 2),
     ids=["motor and weak fingers", "force", "tendon", "tendon motor", "tendon filter"],
 )  # fmt: skip
 def test_servos_are_made_where_others_do_not_do(
@@ -461,7 +461,7 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("name", REFUSED)
+@pytest.mark.parametrize("name", few(REFUSED, 2))
 def test_a_file_that_no_profile_fits_is_refused(name: str, here: Path, refused: Refused) -> None:
     content, message = REFUSED[name]
     (here / "arm.xml").write_text(content)

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 from compositions import load_config, refusal
-from environments import Patch, Refused, configure, gate_of, has_gl
+from environments import Patch, Refused, configure, few, gate_of, has_gl
 from PIL import Image, ImageSequence
 from policies import write_policy
 
@@ -210,7 +210,7 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize(("overrides", "says"), BAD, ids=[" ".join(o) for o, _ in BAD])
+@pytest.mark.parametrize(("overrides", "says"), few(BAD, 2), ids=[" ".join(o) for o, _ in BAD])
 def test_bad_input_is_one_line(overrides: list[str], says: str) -> None:
     args = [*REACH, *overrides]
     refusal(lambda: check_job(load_config(args), args), says)
@@ -241,6 +241,7 @@ def test_without_a_display_nothing_is_written(refused: Refused, monkeypatch: Pat
     assert "view=true: expected a display that opens windows (DISPLAY=:98765)" in line
 
 
+@pytest.mark.full
 def test_a_video_that_cannot_be_written_fails_the_job(
     saved: list[np.ndarray], tmp_path: Path, monkeypatch: Patch
 ) -> None:

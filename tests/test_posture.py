@@ -13,6 +13,7 @@ import torch
 from arm_file import MJCF, SCARA, changed, scara, write_arm
 from arms import model_of
 from compositions import load_config, make_env, refusal
+from environments import few
 from ik_arm import Arm
 
 from mjstack.config.schema import Config
@@ -230,15 +231,18 @@ VALUES = 'kp="50" kv="5" ctrlrange="-2 2"'
 
 @pytest.mark.parametrize(
     "actuator",
-    [
-        f'<position joint="spare" {VALUES}/>',
-        f'<position joint="spare" {VALUES} timeconst="0.2"/>',
-        f'<position jointinparent="spare" {VALUES} gear="-2"/>',
-        f'<position tendon="t" {VALUES} timeconst="0.5"/>',
-        '<intvelocity joint="spare" kp="50" kv="5" actrange="-2 2" ctrlrange="-1 1"/>',
-        '<general joint="spare" dyntype="filter" dynprm="0.3" gainprm="7" biastype="affine"'
-        ' biasprm="3 -40 -5"/>',
-    ],
+    few(
+        [
+            f'<position joint="spare" {VALUES}/>',
+            f'<position joint="spare" {VALUES} timeconst="0.2"/>',
+            f'<position jointinparent="spare" {VALUES} gear="-2"/>',
+            f'<position tendon="t" {VALUES} timeconst="0.5"/>',
+            '<intvelocity joint="spare" kp="50" kv="5" actrange="-2 2" ctrlrange="-1 1"/>',
+            '<general joint="spare" dyntype="filter" dynprm="0.3" gainprm="7" biastype="affine"'
+            ' biasprm="3 -40 -5"/>',
+        ],
+        2,
+    ),
     ids=["position", "timeconst", "in parent", "tendon", "intvelocity", "general"],
 )
 def test_a_servo_without_a_command_holds_its_joint(actuator: str, tmp_path: Path) -> None:

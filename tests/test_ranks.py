@@ -22,7 +22,7 @@ import pytest
 import torch
 from compositions import load_config
 from dataset_checker import check_dataset
-from environments import Patch, one_second_episode, report_of
+from environments import Patch, few, one_second_episode, report_of
 from policies import run_as_torchrun
 
 import mjstack
@@ -148,7 +148,7 @@ def test_ranks_play_what_one_plays(tmp_path: Path) -> None:
     assert len(two["provenance"]["ranks"]) == 2
 
 
-@pytest.mark.parametrize("size", [2, 3])
+@pytest.mark.parametrize("size", few([2, 3], 2))
 def test_shares_played_apart_join_to_the_whole(finished: Path, size: int) -> None:
     """Three worlds as ranks share them, in one process: bit for bit what one rank played."""
     cfg = load_config([*SHORT, "nworld=3"])
@@ -168,6 +168,7 @@ def test_shares_played_apart_join_to_the_whole(finished: Path, size: int) -> Non
         np.testing.assert_array_equal(values, whole.worlds[name], err_msg=name)
 
 
+@pytest.mark.full
 def test_two_ranks_meet(tmp_path: Path) -> None:
     """What they gather, sum and do in turns; an error of one is an error of both."""
     (tmp_path / "meeting.py").write_text(MEETING)

@@ -117,6 +117,7 @@ def test_a_file_taken_from_a_later_object_is_beside_its_yaml(tmp_path: Path, cas
     assert set(files.values()) == {str(tmp_path / "mug.xml")}
 
 
+@pytest.mark.full
 def test_a_run_finds_its_files_where_the_project_has_moved(
     tmp_path: Path, monkeypatch: Patch
 ) -> None:

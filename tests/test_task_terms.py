@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from compositions import refusal
-from environments import Capture, Patch, record_of, report_of
+from environments import Capture, Patch, few, record_of, report_of
 
 import mjstack
 from mjstack.cli import run
@@ -171,28 +171,39 @@ def test_training_is_judged_from_the_starts_of_the_task(turned: Path, tmp_path: 
 
 @pytest.mark.parametrize(
     ("overrides", "names", "line"),
-    [
-        # Added by a command line, or by an own function under a name that the gate has too
-        (["+reset.more={func: turned.turn}"], [*SHIPPED, "turn", "slide", "more"], ""),
-        (["reset.cubes={func: turned.turn}"], [*SHIPPED, "turn", "slide"], ""),
-        # Removed from the task
-        (["~reset.cubes"], ["home", "joints", "mass", "friction", "gains", "turn", "slide"], ""),
-        (["reset.turn=null"], [*SHIPPED, "slide"], ""),
-        # The gate's choice has another function of mjstack under this name
-        (["reset.cubes.params.xy=0.01"], [*SHIPPED, "turn", "slide"], "reset.cubes does not act"),
-        # Replaced in the gate by name, on purpose
-        (
-            ["+gate.success.reset.turn={func: turned.slide}"],
-            [*SHIPPED, "turn", "slide"],
-            "reset.turn does not act in gate success: gate.success.reset.turn takes its place",
-        ),
-        # A chosen file that the gate does not have
-        (
-            ["looks=randomized", "reset.light.params.tint=0.2"],
-            [*SHIPPED, "turn", "slide"],
-            "reset.light does not act in gate success: gate.success.reset has no light",
-        ),
-    ],
+    few(
+        [
+            # Added by a command line, or by an own function under a name that the gate has too
+            (["+reset.more={func: turned.turn}"], [*SHIPPED, "turn", "slide", "more"], ""),
+            (["reset.cubes={func: turned.turn}"], [*SHIPPED, "turn", "slide"], ""),
+            # Removed from the task
+            (
+                ["~reset.cubes"],
+                ["home", "joints", "mass", "friction", "gains", "turn", "slide"],
+                "",
+            ),
+            (["reset.turn=null"], [*SHIPPED, "slide"], ""),
+            # The gate's choice has another function of mjstack under this name
+            (
+                ["reset.cubes.params.xy=0.01"],
+                [*SHIPPED, "turn", "slide"],
+                "reset.cubes does not act",
+            ),
+            # Replaced in the gate by name, on purpose
+            (
+                ["+gate.success.reset.turn={func: turned.slide}"],
+                [*SHIPPED, "turn", "slide"],
+                "reset.turn does not act in gate success: gate.success.reset.turn takes its place",
+            ),
+            # A chosen file that the gate does not have
+            (
+                ["looks=randomized", "reset.light.params.tint=0.2"],
+                [*SHIPPED, "turn", "slide"],
+                "reset.light does not act in gate success: gate.success.reset has no light",
+            ),
+        ],
+        2,
+    ),
 )
 def test_a_reset_that_does_not_act_is_named(
     turned: Path, overrides: Sequence[str], names: list[str], line: str

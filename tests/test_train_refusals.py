@@ -2,6 +2,7 @@
 
 import pytest
 from compositions import load_config, refusal
+from environments import few
 from test_pixels import SMALL
 from test_ppo import REACH as PPO
 
@@ -61,12 +62,12 @@ BAD: dict[tuple[str, ...], list[tuple[list[str], str]]] = {
         (["job.episodes=1"], "job.episodes=1: expected at least 2"),
     ],
 }
-CASES = [
-    pytest.param(base, *case, id=" ".join(case[0])) for base, cases in BAD.items() for case in cases
-]
+CASES = [(base, *case) for base, cases in BAD.items() for case in cases]
 
 
-@pytest.mark.parametrize(("base", "overrides", "says"), CASES)
+@pytest.mark.parametrize(
+    ("base", "overrides", "says"), few(CASES, 2), ids=[" ".join(case[1]) for case in CASES]
+)
 def test_bad_input_is_one_line(base: tuple[str, ...], overrides: list[str], says: str) -> None:
     args = [*base, *overrides, "job.folder=out"]
     refusal(lambda: check_job(load_config(args), args), says)
