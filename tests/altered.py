@@ -1,7 +1,7 @@
 """Episodes of the examples whose states are written by hand near the end, each with the rules that
 it breaks, by geometry that is worked out here.
 
-The object of a task is held in a pose, or lies there and physics goes on.
+The object of a task is held in a pose: every state is the written one.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,8 +14,6 @@ import numpy as np
 import torch
 from compositions import load_config
 
-from mjstack.drivers.driver import Driver
-from mjstack.episodes.rollout import play_episode
 from mjstack.episodes.stage import Stage
 from mjstack.managers.view import EnvView
 from mjstack.tasks.check import make_check
@@ -138,34 +136,3 @@ def judge_held(
         sim.step_count.fill_(STEPS * cfg.timing.decimation)
         broken = [set(check.rules.broken(int(bits))) for bits in check.result().failed]
         return list(zip(broken, succeeded.tolist(), strict=True))
-
-
-class Still(Driver):
-    """Holds the arm where it starts, the gripper open."""
-
-    def __init__(self, stage: Stage, nworld: int) -> None:
-        super().__init__(nworld, STEPS, torch.device("cpu"))
-        robot = stage.cfg.robot
-        start = [*robot.start[: len(robot.arm_joints)], *robot.gripper_open]
-        self._command = torch.tensor(start).expand(nworld, -1)
-
-    def command(self) -> torch.Tensor:
-        return self._command
-
-
-def judge_let_go(
-    task: str,
-    robot: str,
-    name: str,
-    anchor: Callable[[EnvView], torch.Tensor],
-    worlds: list[Altered],
-) -> list[set[str]]:
-    """The same, the object put into its pose once, in the first step, and left to physics."""
-    stage = altered_stage(task, robot, len(worlds))
-    with closing(stage.simulation(len(worlds), "native", "cpu")) as sim:
-        env = stage.start(sim, stage.cfg.reset)
-        write_poses(env, name, worlds, LATE, anchor(env))
-        sim.forward()
-
-        episode = play_episode(env, Still(stage, len(worlds)))
-        return [set(stage.check.rules.broken(int(bits))) for bits in episode.failed]

@@ -38,7 +38,8 @@ def _read_yaml_once(stream: Any, Loader: Any) -> Any:
         return _read_yaml(stream, Loader=Loader)
     text = stream.read()
     if text not in _texts:
-        _texts[text] = _read_yaml(text, Loader=Loader)
+        stream.seek(0)  # whose name is in the message of an error
+        _texts[text] = _read_yaml(stream, Loader=Loader)
     return copy.deepcopy(_texts[text])
 
 

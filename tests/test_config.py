@@ -122,7 +122,7 @@ FIGURES = {
 
 
 def test_task_figures_of_each_robot(robot: str) -> None:
-    cfg = load_config([f"robot={robot}"])
+    cfg = compositions.load_config([f"robot={robot}"])
     want = FIGURES[robot].copy()
     assert (cfg.scene.table_center, cfg.scene.table_half) == want.pop("table")
     assert (cfg.scene.objects["red"].xy, cfg.scene.objects["blue"].xy) == want.pop("cubes")
@@ -344,9 +344,8 @@ def test_a_choice_by_key_is_told_how(choice: str) -> None:
 )
 def test_a_task_has_any_rate(task: str, folder: str | None, seconds: float) -> None:
     for timing, hz in (("fine", 50.0), ("hz30", 30.0)):
-        cfg = mjstack.load_config(
-            [f"task={task}", f"timing={timing}"], config_dir=folder and ROOT / folder
-        )
+        chosen = [f"task={task}", f"timing={timing}"]
+        cfg = compositions.load_config(chosen, folder and ROOT / folder)
         assert cfg.task.control_hz == hz
         assert cfg.task.episode_steps == round(seconds * hz)
         assert cfg.task.check

@@ -332,10 +332,10 @@ def damage(draw: random.Random, path: Path) -> None:
         with suppress(Exception):  # it may be damaged already
             CHANGES[path.suffix](draw, path)
     else:
-        moved = path.with_name("moved")
+        moved = path.with_name(f"{path.name}.moved")
         path.rename(moved)
         if kind == "link":
-            path.symlink_to(draw.choice(("moved", "/dev/null", "/dev/zero", path.name, "nope")))
+            path.symlink_to(draw.choice((moved.name, "/dev/null", "/dev/zero", path.name, "nope")))
         elif kind == "other":
             draw.choice((path.mkdir, lambda: os.mkfifo(path), lambda: path.write_text("x")))()
 

@@ -71,20 +71,20 @@ def test_a_robot_is_read_from_its_file(
     name: str, file: str, config: list[str], here: Path, capsys: Capture
 ) -> None:
     """What the project's own YAML says of it, and gate *baseline* passes as it is written."""
-    assert run(["new", "robot", f"fresh_{name}", str(ROOT / file)]) == 0
+    assert run(["new", "robot", f"read_{name}", str(ROOT / file)]) == 0
     printed = capsys.readouterr().out
     assert "pass baseline" in printed
     assert "branches" in printed or "one jaw" in printed
-    folder = here / f"fresh_{name}"
+    folder = here / f"read_{name}"
     assert (folder / "home.png").stat().st_size > 10_000 or "offscreen" in printed
-    robot = mjstack.load_config([f"robot=fresh_{name}"], config_dir=folder / "conf").robot
+    robot = mjstack.load_config([f"robot=read_{name}"], config_dir=folder / "conf").robot
     own = mjstack.load_config(config, config_dir=ROOT / "examples/scara/conf").robot
     for key in ("arm_joints", "gripper_joints", "jaw_bodies", "roll_joint", "approach_axis"):
         assert getattr(robot, key) == getattr(own, key), key
     assert Path(str(robot.file)).samefile(ROOT / file)
     assert [joint for joint in robot.arm_joints if joint in robot.locked] == [*own.locked]
     # The nominal plan closes the jaws on two faces of the first cube
-    stage = Stage(mjstack.load_config([f"robot=fresh_{name}"], config_dir=folder / "conf"))
+    stage = Stage(mjstack.load_config([f"robot=read_{name}"], config_dir=folder / "conf"))
     data = mujoco.MjData(stage.model)
     grasp = [phase.grasped >= 0 for phase in stage.planner.phases].index(True)
     data.qpos[stage.index.robot_qpos] = stage.planner.nominal[grasp]

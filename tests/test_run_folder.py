@@ -115,19 +115,6 @@ def put(folder: Path, files: dict[str, str]) -> None:
         path.write_text(text)
 
 
-@pytest.mark.full
-def test_runs_that_begin_at_once_have_a_folder_each(begin: Callable[..., int]) -> None:
-    assert in_children(3, lambda number: begin(f"seed={number}")) == [0, 0, 0]
-    seeds = set()
-    for folder in (NOON, f"{NOON}-2", f"{NOON}-3"):
-        assert json.loads(Path(folder, "report.json").read_text())["status"] == "pass"
-        (seed,) = Path(folder, ".hydra", "overrides.yaml").read_text().split("- ")[1:]
-        seeds.add(seed.strip())
-        assert f"seed: {seed.strip()[5:]}\n" in Path(folder, ".hydra", "config.yaml").read_text()
-    assert seeds == {"seed=0", "seed=1", "seed=2"}
-    assert len(list(Path(NOON).parent.iterdir())) == 3
-
-
 def test_claims_at_once(tmp_path: Path) -> None:
     def claim(_: int) -> None:
         with claim_folder(tmp_path / "a" / "run", numbered=True) as folder:
@@ -244,7 +231,6 @@ TRAINING = {"resumes": "train 12", "folder": Path("elsewhere")}
     ("files", "args", "changes"),
     [
         (GATES, [RUN_DIR], {}),
-        (GATES, ["job=replay", "run=given", "world=1", RUN_DIR], {}),
         (GATES, ["job=collect", "job.folder=given"], COLLECTING),
         (GATES, ["job=play", RUN_DIR], TRAINING),
         (GATES, ["-m", "seed=1,2", "hydra.sweep.dir=given"], {}),
@@ -252,8 +238,6 @@ TRAINING = {"resumes": "train 12", "folder": Path("elsewhere")}
         (COLLECT, [RUN_DIR], {}),
         ({"report.json": '{"resumes": "train 34"}'}, ["job=play", RUN_DIR], TRAINING),
         ({"notes.txt": "mine"}, [RUN_DIR], {}),
-        ({"notes.txt": "mine"}, ["-m", "seed=1,2", "hydra.sweep.dir=given"], {}),
-        ({"report.json": '{"resumes": ""}'}, ["job=collect"], COLLECTING),
         ({"dataset/mine.txt": "mine", "batches.json": "mine"}, ["job=collect"], COLLECTING),
     ],
 )
@@ -283,9 +267,7 @@ HALF = {".hydra/config.yaml": "a: [", ".hydra/hydra.yaml": "", "run.log": "2026"
     [
         ({}, {}),
         (HALF, {}),
-        (HALF, COLLECTING),
-        (COLLECT | HALF, COLLECTING),
-        ({".report.json.x1": "{"} | HALF, COLLECTING),
+        ({".report.json.x1": "{"} | COLLECT | HALF, COLLECTING),
         ({"report.json": '{"resumes": "collect"}'} | HALF, COLLECTING),
         ({"report.json": '{"resumes": "train 12"}'} | HALF, TRAINING),
     ],
@@ -325,13 +307,8 @@ def test_a_failed_claim_removes_what_it_made_alone(tmp_path: Path, monkeypatch: 
         assert (tmp_path / "run").is_dir()
 
 
-def test_a_run_that_did_not_begin_leaves_nothing(begin: Callable[..., int]) -> None:
-    assert begin("hydra.job_logging.handlers.file.filename=/proc/x") == 2
-    assert contents(Path()) == {}
-
-
 @pytest.mark.full
-@pytest.mark.parametrize("limit", [0, 1, 8, 16, 40])
+@pytest.mark.parametrize("limit", [0, 8, 40])
 def test_a_full_disk_is_a_line_and_the_same_command_goes_on(
     limit: int, begin: Callable[..., int], tmp_path: Path
 ) -> None:
@@ -366,8 +343,6 @@ def test_a_full_disk_is_a_line_and_the_same_command_goes_on(
 DENIED: dict[str, tuple[Callable[[Path], object], list[str]]] = {
     "a folder": (lambda f: f.chmod(0), [RUN_DIR]),
     ".hydra": (lambda f: (f / ".hydra").chmod(0), []),
-    "a foreign .hydra": (lambda f: os.chown(f / ".hydra", 0, 0), []),
-    "a file of Hydra's": (lambda f: (f / ".hydra" / "config.yaml").chmod(0o444), []),
     "run.log": (lambda f: (f / "run.log").mkdir(), []),
     "the folder above": (lambda f: f.parent.chmod(0o555), ["hydra.run.dir=new"]),
 }
@@ -396,8 +371,6 @@ def denied(what: str, begin: Callable[..., int], output: Path) -> tuple[int, lis
     if os.geteuid() == 0:
         for path in (Path(), *Path().rglob("*")):
             os.chown(path, 65534, 65534)
-    elif "foreign" in what:
-        pytest.skip("only root gives files away")
     deny(Path("given"))
 
     def as_nobody(_: int) -> int:

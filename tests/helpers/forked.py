@@ -2,7 +2,6 @@
 some seconds.
 """
 
-import copy
 import gc
 import hashlib
 import importlib
@@ -18,7 +17,6 @@ import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import mjstack.cli  # before mujoco, which decides at its import how it draws
 
@@ -46,27 +44,14 @@ class Child:
 
 def preload(choices: Sequence[Sequence[str]] = ()) -> None:
     """Load what a command loads, and keep the YAML that some choices of groups read."""
+    import compositions  # noqa: F401  # which reads a YAML text once
     import matplotlib
-    import yaml
 
     matplotlib.use("Agg")
     torch.set_num_threads(1)  # a forked child waits for ever for OpenMP's threads of its parent
     for module in pkgutil.walk_packages(mjstack.__path__, "mjstack.", onerror=lambda name: None):
         if not re.search(r"__main__|adapters|bench", module.name):
             importlib.import_module(module.name)
-    read = yaml.load
-    known: dict[str, Any] = {}
-
-    def load(stream: Any, Loader: Any) -> Any:
-        if not hasattr(stream, "seek"):
-            return read(stream, Loader=Loader)
-        text = stream.read()
-        if text not in known:
-            stream.seek(0)
-            known[text] = read(stream, Loader=Loader)
-        return copy.deepcopy(known[text])
-
-    yaml.load = load
     with hydra_session():
         for choice in [[], *choices]:
             compose(choice)
