@@ -1,7 +1,6 @@
 """Batched inverse kinematics against native MuJoCo's forward kinematics, and against mink."""
 
 import gc
-import os
 from collections.abc import Callable
 from functools import cache
 from typing import NamedTuple
@@ -12,9 +11,8 @@ import pytest
 import torch
 import warp as wp
 from compositions import load_config
-from environments import CUDA, GetStage, Patch
+from environments import CUDA, GetStage
 from ik_arm import Arm, results, tensors
-from test_robot_models import REPO, upstream
 
 from mjstack.episodes.stage import Stage
 from mjstack.kinematics.mink_ik import GraspIk
@@ -349,20 +347,11 @@ def test_a_goal_that_is_not_finite_stays_in_its_world(
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("source", ["builtin", "menagerie"])
-def test_the_approach_axis_leads_from_the_wrist_to_the_grasp_point(
-    robot: str, source: str, monkeypatch: Patch
-) -> None:
+def test_the_approach_axis_leads_from_the_wrist_to_the_grasp_point(robot: str) -> None:
     """It is the axis about which the last arm joint rolls, away from the wrist, and across the way
     the jaws close.
     """
-    if source == "menagerie":
-        upstream(robot)
-        monkeypatch.setenv(
-            "MENAGERIE_ROOT",
-            os.environ.get("MENAGERIE_ROOT", str(REPO.parent / "shared" / "menagerie")),
-        )
-    cfg = load_config([f"robot={robot}", f"model={source}"])
+    cfg = load_config([f"robot={robot}"])
     arm = Arm(robot_spec(cfg.robot, cfg.model).compile(), cfg.robot)
     data = mujoco.MjData(arm.model)
     for name, value in zip(

@@ -16,7 +16,7 @@ from browser import messages
 from compositions import load_config
 from environments import SHORT_REACH, Patch
 from policies import curve, interrupted, report, run_as_torchrun, same
-from test_ranks import rank_process, start
+from processes import rank_process, start
 
 import mjstack.train.rounds as rounds
 from mjstack.cli import run

@@ -2,7 +2,7 @@
 
 The check of each passes, or ends in one line and exit status 2; then nothing is written. Nothing in
 the home folder changes, and no process is left. A tenth of the command lines that pass are run to
-the end. ``python tests/test_fuzz.py commands 17 200-220`` tries these cases and prints the lines.
+the end. ``PYTHONPATH=tests/helpers python tests/test_fuzz.py commands 17 200-220`` prints cases.
 """
 
 import json
@@ -24,7 +24,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from helpers.forked import PASSED, SECONDS, Child, content, fork, is_alive, kill, preload
+from forked import PASSED, SECONDS, Child, content, fork, is_alive, kill, preload
 
 # isort: split
 import numpy as np
@@ -54,7 +54,9 @@ Make = Callable[[int, Path], list[str]]
 @pytest.mark.full
 def test_a_check_passes_or_says_one_line() -> None:
     """All kinds in one process: loading all modules takes it as long as thirty cases."""
-    done = subprocess.run([sys.executable, __file__], capture_output=True, text=True, timeout=1500)
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, __file__]
+    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=1500)
     print(done.stdout[-20_000:])
     assert done.returncode == 0, done.stdout[-20_000:] + done.stderr[-3000:]
     for kind, count in COUNTS.items():
@@ -63,7 +65,6 @@ def test_a_check_passes_or_says_one_line() -> None:
 
 def main(kind: str = "", *numbers: str) -> int:
     """Try all cases of each kind, those of one kind, or some of them."""
-    sys.path.insert(0, str(Path(__file__).parent))
     preload([[choice, *more] for choice in CHOSEN for more in ([], QUICK[1:2])])
     spans = [[int(end) for end in number.split("-")] for number in numbers]
     cases = [case for span in spans for case in range(span[0], span[-1] + 1)]

@@ -21,12 +21,11 @@ from urllib.request import urlopen
 import msgspec
 import numpy as np
 import pytest
-import test_ppo
 import viser
 import viser.infra._infra
 from browser import EXECUTABLE, browse
 from compositions import load_config, refusal
-from environments import GetStage, Patch, configure, has_gl
+from environments import SHORT_REACH, GetStage, Patch, configure, has_gl
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
@@ -46,6 +45,14 @@ from mjstack.report.web import start_server, stop_server
 from mjstack.sim.cameras import with_outputs
 
 GL = pytest.mark.skipif(not has_gl(), reason="MuJoCo does not draw offscreen here")
+
+
+PPO = (
+    *("job=train", "trainer=ppo", "task=reach", "sim=native", "nworld=4", "job.iterations=4"),
+    *("job.save_every=2", "job.hidden=[16]", "job.horizon=4", "job.epochs=2", "job.minibatches=2"),
+    *("gate.success.rate=0.0", "web.episode=false", *SHORT_REACH),
+    "termination.time_out.params.steps=30",
+)
 
 
 def refusal_of(*overrides: str) -> str:
@@ -453,7 +460,7 @@ def test_worlds_move_as_without_it(tmp_path: Path, port: int) -> None:
 
 JOBS: dict[str, tuple[tuple[str, ...], set[str]]] = {
     "play": (("job=play", "task=reach", "sim=native", "nworld=1"), {"play"}),
-    "ppo": (test_ppo.REACH, {"train", "success"}),
+    "ppo": (PPO, {"train", "success"}),
 }
 
 

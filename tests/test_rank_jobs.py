@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from dataset_checker import images_of
 from environments import SHORT_REACH, at_double_speed, one_second_episode, report_of
-from test_ranks import PLAIN, SCRIPT, play, start_python
+from processes import PLAIN, SCRIPT, play, start_python
 
 from mjstack.cli import run
 from mjstack.datasets import read_dataset

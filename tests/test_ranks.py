@@ -2,7 +2,6 @@
 on with in another number of ranks.
 """
 
-import contextlib
 import csv
 import logging
 import os
@@ -10,10 +9,7 @@ import re
 import shutil
 import signal
 import socket
-import subprocess
-import sys
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +20,7 @@ from compositions import load_config
 from dataset_checker import check_dataset
 from environments import Patch, few, one_second_episode, report_of
 from policies import run_as_torchrun
+from processes import PLAIN, SCRIPT, SHORT, play, rank_process, start, start_python
 
 import mjstack
 from mjstack.cli import run
@@ -38,9 +35,6 @@ from mjstack.gates import runner
 from mjstack.gates.runner import log_error
 from mjstack.jobs import check_ranks, count_devices
 
-SHORT = ["sim=native", "gates=[batch]", *one_second_episode()]
-PLAIN = [*SHORT, "web.episode=false"]
-SCRIPT = Path(mjstack.__file__).parents[1] / "scripts" / "run.py"
 ON_CUDA = (Backend.mjwarp, "cuda:0")
 OF_CALL = {"seconds", "rank_first_world", "rank_place"}  # of a record
 
@@ -78,34 +72,6 @@ def spring(env, mask):
             os.kill(os.getpid(), signal.SIGKILL)
         raise RuntimeError("the trap")
 """
-
-
-def start(ranks: int, args: Sequence[str], folder: Path, **env: str) -> subprocess.Popen[str]:
-    """A command in ranks of this machine; its output goes to one pipe."""
-    launcher = ["-m", "torch.distributed.run", f"--nproc-per-node={ranks}", "-m"]
-    command = [*(launcher if ranks else ["-m"]), "mjstack", *args]
-    return start_python(command, folder, **env)
-
-
-def start_python(args: Sequence[str], folder: Path, **env: str) -> subprocess.Popen[str]:
-    """Python with arguments; it finds this mjstack, and its output goes to one pipe."""
-    root = str(Path(mjstack.__file__).parents[1])
-    return subprocess.Popen(
-        [sys.executable, *args],
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": root, "OMP_NUM_THREADS": "1"} | env,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-
-
-def play(ranks: int, args: Sequence[str], folder: Path, status: int | None = 0, **env: str) -> str:
-    """The output of such a command when it has ended."""
-    process = start(ranks, args, folder, **env)
-    text, _ = process.communicate(timeout=400)
-    assert status is None or process.returncode == status, text
-    return text
 
 
 def assert_same_episodes(one: Path, other: Path) -> None:
@@ -277,20 +243,6 @@ def test_a_killed_first_rank_is_named(script: bool, trap: list[str], tmp_path: P
     assert ("mjstack: rank 0 of 2 was killed (SIGKILL, process " in text) == (not script)
     assert report_of(folder)["status"] == "interrupted"
     assert EpisodeRecord.read(folder, 1) is not None
-
-
-def rank_process(parent: int, rank: int) -> int:
-    """The process of a rank that a command has started, as soon as there is one."""
-    until = time.monotonic() + 60.0
-    while time.monotonic() < until:
-        for path in Path("/proc").glob("[0-9]*"):
-            with contextlib.suppress(OSError, IndexError):
-                above = int((path / "stat").read_text().rpartition(")")[2].split()[1])
-                environment = (path / "environ").read_bytes().split(b"\0")
-                if above == parent and f"RANK={rank}".encode() in environment:
-                    return int(path.name)
-        time.sleep(0.05)
-    raise AssertionError(f"rank {rank} has not started")
 
 
 @pytest.mark.full

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from environments import Capture, Patch, report_of
-from test_ranks import PLAIN, start
+from processes import PLAIN, start
 from test_run_folder import contents
 
 from mjstack import process

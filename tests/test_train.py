@@ -1,7 +1,11 @@
 """job=train: small trainings on native MuJoCo, what they leave, and how they go on."""
 
+import os
 import resource
 import shutil
+import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -233,3 +237,35 @@ def test_a_task_without_an_expert_has_no_clone() -> None:
     cfg.controller.phases = {}
     with pytest.raises(MjstackError, match=r"task=reach: expected a task with phases.*has no phas"):
         check_train(cfg)
+
+
+@pytest.mark.full
+@pytest.mark.long
+def test_a_training_that_is_killed_goes_on_where_it_saved(tmp_path: Path) -> None:
+    """SIGKILL after the first save: the same command ends bit for bit as a whole one."""
+    # With more batches than can follow before the kill
+    train = [*REACH, "job.batches=400", "job.save_every=50"]
+    state = tmp_path / "killed" / STATE
+    process = subprocess.Popen(
+        [sys.executable, "-m", "mjstack", *train, f"job.folder={state.parent}"],
+        env=os.environ | {"OMP_NUM_THREADS": "1"},  # other work may share the machine
+        stdout=subprocess.DEVNULL,
+    )
+    until = time.monotonic() + 300.0
+    while not state.exists():
+        assert process.poll() is None
+        assert time.monotonic() < until
+        time.sleep(0.005)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL
+    assert 0 < read_state(state)[1]["done"] < 400
+    ends = []
+    for name in ("killed", "whole"):
+        folder = tmp_path / name
+        assert run([*train, f"job.folder={folder}"]) == 0
+        tensors, facts = read_state(folder / STATE)
+        ends.append(tensors | weights(folder / "last") | weights(folder / "best"))
+        assert facts["done"] == 400
+    killed, whole = ends
+    assert killed.keys() == whole.keys()
+    assert all(torch.equal(value, whole[name]) for name, value in killed.items() if name != "sum")
