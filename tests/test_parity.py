@@ -131,7 +131,7 @@ def test_contacts_that_float32_misses_by_chance_pass_and_lost_ones_do_not() -> N
     with closing(make_simulation(run.stage.model, run.cfg, 1, backend=Backend.mjwarp)) as mjwarp:
         assert compare_states(run, mjwarp, result) == []
     limits = [v for name, v in result.thresholds.items() if name.endswith("contact_count")]
-    assert max(limits) == 2.0  # a range, not its multiple
+    assert {0.0} < {*limits} <= {0.0, 1.0, 2.0, 3.0, 4.0}  # ranges, not multiples of them
     assert any("contact_count" in text for text in compared(run, apart)[1])
 
 

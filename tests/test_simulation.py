@@ -4,9 +4,11 @@ import os
 import re
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from threading import Barrier
 
 import mujoco
 import numpy as np
@@ -27,7 +29,9 @@ from environments import (
 from mjstack.config.schema import Backend
 from mjstack.errors import MjstackError
 from mjstack.scene import build_model
-from mjstack.sim import Simulation, SolverLimit, make_simulation
+from mjstack.sim import BatchSizes, Simulation, SolverLimit, compiling, make_simulation
+from mjstack.sim.fused.step import StepPlan
+from mjstack.sim.mujoco_warp import mjw, wp
 
 N = 3
 VIEWS = (*STATE, *POSES, "qfrc_actuator", "sensordata")
@@ -458,6 +462,40 @@ def test_twice_the_same_run(backend: str, make_sim: MakeSim, get_stage: GetStage
     for a, b in zip(*finals, strict=True):
         assert_same_run(a, b, backend)
     assert not torch.equal(finals[0][0][0], finals[0][0][1])
+
+
+def test_one_thread_at_a_time_declares_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compilers alone run side by side: Warp's decorators hand out the newest function of a name,
+    so of two threads one would get a kernel that calls the other's function.
+    """
+    declaring, most = [], {"declaring": 0, "compiling": 0}
+    both = Barrier(2, timeout=20.0)
+    source = wp._src.build
+
+    def compiler() -> None:
+        both.wait()
+        most["compiling"] += 1
+
+    def stage(m: object, d: object) -> None:
+        for _ in range(2):
+            declaring.append(stage)
+            time.sleep(0.01)
+            most["declaring"] = max(most["declaring"], len(declaring))
+            declaring.pop()
+            source.build_cpu()
+
+    monkeypatch.setattr(source, "build_cpu", compiler)
+    monkeypatch.setattr(compiling, "available_cores", lambda: 2)
+    monkeypatch.setattr(compiling, "_done", set())
+    monkeypatch.setattr(compiling, "_stages", lambda m, plan: [stage, stage])
+    monkeypatch.setattr(compiling.constraints, "collision", lambda m, d: None)
+    model = mujoco.MjModel.from_xml_string(SENSING)
+    device = wp.get_device("cpu")
+    with wp.ScopedDevice(device):
+        m = mjw.put_model(model)
+        compiling.compile_step(model, m, BatchSizes(nconmax=8, njmax=8), device, StepPlan("fused"))
+    assert most == {"declaring": 1, "compiling": 4}
+    assert source.build_cpu is compiler
 
 
 @pytest.mark.full

@@ -28,9 +28,9 @@ class RoundedSimulation(NativeSimulation):
     to float32's rounding, in each world otherwise. Shapes whose contacts MuJoCo has to search for,
     such as cylinders, lie elsewhere by less than a search in float32 can tell.
 
-    If equalities connect bodies, bodies lie elsewhere by the rounding of their positions in the
-    world, which cancels along a chain but not around a loop. Their inertia is off by its rounding
-    about the centre of mass of their tree: the light links of a gripper lose most by it.
+    Inertia is off by its rounding about the centre of mass of its tree: light links far from it,
+    such as a wrist's, lose most by it. If equalities connect bodies, they lie elsewhere by the
+    rounding of their positions in the world, which cancels along a chain but not around a loop.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class RoundedSimulation(NativeSimulation):
             self.fields[name].copy_(values)
         self._round(*self.fields.values())
         linked = np.isin(model.eq_type, _LINKS).any()
-        names = ("body_pos", "body_quat", "body_inertia") if linked else ()
+        names = ("body_inertia", *("body_pos", "body_quat") * bool(linked))
         self._bodies = {name: self.fields[name].clone() for name in names}
         solid = (model.geom_contype | model.geom_conaffinity) > 0
         geoms = np.flatnonzero(np.isin(model.geom_type, _SEARCHED) & solid)
