@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from compositions import checked, load_config, refusal
-from environments import NOMINAL, configure
+from environments import NOMINAL, configure, few
 
 from mjstack.config.fields import spec
 from mjstack.config.schema import Backend, Config, TermCfg
@@ -244,7 +244,7 @@ def drawer(least: float, wrong: str = "") -> Config:
     return replace(cfg, task=replace(cfg.task, check=check, success=success))
 
 
-@pytest.mark.parametrize(("least", "broken"), [(-9.0, []), (9.0, ["OPEN"])])
+@pytest.mark.parametrize(("least", "broken"), few([(-9.0, []), (9.0, ["OPEN"])], 2))
 def test_a_check_may_be_about_no_object(least: float, broken: list[str]) -> None:
     """Played and watched as gate *success* does; success is that of `placed`."""
     stage = check_machine(drawer(least))

@@ -319,11 +319,12 @@ def test_jaws_close_as_far_as_an_object_is_wide(robot: str, get_stage: GetStage)
     np.testing.assert_allclose(np.diff(apart), [0.012, 0.006], rtol=0.0, atol=2e-5)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("robot", "expert", "half"),
     [
         ("so101", "closed_loop", 0.016),
-        pytest.param("rebot", "open_loop", 0.012, marks=pytest.mark.full),
+        ("rebot", "open_loop", 0.012),
     ],
 )
 def test_a_narrow_peg_is_lifted(robot: str, expert: str, half: float) -> None:

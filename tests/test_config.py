@@ -14,7 +14,7 @@ import pytest
 from check_cases import limits
 from compositions import checked, refusal
 from doc_blocks import ROOT
-from environments import Patch
+from environments import Patch, few
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -309,7 +309,7 @@ STARTS = [
 ]
 
 
-@pytest.mark.parametrize(("overrides", "starts", "unused"), STARTS)
+@pytest.mark.parametrize(("overrides", "starts", "unused"), few(STARTS, 2))
 def test_how_the_success_gate_starts(overrides: list[str], starts: str, unused: list[str]) -> None:
     """By its own choice, which a line names where another was made."""
     cfg = mjstack.load_config(overrides)

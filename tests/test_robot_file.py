@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 from compositions import refusal
-from environments import Patch, one_second_episode
+from environments import Patch, few, one_second_episode
 from ik_arm import Arm
 
 from mjstack import load_config
@@ -58,7 +58,7 @@ scene:
 """
 
 
-@pytest.mark.parametrize("folders", [("alpha", "beta"), ("beta", "alpha")])
+@pytest.mark.parametrize("folders", few([("alpha", "beta"), ("beta", "alpha")], 2))
 def test_each_file_is_beside_the_yaml_that_names_it(
     tmp_path: Path, monkeypatch: Patch, folders: tuple[str, str]
 ) -> None:
@@ -103,7 +103,7 @@ TAKEN = {
 }
 
 
-@pytest.mark.parametrize("case", TAKEN)
+@pytest.mark.parametrize("case", few(TAKEN, 2))
 def test_a_file_taken_from_a_later_object_is_beside_its_yaml(tmp_path: Path, case: str) -> None:
     conf = tmp_path / "conf/experiment"
     conf.mkdir(parents=True)

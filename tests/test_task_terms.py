@@ -139,7 +139,7 @@ def test_the_world_of_baseline_and_parity_is_that_of_the_task(turned: Path) -> N
     assert "geom_friction" not in Run(Stage(cfg)).nominal.sim.fields
 
 
-@pytest.mark.parametrize("job", ["collect", "play", "gates"])
+@pytest.mark.parametrize("job", few(["collect", "play", "gates"], 2))
 def test_it_acts_in_other_jobs(turned: Path, job: str) -> None:
     cfg = composed(turned, f"job={job}", "nworld=2", "reset=jitter")
     assert list(cfg.reset) == ["home", "cubes", "turn", "slide"]
