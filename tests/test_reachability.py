@@ -17,7 +17,6 @@ import reachability
 import torch
 from compositions import load_config, make_env
 from environments import Capture, GetStage, Patch, configure
-from ik_arm import Arm, results
 
 from mjstack.config.schema import Config
 from mjstack.errors import ConfigError, ParameterError
@@ -51,24 +50,6 @@ def test_what_mink_reaches_is_reached(get_stage: GetStage, robot: str, grip: str
         np.testing.assert_allclose(q[-len(gripper) :], gripper, atol=1e-6)
         assert np.linalg.norm(ik.grasp_point(q) - point) < 5e-4
         assert ik.solve(point, np.array([*ik.home[: -len(gripper)], *gripper]))[1] < 5e-4
-
-
-@pytest.mark.full
-def test_the_tilt_is_the_smallest(get_stage: GetStage, robot: str) -> None:
-    cfg = get_stage(robot).cfg
-    model = get_stage(robot).model
-    points = points_over(cfg, 4)
-    distances, tilts = reachability.solve_upright(model, cfg, "open", points)
-    assert distances.max() < 5e-4
-    # Nothing better is found from many other postures, by the kinematics of MuJoCo
-    arm = Arm(model, cfg.robot)
-    solver = arm.solver(300, iterations=40, approach_gain=0.5)
-    for k, (point, tilt) in enumerate(zip(points, tilts, strict=True)):
-        q, targets = arm.anywhere(300, k), np.tile(point, (300, 1))
-        for _ in range(reachability.SOLVES):
-            q, distance = results(solver, q, targets)
-        down = -arm.directions(q[distance < 5e-4])[1][:, 2]
-        assert tilt == pytest.approx(np.degrees(np.arccos(down.max())), abs=0.5)
 
 
 REGIONS = [

@@ -9,15 +9,13 @@ import numpy as np
 import pytest
 import torch
 from compositions import load_config
-from environments import MakeSim, NewRun, Patch, at_double_speed, on_cuda
+from environments import NewRun, Patch, at_double_speed, on_cuda
 
 from mjstack.bench import env_step, episode, timing
 from mjstack.bench.env_step import measure_env_step
 from mjstack.bench.timing import (
     EnergyMeter,
     Measurement,
-    describe_lost,
-    lost_worlds,
     steps_that_fit,
     timed,
 )
@@ -235,16 +233,6 @@ def test_steps_not_made_void_the_figure(new_run: NewRun, monkeypatch: Patch) -> 
         problem = f"{name}: no figure: 2 worlds overflowed, diverged or were not stepped"
         assert problem in result.reason
     assert speeds(result) == []
-
-
-@pytest.mark.full
-def test_no_time_for_worlds_that_diverged(make_sim: MakeSim, backend: str) -> None:
-    sim = make_sim(backend, 2)
-    sim.step(10)
-    assert describe_lost(lost_worlds(sim, 10)) == ""
-    assert lost_worlds(sim, 20).tolist() == [True, True]
-    sim.qvel[1, 0] = torch.nan
-    assert describe_lost(lost_worlds(sim, 10)).startswith("1 worlds overflowed, diverged")
 
 
 @pytest.mark.full
