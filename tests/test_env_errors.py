@@ -12,7 +12,7 @@ import torch
 from compositions import load_config, put
 from environments import Patch, assert_rows, configure, mask_of, on_shared_sim, returned, zeros
 
-from mjstack import make_env
+import mjstack
 from mjstack.config.schema import (
     Backend,
     Config,
@@ -161,7 +161,7 @@ def test_step_before_reset(cfg: Config) -> None:
     ids=["a string", "a configuration"],
 )
 def test_overrides_that_are_no_list(overrides: Callable[[], object], words: str) -> None:
-    call = lambda: make_env(overrides())  # type: ignore[arg-type]  # noqa: E731
+    call = lambda: mjstack.make_env(overrides())  # type: ignore[arg-type]  # noqa: E731
     fails(ArgumentError, call, "overrides", words, "['task=reach', 'robot=rebot']")
 
 

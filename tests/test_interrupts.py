@@ -1,7 +1,8 @@
 """Ctrl-C and SIGTERM at random moments: of a command, in forked children of a process of their own
 as in test_fuzz.py, and of a script that steps an environment.
 
-``PYTHONPATH=tests/helpers python tests/test_interrupts.py gates 250`` prints how 250 runs ended.
+How 250 runs end is printed by
+``PYTHONPATH=tests/helpers python tests/test_interrupts.py gates 250``.
 """
 
 import json
