@@ -13,7 +13,7 @@ import pytest
 import torch
 from compositions import make_env
 from doc_blocks import ROOT
-from environments import Patch
+from environments import Patch, few
 from gymnasium.spaces import Box
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
@@ -494,12 +494,18 @@ def test_make_vec_has_worlds_of_one_environment() -> None:
 
 @pytest.mark.parametrize(
     ("options", "expected"),
-    [
-        ({"render_mode": "ansi"}, "render_mode: found 'ansi', expected None, or one of rgb_array"),
-        ({"render_mode": "human"}, r"on this display \(DISPLAY=not set\)"),
-        ({"overrides": ["robot=ur5"]}, "'ur5' does not exist"),
-        ({"group": "critic"}, "observation group 'critic' does not exist"),
-    ],
+    few(
+        [
+            (
+                {"render_mode": "ansi"},
+                "render_mode: found 'ansi', expected None, or one of rgb_array",
+            ),
+            ({"render_mode": "human"}, r"on this display \(DISPLAY=not set\)"),
+            ({"overrides": ["robot=ur5"]}, "'ur5' does not exist"),
+            ({"group": "critic"}, "observation group 'critic' does not exist"),
+        ],
+        2,
+    ),
 )
 def test_make_refuses_in_one_line(
     options: dict[str, Any], expected: str, monkeypatch: Patch

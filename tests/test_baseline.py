@@ -165,13 +165,16 @@ def test_contacts_of_the_scene_that_are_switched_off_are_seen() -> None:
 
 @pytest.mark.parametrize(
     "overrides",
-    [
-        ["task=box", "robot=rebot"],
-        ["robot=so101", "cameras=[front,wrist]"],
-        ["scene.objects.red={shape: capsule, size: [0.02, 0.02], quat: [0.7, 0.1, 0.7, 0]}"],
-        ["+scene.objects.can={shape: cylinder, size: [0.02, 0.03], mass: 0.1, xy: [0.4, 0.0]}"],
-        ["timing=fine", "solver=benchmark", "scene.table_friction=[0.5, 0.01, 0.001]"],
-    ],
+    few(
+        [
+            ["task=box", "robot=rebot"],
+            ["robot=so101", "cameras=[front,wrist]"],
+            ["scene.objects.red={shape: capsule, size: [0.02, 0.02], quat: [0.7, 0.1, 0.7, 0]}"],
+            ["+scene.objects.can={shape: cylinder, size: [0.02, 0.03], mass: 0.1, xy: [0.4, 0.0]}"],
+            ["timing=fine", "solver=benchmark", "scene.table_friction=[0.5, 0.01, 0.001]"],
+        ],
+        2,
+    ),
 )
 def test_a_scene_as_configured_passes(overrides: list[str]) -> None:
     cfg = load_config(overrides)
@@ -313,6 +316,7 @@ def test_the_end_of_a_range_is_a_load() -> None:
     assert "; it is at the end of its range (" in cause
 
 
+@pytest.mark.full
 def test_another_actuator_that_pulls_is_a_load(tmp_path: Path) -> None:
     """Here a tendon with a constant force, which no command reaches."""
     cable = """<general name="cable" tendon="belt" biastype="affine" biasprm="-30 0 0"/></actuator>

@@ -294,12 +294,14 @@ def read(name: str) -> Config:
     return mjstack.load_config([f"robot={name}"], config_dir=Path(name) / "conf")
 
 
+@pytest.mark.full
 def test_home_is_within_the_range_of_a_geared_servo(here: Path) -> None:
     for ends, low, high in (("0.2 0.6", 0.1, 0.3), ("-0.6 -0.2", -0.3, -0.1)):
         robot = guess(gantry().replace(SERVO.format("x"), GEARED.format(ends)))
         assert low <= robot["home"][0] <= high
 
 
+@pytest.mark.full
 def test_the_reason_tells_the_force_of_the_jaws(here: Path) -> None:
     """Less than 20 N, where the file's own servos have no more; it is enough for a cube."""
     for limit in (8.0, 200.0):
@@ -383,6 +385,7 @@ def test_one_of_two_arms_is_chosen(here: Path) -> None:
         guess(level, "b x")
 
 
+@pytest.mark.full
 def test_a_high_arm_gets_a_table_in_its_reach(here: Path) -> None:
     """On a pedestal the table is higher; below the floor the base is."""
     for height, base, table in ((1.2, None, 0.7), (0.0, 0.5, 0.012)):

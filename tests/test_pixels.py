@@ -232,6 +232,7 @@ def test_images_of_a_round_come_again(backend: str, tmp_path: Path) -> None:
         assert first.flatten(1).float().std(1).min() > 5.0
 
 
+@pytest.mark.full
 def test_it_learns_to_tell_where_objects_are(tmp_path: Path) -> None:
     """What it estimates is recorded in every step, and no part of what the policy sees."""
     stage = Stage(load_config([*TINY, "job.rounds=0", "job.batches=300", "job.learning_rate=0.01"]))

@@ -4,7 +4,16 @@ worlds it repeats them. Both do the same.
 
 import pytest
 import torch
-from environments import REBOT_LATER, Patch, actions, configure, on_new_sim, on_shared_sim, state_of
+from environments import (
+    REBOT_LATER,
+    Patch,
+    actions,
+    configure,
+    few,
+    on_new_sim,
+    on_shared_sim,
+    state_of,
+)
 from policies import make_policy
 
 from mjstack.adapters.rsl_rl import RslRlVecEnv
@@ -60,10 +69,13 @@ def test_held_steps_are_observed_for_a_history_alone(
 
 @pytest.mark.parametrize(
     ("ends", "last", "success"),
-    [
-        (["task.episode_steps=7"], 7, 0.0),
-        (["task.check.distance=10.0", "task.success.params.steps=3"], 3, 1.0),
-    ],
+    few(
+        [
+            (["task.episode_steps=7"], 7, 0.0),
+            (["task.check.distance=10.0", "task.success.params.steps=3"], 3, 1.0),
+        ],
+        2,
+    ),
     ids=["time out", "success"],
 )
 def test_an_episode_ends_within_a_decision(ends: list[str], last: int, success: float) -> None:
@@ -96,7 +108,7 @@ def test_an_episode_ends_within_a_decision(ends: list[str], last: int, success: 
     assert torch.equal(env.sim.qpos, single.sim.qpos)
 
 
-@pytest.mark.parametrize("action", ["joint_delta", "ee_upright"])
+@pytest.mark.parametrize("action", few(["joint_delta", "ee_upright"], 2))
 def test_a_policy_drives_as_it_was_trained(action: str) -> None:
     """With its own action terms, observed last action and rate: the same joint targets and states
     as in the environment of its training, bit for bit.

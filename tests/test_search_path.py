@@ -250,6 +250,7 @@ def test_a_byte_order_mark_is_refused(lean: Path) -> None:
         load_config(["task=lean"], config_dir=lean)
 
 
+@pytest.mark.full
 def test_a_policy_with_terms_of_ones_own_plays_in_python(lean: Path, tmp_path: Path) -> None:
     """By an absolute and a relative folder; without one the advice is that for Python."""
     module = lean.parent / "lean.py"

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from compositions import load_config, refusal
+from environments import few
 
 from mjstack import make_env
 from mjstack.errors import MjstackError
@@ -29,7 +30,9 @@ WORKSHOP = (
 )
 
 
-@pytest.mark.parametrize(("name", "figures"), [("gtc_berlin", GTC_BERLIN), ("workshop", WORKSHOP)])
+@pytest.mark.parametrize(
+    ("name", "figures"), few([("gtc_berlin", GTC_BERLIN), ("workshop", WORKSHOP)], 2)
+)
 def test_the_model_has_the_published_figures(name: str, figures: tuple) -> None:
     model = build_model(load_config([f"actuator={name}"]))
     stiffness, damping, armature, dry, viscous = figures

@@ -244,6 +244,7 @@ def test_a_choice_that_does_not_act_in_a_gate_is_named(
     assert said == [f"{line} chooses it there" for line in lines]
 
 
+@pytest.mark.full
 def test_starts_of_a_gate_are_terms(turned: Path) -> None:
     words = "gate.plain.reset=randomized: expected keys and values"
     args = ["gates=[plain]", "gate.plain.reset=randomized"]

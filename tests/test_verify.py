@@ -41,6 +41,7 @@ def test_what_fails_is_said() -> None:
         mjstack.verify(["nworld=0"])
 
 
+@pytest.mark.full
 def test_a_warp_that_cannot_be_loaded_fails_no_run(monkeypatch: Patch) -> None:
     """The gates that play on it fail."""
 
