@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from compositions import load_config, refusal
-from environments import Patch, few
+from environments import Patch
 from policies import report
 
 import mjstack.jobs.compare as compare
@@ -45,10 +45,10 @@ def test_mcnemar_of_known_pairs(only_a: int, only_b: int, p_value: float) -> Non
 
 def test_mcnemar_is_the_exact_binomial() -> None:
     for pairs in (7, 40, 180):
-        for wins in range(pairs // 2):
-            tail = sum(math.comb(pairs, won) for won in range(wins + 1))
+        for few in range(pairs // 2):
+            tail = sum(math.comb(pairs, won) for won in range(few + 1))
             exact = float(Fraction(2 * tail, 2**pairs))
-            assert mcnemar_p_value(wins, pairs - wins) == exact
+            assert mcnemar_p_value(few, pairs - few) == exact
 
 
 class Faulty(Driver):
@@ -120,36 +120,32 @@ def test_equal_sides(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("overrides", "problem"),
-    few(
-        [
-            ([], "job.against=[]: expected what the second side changes"),
-            (["job.against=[policy]"], "override 'policy' cannot be read: expected key=value"),
-            (['job.against=["polcy=x"]'], "'polcy' does not exist. Did you mean 'policy'?"),
-            (
-                ['job.against=["seed=1"]'],
-                "expected the same robot, task, worlds and seeds (seed=1, expected 0)",
-            ),
-            *(
-                pytest.param([f'job.against=["{side}"]'], f"({side}, expected {value})", marks=FULL)
-                for side, value in (
-                    ("robot=rebot", "so101"),
-                    ("gate.success.seeds=3", "2"),
-                    ("task.check.distance=0.5", "0.02"),
-                )
-            ),
-            (['job.against=["gate.success.region=[0.01,0.01]"]'], "expected equal starts, which"),
-            (['job.against=["controller=policy","policy=nowhere/last"]'], "nowhere/last"),
-            (['job.against=["graph=off"]', "view=web"], "expected false with job=compare"),
-        ],
-        2,
-    ),
+    [
+        ([], "job.against=[]: expected what the second side changes"),
+        (["job.against=[policy]"], "override 'policy' cannot be read: expected key=value"),
+        (['job.against=["polcy=x"]'], "'polcy' does not exist. Did you mean 'policy'?"),
+        (
+            ['job.against=["seed=1"]'],
+            "expected the same robot, task, worlds and seeds (seed=1, expected 0)",
+        ),
+        *(
+            pytest.param([f'job.against=["{side}"]'], f"({side}, expected {value})", marks=FULL)
+            for side, value in (
+                ("robot=rebot", "so101"),
+                ("gate.success.seeds=3", "2"),
+                ("task.check.distance=0.5", "0.02"),
+            )
+        ),
+        (['job.against=["gate.success.region=[0.01,0.01]"]'], "expected equal starts, which"),
+        (['job.against=["controller=policy","policy=nowhere/last"]'], "nowhere/last"),
+        (['job.against=["graph=off"]', "view=web"], "expected false with job=compare"),
+    ],
 )
 def test_other_sides_are_refused_in_one_line(overrides: list[str], problem: str) -> None:
     args = [*TINY, *overrides]
     refusal(lambda: check_job(load_config(args), args), problem)
 
 
-@FULL
 def test_starts_that_turn_out_unequal_fail(tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.setattr(compare, "_start_of_first_world", lambda stage: {"start": np.zeros(1)})
     region = ['job.against=["gate.success.region=[0.01,0.01]"]']
@@ -158,7 +154,6 @@ def test_starts_that_turn_out_unequal_fail(tmp_path: Path, monkeypatch: Patch) -
     assert "a and b did not start alike" in report(tmp_path / "out")["compare"]["reason"]
 
 
-@FULL
 @pytest.mark.parametrize(("device", "code"), [("cpu", 1), ("cuda:0", 0)])
 def test_starts_may_differ_by_rounding_on_another_device(
     device: str, code: int, tmp_path: Path, monkeypatch: Patch
