@@ -21,23 +21,16 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import chdir, suppress
 from dataclasses import asdict
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 from forked import PASSED, SECONDS, Child, content, fork, is_alive, kill, preload
 
 # isort: split
-import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 import yaml
-from dataset_checker import with_column
 from environments import configure, one_second_episode
 from policies import write_policy
-from safetensors.numpy import load_file as load_numpy
-from safetensors.numpy import save
 
 from mjstack import load_config
 from mjstack.cli import run
@@ -322,8 +315,10 @@ def _damaged(folder: Path, names: Sequence[str]) -> Make:
 
 def damage(draw: random.Random, path: Path) -> None:
     """Cut, replace, remove or redirect a file or a folder, or change a value in it."""
-    kind = draw.choice(("cut", "text", "text", "gone", "link", "other", *["value"] * 6))
-    if path.is_dir() and kind in ("cut", "text", "value"):
+    is_text = path.suffix in (".json", ".yaml")
+    values = ["value"] * 6 if is_text else ["cut"]  # tables of each reader have other values
+    kind = draw.choice(("cut", "text", "text", "gone", "link", "other", *values))
+    if path.is_dir() and kind in ("cut", "text"):
         kind = draw.choice(("gone", "link", "other"))
     if kind == "cut":
         content = path.read_bytes()
@@ -332,7 +327,7 @@ def damage(draw: random.Random, path: Path) -> None:
         path.write_bytes(draw.choice(TEXTS))
     elif kind == "value":
         with suppress(Exception):  # it may be damaged already
-            CHANGES[path.suffix](draw, path)
+            _change_value(draw, path)
     else:
         moved = path.with_name(f"{path.name}.moved")
         path.rename(moved)
@@ -342,7 +337,7 @@ def damage(draw: random.Random, path: Path) -> None:
             draw.choice((path.mkdir, lambda: os.mkfifo(path), lambda: path.write_text("x")))()
 
 
-def _change_text(draw: random.Random, path: Path) -> None:
+def _change_value(draw: random.Random, path: Path) -> None:
     """Another value, or none, for a key of JSON or YAML."""
     is_json = path.suffix == ".json"
     node = data = json.loads(path.read_text()) if is_json else yaml.safe_load(path.read_text())
@@ -358,56 +353,6 @@ def _change_text(draw: random.Random, path: Path) -> None:
     path.write_text(json.dumps(data) if is_json else yaml.safe_dump(data))
 
 
-def _change_arrays(draw: random.Random, path: Path) -> None:
-    """Another array in a record, or a tensor in a policy, whose policy.json knows its file."""
-    is_npz = path.suffix == ".npz"
-    data = dict(np.load(path)) if is_npz else load_numpy(path)
-    name = draw.choice(sorted(data))
-    first = data[name].ravel()[:1]
-    arrays = [first, data[name] * np.nan if first.dtype.kind == "f" else first, np.zeros((0, 3))]
-    data[name] = draw.choice([*arrays, *([np.array("evil"), np.array(3.0)] if is_npz else [])])
-    if is_npz:
-        return np.savez(path, **data)
-    content = save(data)
-    path.unlink()
-    digest = sha256(content).hexdigest()
-    (path.parent / f"weights-{digest[:12]}.safetensors").write_bytes(content)
-    facts = json.loads((path.parent / "policy.json").read_text())
-    (path.parent / "policy.json").write_text(json.dumps(facts | {"weights_sha256": digest}))
-    return None
-
-
-def _change_table(draw: random.Random, path: Path) -> None:
-    """Another value in a column, other rows, or a table that unpacks to far more than its size."""
-    table = pq.read_table(path)
-    name = draw.choice(table.column_names)
-    values = table[name].to_pylist()
-    row = draw.randrange(len(values))
-    kind = draw.choice(("value", "value", "order", "rows", "column", "large"))
-    if kind == "rows":
-        table = table.take(draw.choice(([*range(row)], [*range(len(values)), row])))
-    elif kind == "column":
-        table = draw.choice((table.drop_columns([name]), table.append_column("x", table[name])))
-    elif kind == "large":
-        rows = min(draw.choice((10**4, 10**6)), 2 * 10**8 * len(values) // table.nbytes)
-        table = table.take(np.full(rows, row))
-    else:
-        values[row] = draw.choice((*VALUES, [values[row]], str(values[row])))
-        values = values[::-1] if kind == "order" else values
-        try:
-            table = with_column(table, name, pa.array(values))
-        except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError):
-            table = with_column(table, name, pa.array([str(value)[:9999] for value in values]))
-    pq.write_table(table, path)
-
-
-CHANGES = {
-    ".json": _change_text,
-    ".yaml": _change_text,
-    ".npz": _change_arrays,
-    ".safetensors": _change_arrays,
-    ".parquet": _change_table,
-}
 KINDS = {"commands": command_lines, "folders": damaged_folders, "datasets": damaged_datasets}
 
 if __name__ == "__main__":
