@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from mjstack.datasets import StoredDataset, read_dataset
-from mjstack.datasets.part import Part, PartWriter
+from mjstack.datasets.part import PartWriter, ShardFiles
 from mjstack.datasets.spec import EpisodeData
 from mjstack.datasets.writer import DatasetWriter
 
@@ -38,14 +38,14 @@ def listed(folder: Path) -> list[Path]:
     return paths
 
 
-def add(writer: DatasetWriter, *episodes: EpisodeData, commit: bool = True) -> Part:
+def add(writer: DatasetWriter, *episodes: EpisodeData, commit: bool = True) -> ShardFiles:
     """Writes episodes into a file of their own, which counts once it is committed."""
     with writer.guarded():
         part = PartWriter(writer.folder, writer.spec, "rank0000-0", 1.0)
         frame = writer.frames
         for number, episode in enumerate(episodes, len(writer.committed)):
             part.write(episode, number, frame)
-            frame += part.part.rows[-1]["length"]
+            frame += part.files.rows[-1]["length"]
         complete = part.complete()
     if commit:
         writer.commit([complete])

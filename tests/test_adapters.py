@@ -496,50 +496,18 @@ def test_make_vec_has_worlds_of_one_environment() -> None:
     ("options", "expected"),
     few(
         [
-            (
-                {"render_mode": "ansi"},
-                "render_mode: found 'ansi', expected None, or one of rgb_array",
-            ),
-            ({"render_mode": "human"}, r"on this display \(DISPLAY=not set\)"),
+            ({"render_mode": "ansi"}, "render_mode: found 'ansi', expected None or rgb_array"),
             ({"overrides": ["robot=ur5"]}, "'ur5' does not exist"),
             ({"group": "critic"}, "observation group 'critic' does not exist"),
         ],
         2,
     ),
 )
-def test_make_refuses_in_one_line(
-    options: dict[str, Any], expected: str, monkeypatch: Patch
-) -> None:
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.setattr("mjstack.adapters.gymnasium.opens_windows", lambda: False)
+def test_make_refuses_in_one_line(options: dict[str, Any], expected: str) -> None:
     overrides = options.pop("overrides", [])
     warnings.simplefilter("ignore")  # pytest restores it
     with pytest.raises(MjstackError, match=expected):
         gymnasium.make(REACH_ID, overrides=[*SHORT, *overrides], **options)
-
-
-def test_human_rendering_shows_every_step(monkeypatch: Patch) -> None:
-    shown: list[np.ndarray] = []
-
-    class Window:
-        def __init__(self, model: object, step_dt: float) -> None:
-            assert step_dt == 0.02
-
-        def show(self, qpos: np.ndarray) -> None:
-            shown.append(qpos)
-
-        def close(self) -> None:
-            shown.append(np.empty(0))
-
-    monkeypatch.setattr("mjstack.adapters.gymnasium.opens_windows", lambda: True)
-    monkeypatch.setattr("mjstack.adapters.gymnasium.Window", Window)
-    env = gymnasium.make(REACH_ID, overrides=SHORT, render_mode="human")
-    assert env.metadata["render_modes"] == ("rgb_array", "human")
-    env.reset(seed=0)
-    env.step(np.zeros(env.action_space.shape, np.float32))
-    assert len(shown) == 2
-    env.close()
-    assert not shown.pop().size
 
 
 def test_a_task_of_ones_own_has_an_id(monkeypatch: Patch) -> None:

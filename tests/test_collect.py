@@ -537,10 +537,10 @@ def test_the_buffer_bounds_the_worlds() -> None:
     with native_env(cfg) as env:
         for buffer, worlds in ((1.5, 1), (3.5, 3), (7.5, 7), (2**30 / world, 100)):
             cfg.job.buffer_gib = buffer * world / 2**30  # type: ignore[attr-defined]
-            assert CollectPlan.of(stage, Path(), env).most == worlds
+            assert CollectPlan.from_stage(stage, Path(), env).most == worlds
         cfg.job.buffer_gib = 0.9 * world / 2**30  # type: ignore[attr-defined]
         with pytest.raises(ConfigError, match=r"job.buffer_gib"):
-            CollectPlan.of(stage, Path(), env)
+            CollectPlan.from_stage(stage, Path(), env)
 
 
 def test_steps_come_to_the_host_in_chunks(monkeypatch: Patch) -> None:

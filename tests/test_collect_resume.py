@@ -87,7 +87,7 @@ def collection_at(
     cfg.job.keep_failures = keep_failures
     stage = Stage(cfg, _stage(*overrides).assets)
     home.mkdir(parents=True, exist_ok=True)
-    return Collection(CollectPlan.of(stage, home, _env(*overrides)), stage)
+    return Collection(CollectPlan.from_stage(stage, home, _env(*overrides)), stage)
 
 
 def collect(home: Path, *overrides: str, **kwargs: Any) -> GateResult:

@@ -298,7 +298,7 @@ def test_drawn_places_are_in_every_file(tmp_path: Path) -> None:
     cfg = load_config(["task=push"], config_dir=conf)
     quick = [f"controller.phases.{name}.seconds=0.1" for name in cfg.controller.phases]
     args = ["--config-dir", conf, "task=push", "sim=native", "gates=[success]", "nworld=3", *quick]
-    args += ["task.check.window=5", "task.success.params.steps=5", "gate.success.cell_episodes=1"]
+    args += ["task.check.window=5", "task.success.params.steps=5"]
     out = tmp_path / "out"
     assert run([*args, f"hydra.run.dir={out}"]) == 1
     goals = np.load(out / "success_starts_seed0.npz")["goal_xy"]
@@ -308,8 +308,6 @@ def test_drawn_places_are_in_every_file(tmp_path: Path) -> None:
     cells = [[float(row["goal_x_m"]), float(row["goal_y_m"])] for row in rows]
     assert np.allclose(cells, goals, atol=1e-5)
     assert "goal_yaw_rad" not in rows[0]
-    with (out / "success_regions.csv").open() as file:
-        assert {row["object"] for row in csv.DictReader(file)} == {"puck", "goal"}
     text = (out / "report.html").read_text()
     (figure,) = re.findall(r"<figure><figcaption>goal</figcaption>.*?</figure>", text)
     assert figure.count("<path class=x") == 3
@@ -337,9 +335,6 @@ def test_a_page_holds_every_frame(get_stage: GetStage, tmp_path: Path) -> None:
     path = tmp_path / "episode.html"
     worlds = motion(get_stage, 3, 5)
     worlds[2].qpos[3:] = np.nan  # it diverged
-    seen = np.zeros((5, 8, 12, 3), np.uint8)
-    seen[2:] = 200
-    worlds[1] = replace(worlds[1], images={"wrist": seen})
     model = get_stage("so101").assets.visual_model
     save_episode(path, model, worlds, 0.04)
     assert outside(path) == []
@@ -375,13 +370,6 @@ def test_a_page_holds_every_frame(get_stage: GetStage, tmp_path: Path) -> None:
         if message.get("name") == "/0" and message["type"] == "BatchedMeshesMessage"
     ]
     assert tables[0][0].tolist() != tables[0][1].tolist() == tables[0][2].tolist()
-    images = [
-        (time, "_data" in message.get("updates", {}))
-        for time, message in sent
-        if message.get("name") == "/image/1/wrist"
-    ]
-    assert images[0] == (0.0, False)
-    assert [time for time, changed in images if changed] == [pytest.approx(0.08)]
 
 
 def test_sixty_four_worlds_are_shared_by_the_gates() -> None:
@@ -392,7 +380,7 @@ def test_sixty_four_worlds_are_shared_by_the_gates() -> None:
         {"baseline": some("a", 1), "batch": some("b", 64), "success": some("c", 9)}
     )
     labels = [world.label for world in chosen]
-    assert labels == [*(f"b{n}" for n in range(30)), *(f"c{n}" for n in range(9)), "a0"]
+    assert labels == [*(f"b{n}" for n in range(31)), *(f"c{n}" for n in range(9)), "a0"]
     assert len(choose_worlds({"batch": some("b", 64)})) == 64
     assert choose_worlds({}) == []
 

@@ -78,7 +78,7 @@ PATHS: dict[str, dict[str, str] | None] = {
     "tasks/placed.py": {"HeldSuccess": "__call__ reset"},
     "tasks/stack.py": {
         "StackCheck": "placed goals",
-        "StackSuccess": "_look _replace_oldest __call__",
+        "StackSuccess": "_record_step _replace_oldest __call__",
     },
     "tasks/box.py": {
         "BoxCheck": "airborne outside over placed goals",

@@ -218,14 +218,14 @@ def test_maps_show_what_is_judged(tmp_path: Path) -> None:
     worlds.maps[0].marks = {"goal": [0.3, 0.1]}
     worlds.unjudged = ["dummy"]
     report = Report(folder=tmp_path, gates=[gate])
-    page = Page(worlds={"batch": worlds}, notes=["trajectories.png is not drawn"])
+    page = Page(worlds={"batch": worlds}, notes=["web.episode=false"])
     text = to_html(make_sections(report, page))
     (x, y) = re.findall(r"<text x=([\d.]+) y=([\d.]+)>goal</text>", text)[0]
     scale = 320 / 0.52  # the table's far edge at the top, 2 cm behind the base at the bottom
     assert float(x) - 6 == pytest.approx(scale * 0.2, abs=0.1)
     assert float(y) - 4 == pytest.approx(scale * 0.2, abs=0.1)
     assert "The check does not judge dummy." in text
-    assert "<li>trajectories.png is not drawn" in text
+    assert "<li>web.episode=false" in text
 
 
 def test_text_is_not_markup(tmp_path: Path) -> None:

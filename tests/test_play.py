@@ -1,4 +1,4 @@
-"""job=play: worlds with a policy or the expert, in MuJoCo's viewer or as a video."""
+"""job=play: worlds with a policy or the expert, as a video."""
 
 import sys
 from collections.abc import Iterator
@@ -14,9 +14,7 @@ from policies import write_policy
 
 import mjstack
 import mjstack.jobs.play as play
-import mjstack.jobs.showing as showing
 from mjstack.cli import run
-from mjstack.episodes.rollout import Hook
 from mjstack.episodes.stage import Stage
 from mjstack.errors import MjstackError
 from mjstack.jobs import check_job
@@ -75,27 +73,6 @@ def test_a_policy_plays_worlds_as_a_batch_starts_them(
     sim = stage.batch_simulation(2)
     stage.play(sim, cfg.reset)
     assert np.array_equal(qpos[:, -1], sim.qpos.numpy())
-
-
-def test_the_expert_plays_without_a_policy_in_the_viewer(
-    saved: list[np.ndarray], tmp_path: Path, monkeypatch: Patch
-) -> None:
-    """Every step of every world is shown; a video is written on request alone."""
-    shown: list[int] = []
-
-    hook = Hook(lambda step, sim: shown.append(step))
-    monkeypatch.setattr(showing, "find_viewers", lambda stage: [hook])
-    monkeypatch.setattr(showing.picture, "opens_windows", lambda: True)
-    out = tmp_path / "out"
-    names = configure("task=reach").controller.phases
-    fast = [f"controller.phases.{name}.seconds=0.2" for name in names]
-    args = [*REACH, *fast, "task.check.window=5", "view=true", "nworld=2"]
-    assert run([*args, f"hydra.run.dir={out}"]) == 0
-    steps = len(shown) // 2
-    assert shown == [*range(steps)] * 2
-    assert steps > 5
-    assert not saved
-    assert not (out / "episode.mp4").exists()
 
 
 def test_a_task_without_a_check_is_shown_unjudged(saved: list[np.ndarray], tmp_path: Path) -> None:
@@ -231,14 +208,6 @@ def test_without_gl_nothing_is_written(refused: Refused, monkeypatch: Patch) -> 
     line = refused("job=play", "task=reach", "sim=native")
     assert "offscreen rendering fails" in line
     assert line.endswith("Set MUJOCO_GL=egl or osmesa.")
-
-
-def test_without_a_display_nothing_is_written(refused: Refused, monkeypatch: Patch) -> None:
-    """MuJoCo's viewer would end the process."""
-    monkeypatch.setenv("DISPLAY", ":98765")
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    line = refused("job=play", "task=reach", "sim=native", "controller=open_loop", "view=true")
-    assert "view=true: expected a display that opens windows (DISPLAY=:98765)" in line
 
 
 @pytest.mark.full

@@ -2,7 +2,6 @@
 on with in another number of ranks.
 """
 
-import csv
 import logging
 import os
 import re
@@ -415,28 +414,3 @@ def test_ranks_collect_one_dataset(tmp_path: Path) -> None:
         np.testing.assert_array_equal(found.frames(name), expected.frames(name))
     assert found.info["mjstack"]["shards"] > expected.info["mjstack"]["shards"]
     check_dataset(tmp_path / "several" / "dataset")
-
-
-def test_all_failing_worlds_are_replayed(finished: Path, tmp_path: Path) -> None:
-    """Each fails again by the same rules, bit for bit on the same backend."""
-    folder = tmp_path / "replay"
-    args = ["job=replay", f"run={finished}", "world=failing", f"hydra.run.dir={folder}"]
-    assert run(args) == 1
-    (gate,) = report_of(folder)["gates"]
-    rows = list(csv.DictReader((folder / "replayed_worlds.csv").open()))
-    assert gate["metrics"]["worlds"] == gate["metrics"]["by_the_same_rules"] == len(rows) > 1
-    assert all(row["recorded"] == row["native"] for row in rows)
-    failing = list(csv.DictReader((finished / "batch_failing.csv").open()))
-    assert [(row["seed"], row["world"], row["recorded"]) for row in rows] == [
-        (row["seed"], row["world"], row["rules"]) for row in failing
-    ]
-
-
-@pytest.mark.full
-@pytest.mark.long
-def test_ranks_replay_failing_worlds(finished: Path, tmp_path: Path) -> None:
-    args = ["job=replay", f"run={finished}", "world=failing", "sim=mjwarp", "sim.device=cpu"]
-    play(2, [*args, f"hydra.run.dir={tmp_path}/two"], tmp_path, 1)
-    assert run([*args, f"hydra.run.dir={tmp_path}/one"]) == 1
-    tables = [(tmp_path / name / "replayed_worlds.csv").read_text() for name in ("one", "two")]
-    assert tables[0] == tables[1]

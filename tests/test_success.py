@@ -37,7 +37,6 @@ from mjstack.episodes.rollout import Hook, reset_worlds, rollout
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
 from mjstack.gates.episodes import Goal, find_doubts, gate_config
-from mjstack.gates.regions import describe_region, find_regions, radial_yaw_deg, regions_table
 from mjstack.jobs.gates import check_machine
 from mjstack.math import wilson_interval
 from mjstack.report.record import GateResult, Status
@@ -60,8 +59,8 @@ def command(folder: Path, *overrides: str) -> int:
 def passed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a native run of six SO-101 worlds in a small region."""
     folder = tmp_path_factory.mktemp("success") / "run"
-    region = ("gate.success.region=[0.03,0.03]", "gate.success.cell_episodes=2")
-    assert command(folder, "sim=native", "nworld=6", *region) == 0
+    region = "gate.success.reset.cubes.params.xy=[0.03,0.03]"
+    assert command(folder, "sim=native", "nworld=6", region) == 0
     return folder
 
 
@@ -88,10 +87,8 @@ def test_small_region_passes(passed: Path) -> None:
     assert gate["thresholds"]["success_rate_min"] == 0.99
     assert "objects within 0.03 x 0.03 m" in gate["notes"]["starts"]
     files = """.hydra episode.html report.html report.json report.md run.log
-        success_regions.csv success_seed0.npz success_starts_seed0.npz"""
+        success_seed0.npz success_starts_seed0.npz"""
     assert sorted(path.name for path in passed.iterdir()) == files.split()
-    assert "no region of at least 2 episodes had a failure" in gate["details"]
-    assert not [table for table in gate["tables"] if "region" in table["title"]]
     objects = load_config().scene.objects
     with np.load(passed / "success_seed0.npz") as record:
         off = np.abs(record["start_places"][..., :2] - [objects["red"].xy, objects["blue"].xy])
@@ -121,7 +118,6 @@ def test_broken_controller_fails_by_rule_and_phase(tmp_path: Path) -> None:
         assert row.items() >= expected.items()
         assert "LIFT" in row["rules"].split()
     assert world == 1
-    assert any("no region of at least 20 episodes (gate" in line for line in gate["details"])
 
 
 @pytest.fixture
@@ -138,7 +134,7 @@ def hasty() -> NewRun:
 @pytest.mark.full
 def test_seeds_add_up_and_the_rate_decides(hasty: NewRun, tmp_path: Path) -> None:
     """The threshold is on the rate itself; what fails is named all the same."""
-    run = hasty("gates=[batch,success]", "gate.success.seeds=2", "gate.success.cell_episodes=2")
+    run = hasty("gates=[batch,success]", "gate.success.seeds=2")
     result = play(run, tmp_path)
     assert result.status is Status.failed
     assert "4 of 4 episodes (0:0, 0:1, 1:0, 1:1) failed: " in result.reason
@@ -146,10 +142,6 @@ def test_seeds_add_up_and_the_rate_decides(hasty: NewRun, tmp_path: Path) -> Non
     assert result.metrics["distinct_starts"] == 4
     seeds = next(table for table in result.tables if table.title == "Seeds")
     assert [row[:3] for row in seeds.rows] == [["0", "2", "0"], ["1", "2", "0"]]
-    title = "Worst regions of at least 2 episodes"
-    (worst,) = [table for table in result.tables if table.title.startswith(title)]
-    assert worst.title.endswith(f"({len(worst.rows)} of {len(worst.rows)} with a failure)")
-    assert not any("had a failure" in line for line in result.details)
     (signs,) = [table for table in result.tables if "first sign" in table.header[0]]
     # Every failed episode is in one line, with a sign or without
     assert sum(int(row[1]) for row in signs.rows) == 4
@@ -206,20 +198,18 @@ def test_a_gate_of_ones_own_is_a_file(
     assert "bit for bit where it did" in gate_of(Path("again"))["reason"]
     assert run([*conf, "gates=[site]", "gate.site.rate=2"]) == 2
     assert "gate.site.rate=2.0: expected a number from 0 to 1" in capsys.readouterr().err
-    assert run([*conf[:2], "--help", "gate.site.cell_episodes"]) == 0
-    assert "gate.site.cell_episodes=20" in capsys.readouterr().out
+    assert run([*conf[:2], "--help", "gate.site.seeds"]) == 0
+    assert "gate.site.seeds=1" in capsys.readouterr().out
 
 
 FILE = "reset=starts_file starts={run}/success_starts_seed0.npz"
-NO_REGION = "null, because no reset term of the success gate has a region"
+REGION = "gate.success.reset.cubes.params.xy"
 BAD = [
-    ("gate.success.region=[0.5,0.02]", "expected a region with a free position for every object"),
-    ("gate.success.region=[0.1,0.1]", "expected a region that the arm reaches"),
-    ("gate.success.region=[0.01]", "2 numbers"),
-    ("gate.success.region=[0.01,0.01] ~gate.success.reset.cubes", NO_REGION),
+    (f"{REGION}=[0.5,0.02]", "expected a region with a free position for every object"),
+    (f"{REGION}=[0.1,0.1]", "expected a region that the arm reaches"),
+    (f"{REGION}=[0.01]", "expected two numbers [m]"),
     ("gate.success.reset.cubes.params.gap=0.3", "gate.success.reset.cubes.params.xy"),
     (f"{FILE} gate.success.seeds=2", "start alike under every seed"),
-    (f"{FILE} gate.success.region=[0.01,0.01]", NO_REGION),
     (f"{FILE} nworld=7", "at least 7 worlds, it has 6"),
 ]
 
@@ -238,10 +228,9 @@ def test_bad_input_is_one_line_and_writes_nothing(
 @pytest.mark.full
 def test_region_is_the_gates_alone() -> None:
     """Without the gate, its region is not tried; with it, no other start changes."""
-    check_machine(load_config(["sim=native", "gates=[batch]", "gate.success.region=[0.1,0.1]"]))
-    cfg = load_config(["gate.success.region=[0.01,0.02]"])
+    check_machine(load_config(["sim=native", "gates=[batch]", f"{REGION}=[0.1,0.1]"]))
+    cfg = load_config([f"{REGION}=[0.01,0.02]"])
     assert gate_config(cfg, "success").reset["cubes"].params["xy"] == [0.01, 0.02]
-    assert cfg.gate.success.reset["cubes"].params["xy"] == [0.05, 0.05]
     assert gate_config(cfg, "success").controller.name == "closed_loop"
     assert cfg.controller.name == "open_loop"
 
@@ -396,59 +385,6 @@ def test_each_cube_of_the_box_has_its_own_release(monkeypatch: Patch) -> None:
     assert watch.step[1:].tolist() == steps
 
 
-def test_radial_yaw() -> None:
-    """A cube that faces the base is at 0 wherever it stands, and a quarter turn changes nothing."""
-    angle = np.linspace(-3.0, 3.0, 13)
-    places = np.stack((0.3 * np.cos(angle), 0.3 * np.sin(angle), angle), axis=1)
-    for quarter in (-2, -1, 0, 1):
-        yaw = radial_yaw_deg(places + np.array([0.0, 0.0, quarter * np.pi / 2]))
-        assert np.minimum(yaw, 90.0 - yaw).max() < 1e-9
-        assert ((yaw >= 0.0) & (yaw < 90.0)).all()
-    assert radial_yaw_deg(np.array([0.0, 0.3, np.radians(90.0 + 37.0)])) == pytest.approx(37.0)
-    assert radial_yaw_deg(np.array([0.3, 0.0, -1e-18])) == 0.0
-
-
-def test_worst_regions_of_made_up_episodes() -> None:
-    """Red fails in one corner, blue at some angles; a cell with too few episodes has no rate."""
-    rng = np.random.default_rng(1)
-    n = 4000
-    places = np.empty((n, 2, 3))
-    places[:, 0, :2] = rng.uniform([0.30, -0.14], [0.36, -0.10], (n, 2))
-    places[:, 1, :2] = rng.uniform([0.30, 0.06], [0.36, 0.10], (n, 2))
-    places[..., 2] = rng.uniform(-np.pi, np.pi, (n, 2))
-    places[:5, 0, :2] = 0.41, -0.05
-    corner = (places[:, 0, 0] >= 0.34) & (places[:, 0, 0] < 0.36) & (places[:, 0, 1] < -0.12)
-    turned = (radial_yaw_deg(places[:, 1]) >= 30.0) & (radial_yaw_deg(places[:, 1]) < 45.0)
-    succeeded = ~(corner & (rng.random(n) < 0.9)) & ~(turned & (rng.random(n) < 0.5))
-    assert load_config().gate.success.cell_episodes == 20
-    regions = find_regions(20, places, succeeded, ("red", "blue"), (0.0, 0.0))
-    assert [region["rate"] for region in regions] == sorted(region["rate"] for region in regions)
-    assert all(region["episodes"] >= 20 for region in regions)
-    assert not any(region["object"] == "red" and region.get("x_min_m") == 0.4 for region in regions)
-    worst = regions[0]
-    assert (worst["object"], worst["x_min_m"], worst["y_min_m"]) == ("red", 0.34, -0.14)
-    text = describe_region(worst)
-    assert text.startswith("red: x 0.340 to 0.360 m, y -0.140 to -0.120 m")
-    angles = [r for r in regions if r["object"] == "blue" and "x_min_m" not in r]
-    assert (angles[0]["yaw_min_deg"], angles[0]["yaw_max_deg"]) == (30.0, 45.0)
-    assert describe_region(angles[0]) == "blue: turned 30 to 45 deg"
-    assert len(angles) == 6
-    assert sum(region["episodes"] for region in angles) == n
-    assert sum(region["succeeded"] for region in angles) == succeeded.sum()
-    placed = [r for r in regions if r["object"] == "red" and "yaw_min_deg" not in r]
-    assert len(placed) == 6
-    whole = next(r for r in placed if (r["x_min_m"], r["y_min_m"]) == (0.34, -0.14))
-    counts = (int(corner.sum()), int((corner & succeeded).sum()))
-    assert (whole["episodes"], whole["succeeded"]) == counts
-    assert (whole["rate_low95"], whole["rate_high95"]) == wilson_interval(*reversed(counts))
-    assert len({str(region) for region in regions}) == len(regions)
-    # A region without a failure has no place among the worst
-    flawless = worst | {"object": "blue", "succeeded": worst["episodes"]}
-    (table,) = regions_table(20, [worst, flawless])
-    assert table.title == "Worst regions of at least 20 episodes (1 of 1 with a failure)"
-    assert [row[0] for row in table.rows] == [text]
-
-
 @pytest.mark.full
 @on_cuda
 def test_steps_with_the_tracker_are_one_graph(robot: str, new_run: NewRun, tmp_path: Path) -> None:
@@ -462,7 +398,7 @@ def test_steps_with_the_tracker_are_one_graph(robot: str, new_run: NewRun, tmp_p
     failed = episode.result.failed != 0
     assert int(failed.sum()) <= 3
     assert not bool(((watch.sign != 0) & ~failed).sum() > 3)
-    assert int(watch._now) == episode.timing.steps
+    assert int(watch._count) == episode.timing.steps
     sim.close()
     assert play(new_run(*device, robot=robot), tmp_path).metrics["succeeded"] >= 61
 

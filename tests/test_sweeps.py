@@ -1,20 +1,20 @@
-"""Sweeps whose jobs run in processes: a queue over GPUs or cores, and Slurm."""
+"""Sweeps whose jobs run in processes: a queue over GPUs."""
 
 import json
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from environments import Capture, Patch, report_of
-from processes import PLAIN, start
+from environments import Capture, Patch
 from test_run_folder import contents
 
 from mjstack import process
 from mjstack.errors import ConfigError, FolderError
-from mjstack.jobs.sweep import LOG, SWEEP, Queueing, SweepJob, add_jobs, lock_file, run_jobs
+from mjstack.jobs.sweep import LOG, SWEEP, Queueing, SweepJob, add_jobs, run_jobs
 from mjstack.report.record import GateResult, Report, Status
 from mjstack.report.write import read_report, write_report
 
@@ -49,6 +49,15 @@ def stub(tmp_path: Path, monkeypatch: Patch) -> Path:
     return tmp_path / "sweep"
 
 
+def play(
+    folder: Path,
+    sweep: list[SweepJob],
+    queueing: Queueing | None = None,
+    finish: Callable[[dict[int, Report]], None] = lambda reports: None,
+) -> list[Report]:
+    return run_jobs(folder, sweep, queueing or Queueing(), finish)
+
+
 def jobs(folder: Path, *seeds: int) -> list[SweepJob]:
     return [SweepJob(n, folder / str(n), (f"seed={seed}",)) for n, seed in enumerate(seeds)]
 
@@ -56,50 +65,35 @@ def jobs(folder: Path, *seeds: int) -> list[SweepJob]:
 def test_a_queue(stub: Path, capsys: Capture) -> None:
     """Reports in the order of the jobs; a killed one says so, and it alone runs again."""
     sweep = jobs(stub, 1, 2, 9, 4)
-    reports = run_jobs(stub, sweep)
+    reports = play(stub, sweep)
     assert [report.status for report in reports] == ["pass", "fail", "fail", "pass"]
     assert max(report.exit_code for report in reports) == 1
     (gate,) = reports[2].gates
     assert "killed by signal 9: mjstack: what it says" in gate.reason
     assert (stub / "0" / LOG).read_text().startswith("mjstack: what it says None")
     capsys.readouterr()
-    assert [report.status for report in run_jobs(stub, sweep)] == ["pass", "fail", "fail", "pass"]
+    assert [report.status for report in play(stub, sweep)] == ["pass", "fail", "fail", "pass"]
     out = capsys.readouterr().out
     assert out.count("done before") == 3
-    assert "job 2 on cores" in out
+    assert "job 2: seed=9" in out
     other = jobs(stub, 1, 3)
     refusal = "has another sweep, whose job 1 is seed=2"
     with pytest.raises(FolderError, match=refusal):
-        run_jobs(stub, other)
+        play(stub, other)
 
 
 def test_the_reason_is_not_an_earlier_processs(stub: Path, monkeypatch: Patch) -> None:
     sweep = jobs(stub, 9)
-    run_jobs(stub, sweep)
+    play(stub, sweep)
     monkeypatch.setenv("SILENT", "1")
-    ((gate,),) = [report.gates for report in run_jobs(stub, sweep)]
+    ((gate,),) = [report.gates for report in play(stub, sweep)]
     assert gate.reason == f"exit status 3 ({stub / '0' / LOG})"
-
-
-def test_failures_are_repeated_on_request(stub: Path, capsys: Capture) -> None:
-    """Anew, and once in a call."""
-    sweep = jobs(stub, 1, 2)
-    run_jobs(stub, sweep)
-    (stub / "1" / "notes.txt").write_text("mine")
-    capsys.readouterr()
-    assert [report.status for report in run_jobs(stub, sweep, Queueing(retry=True))][1] == "fail"
-    out = capsys.readouterr().out
-    assert "job 0: pass, done before" in out
-    assert out.count("job 1 on cores") == 1
-    assert not (stub / "1" / "notes.txt").exists()
-    assert (stub / "1-earlier-1" / "notes.txt").read_text() == "mine"
-    assert (stub / "1-earlier-1" / "report.json").exists()
 
 
 def test_a_job_that_takes_too_long_has_failed(stub: Path) -> None:
     """And stops no other; what was reported so far is told as each job ends."""
     counts: list[int] = []
-    reports = run_jobs(
+    reports = play(
         stub, jobs(stub, 7, 1), Queueing(minutes=0.02), lambda some: counts.append(len(some))
     )
     assert [report.status for report in reports] == ["fail", "pass"]
@@ -127,14 +121,14 @@ os._exit(130)
 
 def test_jobs_in_several_calls_are_in_one_list(stub: Path) -> None:
     for job in jobs(stub, 1, 4):
-        assert [report.status for report in run_jobs(stub, [job])] == ["pass"]
+        assert [report.status for report in play(stub, [job])] == ["pass"]
     assert json.loads((stub / SWEEP).read_text())["1"] == ["1", ["seed=4"]]
 
 
 @pytest.mark.parametrize("count", [0, -1, "x", 1.5])
 def test_a_number_of_jobs_that_cannot_be_is_refused(count: Any) -> None:
     with pytest.raises(ConfigError, match=f"hydra.launcher.jobs={count}: expected an integer of"):
-        Queueing.of({"jobs": count})
+        Queueing.from_launcher({"jobs": count})
 
 
 def test_a_job_that_was_stopped_goes_on(stub: Path) -> None:
@@ -145,7 +139,7 @@ def test_a_job_that_was_stopped_goes_on(stub: Path) -> None:
         (stub / name / "kept").touch()
         report = {"status": "interrupted", "resumes": resumes, "gates": []}
         (stub / name / "report.json").write_text(json.dumps(report))
-    run_jobs(stub, jobs(stub, 1, 3))
+    play(stub, jobs(stub, 1, 3))
     assert (stub / "0" / "kept").exists()
     assert not (stub / "1" / "kept").exists()
     assert (stub / "1-earlier-1" / "kept").exists()
@@ -156,7 +150,7 @@ def test_a_job_that_was_stopped_goes_on(stub: Path) -> None:
 def test_a_job_removes_no_file_that_it_did_not_write(stub: Path, what: str, listed: bool) -> None:
     """A folder with other files, or a link in its place, is refused before any job starts."""
     sweep = jobs(stub, 1, 2)
-    run_jobs(stub, sweep[: 1 + listed])
+    play(stub, sweep[: 1 + listed])
     place = stub / "1"
     report = (stub / "0" / "report.json").read_text()
     files = {"notes.txt": "mine", "data/x": "mine"}
@@ -178,42 +172,8 @@ def test_a_job_removes_no_file_that_it_did_not_write(stub: Path, what: str, list
     before = contents(stub.parent)
     expected = "1 is a link" if what.endswith("link") else r"1 has data, expected a new or an empty"
     with pytest.raises(FolderError, match=expected):
-        run_jobs(stub, jobs(stub, 1, 2, 3))
+        play(stub, jobs(stub, 1, 2, 3))
     assert contents(stub.parent) == before
-
-
-def test_a_gpu_for_each_job(stub: Path, monkeypatch: Patch) -> None:
-    """Two GPUs, of which another command has one: all jobs run on the free one."""
-    monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,7")
-    monkeypatch.setenv("HOME", str(stub.parent))
-    with pytest.raises(ConfigError, match=r"hydra.launcher.jobs=3: expected at most 2"):
-        run_jobs(stub, jobs(stub, 1), Queueing(3))
-    for slot in Queueing().slots():
-        assert slot.lock is not None
-        if slot.name == "GPU 5":
-            lock = lock_file(slot.lock)
-    assert lock is not None
-    run_jobs(stub, jobs(stub, 1, 3))
-    assert all((stub / name / LOG).read_text().endswith(" 7\n") for name in "01")
-    lock.close()
-
-
-@pytest.mark.full
-@pytest.mark.long
-def test_a_sweep_in_two_terminals(tmp_path: Path) -> None:
-    """Each job runs once, and both commands report all of them."""
-    args = [*PLAIN, "-m", "hydra/launcher=gpus", "seed=1,2,3", "nworld=2"]
-    args += [f"hydra.sweep.dir={tmp_path}/sweep"]
-    commands = [start(0, args, tmp_path) for _ in range(2)]
-    texts = [command.communicate(timeout=400)[0] for command in commands]
-    assert [command.returncode for command in commands] == [1, 1], (
-        texts
-    )  # the episodes are too short
-    for number in range(3):
-        assert sum(text.count(f"job {number} on ") for text in texts) == 1
-        assert report_of(tmp_path / "sweep" / str(number))["status"] == "fail"
-        assert all("sweep of 3 jobs" in text for text in texts)
 
 
 def test_a_report_is_read_back(tmp_path: Path) -> None:
@@ -226,24 +186,13 @@ def test_a_report_is_read_back(tmp_path: Path) -> None:
     assert read_report(tmp_path) == written
 
 
-def test_the_locks_of_gpus_are_the_users_own(tmp_path: Path, monkeypatch: Patch) -> None:
-    monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
-    monkeypatch.setenv("HOME", str(tmp_path))
-    (slot,) = Queueing().slots()
-    assert slot.lock is not None
-    assert slot.lock.is_relative_to(tmp_path / ".cache")
-
-
-@pytest.mark.parametrize("home", ["/dev/null", "/proc/1", ""])
-def test_locks_without_a_home_are_a_line(home: str, monkeypatch: Patch) -> None:
-    """A file, a folder that takes none, and a user without one."""
-
-    def no_home(path: Path) -> Path:
-        raise RuntimeError("Could not determine home directory.")
-
-    monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
-    monkeypatch.setenv("HOME", home)
-    if not home:
-        monkeypatch.setattr(Path, "expanduser", no_home)
-    with pytest.raises(FolderError, match=r"expected a folder for the GPUs' locks. Set HOME to"):
-        Queueing().slots()
+def test_a_gpu_for_each_job(stub: Path, monkeypatch: Patch) -> None:
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,7")
+    with pytest.raises(ConfigError, match=r"hydra.launcher.jobs=3: expected at most 2"):
+        play(stub, jobs(stub, 1), Queueing(3))
+    play(stub, jobs(stub, 1, 3))
+    ends = {(stub / name / LOG).read_text()[-3:] for name in "01"}
+    assert ends == {" 5\n", " 7\n"}
+    play(stub / "one", jobs(stub / "one", 1, 3), Queueing(1))
+    assert all((stub / "one" / name / LOG).read_text().endswith(" 5\n") for name in "01")

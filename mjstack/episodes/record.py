@@ -15,7 +15,7 @@ from mjstack.episodes.batches import Batch
 from mjstack.episodes.failures import FailureMonitor, Sign
 from mjstack.files import read_npz, reading
 
-_FACTS = ("seed", "backend", "device", "seconds", "steps")
+_SCALARS = ("seed", "backend", "device", "seconds", "steps")
 _NAMES = ("object_names", "phase_names")
 
 
@@ -112,19 +112,24 @@ class EpisodeRecord:
         )
 
     @classmethod
-    def join(cls, parts: Sequence["EpisodeRecord"]) -> "EpisodeRecord":
+    def join(cls, records: Sequence["EpisodeRecord"]) -> "EpisodeRecord":
         """The record of all worlds, from those of ranks, in the order of their worlds."""
-        first = parts[0]
-        if len(parts) == 1:
+        first = records[0]
+        if len(records) == 1:
             return first
         return replace(
             first,
             worlds={
-                name: np.concatenate([part.worlds[name] for part in parts]) for name in first.worlds
+                name: np.concatenate([rank_record.worlds[name] for rank_record in records])
+                for name in first.worlds
             },
-            seconds=max(part.seconds for part in parts),
-            steps=sum(part.steps for part in parts),
-            ranks={world: where for part in parts for world, where in part.ranks.items()},
+            seconds=max(rank_record.seconds for rank_record in records),
+            steps=sum(rank_record.steps for rank_record in records),
+            ranks={
+                world: where
+                for rank_record in records
+                for world, where in rank_record.ranks.items()
+            },
         )
 
     @classmethod
@@ -142,7 +147,7 @@ class EpisodeRecord:
             ranks = [arrays.pop(name) for name in ("rank_first_world", "rank_place")]
             arrays.pop("sign_names", None)
             record = cls(
-                **{n: arrays.pop(n).item() for n in _FACTS},
+                **{n: arrays.pop(n).item() for n in _SCALARS},
                 **{n: _items(arrays.pop(n)) for n in _NAMES if n in arrays},
                 worlds=arrays,
                 ranks=dict(zip(*map(_items, ranks), strict=True)),
@@ -166,7 +171,7 @@ class EpisodeRecord:
 
     def arrays(self) -> dict[str, Any]:
         """The content of its file, `record_name`."""
-        arrays: dict[str, Any] = self.worlds | {name: getattr(self, name) for name in _FACTS}
+        arrays: dict[str, Any] = self.worlds | {name: getattr(self, name) for name in _SCALARS}
         arrays["object_names"] = self.object_names
         if "sign" in arrays:
             arrays["phase_names"] = self.phase_names

@@ -186,10 +186,9 @@ class EpisodeTally:
         passed: bool,
         figures: Sequence[Figure],
         rate: float = -math.inf,
-        tables: Sequence[Table] = (),
     ) -> GateResult:
         """The episodes as the gate's result, in words (``parts``) before failures and problems;
-        with a problem it has failed. Figures and tables add to those of the tally and the check.
+        with a problem it has failed. Figures add to those of the tally and the check.
         ``rate`` is the least success rate that is wanted.
         """
         bits = self.array("failed")
@@ -202,13 +201,13 @@ class EpisodeTally:
         if len(failed):
             counts = "; ".join(f"{texts[n]} in {len(which[n])}{words}" for n, words in why.items())
             reason.append(f"{self._name(failed, 8)} failed: {counts}")
-        look = ""
+        hint = ""
         cfg = self.check.cfg
         if len(failed) and self.folder is not None and cfg.job.name == "gates":
             gate = "" if self.gate == cfg.episode_gates[0] else f"{self.gate}:"
             world = f"world={gate}{self.names(failed[:1])[0]}"
-            look = command("job=replay", assign("run", self.folder), world)
-            look = f". To look at one: {look}"
+            hint = command("job=replay", assign("run", self.folder), world)
+            hint = f". To look at one: {hint}"
         if "sign" in self.records[0].worlds and self.array("unreachable").any():
             unreachable = np.flatnonzero(self.array("unreachable"))
             broken = {"target out of reach": unreachable.tolist()} | broken
@@ -216,12 +215,12 @@ class EpisodeTally:
         return GateResult(
             name=self.gate,
             status=Status.passed if passed and not self.problems else Status.failed,
-            reason="; ".join([*reason, *self.problems]) + look,
+            reason="; ".join([*reason, *self.problems]) + hint,
             figures=[*self.check.thresholds(), *self.figures(rate), *figures],
             beyond=beyond,
             notes=self.notes,
             details=named + self.details,
-            tables=[*self.tables(), *tables],
+            tables=self.tables(),
         )
 
     def _name(self, episodes: Sequence[int] | np.ndarray, limit: int) -> str:
@@ -250,20 +249,20 @@ class EpisodeTally:
         index = stage.index
         judged = self.check.objects
         starts = self.places
-        marks = {name: place.xy for name, place in scene.places.items()}
+        marks = {name: place_cfg.xy for name, place_cfg in scene.places.items()}
         marks |= {name: at for name, at in index.fixed.items() if name in judged}
         marks = {name: at[:2] for name, at in marks.items() if name not in starts}
         for name, places in starts.items():
             if name in index.objects and name not in judged:
                 worlds.unjudged.append(name)
                 continue
-            ways = []
+            paths = []
             if name in index.objects:
                 x, _ = index.objects[name]
-                ways = [(w.caption, bool(w.rules), w.qpos[:, x : x + 2]) for w in moving]
+                paths = [(w.caption, bool(w.rules), w.qpos[:, x : x + 2]) for w in moving]
             xy = places[plotted, :2]
             worlds.maps.append(
-                Map(title=name, xy=xy, table=table, ways=ways, marks=marks, base=index.base)
+                Map(title=name, xy=xy, table=table, ways=paths, marks=marks, base=index.base)
             )
         return worlds
 

@@ -24,9 +24,10 @@ _TERMS = 4  # of a moment of inertia about an axis elsewhere, each of which is r
 
 
 class RoundedSimulation(NativeSimulation):
-    """Native worlds whose model, state at every step, and forces of constraint rows are off by up
-    to float32's rounding, in each world otherwise. Shapes whose contacts MuJoCo has to search for,
-    such as cylinders, lie elsewhere by less than a search in float32 can tell.
+    """Native worlds whose model, state at every step, inertia times acceleration, and forces of
+    constraint rows are off by up to float32's rounding, in each world otherwise. Shapes whose
+    contacts MuJoCo has to search for, such as cylinders, lie elsewhere by less than a search in
+    float32 can tell.
 
     Inertia is off by its rounding about the centre of mass of its tree: light links far from it,
     such as a wrist's, lose most by it. If equalities connect bodies, they lie elsewhere by the
@@ -61,8 +62,8 @@ class RoundedSimulation(NativeSimulation):
 
     @override
     def forward(self) -> None:
-        """Compute everything, and the errors for the steps that follow: of bodies, and of the rows'
-        forces.
+        """Compute everything, and the errors for the steps that follow: of bodies, of the inertia
+        matrix and of the rows' forces.
         """
         self._round(self.qpos, self.qvel)
         super().forward()
@@ -79,9 +80,14 @@ class RoundedSimulation(NativeSimulation):
         for name, values in self._bodies.items():
             unit = UNIT * torch.from_numpy(sizes[name])[:, None]
             self.fields[name].copy_(values + unit * self._random(*values.shape))
-        errors = UNIT * self._random(self.nworld, data.nefc).numpy() * data.efc_force
-        for error, row in zip(errors, self.batch.bind("qfrc_applied"), strict=True):
+        inertia = np.empty((self.model.nv, self.model.nv))
+        mujoco.mj_fullM(self.model, data, inertia)
+        inertial = self._random(self.nworld, *inertia.shape).numpy() * inertia @ data.qacc
+        errors = self._random(self.nworld, data.nefc).numpy() * data.efc_force
+        applied = self.batch.bind("qfrc_applied")
+        for error, row in zip(errors, applied, strict=True):
             mujoco.mj_mulJacTVec(self.model, data, row, error)
+        applied[:] = UNIT * (applied + inertial)
 
     def _round(self, *views: Tensor) -> None:
         for view in views:

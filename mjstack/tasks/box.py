@@ -171,7 +171,7 @@ class BoxCheck(EpisodeCheck):
             raise ConfigError("task.check.into", t.into, expected, "Set scene=box")
         center = [box.xy[i] + floor.pos[i] for i in (0, 1)]
         bottom, rim = (
-            scene.table_top + max(part.pos[2] + part.size[2] for part in parts)
+            scene.table_top + max(shape.pos[2] + shape.size[2] for shape in parts)
             for parts in ([floor], box.parts.values())
         )
         self._low = [*(center[i] - floor.size[i] for i in (0, 1)), bottom]
@@ -205,7 +205,7 @@ class BoxCheck(EpisodeCheck):
 
     def high(self, step: Step) -> Tensor:
         """Whether each object is too high to be let go of, ``(nworld, objects)``, bool."""
-        heights = [self._low[2] + thing.half_height for thing in step.things]
+        heights = [self._low[2] + object_cfg.half_height for object_cfg in step.object_cfgs]
         return step.pos[..., 2] - step.constant(*heights) > self.t.drop_height
 
     def over(self, step: Step) -> Tensor:
@@ -236,9 +236,9 @@ class BoxCheck(EpisodeCheck):
 
     def headline(self, values: Mapping[str, float]) -> str:
         """How well the objects are placed."""
-        off = [f"{name} {1e3 * values[f'slot_err_{name}_m']:.1f} mm" for name in self.objects]
+        offsets = [f"{name} {1e3 * values[f'slot_err_{name}_m']:.1f} mm" for name in self.objects]
         clearance = 1e3 * values["jaw_clearance_m"]
-        return f"{', '.join(off)} off their places, jaws {clearance:.0f} mm above the rim"
+        return f"{', '.join(offsets)} off their places, jaws {clearance:.0f} mm above the rim"
 
 
 @dataclass(eq=False, kw_only=True)
@@ -334,14 +334,14 @@ class _Order(Rule):
         self._release = release
 
     def start(self, step: Step) -> None:
-        self._early = step.zeros()
+        self._premature = step.zeros()
 
     def update(self, step: Step) -> None:
-        early = step.in_hand[:, 1:] & ~self._release.holds()[:, :-1]
-        self._early.masked_fill_(early.any(1), 1.0)
+        premature = step.in_hand[:, 1:] & ~self._release.holds()[:, :-1]
+        self._premature.masked_fill_(premature.any(1), 1.0)
 
     def judge(self, end: Step) -> Judgement:
-        return self._early == 0.0, [self._early]
+        return self._premature == 0.0, [self._premature]
 
 
 class _JawClear(Rule):

@@ -31,8 +31,8 @@ def airborne(*objects: str, height: float) -> Condition:
 
     def condition(step: Step) -> Tensor:
         columns = step.columns(objects)
-        up = columns.read(step.height) > height
-        return up if step.phased else up & columns.read(step.in_hand)
+        above_height = columns.read(step.height) > height
+        return above_height if step.phased else above_height & columns.read(step.in_hand)
 
     return condition
 
@@ -61,8 +61,8 @@ def on_top(object: str, onto: str, *, xy_err: float, dz_min: float, dz_max: floa
     """
 
     def parts(step: Step) -> tuple[Tensor, ...]:
-        apart, dz = offset(step, object, onto)
-        return apart <= xy_err, dz.clamp(dz_min, dz_max) == dz
+        separation, dz = offset(step, object, onto)
+        return separation <= xy_err, dz.clamp(dz_min, dz_max) == dz
 
     return AllOf(("xy_err", "dz"), parts)
 
@@ -71,8 +71,8 @@ def offset(step: Step, object: str, onto: str) -> tuple[Tensor, Tensor]:
     """Horizontal distance of the centres [m], and height of the first above the second [m], each
     ``(nworld,)``.
     """
-    apart = step.center(object) - step.center(onto)
-    return norm(apart[:, :2]), apart[:, 2]
+    separation = step.center(object) - step.center(onto)
+    return norm(separation[:, :2]), separation[:, 2]
 
 
 def on_top_of(step: Step, onto: str, object: str) -> Tensor:
@@ -89,8 +89,8 @@ def at_place(object: str, place: str, *, distance: float) -> AllOf:
 
 def away(step: Step, object: str, place: str) -> Tensor:
     """Horizontal distance of an object's centre from a place [m], shape ``(nworld,)``."""
-    apart = step.center(object)[:, :2] - place_xy(step.env, place).float()
-    return norm(apart)
+    separation = step.center(object)[:, :2] - place_xy(step.env, place).float()
+    return norm(separation)
 
 
 def on_table(object: str, *, gap: float) -> AllOf:
@@ -133,8 +133,8 @@ def in_zone(object: str, frame: str, *, low: Sequence[float], high: Sequence[flo
 
     def parts(step: Step) -> Tensor:
         pose = pose_w(step.env, frame).float()
-        apart = step.center(object) - pose[:, :3]
-        at = (quat_to_matrix(pose[:, 3:]) * apart[..., None]).sum(-2)[:, : len(low)]
+        separation = step.center(object) - pose[:, :3]
+        at = (quat_to_matrix(pose[:, 3:]) * separation[..., None]).sum(-2)[:, : len(low)]
         constant = step.constant
         return at.clamp(constant(*low), constant(*high)) == at
 
@@ -371,8 +371,8 @@ class AtRest(Rule):
             a = self._poses[:, : self.window - lag]
             b = self._poses[:, lag:]
             # amax hands NaN on, so that an unfilled or diverged window fails its rule.
-            apart = norm(a[..., :3] - b[..., :3])
-            distance = torch.maximum(distance, apart.amax((1, 2)))
+            separation = norm(a[..., :3] - b[..., :3])
+            distance = torch.maximum(distance, separation.amax((1, 2)))
             angle = torch.maximum(angle, quat_angle(a[..., 3:], b[..., 3:]).amax((1, 2)))
         turn = math.radians(self.rotation_deg)
         holds = (rms <= self.speed, distance <= self.position, angle <= turn)

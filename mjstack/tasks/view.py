@@ -77,10 +77,14 @@ class Step:
 
         index = env.index
         scene = env.cfg.scene
-        self.things = [scene.objects[name] for name in objects]
+        self.object_cfgs = [scene.objects[name] for name in objects]
         self.top = scene.table_top
-        self.half = torch.tensor([thing.half for thing in self.things], device=env.device)
-        self.radius = torch.tensor([thing.radius for thing in self.things], device=env.device)
+        self.half = torch.tensor(
+            [object_cfg.half for object_cfg in self.object_cfgs], device=env.device
+        )
+        self.radius = torch.tensor(
+            [object_cfg.radius for object_cfg in self.object_cfgs], device=env.device
+        )
 
         def columns(forces: Mapping[str, Sequence[int]]) -> Columns:
             addresses = itertools.chain(*(forces.get(name, ()) for name in objects))
@@ -163,7 +167,7 @@ class Step:
     @_value
     def height(self) -> Tensor:
         """Height of the lowest point above the table [m], shape ``(nworld, objects)``."""
-        forms = [thing.form for thing in self.things]
+        forms = [object_cfg.form for object_cfg in self.object_cfgs]
         if forms[1:] == forms[:-1]:  # all alike
             return lowest_point(self.pos, self.quat, *forms[0]) - self.top
         poses = zip(self.pos.unbind(1), self.quat.unbind(1), forms, strict=True)

@@ -61,14 +61,6 @@ class ExportJobCfg(JobCfg):
 
 
 @dataclass(slots=True)
-class CompareJobCfg(JobCfg):
-    """Two policies, drivers or settings, compared on equal starts."""
-
-    against: list[str] = spec([])
-    """Overrides that make the second side of the command's configuration, which is the first."""
-
-
-@dataclass(slots=True)
 class TrainJobCfg(JobCfg):
     """A policy is trained, and judged from starts that training has not used."""
 
@@ -204,7 +196,6 @@ TRAINER_SCHEMAS = {"ppo": PpoJobCfg}
 JOB_SCHEMAS = {
     "collect": CollectJobCfg,
     "play": PlayJobCfg,
-    "compare": CompareJobCfg,
     "export": ExportJobCfg,
     "train": CloneJobCfg,
 }

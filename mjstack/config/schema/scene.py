@@ -279,7 +279,9 @@ class SceneCfg:
     @property
     def free(self) -> dict[str, ObjectCfg]:
         """The objects that move."""
-        return {name: thing for name, thing in self.objects.items() if not thing.fixed}
+        return {
+            name: object_cfg for name, object_cfg in self.objects.items() if not object_cfg.fixed
+        }
 
     @property
     def table_top(self) -> float:
