@@ -16,7 +16,7 @@ from mjstack.episodes.rollout import play_episode
 from mjstack.episodes.stage import Stage
 from mjstack.mdp.geometry import place_xy
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
+EXAMPLES = Path(__file__).parents[2] / "examples"
 FRANKA = Path(os.environ.get("MENAGERIE_ROOT", "/nowhere")) / "franka_emika_panda"
 needs_franka = pytest.mark.skipif(
     not FRANKA.is_dir(), reason="MENAGERIE_ROOT has no franka_emika_panda"

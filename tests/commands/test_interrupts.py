@@ -2,7 +2,7 @@
 as in test_fuzz.py, and of a script that steps an environment.
 
 How 250 runs end is printed by
-``PYTHONPATH=tests/helpers python tests/test_interrupts.py gates 250``.
+``PYTHONPATH=tests/helpers python tests/commands/test_interrupts.py gates 250``.
 """
 
 import json

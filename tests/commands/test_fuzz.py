@@ -3,7 +3,7 @@
 The check of each passes, or ends in one line and exit status 2; then nothing is written. Nothing in
 the home folder changes, and no process is left. A tenth of the command lines that pass are run to
 the end. These cases are tried and printed by
-``PYTHONPATH=tests/helpers python tests/test_fuzz.py commands 17 200-220``.
+``PYTHONPATH=tests/helpers python tests/commands/test_fuzz.py commands 17 200-220``.
 """
 
 import json

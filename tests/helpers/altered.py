@@ -19,7 +19,7 @@ from mjstack.managers.view import EnvView
 from mjstack.tasks.check import make_check
 from mjstack.tasks.placed import Placed
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
+EXAMPLES = Path(__file__).parents[2] / "examples"
 STEPS = 110  # of an altered episode; the window is 50
 LATE = 30  # the step from which on a pose is written that is not there from the start
 

@@ -30,7 +30,7 @@ from mjstack.report.figure import figures
 from mjstack.report.record import GateResult, Report, Status
 from mjstack.report.write import write_report
 
-SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "run.py"
+SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "run.py"
 RATE = "physics.world_steps_per_s.median"
 TINY = [
     *("-m", "experiment=scaling", "sim=native", "gate.throughput.repetitions=1"),

@@ -9,7 +9,7 @@ from compositions import load_config
 
 from mjstack.config.schema import Config
 
-SCARA = Path(__file__).parents[1] / "examples" / "scara"
+SCARA = Path(__file__).parents[2] / "examples" / "scara"
 MJCF = (SCARA / "scara.xml").read_text()
 SERVOS = {m[1]: m[0] for m in re.finditer(r'<position name="(\w+)"[^>]*/>', MJCF)}
 """Its servos' elements, by joint."""

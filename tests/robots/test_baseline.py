@@ -25,7 +25,7 @@ from mjstack.scene import build_model
 from mjstack.scene.build import add_scene
 from mjstack.scene.index import SceneIndex
 
-SCARA = Path(__file__).parents[1] / "examples" / "scara"
+SCARA = Path(__file__).parents[2] / "examples" / "scara"
 MJCF = (SCARA / "scara.xml").read_text()
 CONFIG = [f"hydra.searchpath=[file://{SCARA}/conf]", "robot=scara"]
 RUN = ["sim=native", "nworld=1", "gates=[baseline]", "web.episode=false"]

@@ -31,7 +31,7 @@ from mjstack.datasets.spec import DatasetSpec, EpisodeData, Feature
 from mjstack.datasets.writer import DatasetWriter
 from mjstack.errors import FolderError, MissingExtra, UnknownName
 
-GUIDE = Path(__file__).resolve().parents[1] / "docs" / "datasets.md"
+GUIDE = Path(__file__).resolve().parents[2] / "docs" / "datasets.md"
 JOINTS = ("shoulder", "elbow", "jaw")
 
 

@@ -29,7 +29,7 @@ from mjstack.managers.term import Term
 from mjstack.tasks.check import make_check
 from mjstack.tasks.progress import STAGES
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
+EXAMPLES = Path(__file__).parents[2] / "examples"
 REACH_WAVER = 0.4  # of the stage reach: the arm goes up, and around to the point above the object
 WAVER = 0.05  # of any later one
 NWORLD = 2

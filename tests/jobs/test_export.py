@@ -33,7 +33,7 @@ from mjstack.policy import Vision, lerobot, load_policy, save_policy
 from mjstack.policy.onnx import to_onnx
 
 SEEN = ("observation=state", "+observation.policy.terms.joint_vel.history=2")
-EXAMPLE = Path(__file__).parents[1] / "examples" / "policy_native.py"
+EXAMPLE = Path(__file__).parents[2] / "examples" / "policy_native.py"
 
 
 def write_noiseless(folder: Path, cfg: Config) -> Path:

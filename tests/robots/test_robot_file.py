@@ -27,7 +27,7 @@ from mjstack.kinematics.batched_ik import find_reach
 from mjstack.robots import robot_spec
 from mjstack.scene import build_model
 
-SCARA = Path(__file__).parents[1] / "examples" / "scara"
+SCARA = Path(__file__).parents[2] / "examples" / "scara"
 MJCF = (SCARA / "scara.xml").read_text()
 
 

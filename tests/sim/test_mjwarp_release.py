@@ -23,7 +23,7 @@ from mjstack.sim.mujoco_warp import mjw
 
 SIM = Path(mjstack.sim.__file__).parent
 KERNELS = (("tree", "positions"), ("tree", "forces"), ("tree", "advance"), ("rows",), ("newton",))
-ARRAYS = Path(__file__).with_name("data") / "mjwarp_arrays.txt"
+ARRAYS = Path(__file__).parents[1] / "data" / "mjwarp_arrays.txt"
 """Arrays and numbers that the C++ texts name, by type and number of dimensions."""
 OWNERS = {
     **{"m": mjw.Model, "d": mjw.Data, "rc": mjw.RenderContext, "opt": mjw.Option},

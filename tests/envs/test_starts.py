@@ -21,7 +21,7 @@ from mjstack.mdp.starts.placement import Placement, may_meet
 from mjstack.mdp.starts.randomization import bounds
 
 MANY = 200
-EXAMPLES = Path(__file__).parents[1] / "examples"
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 def start_of(cfg: Config, seed: int = 0) -> Env:

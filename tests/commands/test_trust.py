@@ -49,7 +49,7 @@ from mjstack.policy import load_policy, save_policy
 from mjstack.policy.checkpoint import read_state, write_state
 from mjstack.process import Child
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 NAMEABLE = (ROOT / "tests" / "data" / "may_be_named.txt").read_text().splitlines()
 SHELL = {"func": "pydoc.pipepager", "params": {"cmd": "id > PWNED"}}
 PAYLOAD = "open('PWNED', 'w').close()\nfrom shutil import rmtree\ndef X(env): ...\n"

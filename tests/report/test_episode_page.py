@@ -294,7 +294,7 @@ def test_a_page_says_what_it_does_not_show(get_stage: GetStage) -> None:
 @pytest.mark.full
 def test_drawn_places_are_in_every_file(tmp_path: Path) -> None:
     """The goal of examples/push: tables, map and 3-D page."""
-    conf = str(Path(__file__).parents[1] / "examples" / "push" / "conf")
+    conf = str(Path(__file__).parents[2] / "examples" / "push" / "conf")
     cfg = load_config(["task=push"], config_dir=conf)
     quick = [f"controller.phases.{name}.seconds=0.1" for name in cfg.controller.phases]
     args = ["--config-dir", conf, "task=push", "sim=native", "gates=[success]", "nworld=3", *quick]

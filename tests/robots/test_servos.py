@@ -12,7 +12,7 @@ from mjstack.errors import MjstackError
 from mjstack.mdp.starts.starts_file import start_arrays
 from mjstack.scene.build import build_model
 
-EXAMPLE = Path(__file__).parents[1] / "examples" / "servos"
+EXAMPLE = Path(__file__).parents[2] / "examples" / "servos"
 # Figures of the joints in their order: stiffness, damping, armature, dry and viscous friction.
 GTC_BERLIN = (
     [48.94, 51.34, 18.57, 43.03, 47.14, 50.83],

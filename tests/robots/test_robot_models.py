@@ -14,7 +14,7 @@ from compositions import load_config, put
 
 from mjstack.scene import build_model
 
-REPO = Path(__file__).resolve().parents[1]
+REPO = Path(__file__).resolve().parents[2]
 BUILT_IN = REPO / "mjstack" / "robots"
 UPSTREAM = {
     "so101": "robotstudio_so101/so101.xml",

@@ -23,7 +23,7 @@ from mjstack.config.session import CONFIG_FOLDER
 from mjstack.errors import MjstackError
 from mjstack.jobs import CheckedJob
 
-SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "run.py"
+SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "run.py"
 PROVENANCE = {"versions", "device", "driver", "cpu_count", "git_commit"}
 PROVENANCE |= {"config_sha256", "model_sha256"}
 
@@ -370,7 +370,7 @@ def test_a_reader_that_goes_away_fails_nothing(tmp_path: Path) -> None:
     args = ["sim=native", "nworld=2", "gates=[baseline,batch]", f"hydra.run.dir={tmp_path}/run"]
     command = [sys.executable, "scripts/run.py", *args, *at_double_speed()]
     done = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=Path(__file__).parents[1]
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=Path(__file__).parents[2]
     )
     assert done.stdout is not None
     done.stdout.read(1)
