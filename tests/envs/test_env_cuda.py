@@ -35,7 +35,7 @@ def test_a_step_reads_nothing_from_the_device(task: str, action: str) -> None:
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, 1e20, 1e38])
 def test_a_bad_action_is_named_and_stays_in_its_world(value: float) -> None:
-    """Its CPU twins are in test_env_errors.py."""
+    """Its CPU twins are in test_actions.py."""
     env = mjstack.make_env(["task=reach", "sim=mjwarp"], nworld=2048)
     ends = []
     for spoilt in (False, True):

@@ -11,14 +11,7 @@ import numpy as np
 import pytest
 import torch
 from compositions import refusal
-from environments import (
-    configure,
-    mask_of,
-    on_cuda,
-    on_shared_sim,
-    quats,
-    stack_starts,
-)
+from environments import configure, mask_of, on_cuda, on_shared_sim, quats, stack_starts
 
 from mjstack.config.schema import Config
 from mjstack.envs import Env

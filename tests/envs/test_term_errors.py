@@ -2,167 +2,37 @@
 and says what to do.
 """
 
-import re
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
-from compositions import load_config, put
-from environments import Patch, assert_rows, configure, mask_of, on_shared_sim, returned, zeros
+from compositions import put
+from env_cases import fails
+from environments import Patch, configure, on_shared_sim, zeros
 
-import mjstack
 from mjstack.config.schema import (
     Backend,
     Config,
-    ObservationGroupCfg,
     ObservationTermCfg,
     RewardTermCfg,
     TermCfg,
     TerminationTermCfg,
 )
 from mjstack.envs import Env, build_env
-from mjstack.errors import (
-    ArgumentError,
-    ConfigError,
-    FaultError,
-    MjstackError,
-    ParameterError,
-    TermError,
-)
-from mjstack.sim import make_simulation
+from mjstack.errors import ConfigError, FaultError, MjstackError, TermError
 
 HERE = __name__  # terms below are found by dotted name, as a user's own are
-
-
-@pytest.fixture
-def cfg() -> Config:
-    """A small configuration to be spoilt."""
-    return configure("task=stack", "reset=jitter")
-
-
-@pytest.fixture
-def env(cfg: Config) -> Env:
-    """Three native worlds that have started."""
-    env = on_shared_sim("native", 3, cfg)
-    env.reset(seed=0)
-    return env
-
-
-def fails(kind: type[MjstackError], call: Callable[[], object], *words: str) -> str:
-    """The one sentence of the error that a call has to raise."""
-    with pytest.raises(kind) as caught:
-        call()
-    message = str(caught.value)
-    assert "\n" not in message
-    assert type(caught.value) in (kind, ParameterError)  # a ConfigError of a parameter
-    assert re.search(r"[^.]\.$", message)
-    for word in words:
-        assert word in message, message
-    return message
 
 
 # Actions
 
 
-@pytest.mark.parametrize(
-    ("action", "words"),
-    [
-        (lambda env: zeros(env)[:2], ["shape (2, 6)", "(3, 6)"]),
-        (lambda env: zeros(env).int(), ["a torch.int32 tensor", "a float32 or float64 tensor"]),
-        (lambda env: zeros(env, device="meta"), ["on meta", "cpu"]),
-        (lambda env: zeros(env).numpy(), ["ndarray", "a float32 or float64 tensor"]),
-    ],
-)
-def test_action_of_the_wrong_kind(
-    env: Env, action: Callable[[Env], object], words: list[str]
-) -> None:
-    fails(ArgumentError, lambda: env.step(action(env)), "action: found", "expected", *words)  # type: ignore[arg-type]
-
-
-def test_an_action_of_float64_is_taken_as_its_float32(env: Env) -> None:
-    """Both are what the message about other types expects."""
-    seen = []
-    for dtype in (torch.float32, torch.float64):
-        env.reset(seed=3)
-        action = torch.full((3, 6), 0.25).to(dtype)  # exact in both
-        seen.append(env.step(action)[0]["policy"])
-    assert torch.equal(*seen)
-
-
-@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
-def test_action_that_is_not_finite_names_its_world(env: Env, bad: float) -> None:
-    action = zeros(env)
-    action[1, 4] = bad
-    fails(ArgumentError, lambda: env.step(action), "action: found", "in world 1", "finite")
-
-
-@pytest.mark.full
-def test_action_that_the_simulation_cannot_hold_names_its_world(cfg: Config) -> None:
-    env = on_shared_sim("mjwarp", 3, cfg)  # float32
-    env.reset(seed=0)
-    action = zeros(env).double()
-    action[1, 4] = 1e300
-    fails(ArgumentError, lambda: env.step(action), "1e+300", "in world 1", "finite")
-
-
-@pytest.mark.parametrize("huge", [1e20, 1e38])
-def test_a_reward_that_a_huge_action_breaks_names_the_action(env: Env, huge: float) -> None:
-    env.step(zeros(env))
-    clean = env.sim.qpos.clone()
-    env.reset(seed=0)
-    action = zeros(env)
-    action[1, 4] = huge
-    words = [
-        "reward is not finite in 1 of 3 worlds (1)",
-        f"after an action of {huge:.3g}",
-        "policy",
-    ]
-    fails(FaultError, lambda: env.step(action), *words)
-    assert torch.equal(env.sim.qpos[[0, 2]], clean[[0, 2]])
-
-
-def test_argument_errors_leave_the_environment_as_it_was(env: Env) -> None:
-    action = 0.3 * torch.ones_like(zeros(env))
-    expected = [returned(env.step(action)), returned(env.step(-action))]
-    env.reset(seed=0)
-    attempts: list[Callable[[], object]] = [
-        lambda: env.step(action * float("nan")),
-        lambda: env.step(action.to("meta")),
-        lambda: env.step(action[:1]),
-        lambda: env.reset(seed=-1),
-        lambda: env.reset(seed=1, mask=mask_of(env, 0)),
-        lambda: env.reset(mask=torch.ones(2, dtype=torch.bool)),
-    ]
-    for move, result in zip((action, -action), expected, strict=True):
-        for attempt in attempts:
-            fails(ArgumentError, attempt)
-        assert_rows(returned(env.step(move)), result, slice(None), slice(None), "native")
-
-
 # Resets
 
 
-def test_step_before_reset(cfg: Config) -> None:
-    env = on_shared_sim("native", 3, cfg)
-    fails(ArgumentError, lambda: env.step(zeros(env)), "before reset()", "env.reset()")
-    fails(ArgumentError, lambda: env.reset(mask=mask_of(env, 1)), "mask", "env.reset()")
-    env.reset()
-    env.step(zeros(env))
-
-
 # Configuration
-
-
-@pytest.mark.parametrize(
-    ("overrides", "words"),
-    [(lambda: "task=reach", "'task=reach'"), (lambda: load_config([]), "Config(")],
-    ids=["a string", "a configuration"],
-)
-def test_overrides_that_are_no_list(overrides: Callable[[], object], words: str) -> None:
-    call = lambda: mjstack.make_env(overrides())  # type: ignore[arg-type]  # noqa: E731
-    fails(ArgumentError, call, "overrides", words, "['task=reach', 'robot=rebot']")
 
 
 # Terms
@@ -367,11 +237,6 @@ def test_parameters_and_settings_out_of_range(
         assert "smaller" in message
 
 
-def test_action_that_is_no_action_term(cfg: Config) -> None:
-    cfg.action["arm"].func = "mjstack.mdp.reward.lift"
-    refused(cfg, "action.arm", "mjstack.mdp.reward.lift", "ActionTerm")
-
-
 SINGLE = ("reward.mine", "termination.mine", "task.success")
 
 
@@ -397,18 +262,6 @@ def test_term_that_returns_what_its_manager_cannot_use(
         refused(cfg, f"{kind}: ", *words)
 
 
-def test_reset_term_without_its_fields(cfg: Config) -> None:
-    env = on_shared_sim("native", 3, cfg)
-    bare = make_simulation(env.sim.model, cfg, 3, backend=Backend.native)
-    cfg.reset["mass"] = TermCfg(func="mjstack.mdp.reset.ObjectMass", params={"scale": [0.9, 1.1]})
-    fails(TermError, lambda: Env(bare, env.index, cfg), "reset.mass", "body_mass", "fields=")
-
-
-def test_an_empty_group(cfg: Config) -> None:
-    cfg.observation["empty"] = ObservationGroupCfg(terms={})
-    refused(cfg, "observation.empty", "no terms")
-
-
 # Faults while stepping
 
 
@@ -431,15 +284,6 @@ def test_value_that_becomes_nan_is_named(cfg: Config, kind: str, fault: str) -> 
     env.step(zeros(env))
 
 
-def test_state_that_becomes_nan_is_named_without_its_termination(cfg: Config) -> None:
-    cfg.termination.pop("non_finite")
-    env = build(cfg)
-    env.reset()
-    env.sim.qvel[1, 0] = float("nan")
-    words = ["state is not finite", "1 of 3 worlds (1)", "non_finite"]
-    fails(FaultError, lambda: env.step(zeros(env)), *words)
-
-
 def warp_env(cfg: Config, **batch: int) -> Env:
     """Two worlds that have started."""
     for name, value in batch.items():
@@ -447,22 +291,3 @@ def warp_env(cfg: Config, **batch: int) -> Env:
     env = build_env(cfg, nworld=2, backend=Backend.mjwarp, device="cpu")
     env.reset()
     return env
-
-
-@pytest.mark.full
-def test_constraint_rows_too_few(cfg: Config) -> None:
-    """Each step of a resting start needs some 100 rows; the environment says so at the first step,
-    or ends the episodes if it has the termination.
-    """
-    env = warp_env(cfg, njmax=40)
-    _, _, terminated, _, _ = env.step(zeros(env))
-    assert terminated.all()
-    column = env.termination_manager.names.index("overflow")
-    assert env.termination_manager.values[:, column].all()
-    cfg.termination.pop("overflow")
-    env = warp_env(cfg, njmax=40)
-    words = ["NEFC overflow in 2 of 2 worlds (0, 1)", "Raise batch.njmax", "njmax=40"]
-    message = fails(FaultError, lambda: env.step(zeros(env)), *words)
-    rows = re.search(r"up to (\d+) rows", message)
-    assert rows is not None
-    assert int(rows[1]) > 40
