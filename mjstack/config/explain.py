@@ -26,7 +26,7 @@ from mjstack.config.schema import Config, GateCfg
 from mjstack.errors import MjstackError, UnknownName, first_line, shorten, suggest
 
 COMMANDS = ("doctor", "list", "new")  # first words of a command line
-LISTS = ("cameras", "experiment")  # groups of which several may be chosen
+LISTS = ("cameras", "experiment", "randomization")  # groups of which several may be chosen
 TERM_GROUPS = ("action", "observation", "reset", "termination", "reward")
 
 

@@ -52,6 +52,13 @@ def _by_device(cuda: Any, cpu: Any, *, _root_: DictConfig) -> Any:
     return cuda if device.startswith("cuda") else cpu
 
 
+def _ranged(values: Any, middle: float = 0.0, *, _root_: DictConfig) -> Any:
+    """The ends of a range, or its half-width, as far from the middle as ``range_scale`` says."""
+    if isinstance(values, Sequence):
+        return [_ranged(value, middle, _root_=_root_) for value in values]
+    return middle + _root_.range_scale * (values - middle)
+
+
 # The functions that a replay calls: where a run's configuration names them, and of which kind.
 _REPLAYED = {
     r"controller\.func": "driver",
@@ -65,6 +72,7 @@ _RESOLVERS: dict[str, Callable] = {
     "steps": _control_steps,
     "by_device": _by_device,
     "if_native": lambda a, b, *, _root_: a if _root_.sim.backend == Backend.native else b,
+    "ranged": _ranged,
     "at_most": lambda value, limit, small, large: small if value <= limit else large,
 }
 for _name, _function in _RESOLVERS.items():

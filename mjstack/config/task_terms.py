@@ -93,6 +93,8 @@ def _complete_copy(cfg: DictConfig, gate: str) -> Iterator[str]:
     copy = _terms(cfg, key)
     explicit = {*_written(cfg, key), *(name for name, term in copy.items() if term is None)}
     for name, term in _written(cfg, "reset").items():
+        if copy.get(name) == f"${{reset.{name}}}":  # acts there already
+            continue
         func = _func(term)
         copied = _func(copy.get(name))
         added = func != _func(shipped.get(name)) and not (copied and func.startswith("mjstack."))

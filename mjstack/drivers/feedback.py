@@ -18,10 +18,12 @@ from mjstack.envs import Env
 from mjstack.errors import ArgumentError
 from mjstack.kinematics.batched_ik import BatchedIk
 from mjstack.managers.view import EnvView
-from mjstack.math import atan2
-from mjstack.mdp.geometry import gripper_opening, objects_in_hand, place_xy, pose_w, robot
+from mjstack.math import atan2, quat_to_matrix
+from mjstack.mdp.geometry import objects_in_hand, place_xy, pose_w, robot, zeros
+from mjstack.robots.bodies import ancestors
 from mjstack.scene.index import gripper_targets, turn_sign
 from mjstack.scene.phases import Phase, Target, build_phases, source_names
+from mjstack.sim.simulation import Columns
 
 _BEYOND = 10.0  # what a roll beyond the joint's range costs, per rad
 _BACK = 3.0  # rad: what a roll counts that leads back over the nominal one
@@ -188,7 +190,10 @@ class FeedbackDriver(Driver):
         grips = gripper_targets(env.sim.model, cfg.robot, [phase.width for phase in self._plan])
         self._grip = self._tensor(grips.tolist())
 
-        # Inverse kinematics
+        # Inverse kinematics, and where the arm stands
+        model = env.sim.model
+        body = int(model.body_rootid[model.jnt_bodyid[model.joint(cfg.robot.arm_joints[0]).id]])
+        self._base = body, self._tensor(model.body_pos[body].tolist())
         self._ik = _solver(env, c.posture_gain)
         # Where nothing is carried, the gripper points down as far as it can.
         grasped = {phase.grasps for phase in c.phases.values()} - {None}
@@ -242,13 +247,20 @@ class FeedbackDriver(Driver):
     def _measure(self) -> State:
         """The state now."""
         env = self._env
-        q = robot(env).qpos.read(env.sim.qpos).float()
+        tensors = robot(env)
+        q = tensors.qpos.read(env.sim.qpos).float()
+        if (off := zeros(env)) is not None:  # the joints' truth, whatever their servos believe
+            q = q + off.float()
+        point, closing, approach = self._ik.forward(q)
+        grip = (q[:, self._n_arm :] - tensors.gripper_closed) / tensors.gripper_travel
         pos = [pose_w(env, name)[:, :3].float() for name in self._cfg.scene.objects]
         return State(
             q,
-            robot(env).qvel.read(env.sim.qvel)[:, : self._n_arm].float().abs().amax(1),
-            *self._ik.forward(q),
-            opening=gripper_opening(env).float().amin(1),
+            tensors.qvel.read(env.sim.qvel)[:, : self._n_arm].float().abs().amax(1),
+            point - self._sunk(),
+            closing,
+            approach,
+            opening=grip.float().amin(1),
             pos=torch.stack(pos, dim=1),
             in_hand=objects_in_hand(env.index, env.sim),
         )
@@ -267,7 +279,19 @@ class FeedbackDriver(Driver):
     ) -> tuple[Tensor, Tensor]:
         """Inverse kinematics near the posture of each world's phase; as of `BatchedIk.solve`."""
         posture = self._nominal[phase] if self._cfg.controller.posture_gain > 0.0 else None
-        return self._ik.solve(start, target, posture, approach)
+        return self._ik.solve(start, target + self._sunk(), posture, approach)
+
+    def _sunk(self) -> Tensor | float:
+        """How much lower each world's arm stands than in the model, over x, y, z [m]."""
+        if "body_pos" not in self._env.sim.fields:
+            return 0.0
+        body, nominal = self._base
+        return nominal - self._env.sim.fields["body_pos"][:, body].float()
+
+    def _as_read(self, command: Tensor) -> Tensor:
+        """A command of the joints' true positions, as their servos count it."""
+        off = zeros(self._env)
+        return command if off is None else command - off.float()
 
     def _keep_finite(self, command: Tensor) -> Tensor:
         """Keep the command for the next step. A world whose state is not finite keeps its last one,
@@ -301,6 +325,80 @@ def _solver(env: EnvView, posture_gain: float = 0.0) -> BatchedIk:
         posture_gain=posture_gain,
         approach_gain=c.approach_gain,
     )
+
+
+class ServoInverse:
+    """By how much servos that differ between worlds, or have backlash, are to be led."""
+
+    def __init__(self, env: EnvView) -> None:
+        """Find the figures of the robot's servos, and the weights that they hold."""
+        cfg = env.cfg
+        self._sim = env.sim
+
+        def live(name: str) -> Tensor:
+            if name in env.sim.fields:
+                return env.sim.fields[name]
+            return torch.from_numpy(getattr(env.sim.model, name)[None].copy()).to(env.device)
+
+        self._gain, self._bias, self._damping, self._friction = map(
+            live, ("actuator_gainprm", "actuator_biasprm", "dof_damping", "dof_frictionloss")
+        )
+        self._servos, self._dofs = (
+            Columns(at, env.device) for at in (env.index.ctrl, env.index.robot_qvel)
+        )
+        self._backlash = cfg.robot.backlash
+        self._dt = cfg.timing.step_dt
+        moves = [name in cfg.robot.ik_joints for name in cfg.robot.joints]
+        self._moves = torch.tensor(moves, device=env.device)
+
+        # Weights that each hinge holds: of the bodies that it moves, and of objects in the hand
+        model = env.sim.model
+        joints = [model.joint(name).id for name in cfg.robot.joints]
+        self._carriers = Columns(model.jnt_bodyid[joints], env.device)
+        objects = [env.index.bodies[name] for name in cfg.scene.objects]
+        above = [{*ancestors(model, body)} for body in range(model.nbody)]
+        moved = [[carrier in bodies for bodies in above] for carrier in self._carriers.indices]
+        force = -model.opt.gravity[2] * model.body_mass * (1.0 - model.body_gravcomp)
+        hinges = model.jnt_type[joints, None] == mujoco.mjtJoint.mjJNT_HINGE
+        self._weights, self._loads, self._centers, self._anchors, self._axes = (
+            torch.from_numpy(values).to(env.device, torch.float32)
+            for values in (
+                moved * force * hinges,
+                force[objects] * hinges,
+                model.body_ipos,
+                model.jnt_pos[joints],
+                model.jnt_axis[joints],
+            )
+        )
+
+    def lead(self, change: Tensor, state: State, holds: Tensor) -> Tensor:
+        """The change of the joint targets that moves joints by a change in a control step [rad, m],
+        each ``(nworld, nu)``: beyond their lag, except in worlds that hold, ``(nworld,)`` bool;
+        beyond dry friction and backlash; and beyond what gravity pulls.
+        """
+        stiffness = self._servos.read(self._gain)[..., 0]
+        damping = self._dofs.read(self._damping) - self._servos.read(self._bias)[..., 2]
+        lag = (damping / stiffness).clamp(min=1e-6)
+        share = torch.where(self._moves & ~holds[:, None], 1.0 - torch.exp(-self._dt / lag), 1.0)
+        stick = self._dofs.read(self._friction) / stiffness + self._backlash
+        stick = stick * change / (change.abs() + stick).clamp(min=1e-6)
+        return (change / share + stick + self._hold(state) / stiffness).to(change)
+
+    def _hold(self, state: State) -> Tensor:
+        """Torques that hold the arm up, with what is in the hand [N m], ``(nworld, nu)``."""
+        sim = self._sim
+        turns = quat_to_matrix(sim.xquat.float())
+        centers = sim.xpos.float() + (turns * self._centers[:, None]).sum(-1)
+        turns = self._carriers.read(turns)
+        at = self._carriers.read(sim.xpos).float() + (turns * self._anchors[:, None]).sum(-1)
+        x, y, _ = (turns * self._axes[:, None]).sum(-1).unbind(-1)
+
+        def torque(points: Tensor, weights: Tensor) -> Tensor:
+            off = points[:, None] - at[:, :, None]
+            return ((x[..., None] * off[..., 1] - y[..., None] * off[..., 0]) * weights).sum(-1)
+
+        loads = self._loads * state.in_hand[:, None]
+        return torque(centers, self._weights) + torque(state.pos, loads)
 
 
 def measure_planar(env: EnvView, name: str) -> Tensor:

@@ -1,5 +1,6 @@
 """Roles of the configured phases in moving objects, for the state-based expert."""
 
+import math
 from collections.abc import Sequence
 from enum import IntEnum
 from typing import NamedTuple
@@ -8,6 +9,7 @@ from mjstack.config.schema import Config
 from mjstack.errors import ConfigError
 from mjstack.scene.phases import Phase, source_names
 
+_LATE = 0.1001  # s: by so much commands may be late
 _FIX = "Set controller=closed_loop, or trainer=clone to train a policy"
 
 
@@ -41,13 +43,14 @@ class ObjectRoles(NamedTuple):
 
 def find_roles(cfg: Config, phases: Sequence[Phase]) -> list[ObjectRoles]:
     """The objects that a configuration's phases move, in the order in which they do; a ConfigError
-    if they do nothing that a state tells, or commands are late: a state does not have those that
-    are still to come.
+    if they do nothing that a state tells, or commands are too late: a state does not have those
+    that are still to come.
     """
-    for key in ("command_delay", "random_delay"):
-        if delay := getattr(cfg.timing, key):
-            expected = f"0 with controller={cfg.controller.name}, which does not command ahead"
-            raise ConfigError(f"timing.{key}", delay, expected, _FIX)
+    most = math.floor(_LATE / cfg.timing.step_dt)
+    if cfg.timing.command_delay + cfg.timing.random_delay > most:
+        late = "command_delay" if cfg.timing.command_delay else "random_delay"
+        expected = f"at most {most}, both delays together, with controller={cfg.controller.name}"
+        raise ConfigError(f"timing.{late}", getattr(cfg.timing, late), expected, _FIX)
     names = source_names(cfg.scene)
     moves = [k for k, phase in enumerate(phases) if phase.target is not None]
     moved: dict[str, ObjectRoles] = {}

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from mjstack.drivers.feedback import STAY, FeedbackDriver, State, servo_lag
+from mjstack.drivers.feedback import STAY, FeedbackDriver, ServoInverse, State, servo_lag
 from mjstack.drivers.roles import Role, find_roles
 from mjstack.managers.view import EnvView, offers
 from mjstack.math import atan2, norm, quat_to_matrix
@@ -20,6 +20,7 @@ from mjstack.mdp.geometry import pose_w, robot
 _SPEED = 0.5  # m/s, of the grasp point
 _CARRY_SPEED = 0.25  # m/s, with an object in the jaws
 _PUSH_SPEED = 0.1  # m/s, with one before them
+_AHEAD = 0.4  # of a step's way that is led more, for each step by which commands are late
 _SLOWING = 0.5  # largest share of the distance that is left, in one step,
 _PUSH_SLOWING = 0.4  # and with an object before the jaws
 _JOINT = 0.25  # rad, m: largest lead of a joint
@@ -146,11 +147,17 @@ class StateBasedDriver(FeedbackDriver):
         lag = servo_lag(env.sim.model, env.index.ctrl[: self._n_arm].tolist())
         # A servo that lags has to be led by more than it is to move in a step.
         self._lead = 1.0 / (1.0 - math.exp(-cfg.timing.step_dt / lag))
+        self._servos: ServoInverse | None = None
+        if cfg.robot.servos or cfg.robot.backlash or "dof_frictionloss" in env.sim.fields:
+            self._servos = ServoInverse(env)
+            self._lead = 1.0
+        self._pace = torch.ones_like(self.error)
         self._always = torch.ones((env.nworld, len(things)), dtype=torch.bool, device=device)
 
     @override
     def command(self) -> Tensor:
         self._observe(self._always)
+        self._pace = 1.0 + _AHEAD * self._env.command_delay.steps
         state = self._measure()
         due = self._decide(state)
         target, phase = self._lead_point(state, due)
@@ -163,7 +170,8 @@ class StateBasedDriver(FeedbackDriver):
             start[:, column] = value
         if self._aligns:
             rolls = (due.role == Role.down) | due.pushes
-            start[:, self._roll_column] += due.turn.clamp(-_ROLL, _ROLL) * rolls
+            most = _ROLL * self._pace
+            start[:, self._roll_column] += due.turn.clamp(-most, most) * rolls
         approach = None if self._tilt is None else self._tilted(state, due, phase)
         if approach is not None:
             # From a gripper that points elsewhere, the shortest way may end at a joint's limit.
@@ -172,14 +180,17 @@ class StateBasedDriver(FeedbackDriver):
             start = torch.where(flipped, self._nominal[phase], start)
             start[:, self._roll_column] = roll
         change = self._solve(start, target, phase, approach)[0] - q
+        if self._servos is not None:
+            change = self._servos.lead(change, state, holds=due.role == Role.close)
         largest = change.abs().amax(1, keepdim=True)
         command = q + change * (_JOINT / largest.clamp(min=1e-6)).clamp(max=1.0)
 
         # The gripper
         now = q[:, self._n_arm :]
-        grip = (self._grip[phase] - now).clamp(-self._grip_lead, self._grip_lead)
+        most = self._pace[:, None] * self._grip_lead
+        grip = (self._grip[phase] - now).clamp(-most, most)
         command[:, self._n_arm :] = now + grip
-        return self._keep_finite(command)
+        return self._as_read(self._keep_finite(command))
 
     def _decide(self, state: State) -> _Due:
         """The next thing to do in every world."""
@@ -289,7 +300,7 @@ class StateBasedDriver(FeedbackDriver):
         move = torch.cat(((end - point)[:, :2] * level[:, None], (way - point[:, 2])[:, None]), 1)
         distance = norm(move)
         slow = torch.where(due.pushes, _PUSH_SPEED, _CARRY_SPEED)
-        speed = torch.where(due.grasped, slow, _SPEED) * self._cfg.timing.step_dt
+        speed = torch.where(due.grasped, slow, _SPEED) * self._cfg.timing.step_dt * self._pace
         slowing = torch.where(pushing, _PUSH_SLOWING, _SLOWING)
         lead = self._lead * torch.minimum(speed, slowing * distance)
         # Fingers that touch the table are not pressed onto it.

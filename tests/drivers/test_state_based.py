@@ -164,11 +164,12 @@ def find(cfg: Config) -> list[ObjectRoles]:
 
 
 def test_late_commands_are_refused_before_anything_runs(tmp_path: Path) -> None:
-    late = ["timing.command_delay=1", "sim=native", "nworld=2", f"hydra.run.dir={tmp_path}/out"]
+    late = ["timing.command_delay=6", "sim=native", "nworld=2", f"hydra.run.dir={tmp_path}/out"]
     for overrides in ([EXPERT, "gates=[success]"], ["job=train", f"job.folder={tmp_path}/out"]):
         assert run([*overrides, *late]) == 2
     assert not (tmp_path / "out").exists()
-    with pytest.raises(ConfigError, match=r"timing.command_delay=1: expected 0 .* trainer=clone"):
+    message = r"timing.command_delay=6: expected at most 5, both .* trainer=clone"
+    with pytest.raises(ConfigError, match=message):
         find(load_config([EXPERT, *late[:1]]))
 
 

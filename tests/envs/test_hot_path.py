@@ -55,6 +55,10 @@ PATHS: dict[str, dict[str, str] | None] = {
         "JointNoise JointZeros JitterObjects RandomizeObjects FixtureJoints": "__call__",
         "ObjectMass ObjectFriction ActuatorGains": "read write",
     },
+    "mdp/hardware.py": {
+        "Servos ObjectSize BaseHeight": "__call__",
+        "GripForce": "read write",
+    },
     "mdp/starts/randomization.py": {"Randomized": "__call__", "Elements": "scale"},
     "mdp/starts/starts_file.py": {"FromStartsFile": "__call__"},
     "mdp/starts/expert_states.py": {"ExpertStates": "__call__"},
@@ -97,7 +101,8 @@ PATHS: dict[str, dict[str, str] | None] = {
     "drivers/policy.py": {"PolicyDriver": "command _query"},
     "drivers/feedback.py": {
         "CarryTilt": "desired_approach release_approach",
-        "FeedbackDriver": "_observe _aim _last_seen _measure _keep_finite",
+        "FeedbackDriver": "_observe _aim _last_seen _measure _solve _sunk _as_read _keep_finite",
+        "ServoInverse": "lead _hold",
     },
     "drivers/state_based.py": {
         "StateBasedDriver": (
@@ -105,7 +110,7 @@ PATHS: dict[str, dict[str, str] | None] = {
         )
     },
     "train/rounds.py": {"MixedDriver": "command"},
-    "policy/network.py": {"PolicyNetwork": "normalized forward"},
+    "policy/network.py": {"PolicyNetwork": "normalized measured forward"},
     "episodes/failures.py": {"FailureMonitor": "update", "": "_of"},
     "kinematics/batched_ik.py": {"BatchedIk": "solve forward _launch _copy_in"},
     "sim/mjwarp.py": {"MjwarpSimulation": "step reset kinematics _decimation _pose _place"},

@@ -50,6 +50,7 @@ OBSERVATIONS = {
     "object_velocity": (OBJECT, 6),
     "jaw_force": (OBJECT, 2),
     "last_action": ({}, "a"),
+    "joint_zeros": ({}, "n"),
 }
 REWARDS = {  # whether it is a fraction, from 0 to 1
     "reach": ({**OBJECT, "scale": 0.1}, True),

@@ -1,18 +1,13 @@
 """Servos of the group ``actuator``: published figures in the compiled model; what is refused."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from compositions import load_config, refusal
 from environments import few
 
-from mjstack import make_env
 from mjstack.errors import MjstackError
-from mjstack.mdp.starts.starts_file import start_arrays
 from mjstack.scene.build import build_model
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "servos"
 # Figures of the joints in their order: stiffness, damping, armature, dry and viscous friction.
 GTC_BERLIN = (
     [48.94, 51.34, 18.57, 43.03, 47.14, 50.83],
@@ -79,27 +74,3 @@ def test_one_servo_is_set_over_those_of_the_file() -> None:
     for override in (f"+{key}.stiffness=25", f"+{key}={{stiffness: 25}}"):
         gains = build_model(load_config([override])).actuator_gainprm[:, 0]
         assert gains.tolist() == [998.22, 998.22, 25.0, 998.22, 998.22, 998.22]
-
-
-def test_the_example_draws_servos_for_each_world() -> None:
-    """All figures of a world are one model's, and every model is drawn."""
-    names = ("default", "gtc_berlin", "workshop")
-    models = [build_model(load_config([f"actuator={name}"])) for name in names]
-    env = make_env(["experiment=any_servo", "sim=native"], config_dir=EXAMPLE / "conf", nworld=24)
-    env.reset(seed=0)
-    fields = ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange", "dof_armature")
-    drawn = set()
-    for world in range(env.nworld):
-        values = {name: env.sim.fields[name][world].numpy() for name in fields}
-        values["dof_damping"] = env.sim.fields["dof_damping"][world].numpy()
-        (number,) = [
-            k
-            for k, model in enumerate(models)
-            if all(np.array_equal(getattr(model, name), part) for name, part in values.items())
-        ]
-        drawn.add(number)
-    assert drawn == {0, 1, 2}
-    starts = start_arrays(env)  # which gate success writes
-    assert not any(name.endswith("_mass") for name in starts)
-    assert starts["gain_gripper"].min() < 0.1
-    env.close()

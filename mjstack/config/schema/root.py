@@ -76,6 +76,8 @@ class Config:
     without view does so of every world."""
     web: WebCfg = spec(WebCfg, changes=("nothing",))
     """Worlds in a browser."""
+    range_scale: float = spec(1.0, ge=0.0, le=10.0)
+    """How wide the ranges of ``randomization`` are, of their own; 1.5: wider by half."""
     starts: str | None = spec(None)
     """reset=starts_file: an npz file with one row per world, from which all of them start."""
     policy: str | None = spec(None)
