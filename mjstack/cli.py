@@ -96,8 +96,8 @@ def _dispatch(flags: Namespace, overrides: list[str]) -> int:
         elif command == "doctor":
             from mjstack.jobs.doctor import findings  # it loads Warp
 
-            for name, words in findings(overrides[1:]):
-                print(f"{name:<14} {words}", flush=True)
+            for name, text in findings(overrides[1:]):
+                print(f"{name:<14} {text}", flush=True)
         elif flags.help:
             _print_help(overrides)
         elif flags.hydra_help:

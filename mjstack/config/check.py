@@ -272,9 +272,9 @@ def _gates(cfg: Config) -> Checks:
     require_names("gate.parity.states: phase", gate.parity.states.values(), phases)
     if phases:
         require_names("gate.throughput.from_phase: phase", [gate.throughput.from_phase], phases)
-    wrong = gate.parity.images is not None and not cfg.scene.cameras
+    invalid = gate.parity.images is not None and not cfg.scene.cameras
     expected = "null, because there are no cameras. Set cameras to those of that run"
-    yield "gate.parity.images", wrong, expected
+    yield "gate.parity.images", invalid, expected
     for name, t in gate.episodes().items():
         from_file = bool(t.reset) and reads_starts_file(gate_reset(cfg, name))
         expected = "1, because with reset=starts_file worlds start alike under every seed"

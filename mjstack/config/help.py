@@ -211,7 +211,7 @@ def list_text(kinds: Sequence[str]) -> str:
         if kind != "policies":
             one_kind = len(kinds) == 1
             named = _functions(kind, one_kind) if kind in _FUNCTIONS else _files(kind[:-1])
-        lines += [f"{kind}:", *(f"  {name:<12} {words}".rstrip() for name, words in named)]
+        lines += [f"{kind}:", *(f"  {name:<12} {meaning}".rstrip() for name, meaning in named)]
     return "\n".join(lines)
 
 

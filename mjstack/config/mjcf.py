@@ -179,12 +179,8 @@ def measure(file: str, *, fixed: bool) -> Solid:
     if not collides.any() and (not fixed or model.ngeom == 1):
         raise MjstackError(f"{file}: expected a geom that collides, there is none.")
     geoms = np.flatnonzero(collides if collides.any() else np.arange(model.ngeom) != probe.id)
-    z = np.linspace(-1.0, 1.0, _DIRECTIONS)  # of a spiral from pole to pole
-    turn = np.pi * (1.0 + 5.0**0.5) * np.arange(_DIRECTIONS)
-    spiral = np.stack((np.cos(turn), np.sin(turn), z), axis=1)
-    spiral[:, :2] *= np.sqrt(1.0 - z**2)[:, None]
     # The point of an object that lies farthest in a direction is nearest to one far away there
-    directions = np.concatenate((np.eye(3), -np.eye(3), spiral))
+    directions = unit_vectors(_DIRECTIONS)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     ends = np.empty((len(directions), len(geoms), 6))
@@ -198,6 +194,15 @@ def measure(file: str, *, fixed: bool) -> Solid:
     farthest = np.argmax(np.einsum("nki,ni->nk", points, directions), axis=1)
     hull = np.unique(points[np.arange(len(directions)), farthest].round(9), axis=0)
     return Solid(center, (high - center).tolist(), (hull - center * (not fixed)).tolist())
+
+
+def unit_vectors(count: int) -> np.ndarray:
+    """Unit vectors to all sides, shape ``(6 + count, 3)``: the axes', and a spiral's."""
+    z = np.linspace(-1.0, 1.0, count)
+    turn = np.pi * (1.0 + 5.0**0.5) * np.arange(count)
+    spiral = np.stack((np.cos(turn), np.sin(turn), z), axis=1)
+    spiral[:, :2] *= np.sqrt(1.0 - z**2)[:, None]
+    return np.concatenate((np.eye(3), -np.eye(3), spiral))
 
 
 def attach_guest(

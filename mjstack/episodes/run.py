@@ -103,7 +103,7 @@ class Run:
         """Print a line, which has no markup."""
         self.stage.progress.print_line(line)
 
-    def on(self, stage: Stage) -> "Run":
+    def with_stage(self, stage: Stage) -> "Run":
         """The run on another stage, with artifacts of its own."""
         return replace(self, stage=stage, artifacts=Artifacts())
 
@@ -169,7 +169,7 @@ class Run:
         values in a few words.
         """
         check = self.stage.check
-        broken, beyond = check.why(episode.failed, episode.values)
+        broken, beyond_keys = check.why(episode.failed, episode.values)
         failures = ", ".join(f"{check.rules.texts[rule]}{why}" for rule, why in broken.items())
         values = {key: float(values[0]) for key, values in episode.values.items()}
         measured = [replace(check.figures[key], value=value) for key, value in values.items()]
@@ -178,13 +178,13 @@ class Run:
             status=Status.failed if broken else Status.passed,
             reason=f"failed: {failures}" if failures else "",
             figures=[*check.thresholds(), *measured],
-            beyond=beyond,
+            beyond=beyond_keys,
         )
         return result, check.headline(values)
 
     def show_world(
         self,
-        part: str,
+        section: str,
         label: str,
         qpos: np.ndarray,
         episode: Episode,
@@ -192,8 +192,8 @@ class Run:
         title: str = "",
     ) -> None:
         """Show a world that was played alone, under a label, on the run's page if that has worlds
-        in motion; with a title on the run's pictures too. ``part`` is the part of the run that has
-        played it, ``qpos`` its positions at every step end, shape ``(steps, nq)``.
+        in motion; with a title on the run's pictures too. ``section`` is the part of the run that
+        has played it, ``qpos`` its positions at every step end, shape ``(steps, nq)``.
         """
         (fields,) = world_fields(self.stage, env, [0])
         if self.page.motion:
@@ -201,6 +201,6 @@ class Run:
             rules = self.stage.check.rules.broken(bits) if bits else []
             frames = qpos[:: frame_stride(self.cfg.timing.step_dt)]
             world = World(label=label, qpos=frames, rules=rules, fields=fields)
-            self.page.worlds3d[part] = [world]
+            self.page.worlds3d[section] = [world]
         if title:
             self.artifacts.pictured = World(label=title, qpos=qpos, fields=fields)

@@ -54,7 +54,7 @@ def judge_episodes(run: Run) -> list[GateResult]:
     """
     cfg = gate_config(run.cfg, run.gate)
     if cfg is not run.cfg:
-        run = run.on(run.stage.with_config(cfg))
+        run = run.with_stage(run.stage.with_config(cfg))
     t = cfg.gate[run.gate]
     tally = EpisodeTally(gate=run.gate, check=run.stage.check, folder=run.folder)
     run.records[run.gate] = tally.records
@@ -80,7 +80,7 @@ def judge_episodes(run: Run) -> list[GateResult]:
         problem = f"only {ends} distinct final states of {tally.episodes} episodes"
         tally.problems.append(f"{problem}: identical worlds prove nothing, use reset=jitter")
     if t.reset:
-        rows = np.stack([*tally.places.values()], axis=1)
+        rows = np.stack([*tally.start_poses.values()], axis=1)
         distinct = _count_distinct(np.nan_to_num(rows).reshape(len(rows), -1), 6)
         retries = tally.array("retries")
         retried = int((retries > 0).sum())
@@ -127,7 +127,7 @@ def _play(run: Run, tally: EpisodeTally) -> int | None:
     try:
         with closing(play_batches(stage, plans, observers=observe)) as batches:
             for batch in batches:
-                rank_record = EpisodeRecord.from_batch(ranks, batch, monitor)
+                rank_record = EpisodeRecord.from_batch(batch, monitor)
                 record = EpisodeRecord.join(ranks.gather(rank_record))
                 # Before the next one can break or be stopped. A full disk takes no result back.
                 tally.write(record_name(run.gate, record.seed), write_npz, record.arrays())

@@ -100,9 +100,7 @@ def run_guarded(run: Run, name: str, gate: Gate, spread: str = "") -> None:
 
 
 def _in_each_rank(run: Run, gate: Gate) -> list[GateResult]:
-    """Run a gate in every rank on its own worlds: the results of rank 0, with the sums of all
-    ranks' rates. It has failed if it has failed in any.
-    """
+    """Run a gate in every rank on its own worlds. It has failed if it has failed in any."""
     stage = run.stage
     ranks = stage.ranks
     gate_cfg = run.cfg.gate
@@ -111,8 +109,13 @@ def _in_each_rank(run: Run, gate: Gate) -> list[GateResult]:
     gates = replace(gate_cfg, throughput=throughput)
     share = replace(run.cfg, nworld=len(stage.worlds), gate=gates)
     single = replace(run, stage=stage.with_config(share, ranks=Ranks(), measured=stage.measured))
-    results_of = ranks.in_all(lambda: gate(single))
-    note = f"each of {ranks.size} ranks its own worlds; figures are rank 0's"
+    return join_ranks(ranks.in_all(lambda: gate(single)))
+
+
+def join_ranks(results_of: list[list[GateResult]]) -> list[GateResult]:
+    """The results of rank 0, with sums of all ranks' rates and the slowest of each."""
+    size = len(results_of)
+    note = f"each of {size} ranks its own worlds; figures are rank 0's"
     results = _with_note(results_of[0], note)
     for result, *later in zip(*results_of, strict=True):
         for rank, rank_result in enumerate(later, 1):
@@ -120,11 +123,17 @@ def _in_each_rank(run: Run, gate: Gate) -> list[GateResult]:
             if rank_result.status is Status.failed and result.status is not Status.failed:
                 result.status = Status.failed
                 result.reason = f"rank {rank}: {rank_result.reason}"
+        rates = {}
         for figure in [f for f in result.figures if f.unit == "/s" and f.column == "median"]:
             if all(figure.key in rank_result.metrics for rank_result in later):
-                total = sum(rank_result.metrics[figure.key] for rank_result in (result, *later))
+                values = [rank_result.metrics[figure.key] for rank_result in (result, *later)]
                 group = f"all_ranks.{figure.group}"
-                result.figures.append(replace(figure, value=total, group=group))
+                result.figures.append(replace(figure, value=sum(values), group=group))
+                unit = f"{figure.name.replace('_', '-')}/s"
+                slowest = f"rank {values.index(min(values))}, the slowest, {min(values):,.0f}"
+                rates[figure.group] = f"{figure.group} {sum(values):,.0f} {unit} ({slowest})"
+        if rates and result.status is not Status.failed:
+            result.reason = f"{size} ranks: {'; '.join(rates.values())}; rank 0: {result.reason}"
     return results
 
 

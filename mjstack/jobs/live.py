@@ -58,9 +58,9 @@ class LiveView(Observer):
         self._pace = gui.add_dropdown("Pace", (_REAL, _FAST), initial_value=_FAST)
         self._worlds = gui.add_text("Worlds", "", hint=f"such as 0-15, 20; at most {MOST_WORLDS}")
 
-    def begin(self, part: str) -> None:
+    def begin(self, section: str) -> None:
         """Name the part of the run that follows."""
-        self._section = part
+        self._section = section
 
     @override
     def start(self, env: Env, driver: Driver) -> None:
@@ -167,8 +167,8 @@ def read_worlds(text: str, count: int) -> list[int]:
     if not _RANGES.fullmatch(text):
         return []
     worlds: dict[int, None] = {}
-    for part in text.split(","):
-        first, _, last = part.strip().partition("-")
+    for item in text.split(","):
+        first, _, last = item.strip().partition("-")
         stop = min(int(last or first), count - 1, int(first) + MOST_WORLDS)
         worlds |= dict.fromkeys(range(int(first), stop + 1))
     return list(worlds)[:MOST_WORLDS]

@@ -168,8 +168,8 @@ def _replay_all(plan: _Plan, run: Run, folder: Path) -> None:
 def _changes(recorded: dict, current: dict) -> list[str]:
     """Facts that differ from the earlier run's and could change a result, or its last bits."""
     original, replayed = (
-        facts["versions"] | {meaning: facts.get(key) for key, meaning in _COMPARED.items()}
-        for facts in (recorded, current)
+        identity["versions"] | {meaning: identity.get(key) for key, meaning in _COMPARED.items()}
+        for identity in (recorded, current)
     )
     return [
         f"{name} was {shorten(str(original[name]), 100)} in that run and is {value} now"
@@ -189,7 +189,7 @@ def _replay(
     monitors = [FailureMonitor()] if stage.cfg.gate[plan.gate].reset else []
     trace = WorldTrace()
     observers = [trace, *monitors]
-    facts = {"seed": plan.seed, "world": plan.world}
+    identity = {"seed": plan.seed, "world": plan.world}
     plans = [BatchPlan(plan.seed, [plan.world])]
     batches = play_batches(stage, plans, alone=(backend, device), observers=lambda _: observers)
     with closing(batches):
@@ -206,11 +206,11 @@ def _replay(
         run.print_line(f"  {line}")
     name = "trajectory.npz" if first else f"trajectory_{backend}.npz"
     ends = {"backend": episode.description, "failed": int(episode.failed[0])}
-    write_npz(folder / name, facts | ends | trace.arrays)
+    write_npz(folder / name, identity | ends | trace.arrays)
     recorded = check.rules.describe(int(plan.record.failed[plan.world])) or "succeeded"
     result.status = result.status if agrees else Status.failed
     result.reason = f"{result.reason or f'succeeded, {headline}'}; {comparison}"
-    result.figures = figures(**facts) + result.figures
+    result.figures = figures(**identity) + result.figures
     result.notes = {"backend": episode.description, "recorded": recorded, "trajectory": name}
     result.details = lines + changes
     return [result]

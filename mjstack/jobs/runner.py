@@ -13,7 +13,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from threading import Thread
 
 import mujoco
 import numpy as np
@@ -160,8 +159,6 @@ class CheckedJob:
         def begin(name: str) -> None:
             bar.start(name)
             self._load(warp=name == "parity")
-            if name == "capacity":  # it times nothing, and waits for a GPU if there is one
-                Thread(target=showing.load_drawing, daemon=True).start()
             if live is not None:
                 live.begin(name)
 

@@ -2,8 +2,7 @@
 
 import secrets
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from importlib import import_module
+from contextlib import contextmanager
 from pathlib import Path
 
 from mjstack.config.schema import Config
@@ -24,12 +23,6 @@ def check_showing(cfg: Config, ending: str = ".mp4") -> None:
         web.check_address(cfg.web.host, cfg.web.port)
     if cfg.video:
         picture.require_video(ending)
-
-
-def load_drawing() -> None:
-    """Load what draws pages."""
-    with suppress(Exception):  # what draws says why
-        import_module("trimesh")
 
 
 def draw_episode(

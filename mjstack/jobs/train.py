@@ -86,7 +86,7 @@ def _run(trainer: Trainer, run: Run, folder: Path) -> None:
         write_atomic(folder / CONFIG, json.dumps(training_fingerprint(run.cfg), indent=1) + "\n")
     run_guarded(run, NAME, partial(_train, trainer, folder), "worlds")
     if run.artifacts.results[NAME].status is Status.passed:
-        judged = run.on(judged_stage(run.stage, folder / LAST))
+        judged = run.with_stage(judged_stage(run.stage, folder / LAST))
         run_guarded(judged, "success", judge_episodes)
         trained = run.artifacts.results[NAME]
         judgement = Figure("judgement", judged.artifacts.results["success"].seconds, "s")

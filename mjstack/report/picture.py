@@ -188,6 +188,6 @@ def save_images(
     for i, (name, images) in enumerate(rows.items()):
         for j, (column, image) in enumerate(zip(columns, images, strict=True)):
             at = (side * j, side * i)
-            picture.paste(Image.fromarray(image).resize((side, side)), at)
+            picture.paste(Image.fromarray(image.astype(np.uint8)).resize((side, side)), at)
             draw.text(at, f" {name}, {column}", stroke_width=1, stroke_fill="black")
     picture.save(path)

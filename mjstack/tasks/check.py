@@ -277,7 +277,7 @@ class EpisodeCheck(ABC):
         the rules' bits, ``values`` what was measured, each of shape ``(nworld,)``.
         """
         broken = dict.fromkeys(self.rules.failing(failed), "")
-        beyond = []
+        beyond_keys = []
         for name, figures in chain(*(zip(r.texts, r.figures, strict=True) for r in self._rules)):
             limited = [figure for figure in figures if figure.limits]
             reasons = []
@@ -291,10 +291,10 @@ class EpisodeCheck(ABC):
                         f"{figure.column or figure.key}"
                         f" {number if len(failed) == 1 else f'in {violating.sum()}'}"
                     )
-                    beyond.append(figure.key)
+                    beyond_keys.append(figure.key)
             if reasons and len(limited) > 1:
                 broken[name] = f" ({', '.join(reasons)})"
-        return broken, beyond
+        return broken, beyond_keys
 
     @abstractmethod
     def placed(self, step: Step) -> Tensor:

@@ -79,9 +79,9 @@ class Progress:
         self._least = constant(-inf, -inf, -SUPPORT_GAP, height, -inf)
         self._most = constant(within, near, inf, inf, inf)
         # Conditions of each of these stages. Any opening will do, so the first has none.
-        away, across, above, low, opening, in_hand, placed = range(7)
-        conditions = [[opening] * 3, [in_hand, away, low], [across, above, above]]
-        conditions += [[in_hand, away, away], [placed] * 3]
+        distance, offset_xy, offset_z, low, opening, in_hand, placed = range(7)
+        conditions = [[opening] * 3, [in_hand, distance, low], [offset_xy, offset_z, offset_z]]
+        conditions += [[in_hand, distance, distance], [placed] * 3]
         self._conditions = torch.tensor(conditions, device=env.device).flatten()
 
     def __call__(self, env: EnvView) -> Tensor:
@@ -119,8 +119,8 @@ class Progress:
         pos = self._columns.read(step.pos)
         goals = list(self._check.goals(step).values())
         offset = pos - (torch.stack(goals, dim=1) if len(goals) > 1 else goals[0][:, None])
-        away = norm(pos - grasp_point_pos(step.env).float()[:, None])
+        distance = norm(pos - grasp_point_pos(step.env).float()[:, None])
         low = self._columns.read(step.height)
         opening = step.narrowest.expand_as(low)
-        parts = (away, norm(offset[..., :2]), offset[..., 2], low, opening)
-        return torch.stack(parts, dim=-1), self._columns.read(step.in_hand)
+        measures = (distance, norm(offset[..., :2]), offset[..., 2], low, opening)
+        return torch.stack(measures, dim=-1), self._columns.read(step.in_hand)

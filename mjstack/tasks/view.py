@@ -303,7 +303,7 @@ class AllOf:
         holds = self.parts(step)  # in as few calls of torch as there are
         return holds.all(-1) if isinstance(holds, Tensor) else reduce(and_, holds)
 
-    def apart(self, step: Step) -> Tensor:
+    def by_part(self, step: Step) -> Tensor:
         """Whether each part holds for all objects, shape ``(nworld, parts)``, bool."""
         holds = self.parts(step)
         if not isinstance(holds, Tensor):
@@ -314,6 +314,6 @@ class AllOf:
         """A condition of the parts of both, each for all its objects, shape ``(nworld,)``, bool."""
 
         def parts(step: Step) -> Tensor:
-            return torch.cat((self.apart(step), condition.apart(step)), dim=-1)
+            return torch.cat((self.by_part(step), condition.by_part(step)), dim=-1)
 
         return AllOf((*self.names, *condition.names), parts)

@@ -100,6 +100,9 @@ class RobotCfg:
     exclude: list[Any] = spec([])
     """Pairs of the robot's bodies that do not collide, such as ``[world, link1]``. world:
     what its file has in the worldbody."""
+    collision: Any = spec("hull 64", changes=("episodes",))
+    """How its meshes collide: ``file``, as they are; ``hull N``, as convex hulls of N vertices at
+    most, nearest to them; ``primitives``, as boxes and capsules around them."""
     menagerie_name: str = ""
     """The robot's folder in MuJoCo Menagerie, for ``model=menagerie``."""
     menagerie_file: str = ""
