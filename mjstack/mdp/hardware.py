@@ -117,7 +117,10 @@ class GripForce(Randomized):
         self._range.write(mask, torch.stack((-values, values), dim=-1).to(self._range.dtype))
 
 
-@uses_fields("geom_size", "geom_aabb", "geom_rbound")
+_SIZE_FIELDS = ("geom_size", "geom_aabb", "geom_rbound")
+
+
+@uses_fields(*_SIZE_FIELDS)
 class ObjectSize:
     """Makes each box larger or smaller, by as much along each of its edges. Mass and height stay,
     so that it starts half as much in or over its table, and checks judge the nominal size.
@@ -134,7 +137,7 @@ class ObjectSize:
             raise ParameterError("edge", edge, "0, or a scene with a box that moves")
         geoms = [env.index.geoms[name][0] for name in boxes]
         self._half = 0.5 * edge
-        self._size, self._box, self._bound = (Elements(env, n, geoms) for n in self.model_fields)
+        self._size, self._box, self._bound = (Elements(env, n, geoms) for n in _SIZE_FIELDS)
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
         """Write the sizes."""

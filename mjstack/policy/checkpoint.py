@@ -258,9 +258,9 @@ def _from_facts(facts: Facts, path: Path) -> Policy:
     relative = layers.get("relative", [])
     if relative and (len(relative) != action["width"] or not {*relative} <= {*range(inputs)}):
         raise ValueError("network.relative is no column of the observation for each joint")
-    sizes = (inputs, action["width"], action["chunk"], layers["hidden"])
+    shape = (inputs, action["width"], action["chunk"], layers["hidden"])
     with torch.device("meta"):
-        network = PolicyNetwork(*sizes, vision, relative)
+        network = PolicyNetwork(*shape, vision, relative)
     policy = Policy(
         network=network,
         group=str(seen["group"]),

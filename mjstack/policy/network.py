@@ -133,10 +133,8 @@ class PolicyNetwork(nn.Module):
         scaled = torch.cat([scaled, *(part.to(scaled.dtype) for part in features)], dim=1)
         return self.layers(scaled).unflatten(1, (self.chunk, self.width))
 
-    def measured(self, observation: Tensor) -> Tensor | float:
-        """The joints that actions are added to, ``(n, 1, width)``; 0 where they are absolute."""
-        if not self.relative:
-            return 0.0
+    def measured(self, observation: Tensor) -> Tensor:
+        """The joints that actions are added to, ``(n, 1, width)``."""
         columns = [observation[:, column] for column in self.relative]
         return (torch.stack(columns, dim=1) + self.origin)[:, None]
 
@@ -146,5 +144,7 @@ class PolicyNetwork(nn.Module):
         width, 3)``, 0 to 255, in the network's type.
         """
         normalized = self.normalized(observation, self.encode(images))
-        actions = self.action_mean + self.action_std * normalized + self.measured(observation)
+        actions = self.action_mean + self.action_std * normalized
+        if self.relative:
+            actions = actions + self.measured(observation)
         return torch.minimum(torch.maximum(actions, self.action_low), self.action_high)
