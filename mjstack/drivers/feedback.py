@@ -25,6 +25,7 @@ from mjstack.scene.phases import Phase, Target, build_phases, source_names
 
 _BEYOND = 10.0  # what a roll beyond the joint's range costs, per rad
 _BACK = 3.0  # rad: what a roll counts that leads back over the nominal one
+_SETTLING = 20  # solutions after which spare joints are where they stay
 STAY = 0.3  # how much a roll made so far weighs against the face that is nearer
 
 
@@ -74,6 +75,14 @@ class CarryTilt:
         self._there = nominal.new_zeros((ik.nworld, nominal.shape[1]))
         self._last_axis = nominal.new_zeros((ik.nworld, 3))
         self._last_turn = nominal.new_zeros(ik.nworld)
+        # Of the nominal plan, with the gripper as upright as it can be
+        self._settled = nominal.clone()
+        for row in self._settled:
+            arm = row.expand(ik.nworld, -1)
+            point = self._there_ik.forward(arm)[0].clone()
+            for _ in range(_SETTLING):
+                arm = self._there_ik.solve(arm, point)[0]
+            row.copy_(arm[0])
 
     def desired_approach(
         self, command: Tensor, phase: Tensor, there: Tensor, fresh: Tensor
@@ -105,7 +114,7 @@ class CarryTilt:
         """Approach axis of the release pose, turned about the vertical to where the arm looks; from
         these arguments alone, which are those of `desired_approach`. Fixed shapes, no host read.
         """
-        arm = self._there_ik.solve(self._nominal[self.place[phase]], there)[0]
+        arm = self._there_ik.solve(self._settled[self.place[phase]], there)[0]
         axis = self._there_ik.forward(arm)[2]
         return _turn_about_z(axis, self._sign * (command[:, 0] - arm[:, 0]))
 
