@@ -45,7 +45,7 @@ def play(task: str, mode: str, overrides: list[str], nworld: int, folder: Path) 
         stage = Stage(cfg)
         episode = stage.play(stage.batch_simulation(nworld), cfg.reset)
         failing = stage.check.rules.failing(episode.failed)
-        succeeded: object = int((episode.failed == 0).sum())
+        succeeded: object = int((episode.failed == 0).sum()); print((episode.failed != 0).nonzero()[0].tolist())
     except MjstackError as error:
         succeeded, failing = "", {f"{error}"[:150]: []}
     broken = "; ".join(f"{rule} {len(worlds)}" for rule, worlds in failing.items())

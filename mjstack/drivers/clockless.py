@@ -229,7 +229,8 @@ class ClocklessDriver(FeedbackDriver):
         near = _NEAR_CLOSED + (_NEAR - _NEAR_CLOSED) * state.opening.clamp(0.0, 1.0)
         there = norm(offset[:, :2]) <= near
         stuck = _STUCK * (1.0 - state.speed / _STILL).clamp(min=0.0)
-        there &= (offset[:, 2] >= -_DEPTH) & (offset[:, 2] <= _DEPTH + stuck)
+        deep = torch.where(self._exact[number], _ABOVE, _DEPTH + stuck)
+        there &= (offset[:, 2] >= -_DEPTH) & (offset[:, 2] <= deep)
         opens = letting_go | foreign
         return _Due(
             number,
@@ -425,19 +426,21 @@ class ClocklessDriver(FeedbackDriver):
         stays = due.beside & ~due.led | due.closes
         tilt = torch.where(stays[:, None], state.approach, tilt)
 
-        # The turn of the object's axis that points up most, to the vertical, by Rodrigues' formula
+        # Turned in the arm's vertical plane, until the object's axis that points up most does
         env = self._env
         quat = torch.stack([pose_w(env, name)[:, 3:] for name in self._cfg.scene.objects], dim=1)
         axes = quat_to_matrix(quat.float()[self._worlds, due.object])
         up = axes[self._worlds, :, axes[:, 2].abs().argmax(1)]
         up = up * torch.sign(up[:, 2:])
-        x, y, z = up.unbind(1)
-        turn = torch.stack((y, -x, torch.zeros_like(x)), dim=1)  # up x vertical
+        out = state.point - env.sim.xpos[:, self._links[0]].float()
+        length = norm(out[:, :2]).clamp(min=1e-6)
+        x, y = out[:, 0] / length, out[:, 1] / length
+        sin = -(up[:, 0] * x + up[:, 1] * y)
+        normal = torch.stack((-y, x, torch.zeros_like(x)), dim=1)
         a = state.approach
-        along = (turn * a).sum(1, keepdim=True) / (1.0 + z[:, None])
-        upright = a * z[:, None] + torch.linalg.cross(turn, a) + turn * along
-        # Where phases align, the gripper is tilted as it has to be at the goal from the grasp on.
-        return torch.where((due.led & ~self._exact[due.move])[:, None], upright, tilt)
+        cos = (1.0 - sin.square()).clamp(min=0.0).sqrt()
+        upright = a * cos[:, None] + torch.linalg.cross(normal, a) * sin[:, None]
+        return torch.where(due.led[:, None], upright, tilt)
 
     def _turn_left(self, state: State, due: _Due, aligns: Tensor, phase: Tensor) -> Tensor:
         """How far the open jaws have to roll to the nearer face of an object [rad], shape
