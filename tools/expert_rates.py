@@ -8,6 +8,8 @@ Other arguments are overrides of the configuration. Under a rate stand the rules
 """
 
 import argparse
+import subprocess
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -26,9 +28,8 @@ def config_folder(task: str, folder: Path) -> Path | None:
     """The folder of a task's configuration; that of `mjstack new task` is written for lift."""
     if task == "lift":
         if not (folder / "lift").exists():
-            from mjstack.cli import run
-
-            run(["new", "task", "lift", str(folder / "lift")])
+            command = [sys.executable, "-m", "mjstack", "new", "task", "lift"]
+            subprocess.run(command, cwd=folder, check=True, stdout=subprocess.DEVNULL)
         return folder / "lift" / "conf"
     example = ROOT / "examples" / task / "conf"
     return example if example.exists() else None

@@ -4,7 +4,7 @@ from mjstack.episodes.stage import Stage
 from mjstack.math import norm, quat_z_row
 task, robot, worlds, n, every = sys.argv[1], sys.argv[2], eval(sys.argv[3]), int(sys.argv[4]), int(sys.argv[5])
 ex = Path("examples")/task/"conf"
-cfg = mjstack.load_config([f"task={task}", f"robot={robot}", "controller=state_based","controller.func=mjstack.drivers.clockless.ClocklessDriver","reset=randomized","sim=native", *sys.argv[6:]], config_dir=ex if ex.exists() else None)
+cfg = mjstack.load_config([f"task={task}", f"robot={robot}", "controller=closed_loop","controller.clock=false","reset=randomized","sim=native", *sys.argv[6:]], config_dir=ex if ex.exists() else None)
 st = Stage(cfg)
 env = st.start(st.batch_simulation(len(worlds)), cfg.reset, worlds=worlds)
 d = st.driver(env)

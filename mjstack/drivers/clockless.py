@@ -13,7 +13,7 @@ from typing_extensions import override
 
 from mjstack.drivers.feedback import STAY, FeedbackDriver, State, servo_lag
 from mjstack.drivers.moves import find_moves
-from mjstack.managers.view import EnvView, offers
+from mjstack.managers.view import EnvView
 from mjstack.math import atan2, norm, quat_to_matrix
 from mjstack.mdp.geometry import pose_w, robot
 
@@ -72,7 +72,6 @@ class _Due(NamedTuple):
     beside: Tensor
 
 
-@offers("driver")
 class ClocklessDriver(FeedbackDriver):
     """Joint targets that are a function of the simulation's state: no clock, no memory.
 

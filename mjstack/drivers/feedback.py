@@ -26,6 +26,7 @@ from mjstack.scene.phases import Phase, Target, build_phases, source_names
 _BEYOND = 10.0  # what a roll beyond the joint's range costs, per rad
 _BACK = 3.0  # rad: what a roll counts that leads back over the nominal one
 _SETTLING = 20  # solutions after which spare joints are where they stay
+_FARTHER = 6  # more iterations for an arm that somebody else has moved
 STAY = 0.3  # how much a roll made so far weighs against the face that is nearer
 
 
@@ -306,7 +307,7 @@ def _solver(env: EnvView, posture_gain: float = 0.0) -> BatchedIk:
         env.cfg.robot,
         env.nworld,
         env.device,
-        iterations=c.step_iterations,
+        iterations=c.step_iterations + (0 if c.clock else _FARTHER),
         posture_gain=posture_gain,
         approach_gain=c.approach_gain,
     )

@@ -47,11 +47,10 @@ def check_clone(stage: Stage) -> range:
 
 def _check_rounds(stage: Stage, job: CloneJobCfg) -> None:
     """Refuse what cannot be learned in rounds."""
-    name = stage.cfg.controller.name
     if not stage.driver_class.stateless:
-        expected = "state_based, because trainer=dagger asks the expert in the policy's states"
-        fix = "Set trainer=clone, which learns from any expert, or controller=state_based"
-        raise ConfigError("controller", name, expected, fix)
+        expected = "closed_loop, without a clock: trainer=dagger asks it in the policy's states"
+        fix = "Set trainer=clone, which learns from any expert, or controller.clock=false too"
+        raise ConfigError("controller", stage.cfg.controller.name, expected, fix)
     if job.dataset is not None:
         expected = "null, because trainer=dagger asks the expert itself"
         raise ConfigError("job.dataset", job.dataset, expected, "Set trainer=clone")
