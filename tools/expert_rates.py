@@ -1,10 +1,10 @@
 """How often the expert does every task, with and without a clock, from random starts.
 
-    python tools/expert_rates.py --nworld 32                            # native MuJoCo, on two cores
-    python tools/expert_rates.py --nworld 4096 --out rates.csv sim=mjwarp   # a GPU
+    python tools/expert_rates.py --nworld 32 sim=native                   # two cores
+    python tools/expert_rates.py --nworld 4096 --out rates.csv sim=mjwarp # a GPU
 
-A row of the table is a task and a robot; the tasks are those of mjstack, its examples and the guide.
-Other arguments are overrides of the configuration. Under a rate stand the rules that were broken.
+Tasks are those of mjstack, its examples and `mjstack new task`. A row has the worlds that succeeded,
+how many broke each rule, and seconds. Other arguments are overrides of the configuration.
 """
 
 import argparse
@@ -35,7 +35,9 @@ def config_folder(task: str, folder: Path) -> Path | None:
     return example if example.exists() else None
 
 
-def play(task: str, mode: str, overrides: list[str], nworld: int, folder: Path) -> dict[str, object]:
+def play(
+    task: str, mode: str, overrides: list[str], nworld: int, folder: Path
+) -> dict[str, object]:
     """A row: how many worlds succeeded, and how many broke each rule."""
     began = time.perf_counter()
     chosen = [f"task={task}", "controller=closed_loop", "reset=randomized", f"nworld={nworld}"]

@@ -52,13 +52,10 @@ def complete_terms(cfg: DictConfig, overrides: Sequence[str]) -> None:
 
 
 def _observe_task(cfg: DictConfig, overrides: Sequence[str]) -> None:
-    """Let a new policy see the task's own observation, in place: where that is chosen, or nothing
-    is and the task writes all of its terms. Overrides of the policy's terms come on top.
+    """Let a new policy see the task's own observation, in place, where that is chosen. Overrides of
+    the policy's terms come on top.
     """
-    choices = cfg.hydra.runtime.choices
-    chosen = any(o.startswith(f"{_OBSERVED}=") for o in overrides)
-    alone = choices.get("observation") is None and bool(cfg.observation) and not chosen
-    if choices.get(_OBSERVED) != "task" and not (alone and choices.get(_OBSERVED) == "state"):
+    if cfg.hydra.runtime.choices.get(_OBSERVED) != "task":
         return
     cfg.job.observation = OmegaConf.to_container(cfg.observation)
     for override in map(parse, own_overrides(overrides)):

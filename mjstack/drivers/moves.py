@@ -22,7 +22,7 @@ class Move(NamedTuple):
         carry: Phases whose targets lead on with it; of an object that is kept, the last one alone.
         open: The phase that lets go of it; of an object that is kept, the last of ``carry``.
         retreat: The phase that leads away then.
-        clear: The phases that carry it, ``carry`` and lifts before.
+        lifts: The phases that carry it: ``carry``, and those that lift it before.
     """
 
     name: str
@@ -32,7 +32,7 @@ class Move(NamedTuple):
     carry: list[int]
     open: int
     retreat: int
-    clear: list[int]
+    lifts: list[int]
 
 
 def find_moves(cfg: Config, phases: Sequence[Phase]) -> list[Move]:
@@ -55,26 +55,25 @@ def find_moves(cfg: Config, phases: Sequence[Phase]) -> list[Move]:
                 raise _refusal(cfg, f"grasp {name} without a phase before that leads to it")
             way = "grasp"
             down = close - 1
-            clear = [k for k in later if phases[k].carried == phase.grasped] or [close]
+            lifts = [k for k in later if phases[k].carried == phase.grasped] or [close]
         elif later and _pushes(phase, phases[later[0]]) and phase.spec.anchor in cfg.scene.free:
             name = str(phase.spec.anchor)
             way = "push"
-            clear = later[:1]
+            lifts = later[:1]
         else:
             continue
-        last, retreat = _find_release(phases, clear[-1])
-        if last != clear[-1] and phases[clear[-1]].spec.anchor in (name, None):
+        last, retreat = _find_release(phases, lifts[-1])
+        if last != lifts[-1] and phases[lifts[-1]].spec.anchor in (name, None):
             raise _refusal(cfg, f"let go of {name} where it is, which no state tells from before")
         over = down
         while over > 0 and phases[over - 1].spec.anchor == name:
             over -= 1
-        carry = [k for k in clear if phases[k].spec.anchor != name] or clear[-1:]
-        # Of phases that lead to the same target, the last one
-        following = [*carry[1:], None]
-        carry = [k for k, n in zip(carry, following, strict=True) if n is None or not _same(
-            phases[k], phases[n])]
+        carry = [k for k in lifts if phases[k].spec.anchor != name] or lifts[-1:]
+        carry = [  # of those to the same target the last one
+            k for k in carry if k == carry[-1] or phases[k].target != phases[k + 1].target
+        ]
         reach = [*range(over, down + 1)]
-        moves[name] = Move(name, way, reach, close, carry, last, retreat, clear)
+        moves[name] = Move(name, way, reach, close, carry, last, retreat, lifts)
     if not moves:
         anchor = str(phases[leads[0]].spec.anchor) if leads else ""
         targets = {(phase.spec.anchor or anchor, phase.spec.gripper) for phase in phases}
@@ -84,11 +83,6 @@ def find_moves(cfg: Config, phases: Sequence[Phase]) -> list[Move]:
         last = leads[-1]
         moves[anchor] = Move(anchor, "approach", leads, last, [last], last, last, [last])
     return list(moves.values())
-
-
-def _same(phase: Phase, later: Phase) -> bool:
-    """Whether two phases lead to the same point."""
-    return phase.target == later.target
 
 
 def _pushes(phase: Phase, later: Phase) -> bool:
