@@ -3,8 +3,8 @@
     python tools/expert_rates.py --nworld 32 sim=native                   # two cores
     python tools/expert_rates.py --nworld 4096 --out rates.csv sim=mjwarp # a GPU
 
-Tasks are those of mjstack, its examples and `mjstack new task`. A row has the worlds that succeeded,
-how many broke each rule, and seconds. Other arguments are overrides of the configuration.
+Tasks are those of mjstack, its examples and `mjstack new task`. A row has the worlds that
+succeeded, how many broke each rule, and seconds. Other arguments are overrides.
 """
 
 import argparse

@@ -126,8 +126,8 @@ def headings(env: EnvView) -> Tensor:
 
 @_in(unit="1")
 def tilts(env: EnvView) -> Tensor:
-    """How the objects that can move lean: x and y of the axis of each that is most upright, upwards,
-    shape ``(nworld, 2 * objects)``.
+    """How the objects that can move lean: x and y of the most upright axis of each, upwards, shape
+    ``(nworld, 2 * objects)``.
     """
     names = list(env.cfg.scene.free)
     if not names:
@@ -143,13 +143,6 @@ def held(env: EnvView) -> Tensor:
     """Whether all jaws press on each object that can move, 0 or 1, shape ``(nworld, objects)``."""
     parts = [(jaw_forces(env.index, env.sim, n) > LOADED).all(1) for n in env.cfg.scene.free]
     return torch.stack(parts, dim=1).to(env.sim.qpos) if parts else env.sim.qpos[:, :0]
-
-
-@_in()
-def fixtures(env: EnvView) -> Tensor:
-    """Positions of all joints of fixtures [rad, m], shape ``(nworld, joints)``."""
-    parts = [fixture_pos(env, joint=name)[:, None] for name in env.index.joints]
-    return torch.cat([env.sim.qpos[:, :0], *parts], dim=1)
 
 
 @_in(unit=("m/s",) * 3 + ("rad/s",) * 3)
