@@ -41,7 +41,7 @@ controller phases gate job task experiment
 CHOICES = _words("""
 so101 rebot builtin menagerie stack box reach fine default auto mjwarp native asset benchmark
 joint_delta ee_delta joint_absolute nominal jitter randomized starts_file open_loop
-closed_loop state_based baseline batch parity capacity success throughput asset_solver so100 Stack
+closed_loop baseline batch parity capacity success throughput asset_solver so100 Stack
 null [] [stack,box] '' stack.yaml ../stack /etc/passwd nope
 """)
 _PLAIN = _words("""

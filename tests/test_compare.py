@@ -23,7 +23,7 @@ from mjstack.math import mcnemar_p_value
 
 FULL = pytest.mark.full
 TINY = ("job=compare", "task=reach", "sim=native", "nworld=4", "gate.success.seeds=2")
-FAULTS = {"closed_loop": (0, 2), "state_based": (2, 3)}  # worlds in which the driver does nothing
+FAULTS = {True: (0, 2), False: (2, 3)}  # by the clock: worlds in which the driver does nothing
 
 
 @pytest.mark.parametrize(
@@ -69,13 +69,13 @@ def test_two_drivers_that_differ_in_known_worlds(tmp_path: Path, monkeypatch: Pa
     made = Stage.driver
 
     def driver(stage: Stage, env: Env) -> Driver:
-        return Faulty(made(stage, env), env, FAULTS[env.cfg.controller.name])
+        return Faulty(made(stage, env), env, FAULTS[env.cfg.controller.clock])
 
     shown = []
     replay = compare._replay
     monkeypatch.setattr(Stage, "driver", driver)
     monkeypatch.setattr(compare, "_replay", lambda *args: shown.extend(replay(*args)) or shown)
-    sides = ["controller=closed_loop", 'job.against=["controller=state_based"]']
+    sides = ["controller=closed_loop", 'job.against=["controller.clock=false"]']
     assert run([*TINY, *sides, f"hydra.run.dir={tmp_path}/out"]) == 0
     result = report(tmp_path / "out")["compare"]
     metrics = result["metrics"]
@@ -86,7 +86,7 @@ def test_two_drivers_that_differ_in_known_worlds(tmp_path: Path, monkeypatch: Pa
     assert metrics["a.success_rate"] == metrics["b.success_rate"] == 0.5
     assert metrics["a.success_rate_low95"] < 0.5 < metrics["a.success_rate_high95"]
     assert "no difference is shown" in result["reason"]
-    assert result["notes"]["b"] == "state_based, controller=state_based"
+    assert result["notes"]["b"] == "closed_loop, controller.clock=false"
     with (tmp_path / "out/compare.csv").open() as file:
         rows = [tuple(row.values()) for row in csv.DictReader(file)]
     assert rows == [

@@ -97,12 +97,16 @@ PATHS: dict[str, dict[str, str] | None] = {
     "drivers/policy.py": {"PolicyDriver": "command _query"},
     "drivers/feedback.py": {
         "CarryTilt": "desired_approach release_approach",
-        "FeedbackDriver": "_observe _aim _last_seen _measure _keep_finite",
+        "FeedbackDriver": (
+            "_observe _aim _last_seen _measure _jaw_turn _held_turn _nearest_turn _keep_finite"
+        ),
     },
-    "drivers/state_based.py": {
-        "StateBasedDriver": (
-            "command _decide _find_delivered _lead_point _tilted _turn_left _point _grasp_offsets"
-        )
+    "drivers/clockless.py": {
+        "ClocklessDriver": (
+            "command _decide _find_delivered _lead_point _tilted _turn_left _sag _points"
+            " _grasp_offsets"
+        ),
+        "": "_directions",
     },
     "train/rounds.py": {"MixedDriver": "command"},
     "policy/network.py": {"PolicyNetwork": "normalized forward"},

@@ -63,7 +63,7 @@ BAD: dict[tuple[str, ...], list[tuple[list[str], str]]] = {
         (["trainer=pixels"], "trainer=pixels: 'pixels' does not exist. Available: clone, dagger"),
     ],
     DAGGER: [
-        (["controller=closed_loop"], "Set trainer=clone, which learns from any expert"),
+        (["controller.clock=true"], "Set trainer=clone, which learns from any expert"),
         (["job.dataset=outputs"], "job.dataset=outputs: expected null"),
         (["job.rounds=-1"], "job.rounds=-1"),
         (["task=stack", "job.wider=1"], "Or set job.wider=0, in place of 1."),

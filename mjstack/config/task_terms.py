@@ -52,8 +52,8 @@ def complete_terms(cfg: DictConfig, overrides: Sequence[str]) -> None:
 
 
 def _observe_task(cfg: DictConfig, overrides: Sequence[str]) -> None:
-    """Let a new policy see the task's own observation, in place, where that is chosen, and by default
-    what the task has written beside the state. Overrides of the policy's terms come on top.
+    """Let a new policy see the task's own observation, in place, where that is chosen; by default
+    the state, and what the task writes beside it. Overrides of the policy's terms come on top.
     """
     choice = cfg.hydra.runtime.choices.get(_OBSERVED)
     if choice == "task":
@@ -61,7 +61,7 @@ def _observe_task(cfg: DictConfig, overrides: Sequence[str]) -> None:
     elif choice == "state" and not any(o.startswith(f"{_OBSERVED}=") for o in overrides):
         group = cfg.job.group
         terms = _terms(cfg, "job.observation", group)
-        known = [_content(term) for term in terms.values()]
+        known = [_content(term) for term in terms.values() if term]
         written = _written(cfg, "observation", group).items()
         terms |= {name: t for name, t in written if t and _content(t) not in known}
         cfg.job.observation[group].terms = terms
