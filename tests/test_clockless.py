@@ -10,6 +10,7 @@ from compositions import load_config
 from doc_blocks import ROOT, write_files
 from environments import GetStage
 
+import mjstack
 from mjstack import load_config as load_from
 from mjstack.cli import run
 from mjstack.config.schema import Config
@@ -196,3 +197,12 @@ def test_what_no_state_tells_is_refused(changes: list[str], why: str) -> None:
     cfg = load_config([f"controller.phases.{change}" for change in changes])
     with pytest.raises(ConfigError, match=f"because the phases of task stack {why}"):
         find(cfg)
+
+
+def test_failed_episodes_are_counted_by_the_phase_in_which_they_ended() -> None:
+    """The grasp point stays over the object, farther from it than this check wants."""
+    tight = ["task.check.distance=1e-6", "gate.success.rate=0.0", "gates=[success]"]
+    result = mjstack.verify([*EXPERT, "task=reach", "sim=native", "nworld=3", *tight])
+    (table,) = (t for t in result.gates["success"].tables if "phases" in t.title.lower())
+    assert table.header == ["rule", "down"]
+    assert table.rows == [["REACHED", "3"]]

@@ -103,7 +103,7 @@ PATHS: dict[str, dict[str, str] | None] = {
     },
     "drivers/clockless.py": {
         "ClocklessDriver": (
-            "command _decide _find_delivered _lead_point _tilted _turn_left _sag _points"
+            "command _decide _find_delivered _lead_point _ups _tilted _turn_left _sag _points"
             " _grasp_offsets"
         ),
         "": "_directions",

@@ -308,7 +308,6 @@ def test_terms_that_are_null(turned: Path) -> None:
     """A task's own one, or one that the policy is not to see."""
     cfg = composed(turned, "job=train", "observation.policy.terms.shoulder=null")
     assert "shoulder" not in cfg.job.observation["policy"].terms
-    assert "shoulder" not in cfg.job.observation["policy"].terms
     assert not [line for line in cfg.unused_terms if "does not see" in line]
     cfg = composed(turned, "job=train", "++job.observation.policy.terms.shoulder=null")
     assert "shoulder" not in cfg.job.observation["policy"].terms

@@ -137,6 +137,11 @@ class ClocklessDriver(FeedbackDriver):
 
         # How exactly an object goes: as its check asks where phases align
         self._exact = tensor(any(plan[k].spec.align for k in m.carry) for m in moves)
+        exact = {m.name for m, e in zip(moves, self._exact.tolist(), strict=True) if e}
+        # What arrives there is the foot of an object, however it leans.
+        self._feet = tensor(
+            thing.half_height * (name in exact) for name, thing in cfg.scene.objects.items()
+        )
         half = tensor(min(cfg.scene.objects[m.name].half[:2]) for m in moves)
         self._half = half * self._has_faces[self._moved]
         self._align = tensor(phase.spec.align for phase in plan)
@@ -170,6 +175,9 @@ class ClocklessDriver(FeedbackDriver):
     def command(self) -> Tensor:
         self._observe(self._always)
         state = self._measure()
+        ups = self._ups()
+        foot = self._feet[:, None] * torch.cat((ups[..., :2], torch.zeros_like(ups[..., :1])), 2)
+        state = state._replace(pos=state.pos - foot)
         points = self._points(state)
         due = self._decide(state, points)
         target, phase, turn = self._lead_point(state, points, due)
@@ -182,7 +190,7 @@ class ClocklessDriver(FeedbackDriver):
             start[:, column] = value
         if self._aligns:
             start[:, self._roll_column] += turn.clamp(-_ROLL, _ROLL)
-        approach = None if self._tilt is None else self._tilted(state, due, phase)
+        approach = None if self._tilt is None else self._tilted(state, due, phase, ups)
         if approach is not None:
             # From a gripper that points elsewhere, the shortest way may end at a joint's limit.
             flipped = (state.approach * approach).sum(1, keepdim=True) < _FLIPPED
@@ -361,7 +369,16 @@ class ClocklessDriver(FeedbackDriver):
         turn = torch.where(self._has_faces[due.object] & ~due.pushes, turn, locked)
         return torch.where(aligns, self._held_turn(state.q, phase, due.object), turn)
 
-    def _tilted(self, state: State, due: _Due, phase: Tensor) -> Tensor:
+    def _ups(self) -> Tensor:
+        """The most upright axis of every object, upwards, shape ``(nworld, objects, 3)``."""
+        names = self._cfg.scene.objects
+        quat = torch.stack([pose_w(self._env, name)[:, 3:] for name in names], dim=1)
+        axes = quat_to_matrix(quat.float())
+        number = axes[..., 2, :].abs().argmax(-1)[..., None, None]
+        up = axes.gather(-1, number.expand(*number.shape[:2], 3, 1))[..., 0]
+        return up * torch.sign(up[..., 2:])
+
+    def _tilted(self, state: State, due: _Due, phase: Tensor, ups: Tensor) -> Tensor:
         """Desired approach axis, shape ``(nworld, 3)``: as the object's goal needs it; with the
         object in the jaws, the one with which it is upright; beside one that was let go of, as it
         is.
@@ -372,13 +389,10 @@ class ClocklessDriver(FeedbackDriver):
         tilt = torch.where(stays[:, None], state.approach, tilt)
 
         # Turned in the arm's vertical plane, by as much as the object's most upright axis
-        env = self._env
-        quat = torch.stack([pose_w(env, name)[:, 3:] for name in self._cfg.scene.objects], dim=1)
-        axes = quat_to_matrix(quat.float()[self._worlds, due.object])
-        up = axes[self._worlds, :, axes[:, 2].abs().argmax(1)]
-        out = (state.point - env.sim.xpos[:, self._base].float())[:, :2]
+        up = ups[self._worlds, due.object]
+        out = (state.point - self._env.sim.xpos[:, self._base].float())[:, :2]
         x, y = (out / norm(out).clamp(min=1e-6)[:, None]).unbind(1)
-        sin = -(up[:, 0] * x + up[:, 1] * y) * torch.sign(up[:, 2])
+        sin = -(up[:, 0] * x + up[:, 1] * y)
         cos = (1.0 - sin.square()).clamp(min=0.0).sqrt()
         normal = torch.stack((-y, x, torch.zeros_like(x)), dim=1)
         upright = torch.linalg.cross(normal, state.approach) * sin[:, None]
@@ -402,7 +416,7 @@ class ClocklessDriver(FeedbackDriver):
             return torch.as_tensor(values, device=self.phase.device)
 
         self._base = int(model.jnt_bodyid[joints[0]])
-        self._links = tensor(model.jnt_bodyid[joints])
+        self._links = tensor(model.jnt_bodyid[joints]).long()
         self._axes = tensor(model.jnt_axis[joints]).float()
         self._anchors = tensor(model.jnt_pos[joints]).float()
         self._hinges = tensor(model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE)
