@@ -20,6 +20,8 @@ from mjstack.envs import Env
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ConfigError
 from mjstack.scene.phases import build_phases
+from mjstack.train.clone_network import input_noise
+from mjstack.train.trainer import with_observation
 
 EXPERT = ["controller=closed_loop", "controller.clock=false"]
 
@@ -206,3 +208,19 @@ def test_failed_episodes_are_counted_by_the_phase_in_which_they_ended() -> None:
     (table,) = (t for t in result.gates["success"].tables if "phases" in t.title.lower())
     assert table.header == ["rule", "down"]
     assert table.rows == [["REACHED", "3"]]
+
+
+def test_the_name_that_went_says_what_to_write(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["controller=state_based"]) == 2
+    assert "Write controller=closed_loop controller.clock=false" in capsys.readouterr().err
+
+
+def test_noise_is_less_where_the_check_asks_for_less(folder: Callable[[str], Path]) -> None:
+    """Of the peg's 1.5 mm, three tenths of what the stack has."""
+    widest = {}
+    for task in ("stack", "peg"):
+        choices = [f"task={task}", "job=train", "sim=native"]
+        stage = Stage(load_from(choices, config_dir=folder(task) if task == "peg" else None))
+        cfg = with_observation(stage.cfg)
+        widest[task] = input_noise(cfg, stage.model, {"joint_pos": 6}, torch.zeros(6))
+    torch.testing.assert_close(widest["peg"], 0.3 * widest["stack"])
