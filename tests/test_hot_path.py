@@ -97,14 +97,12 @@ PATHS: dict[str, dict[str, str] | None] = {
     "drivers/policy.py": {"PolicyDriver": "command _query"},
     "drivers/feedback.py": {
         "CarryTilt": "desired_approach release_approach",
-        "FeedbackDriver": (
-            "_observe _aim _last_seen _measure _jaw_turn _held_turn _nearest_turn _keep_finite"
-        ),
+        "FeedbackDriver": "_observe _aim _last_seen _measure _keep_finite",
     },
     "drivers/clockless.py": {
         "ClocklessDriver": (
-            "command _decide _find_delivered _lead_point _ups _tilted _turn_left _sag _points"
-            " _grasp_offsets"
+            "command _decide _find_delivered _lead_point _turn_left _jaw_turn _held_turn"
+            " _nearest_turn _ups _tilted _sag _points _grasp_offsets"
         ),
         "": "_directions",
     },

@@ -12,13 +12,14 @@ from typing_extensions import override
 from mjstack.config.schema import Config
 from mjstack.drivers.clockless import ClocklessDriver
 from mjstack.drivers.driver import Driver
-from mjstack.drivers.feedback import FeedbackDriver
+from mjstack.drivers.feedback import STAY, FeedbackDriver
 from mjstack.drivers.open_loop import OpenLoopPlanner, smoothstep
 from mjstack.envs import Env
 from mjstack.managers.view import EnvView, offers
-from mjstack.math import norm
+from mjstack.math import atan2, norm
 from mjstack.mdp.geometry import jaw_forces, objects_in_hand, robot
 
+_QUARTER = 0.5 * math.pi
 _ROLL_STEP = 0.05  # rad per step
 _ALIGN = 0.1  # share of a held object's turn that is left, per step
 _OFF = 0.03  # m: so far off the grasp point, a held object is made up for
@@ -60,6 +61,7 @@ class ClosedLoopDriver(FeedbackDriver):
         # Buffers
         self._time = torch.zeros_like(self.error)
         self._rate = torch.zeros_like(self.error)
+        self._roll = torch.zeros_like(self.error)
         # Whether the phase was entered to try a grasp once more, and whose has been tried again
         self._again = torch.zeros_like(self.error, dtype=torch.bool)
         self._tried = self._again[:, None].repeat(1, len(self._cfg.scene.objects))
@@ -86,7 +88,7 @@ class ClosedLoopDriver(FeedbackDriver):
         start[:, self._n_arm :] = torch.lerp(self._from[:, 3:], self._to[:, 3:], s)
         self._at.copy_(torch.cat((target, start[:, self._n_arm :]), dim=1))
         if self._aligns:
-            self._turn(start)
+            self._turn(start, fresh)
         approach = None
         if self._tilt is not None:
             there = self._aim(self._tilt.place[self.phase])
@@ -153,18 +155,40 @@ class ClosedLoopDriver(FeedbackDriver):
         self._tried |= retry[:, None] & (grasps[:, None] == self._numbers)
         return retry, rate
 
-    def _turn(self, command: Tensor) -> None:
-        """Roll the open jaws towards a face of the object that a phase observes, and what they hold
-        to a face of the anchor, by a little per step.
+    def _turn(self, command: Tensor, fresh: Tensor) -> None:
+        """Roll the open jaws towards a face of the object that a phase observes, by a little per
+        step.
+
+        A box has a face every quarter turn. A roll about the approach axis turns the closing
+        axis less in the horizontal plane than about the axis, the more the gripper is tilted.
         """
-        axes = self._ik.forward(command)[1:]
+        self._roll.masked_fill_(fresh, 0.0)
+        column = self._nominal[0, self._roll_column]
+        command[:, self._roll_column] = column + self._roll
+        _, closing, approach = self._ik.forward(command)
         yaw = self._last_seen(self._source, self.phase)[:, 2]
-        turn = self._jaw_turn(command, axes, yaw, self._observed[self.phase])
-        step = turn.clamp(-_ROLL_STEP, _ROLL_STEP) * self._turns_jaws[self.phase]
+        off = yaw - atan2(closing[:, 1], closing[:, 0])
+        oblong = self._oblong_anchor[self.phase]
+        # Two faces are in question; what has been turned so far counts for its own.
+        faces = torch.stack(_nearest_turns(off, oblong))
+        upright = (-approach[:, 2]).clamp(min=0.2)
+        rolls = self._roll + self._roll_sign * atan2(torch.sin(faces), torch.cos(faces) * upright)
+        cost = (rolls - STAY * self._roll).abs()
+        cost = cost + oblong * (self._beyond(rolls) + self._detour(rolls, self._roll))
+        goal = torch.where(cost[0] <= cost[1], rolls[0], rolls[1])
+        step = torch.where(oblong, 1.0, self._cfg.controller.yaw_alignment) * goal - self._roll
+        step = step.clamp(-_ROLL_STEP, _ROLL_STEP)
+        self._roll += step * self._turns_jaws[self.phase]
         if self._any_align:
-            turn = _ALIGN * self._held_turn(command, self.phase, self._carried[self.phase])
-            step += turn.clamp(-_ROLL_STEP, _ROLL_STEP) * self._turns_held[self.phase]
-        command[:, self._roll_column] += step
+            off = yaw - self._carried_pose()[:, 2]
+            turns = _nearest_turns(off, self._oblong[self._carried[self.phase]])
+            off, back = (self._roll_sign * turn for turn in turns)
+            # The farther one where the nearer one is out of range
+            cost = off.abs() + self._beyond(self._roll + off)
+            off = torch.where(cost <= back.abs() + self._beyond(self._roll + back), off, back)
+            off = (_ALIGN * off).clamp(-_ROLL_STEP, _ROLL_STEP)
+            self._roll += off * self._turns_held[self.phase]
+        command[:, self._roll_column] = column + self._roll
 
     def _carried_pose(self) -> Tensor:
         """x, y [m] and yaw [rad] of the carried object, shape ``(nworld, 3)``."""
@@ -188,7 +212,7 @@ class ClosedLoopDriver(FeedbackDriver):
         self._turns_jaws = column(
             s.observe and s.gripper == "open" and s.anchor in with_faces for s in specs
         )
-        self._observed = self._source.clamp(max=len(objects) - 1)  # a place is nothing to grasp
+        self._oblong_anchor = column(s.anchor in self._long for s in specs)
         self._observes = column(
             [s.observe and name in (s.anchor, s.toward) for name in objects] for s in specs
         )
@@ -203,6 +227,15 @@ class ClosedLoopDriver(FeedbackDriver):
         self._numbers = torch.arange(len(objects), device=self.phase.device)
         window = 0 if cfg.task.check is None else self._env.check.settle_steps
         self._rest = window + math.ceil(_REST / cfg.timing.step_dt)
+
+
+def _nearest_turns(off: Tensor, oblong: Tensor) -> tuple[Tensor, Tensor]:
+    """The nearest turn after which an angle [rad] is 0, and that to the other side: a box is alike
+    every quarter turn, an oblong one every half.
+    """
+    apart = torch.where(oblong, 2.0 * _QUARTER, _QUARTER)
+    nearest = off - apart * torch.round(off / apart)
+    return nearest, nearest - torch.copysign(apart, nearest)
 
 
 def _put(buffer: Tensor, mask: Tensor, values: Tensor) -> None:

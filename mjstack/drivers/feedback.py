@@ -24,11 +24,10 @@ from mjstack.scene.index import gripper_targets, turn_sign
 from mjstack.scene.phases import Phase, Target, build_phases, source_names
 
 _BEYOND = 10.0  # what a roll beyond the joint's range costs, per rad
-_UPRIGHT = 1e-3  # horizontal part of an approach axis that points straight down
 _BACK = 3.0  # rad: what a roll counts that leads back over the nominal one
 _SETTLING = 20  # solutions after which spare joints are where they stay
 _FARTHER = 6  # more iterations for an arm that somebody else has moved
-_STAY = 0.3  # how much a roll made so far weighs against the face that is nearer
+STAY = 0.3  # how much a roll made so far weighs against the face that is nearer
 
 
 class State(NamedTuple):
@@ -213,7 +212,6 @@ class FeedbackDriver(Driver):
         self._has_faces = self._tensor(thing.has_faces for thing in objects.values())
         self._aligns = c.yaw_alignment > 0.0 or bool(self._long and cfg.robot.roll_joint)
         self._roll_column, self._roll_sign = self._find_roll() if self._aligns else (0, 1.0)
-        self._quarters = 0.5 * math.pi * torch.arange(4, device=device)[:, None]
         rolls = robot(env).ctrl_range[self._roll_column].float()
         self._rolls = (rolls - self._nominal[0, self._roll_column]).unbind(0)
 
@@ -270,44 +268,14 @@ class FeedbackDriver(Driver):
             in_hand=objects_in_hand(env.index, env.sim),
         )
 
-    def _jaw_turn(self, q: Tensor, axes: Sequence[Tensor], yaw: Tensor, number: Tensor) -> Tensor:
-        """How far the jaws of an arm at ``q`` have to roll to the nearest face of an object [rad],
-        ``(nworld,)``, by closing and approach axis, the object's yaw and its number.
-        """
-        # The closing axis at a roll of zero: horizontal. The way from there to a face is the same
-        # at any roll. So the face that is chosen is still the nearer one after the next step.
-        closing, approach = axes
-        x, y, z = approach.unbind(1)
-        level = torch.where(torch.hypot(x, y) > _UPRIGHT, atan2(x, -y), 0.0)
-        axis = torch.stack((torch.cos(level), torch.sin(level), torch.zeros_like(z)), dim=1)
-        side = torch.linalg.cross(approach, axis)
-        now = atan2((closing * side).sum(1), (closing * axis).sum(1))
-        faces = (yaw - level) + self._quarters
-        turns = atan2(-torch.sin(faces), torch.cos(faces) * (-z).clamp(min=0.2)) - now
-        return self._nearest_turn(q, turns, number, self._cfg.controller.yaw_alignment)
-
-    def _held_turn(self, q: Tensor, phase: Tensor, number: Tensor) -> Tensor:
-        """How far the jaws have to roll until the object that they hold, of this number, lies along
-        a face of the phase's anchor [rad], ``(nworld,)``; 0 where it has no faces.
-        """
-        yaw = self._planar()[self._worlds, number, 2]
-        off = yaw - self._last_seen(self._source, phase)[:, 2]
-        return self._nearest_turn(q, off + self._quarters, number, 1.0) * self._has_faces[number]
-
-    def _nearest_turn(self, q: Tensor, turns: Tensor, number: Tensor, share: float) -> Tensor:
-        """The turn that leads to the nearer face within the joint's range, of four seen from below,
-        shape ``(4, nworld)``: an oblong object has two. So much of it as ``share`` says.
-        """
-        roll = q[:, self._roll_column] - self._nominal[0, self._roll_column]
-        oblong = self._oblong[number]
-        rolls = roll - self._roll_sign * atan2(torch.sin(turns), torch.cos(turns))
+    def _beyond(self, rolls: Tensor) -> Tensor:
+        """Cost of rolls beyond the joint's range, from the nominal one [rad]."""
         low, high = self._rolls
-        beyond = (low - rolls).clamp(min=0.0) + (rolls - high).clamp(min=0.0)
-        back = _BACK * (rolls * roll < -0.01)  # over the nominal one, lest it goes to and fro
-        cost = (rolls - _STAY * roll).abs() + _BEYOND * beyond + oblong * back
-        cost[1::2].masked_fill_(oblong, math.inf)
-        goal = rolls.gather(0, cost.argmin(0, keepdim=True))[0]
-        return torch.where(oblong, 1.0, share) * goal - roll
+        return _BEYOND * ((low - rolls).clamp(min=0.0) + (rolls - high).clamp(min=0.0))
+
+    def _detour(self, rolls: Tensor, roll: Tensor) -> Tensor:
+        """Cost of rolls that lead back over the nominal one, lest they go to and fro."""
+        return _BACK * (rolls * roll < -0.01)
 
     def _solve(
         self, start: Tensor, target: Tensor, phase: Tensor, approach: Tensor | None
