@@ -3,19 +3,19 @@ asked in any state that somebody else has brought about.
 """
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
-import mujoco
 import numpy as np
 import torch
 from torch import Tensor
 from typing_extensions import override
 
-from mjstack.drivers.feedback import STAY, FeedbackDriver, State, servo_lag
+from mjstack.drivers.feedback import State, servo_lag
 from mjstack.drivers.moves import find_moves
+from mjstack.drivers.sag import Sag
+from mjstack.drivers.turning import TurningDriver
 from mjstack.managers.view import EnvView
-from mjstack.math import atan2, norm, quat_to_matrix
+from mjstack.math import norm, quat_to_matrix
 from mjstack.mdp.geometry import pose_w, robot
 
 # How fast
@@ -27,7 +27,6 @@ _SLOWING = 0.5  # largest share of the distance that is left, in one step,
 _PUSH_SLOWING = 0.4  # and with an object before the jaws
 _JOINT = 0.25  # rad, m: largest lead of a joint
 _ROLL = 0.1  # rad: largest lead of the roll
-_UPRIGHT = 1e-3  # horizontal part of an approach axis that points straight down
 _FLIPPED = 0.3  # cosine of the angle between the approach axis and the desired one
 _GRIP = 0.3  # largest lead of the gripper, of its opening
 
@@ -74,7 +73,7 @@ class _Due(NamedTuple):
     beside: Tensor
 
 
-class ClocklessDriver(FeedbackDriver):
+class ClocklessDriver(TurningDriver):
     """Joint targets that are a function of the simulation's state: no clock, no memory.
 
     The objects that the phases move go to their goals one after the other, as far as
@@ -105,7 +104,7 @@ class ClocklessDriver(FeedbackDriver):
         """Allocate for the environment's worlds; arguments and errors as of `FeedbackDriver`. It is
         also an error if the task has no check, or as of `find_moves`.
         """
-        super().__init__(env, nominal, clock=False)
+        super().__init__(env, nominal)
         cfg = env.cfg
         plan = self._plan
         tensor = self._tensor
@@ -139,11 +138,6 @@ class ClocklessDriver(FeedbackDriver):
 
         # How exactly an object goes: as its check asks where phases align
         self._exact = tensor(any(plan[k].spec.align for k in m.carry) for m in moves)
-        exact = {m.name for m, e in zip(moves, self._exact.tolist(), strict=True) if e}
-        # What arrives there is the foot of an object, however it leans.
-        self._feet = tensor(
-            thing.half_height * (name in exact) for name, thing in cfg.scene.objects.items()
-        )
         half = tensor(min(cfg.scene.objects[m.name].half[:2]) for m in moves)
         self._half = half * self._has_faces[self._moved]
         self._align = tensor(phase.spec.align for phase in plan)
@@ -157,7 +151,6 @@ class ClocklessDriver(FeedbackDriver):
             for phase, target in self._aimed
         )
         self._off_center = tensor(_OFF_CENTER)
-        self._quarters = 0.5 * math.pi * torch.arange(4, device=env.device)[:, None]
         self._every = torch.arange(len(plan), device=env.device).expand(env.nworld, -1)
         self._order = torch.arange(1, longest + 1, device=env.device)
 
@@ -171,16 +164,13 @@ class ClocklessDriver(FeedbackDriver):
         # A servo that lags has to be led by more than it is to move in a step.
         lag = servo_lag(env.sim.model, actuators)
         self._lead = 1.0 / (1.0 - math.exp(-cfg.timing.step_dt / lag))
-        self._build_weights(env.sim.model, actuators)
+        self._sag = Sag(env)
         self._always = torch.ones_like(self._seen[:, : len(things), 0], dtype=torch.bool)
 
     @override
     def command(self) -> Tensor:
         self._observe(self._always)
         state = self._measure()
-        ups = self._ups()
-        foot = self._feet[:, None] * torch.cat((ups[..., :2], torch.zeros_like(ups[..., :1])), 2)
-        state = state._replace(pos=state.pos - foot)
         points = self._points(state)
         due = self._decide(state, points)
         target, phase, turn = self._lead_point(state, points, due)
@@ -193,7 +183,7 @@ class ClocklessDriver(FeedbackDriver):
             start[:, column] = value
         if self._aligns:
             start[:, self._roll_column] += turn.clamp(-_ROLL, _ROLL)
-        approach = None if self._tilt is None else self._tilted(state, due, phase, ups)
+        approach = None if self._tilt is None else self._tilted(state, due, phase)
         if approach is not None:
             # From a gripper that points elsewhere, the shortest way may end at a joint's limit.
             flipped = (state.approach * approach).sum(1, keepdim=True) < _FLIPPED
@@ -203,7 +193,7 @@ class ClocklessDriver(FeedbackDriver):
         change = self._solve(start, target, phase, approach)[0] - q
         largest = change.abs().amax(1, keepdim=True)
         command = q + change * (_JOINT / largest.clamp(min=1e-6)).clamp(max=1.0)
-        command[:, : self._n_arm] += self._sag()
+        command[:, : self._n_arm] += self._sag.bend()
 
         # The gripper
         now = q[:, self._n_arm :]
@@ -372,53 +362,7 @@ class ClocklessDriver(FeedbackDriver):
         turn = torch.where(self._has_faces[due.object] & ~due.pushes, turn, locked)
         return torch.where(aligns, self._held_turn(state.q, phase, due.object), turn)
 
-    def _jaw_turn(self, q: Tensor, axes: Sequence[Tensor], yaw: Tensor, number: Tensor) -> Tensor:
-        """How far the jaws of an arm at ``q`` have to roll to the nearest face of an object [rad],
-        ``(nworld,)``, by closing and approach axis, the object's yaw and its number.
-        """
-        # The closing axis at a roll of zero: horizontal. The way from there to a face is the same
-        # at any roll. So the face that is chosen is still the nearer one after the next step.
-        closing, approach = axes
-        x, y, z = approach.unbind(1)
-        level = torch.where(torch.hypot(x, y) > _UPRIGHT, atan2(x, -y), 0.0)
-        axis = torch.stack((torch.cos(level), torch.sin(level), torch.zeros_like(z)), dim=1)
-        side = torch.linalg.cross(approach, axis)
-        now = atan2((closing * side).sum(1), (closing * axis).sum(1))
-        faces = (yaw - level) + self._quarters
-        turns = atan2(-torch.sin(faces), torch.cos(faces) * (-z).clamp(min=0.2)) - now
-        return self._nearest_turn(q, turns, number, self._cfg.controller.yaw_alignment)
-
-    def _held_turn(self, q: Tensor, phase: Tensor, number: Tensor) -> Tensor:
-        """How far the jaws have to roll until the object that they hold, of this number, lies along
-        a face of the phase's anchor [rad], ``(nworld,)``; 0 where it has no faces.
-        """
-        yaw = self._planar()[self._worlds, number, 2]
-        off = yaw - self._last_seen(self._source, phase)[:, 2]
-        return self._nearest_turn(q, off + self._quarters, number, 1.0) * self._has_faces[number]
-
-    def _nearest_turn(self, q: Tensor, turns: Tensor, number: Tensor, share: float) -> Tensor:
-        """The turn that leads to the nearer face within the joint's range, of four seen from below,
-        shape ``(4, nworld)``: an oblong object has two. So much of it as ``share`` says.
-        """
-        roll = q[:, self._roll_column] - self._nominal[0, self._roll_column]
-        oblong = self._oblong[number]
-        rolls = roll - self._roll_sign * atan2(torch.sin(turns), torch.cos(turns))
-        cost = (rolls - STAY * roll).abs() + self._beyond(rolls)
-        cost += oblong * self._detour(rolls, roll)
-        cost[1::2].masked_fill_(oblong, math.inf)
-        goal = rolls.gather(0, cost.argmin(0, keepdim=True))[0]
-        return torch.where(oblong, 1.0, share) * goal - roll
-
-    def _ups(self) -> Tensor:
-        """The most upright axis of every object, upwards, shape ``(nworld, objects, 3)``."""
-        names = self._cfg.scene.objects
-        quat = torch.stack([pose_w(self._env, name)[:, 3:] for name in names], dim=1)
-        axes = quat_to_matrix(quat.float())
-        number = axes[..., 2, :].abs().argmax(-1)[..., None, None]
-        up = axes.gather(-1, number.expand(*number.shape[:2], 3, 1))[..., 0]
-        return up * torch.sign(up[..., 2:])
-
-    def _tilted(self, state: State, due: _Due, phase: Tensor, ups: Tensor) -> Tensor:
+    def _tilted(self, state: State, due: _Due, phase: Tensor) -> Tensor:
         """Desired approach axis, shape ``(nworld, 3)``: as the object's goal needs it; with the
         object in the jaws, the one with which it is upright; beside one that was let go of, as it
         is.
@@ -429,53 +373,18 @@ class ClocklessDriver(FeedbackDriver):
         tilt = torch.where(stays[:, None], state.approach, tilt)
 
         # Turned in the arm's vertical plane, by as much as the object's most upright axis
-        up = ups[self._worlds, due.object]
-        out = (state.point - self._env.sim.xpos[:, self._base].float())[:, :2]
+        names = self._cfg.scene.objects
+        quat = torch.stack([pose_w(self._env, name)[:, 3:] for name in names], dim=1)
+        axes = quat_to_matrix(quat.float()[self._worlds, due.object])
+        up = axes[self._worlds, :, axes[:, 2].abs().argmax(1)]
+        out = (state.point - self._env.sim.xpos[:, self._sag.base].float())[:, :2]
         x, y = (out / norm(out).clamp(min=1e-6)[:, None]).unbind(1)
-        sin = -(up[:, 0] * x + up[:, 1] * y)
+        sin = -(up[:, 0] * x + up[:, 1] * y) * torch.sign(up[:, 2])
         cos = (1.0 - sin.square()).clamp(min=0.0).sqrt()
         normal = torch.stack((-y, x, torch.zeros_like(x)), dim=1)
         upright = torch.linalg.cross(normal, state.approach) * sin[:, None]
         upright += state.approach * cos[:, None]
         return torch.where(due.led[:, None], upright, tilt)
-
-    def _build_weights(self, model: mujoco.MjModel, actuators: list[int]) -> None:
-        """Take from the model which weights bend which of the arm's servos, and how much."""
-        joints = model.actuator_trnid[actuators, 0]
-        bodies = np.arange(model.nbody)
-        carries = np.zeros((len(joints), model.nbody), dtype=bool)
-        above = bodies
-        while above.any():  # from each body up to the world
-            carries |= model.jnt_bodyid[joints][:, None] == above
-            above = model.body_parentid[above]
-        weight = model.body_mass * (1.0 - model.body_gravcomp) * abs(model.opt.gravity[2])
-        heavy = bodies[carries.any(0) & (weight > 0.0)]
-        bends = carries * weight / model.actuator_gainprm[actuators, :1]
-
-        def tensor(values: np.ndarray) -> Tensor:
-            return torch.as_tensor(values, device=self.phase.device)
-
-        self._base = int(model.jnt_bodyid[joints[0]])
-        self._links = tensor(model.jnt_bodyid[joints]).long()
-        self._axes = tensor(model.jnt_axis[joints]).float()
-        self._anchors = tensor(model.jnt_pos[joints]).float()
-        self._hinges = tensor(model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE)
-        self._heavy = tensor(heavy)
-        self._centers = tensor(model.body_ipos[heavy]).float()
-        self._bends = tensor(bends[:, heavy]).float()
-
-    def _sag(self) -> Tensor:
-        """How far the arm's servos give under its weight [rad, m], ``(nworld, n_arm)``."""
-        pos = self._env.sim.xpos.float()
-        turn = quat_to_matrix(self._env.sim.xquat.float())
-        links = turn[:, self._links]
-        axes = (links * self._axes[:, None]).sum(-1)
-        anchors = pos[:, self._links] + (links * self._anchors[:, None]).sum(-1)
-        centers = pos[:, self._heavy] + (turn[:, self._heavy] * self._centers[:, None]).sum(-1)
-        arms = centers[:, None] - anchors[:, :, None]
-        torque = axes[..., :1] * arms[..., 1] - axes[..., 1:2] * arms[..., 0]
-        force = torch.where(self._hinges[:, None], torque, axes[..., 2:])
-        return (force * self._bends).sum(-1)
 
     def _points(self, state: State) -> Tensor:
         """Target of every phase, from where its anchor is [m], shape ``(nworld, phases, 3)``."""
