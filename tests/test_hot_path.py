@@ -99,11 +99,11 @@ PATHS: dict[str, dict[str, str] | None] = {
         "CarryTilt": "desired_approach release_approach",
         "FeedbackDriver": "_observe _aim _last_seen _measure _keep_finite",
     },
-    "drivers/turning.py": {"TurningDriver": "_jaw_turn _held_turn _nearest_turn"},
+    "drivers/turning.py": {"TurningDriver": "_turn_left _jaw_turn _held_turn _nearest_turn"},
     "drivers/sag.py": {"Sag": "bend"},
     "drivers/clockless.py": {
         "ClocklessDriver": (
-            "command _decide _find_delivered _lead_point _turn_left _tilted _points _grasp_offsets"
+            "command _decide _find_delivered _lead_point _tilted _points _grasp_offsets"
         ),
         "": "_directions",
     },

@@ -3,7 +3,6 @@ asked in any state that somebody else has brought about.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -13,7 +12,7 @@ from typing_extensions import override
 from mjstack.drivers.feedback import State, servo_lag
 from mjstack.drivers.moves import find_moves
 from mjstack.drivers.sag import Sag
-from mjstack.drivers.turning import TurningDriver
+from mjstack.drivers.turning import Due, TurningDriver
 from mjstack.managers.view import EnvView
 from mjstack.math import norm, quat_to_matrix
 from mjstack.mdp.geometry import pose_w, robot
@@ -52,25 +51,6 @@ _LEFT = 0.08  # m: so near an object that was let go of, the gripper keeps its t
 _BESIDE = 0.015  # m: so near the way from beside an object to where they push it, jaws push it,
 _SHUT = 0.3  # if they are open by no more than this share of their opening
 _OFF_CENTER = (0.015, 0.015, 0.010)  # m: so far from the grasp point, an object is made up for
-
-
-class _Due(NamedTuple):
-    """The next thing to do in each world: the number of the move and of its object; from its centre
-    to the grasp point that moves it; whether the jaws push, and whether the object is grasped or
-    being pushed; whether it is led along with the grasp point; whether jaws close on it, let go of
-    it, and whether all is done; whether the gripper is beside an object that was let go of.
-    """
-
-    move: Tensor
-    object: Tensor
-    offset: Tensor
-    pushes: Tensor
-    grasped: Tensor
-    led: Tensor
-    closes: Tensor
-    opens: Tensor
-    over: Tensor
-    beside: Tensor
 
 
 class ClocklessDriver(TurningDriver):
@@ -201,7 +181,7 @@ class ClocklessDriver(TurningDriver):
         command[:, self._n_arm :] = now + grip
         return self._keep_finite(command)
 
-    def _decide(self, state: State, points: Tensor) -> _Due:
+    def _decide(self, state: State, points: Tensor) -> Due:
         """The next thing to do in every world."""
         # The first object that is not done
         pos = state.pos.index_select(1, self._moved)
@@ -225,7 +205,7 @@ class ClocklessDriver(TurningDriver):
         high = torch.where(self._exact[number], _ABOVE, _DEPTH + stuck)
         there = (norm(offset[:, :2]) <= near) & (offset[:, 2] >= -_DEPTH) & (offset[:, 2] <= high)
         opens = letting_go | foreign
-        return _Due(
+        return Due(
             number,
             thing,
             offsets[self._worlds, number],
@@ -265,7 +245,7 @@ class ClocklessDriver(TurningDriver):
         there = (across <= self._slack[self._place]) & (along <= _ABOVE)
         return (there | placed & ~grasped) & self._leaves, grasped, between
 
-    def _lead_point(self, state: State, points: Tensor, due: _Due) -> tuple[Tensor, Tensor, Tensor]:
+    def _lead_point(self, state: State, points: Tensor, due: Due) -> tuple[Tensor, Tensor, Tensor]:
         """Where the grasp point is led [m], ``(nworld, 3)``, the phase, and how far the jaws are to
         roll [rad], each ``(nworld,)``.
         """
@@ -348,21 +328,7 @@ class ClocklessDriver(TurningDriver):
         rolls = aligns[:, -1] | ~(due.led | due.closes | due.over) | due.pushes
         return target, phase, turn * rolls
 
-    def _turn_left(self, state: State, due: _Due, aligns: Tensor, phase: Tensor) -> Tensor:
-        """How far the open jaws have to roll to the nearer face of an object [rad], shape
-        ``(nworld,)``; where it has no faces or is pushed, to where they are locked. Where a phase
-        aligns, how far with the object in them.
-        """
-        if not self._aligns:
-            return torch.zeros_like(state.opening)
-        yaw = self._seen[self._worlds, due.object, 2]
-        axes = (state.closing, state.approach)
-        turn = self._jaw_turn(state.q, axes, yaw, due.object)
-        locked = self._nominal[0, self._roll_column] - state.q[:, self._roll_column]
-        turn = torch.where(self._has_faces[due.object] & ~due.pushes, turn, locked)
-        return torch.where(aligns, self._held_turn(state.q, phase, due.object), turn)
-
-    def _tilted(self, state: State, due: _Due, phase: Tensor) -> Tensor:
+    def _tilted(self, state: State, due: Due, phase: Tensor) -> Tensor:
         """Desired approach axis, shape ``(nworld, 3)``: as the object's goal needs it; with the
         object in the jaws, the one with which it is upright; beside one that was let go of, as it
         is.

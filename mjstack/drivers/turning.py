@@ -1,17 +1,37 @@
-"""How far jaws have to roll, to a face of an object or with one in them, from the state alone."""
+"""The next thing to do, and how far jaws have to roll for it, from the state alone."""
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from mjstack.drivers.feedback import STAY, FeedbackDriver
+from mjstack.drivers.feedback import STAY, FeedbackDriver, State
 from mjstack.managers.view import EnvView
 from mjstack.math import atan2
 
 _UPRIGHT = 1e-3  # horizontal part of an approach axis that points straight down
+
+
+class Due(NamedTuple):
+    """The next thing to do in each world: the number of the move and of its object; from its centre
+    to the grasp point that moves it; whether the jaws push, and whether the object is grasped or
+    being pushed; whether it is led along with the grasp point; whether jaws close on it, let go of
+    it, and whether all is done; whether the gripper is beside an object that was let go of.
+    """
+
+    move: Tensor
+    object: Tensor
+    offset: Tensor
+    pushes: Tensor
+    grasped: Tensor
+    led: Tensor
+    closes: Tensor
+    opens: Tensor
+    over: Tensor
+    beside: Tensor
 
 
 class TurningDriver(FeedbackDriver):
@@ -21,6 +41,20 @@ class TurningDriver(FeedbackDriver):
         """Allocate for the environment's worlds; arguments and errors as of `FeedbackDriver`."""
         super().__init__(env, nominal, clock=False)
         self._quarters = 0.5 * math.pi * torch.arange(4, device=env.device)[:, None]
+
+    def _turn_left(self, state: State, due: Due, aligns: Tensor, phase: Tensor) -> Tensor:
+        """How far the open jaws have to roll to the nearer face of an object [rad], shape
+        ``(nworld,)``; where it has no faces or is pushed, to where they are locked. Where a phase
+        aligns, how far with the object in them.
+        """
+        if not self._aligns:
+            return torch.zeros_like(state.opening)
+        yaw = self._seen[self._worlds, due.object, 2]
+        axes = (state.closing, state.approach)
+        turn = self._jaw_turn(state.q, axes, yaw, due.object)
+        locked = self._nominal[0, self._roll_column] - state.q[:, self._roll_column]
+        turn = torch.where(self._has_faces[due.object] & ~due.pushes, turn, locked)
+        return torch.where(aligns, self._held_turn(state.q, phase, due.object), turn)
 
     def _jaw_turn(self, q: Tensor, axes: Sequence[Tensor], yaw: Tensor, number: Tensor) -> Tensor:
         """How far the jaws of an arm at ``q`` have to roll to the nearest face of an object [rad],
