@@ -42,9 +42,9 @@ test-all: test test-rest test-long
 
 # Odd command lines, damaged folders and small files that stand for much, many more than test-rest tries.
 fuzz: $(READY_DEV)
-	$(BIN)/python tests/test_fuzz.py commands 0-999
-	$(BIN)/python tests/test_fuzz.py folders 0-499
-	$(BIN)/python tests/test_fuzz.py datasets 0-199
+	PYTHONPATH=tests/helpers $(BIN)/python tests/commands/test_fuzz.py commands 0-999
+	PYTHONPATH=tests/helpers $(BIN)/python tests/commands/test_fuzz.py folders 0-499
+	PYTHONPATH=tests/helpers $(BIN)/python tests/commands/test_fuzz.py datasets 0-199
 
 # In an environment of its own with LeRobot, which it makes: some 6 GB, and Python 3.12 or 3.13.
 test-lerobot:

@@ -84,7 +84,7 @@ def reference_markdown() -> str:
         text += [f"## {section or 'Top level'}", "", words.get(section, "") + choices, ""]
         text += ["| key | default | accepts | meaning |", "| --- | --- | --- | --- |"]
         for k in keys:
-            cells = (f"`{k.name}`", f"`{k.value}`" if k.value else "", k.accepts, k.words)
+            cells = (f"`{k.name}`", f"`{k.value}`" if k.value else "", k.accepts, k.meaning)
             text.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |")
         text.append("")
     return "\n".join(text)

@@ -96,8 +96,8 @@ def _dispatch(flags: Namespace, overrides: list[str]) -> int:
         elif command == "doctor":
             from mjstack.jobs.doctor import findings  # it loads Warp
 
-            for name, words in findings(overrides[1:]):
-                print(f"{name:<14} {words}", flush=True)
+            for name, text in findings(overrides[1:]):
+                print(f"{name:<14} {text}", flush=True)
         elif flags.help:
             _print_help(overrides)
         elif flags.hydra_help:
@@ -155,9 +155,9 @@ def _run_one(hydra: Any, overrides: list[str]) -> int:
     from mjstack.jobs import check_ranks
 
     with joined() as ranks:
-        cfg, checked = ranks.alike(lambda: _compose_one(overrides))
-        ranks.alike(lambda: _check_spreads(checked))
-        ranks.alike(lambda: check_ranks(checked.stage))
+        cfg, checked = ranks.on_all_ranks(lambda: _compose_one(overrides))
+        ranks.on_all_ranks(lambda: _check_spreads(checked))
+        ranks.on_all_ranks(lambda: check_ranks(checked.stage))
         return _run_checked(hydra, cfg, checked, overrides)
 
 
@@ -171,8 +171,8 @@ def _compose_one(overrides: list[str]) -> tuple[DictConfig, "CheckedJob"]:
 def _check_spreads(checked: "CheckedJob") -> None:
     if not checked.spreads:
         raise MjstackError(
-            "torchrun, devices: expected a job whose worlds ranks share: gates, train, collect, or"
-            " replay of world=failing. Run this job in one process."
+            "torchrun, devices: expected a job whose worlds ranks share: gates, train or collect."
+            " Run this job in one process."
         )
 
 

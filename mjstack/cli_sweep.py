@@ -21,7 +21,9 @@ def expand(master: DictConfig, overrides: Sequence[str]) -> list[list[str]]:
     params = OmegaConf.select(master, "hydra.sweeper.params") or {}
     texts = [*(f"{key}={value}" for key, value in params.items()), *own_overrides(overrides)]
     parsed = list(map(parse, texts))
-    if any(part.is_sweep_override() and not part.is_discrete_sweep() for part in parsed):
+    if any(
+        override.is_sweep_override() and not override.is_discrete_sweep() for override in parsed
+    ):
         raise MjstackError(f"{' '.join(overrides)}: expected a list of values.")
     (jobs,) = BasicSweeper.split_arguments(parsed, None)
     if not jobs:
@@ -59,18 +61,17 @@ def _launcher(master: DictConfig) -> str:
 @contextmanager
 def claim_sweep(master: DictConfig, jobs: Sequence[list[str]]) -> Iterator[Path]:
     """A sweep's folder, with the list of its jobs: a new one by the hour, or one in which the same
-    command goes on, with a queue also beside others.
+    command goes on.
     """
     from mjstack.jobs.sweep import SWEEP, Queueing, add_jobs, number_jobs
 
     folder = hydra_path(master, "sweep.dir")
-    queued = _launcher(master).endswith(".GpuLauncher")
-    if queued:
-        Queueing.of(master.hydra.launcher).slots()
+    if _launcher(master).endswith(".GpuLauncher"):
+        Queueing.from_launcher(master.hydra.launcher).gpus()
     hourly = "${now:" in OmegaConf.to_yaml(master.hydra.sweep)
     marker = "" if hourly else SWEEP
     key = "hydra.sweep.dir"
-    with claim_folder(folder, marker=marker, numbered=hourly, shared=queued, key=key) as claimed:
+    with claim_folder(folder, marker=marker, numbered=hourly, key=key) as claimed:
         master.hydra.sweep.dir = str(claimed)
         master.hydra.overrides.hydra.append(assign("hydra.sweep.dir", claimed))  # of its jobs
         add_jobs(claimed, number_jobs(claimed, jobs))

@@ -71,9 +71,9 @@ class Ranks:
         gradients = [p.grad for p in parameters if p.grad is not None]
         flat = torch.cat([gradient.flatten() for gradient in gradients])
         dist.all_reduce(flat)
-        parts = (flat / self.size).split([gradient.numel() for gradient in gradients])
-        for gradient, part in zip(gradients, parts, strict=True):
-            gradient.copy_(part.view_as(gradient))
+        means = (flat / self.size).split([gradient.numel() for gradient in gradients])
+        for gradient, mean in zip(gradients, means, strict=True):
+            gradient.copy_(mean.view_as(gradient))
 
     def gather(self, value: T) -> list[T]:
         """An object of every process, by rank; no tensor of it is on CUDA. A RankError says which
@@ -91,7 +91,7 @@ class Ranks:
             raise self._gone(error) from error
         return values
 
-    def alike(self, work: Callable[[], T]) -> T:
+    def on_all_ranks(self, work: Callable[[], T]) -> T:
         """The result of work that every rank does for itself, as `in_all`."""
         results: list[T] = []
         self.in_all(lambda: results.append(work()))
@@ -139,12 +139,12 @@ class Ranks:
         """Why other ranks have gone before their work was done, by rank, as far as it is known."""
         losses = {}
         for rank in range(self.size):
-            place = f"place/{rank}"
+            place_key = f"place/{rank}"
             ended = f"ended/{rank}"
             with suppress(Exception):  # there is no store, or the rank that has it may be gone
-                if rank == self.rank or not _store.check([place]):
+                if rank == self.rank or not _store.check([place_key]):
                     continue
-                host, pid = _store.get(place).decode().split()
+                host, pid = _store.get(place_key).decode().split()
                 # A rank that concludes says so before its process ends.
                 dead = host == socket.gethostname() and not _alive(int(pid))
                 who = f"rank {rank} of {self.size} ({host}"

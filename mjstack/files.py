@@ -170,7 +170,6 @@ def claim_folder(
     *,
     marker: str = "",
     numbered: bool = False,
-    shared: bool = False,
     key: str = _KEY,
 ) -> Iterator[Path]:
     """Make a run's folder, and keep other runs out of it until the block ends. If that fails before
@@ -181,7 +180,6 @@ def claim_folder(
         job: As of `check_unused`.
         marker: As of `check_unused`.
         numbered: Where the folder is there, make another: its name and ``-2``, ``-3``, ...
-        shared: Let in other runs that share it.
         key: As of `check_unused`.
 
     Yields:
@@ -204,14 +202,14 @@ def claim_folder(
                 if not numbered:
                     raise
             folder = folder.with_name(f"{name}-{number}")
-        handle = lock_folder(folder, shared=shared)
-        before = {*folder.iterdir()}
+        handle = lock_folder(folder)
+        existing = {*folder.iterdir()}
         check_unused(folder, job, marker=marker, key=key)
         yield folder
     except BaseException as error:
         if handle is not None:  # else it is another process's
             with suppress(OSError):  # something stays
-                new = {*folder.iterdir()} - before
+                new = {*folder.iterdir()} - existing
                 if all(path.name == ".hydra" or path.suffix == ".log" for path in new):  # Hydra's
                     for path in new:
                         (shutil.rmtree if path.name == ".hydra" else os.remove)(path)
@@ -242,13 +240,13 @@ def move_aside(folder: Path) -> Path:
     files, which may be open; an OSError if it cannot be made or a file cannot be moved.
     """
     for number in itertools.count(1):
-        aside = folder.with_name(f"{folder.name}-earlier-{number}")
+        moved_folder = folder.with_name(f"{folder.name}-earlier-{number}")
         with suppress(FileExistsError):
-            aside.mkdir()
+            moved_folder.mkdir()
             break
     for path in _run_files(folder):
-        path.rename(aside / path.name)
-    return aside
+        path.rename(moved_folder / path.name)
+    return moved_folder
 
 
 def check_unused(folder: Path, job: str = "", *, marker: str = "", key: str = _KEY) -> None:
@@ -297,30 +295,21 @@ def made_by(folder: Path) -> str:
     return ""
 
 
-def lock_folder(folder: Path, *, shared: bool = False) -> int:
-    """A descriptor that keeps other writers out until it is closed, also by the end of the process;
-    or, if it is shared, those that would have the folder alone. A FolderError if another writer
-    has it, an OSError if it cannot be opened.
+def lock_folder(folder: Path) -> int:
+    """A descriptor that keeps other writers out until it is closed, also by the end of the process.
+    A FolderError if another writer has it, an OSError if it cannot be opened. A file system without
+    locks keeps nobody out.
     """
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    if not lock(handle, shared=shared):
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
         os.close(handle)
         problem = f"{folder} is open in another writer, expected one at a time"
-        raise FolderError(problem, "Wait, or give another folder")
-    return handle
-
-
-def lock(handle: int, *, shared: bool = False) -> bool:
-    """Lock an open file or folder until it is closed, and return whether that could be done. A file
-    system without locks lets it.
-    """
-    try:
-        fcntl.flock(handle, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
+        raise FolderError(problem, "Wait, or give another folder") from error
     except OSError:
         pass
-    return True
+    return handle
 
 
 def to_csv(rows: Sequence[Mapping[str, object]], columns: Sequence[str] = ()) -> str:
@@ -328,8 +317,8 @@ def to_csv(rows: Sequence[Mapping[str, object]], columns: Sequence[str] = ()) ->
     first columns may be given; other keys of the rows follow, in order of appearance.
     """
     columns = list(dict.fromkeys([*columns, *(name for row in rows for name in row)]))
-    out = io.StringIO()
-    writer = csv.DictWriter(out, columns, lineterminator="\n")
+    text_buffer = io.StringIO()
+    writer = csv.DictWriter(text_buffer, columns, lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    return out.getvalue()
+    return text_buffer.getvalue()

@@ -26,15 +26,15 @@ def handle_interrupts() -> Iterator[None]:
     """
     global _running, _asked
     _running = _asked = False
-    before = {}
+    previous = {}
     for number in (signal.SIGINT, signal.SIGTERM):
         # The main thread alone may set handlers.
         if current_thread() is main_thread() and signal.getsignal(number) != signal.SIG_IGN:
-            before[number] = signal.signal(number, _handle)
+            previous[number] = signal.signal(number, _handle)
     try:
         yield
     finally:
-        for number, handler in before.items():
+        for number, handler in previous.items():
             atexit.register(signal.signal, number, signal.SIG_DFL)  # no traceback at the end
             signal.signal(number, handler)
 

@@ -104,20 +104,20 @@ def lowest_point(pos: Tensor, quat: Tensor, shape: str, size: Sequence[float]) -
     """World z of the lowest point [m], shape ``(...)``, of an object with shape and sizes [m] as of
     `ObjectCfg`, by its centre [m], shape ``(..., 3)``, and orientation, shape ``(..., 4)``.
     """
-    up = quat_z_row(quat)
+    vertical = quat_z_row(quat)
     if shape == "sphere":
         reach: Tensor | float = size[0]
     elif shape == "capsule":  # it lies along its x axis
-        reach = size[0] + size[1] * up[..., 0].abs()
+        reach = size[0] + size[1] * vertical[..., 0].abs()
     elif shape == "cylinder":
-        across = norm(up[..., :2])
-        reach = size[0] * across + size[1] * up[..., 2].abs()
+        horizontal = norm(vertical[..., :2])
+        reach = size[0] * horizontal + size[1] * vertical[..., 2].abs()
     elif shape == "hull":  # of points, their coordinates one after the other
-        reach = -(up[..., None, :] * constant(size, up).view(-1, 3)).sum(-1).amin(-1)
+        reach = -(vertical[..., None, :] * constant(size, vertical).view(-1, 3)).sum(-1).amin(-1)
     elif len(set(size)) == 1:  # a cube
-        reach = size[0] * up.abs().sum(-1)
+        reach = size[0] * vertical.abs().sum(-1)
     else:
-        x, y, z = up.abs().unbind(-1)
+        x, y, z = vertical.abs().unbind(-1)
         reach = size[0] * x + size[1] * y + size[2] * z
     return pos[..., 2] - reach
 
@@ -129,22 +129,22 @@ def describe_tensor(value: object) -> str:
     return f"a {value.dtype} tensor of shape {tuple(value.shape)} on {value.device}"
 
 
-def not_finite(*parts: Tensor) -> Tensor:
+def not_finite(*tensors: Tensor) -> Tensor:
     """Rows in which a number is NaN or infinite, shape ``(n,)``, bool, of one or more tensors of
     shape ``(n, d)``; each may have its own d.
     """
-    if all_finite(*parts):
-        return torch.zeros(len(parts[0]), dtype=torch.bool, device=parts[0].device)
+    if all_finite(*tensors):
+        return torch.zeros(len(tensors[0]), dtype=torch.bool, device=tensors[0].device)
     # 0 times what is not finite is NaN, which a sum keeps: fewer kernels than a test of each.
-    numbers = torch.cat(parts, dim=1) if len(parts) > 1 else parts[0]
+    numbers = torch.cat(tensors, dim=1) if len(tensors) > 1 else tensors[0]
     return (numbers * 0.0).sum(1) != 0.0
 
 
-def all_finite(*parts: Tensor) -> bool:
+def all_finite(*tensors: Tensor) -> bool:
     """Whether a short look at tensors on the CPU shows that every number is finite: a finite sum
     has finite summands only.
     """
-    return not parts[0].is_cuda and all(math.isfinite(part.sum().item()) for part in parts)
+    return not tensors[0].is_cuda and all(math.isfinite(tensor.sum().item()) for tensor in tensors)
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
@@ -164,16 +164,3 @@ def rate_interval(name: str, successes: int, trials: int) -> dict[str, float]:
     """A success rate and its 95 % interval: ``NAME``, ``NAME_low95`` and ``NAME_high95``."""
     low, high = wilson_interval(successes, trials)
     return {name: successes / trials, f"{name}_low95": low, f"{name}_high95": high}
-
-
-def mcnemar_p_value(only_a: int, only_b: int) -> float:
-    """Two-sided p-value of McNemar's exact test, by the pairs that either side alone won: how
-    probable it is that they are split so unevenly or more, if it wins each with probability 1/2.
-    """
-    pairs = only_a + only_b
-    ways = 1  # binomial coefficient of the pairs; integers are exact
-    tail = 1
-    for won in range(min(only_a, only_b)):
-        ways = ways * (pairs - won) // (won + 1)
-        tail += ways
-    return min(1.0, 2 * tail / 2**pairs)

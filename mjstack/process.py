@@ -47,12 +47,10 @@ class Child(subprocess.Popen[bytes]):
         log: IO[bytes],
         *,
         env: Mapping[str, str] | None = None,
-        cores: Collection[int] = (),
         folder: Path | None = None,
     ) -> None:
         """Start it with the command's arguments; the log gets its output. Environment variables add
-        to those of this process, it may use some cores, or all if there are none, and by default
-        works in the folder of this process.
+        to those of this process, and by default it works in the folder of this process.
         """
         self._began = time.monotonic()
         super().__init__(
@@ -64,9 +62,6 @@ class Child(subprocess.Popen[bytes]):
             env=os.environ | dict(env or {}),
             start_new_session=True,  # Ctrl-C of the terminal comes through this process
         )
-        if cores:
-            with suppress(OSError):  # it may have ended
-                os.sched_setaffinity(self.pid, cores)
 
     @property
     def seconds(self) -> float:

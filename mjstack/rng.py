@@ -35,20 +35,20 @@ def philox(counter: np.ndarray, key: tuple[int, int]) -> np.ndarray:
     """
     # Words 0 and 2 are multiplied, words 1 and 3 are mixed in: both pairs go through each round
     # together. Mixed in is the lower half of the other pair's product, read where it lies.
-    words = np.empty_like(counter)
+    bits = np.empty_like(counter)
     multiplied = counter[::2].copy()
     mixed = counter[1::2]
     products = np.empty((2, *mixed.shape), dtype=np.uint64)
     lower, upper = (products.view(np.uint32)[:, ::-1, half::2] for half in (0, 1))
     for number, round_key in enumerate(_round_keys(key)):
-        now = number % 2
-        np.multiply(multiplied, _MULTIPLIERS, out=products[now])
-        np.bitwise_xor(upper[now], mixed, out=multiplied)
+        parity = number % 2
+        np.multiply(multiplied, _MULTIPLIERS, out=products[parity])
+        np.bitwise_xor(upper[parity], mixed, out=multiplied)
         multiplied ^= round_key
-        mixed = lower[now]
-    words[::2] = multiplied
-    words[1::2] = mixed
-    return words
+        mixed = lower[parity]
+    bits[::2] = multiplied
+    bits[1::2] = mixed
+    return bits
 
 
 def uniform(
@@ -66,17 +66,17 @@ def uniform(
     """
     blocks = -(-size // 4)
     counter = np.zeros((4, world.shape[0], blocks), dtype=np.uint32)
-    for word, numbers in zip(counter, (world, episode, step), strict=False):
+    for row, numbers in zip(counter, (world, episode, step), strict=False):
         if numbers is not None:
-            word[:] = numbers.cpu().numpy()[:, None]  # modulo 2^32
+            row[:] = numbers.cpu().numpy()[:, None]  # modulo 2^32
     counter[3] = np.arange(blocks)
-    words = philox(counter.reshape(4, -1), (seed & _MASK, stream & _MASK))
+    bits = philox(counter.reshape(4, -1), (seed & _MASK, stream & _MASK))
     # 24 bits fill a float32 mantissa exactly, so that no rounding can reach 1.
-    words >>= np.uint32(8)
-    out = words.reshape(counter.shape).transpose(1, 2, 0).astype(np.float32, order="C")
-    out *= np.float32(2.0 / (1 << 24))
-    out -= np.float32(1.0)
-    return torch.from_numpy(out.reshape(-1, 4 * blocks)[:, :size]).to(world.device)
+    bits >>= np.uint32(8)
+    samples = bits.reshape(counter.shape).transpose(1, 2, 0).astype(np.float32, order="C")
+    samples *= np.float32(2.0 / (1 << 24))
+    samples -= np.float32(1.0)
+    return torch.from_numpy(samples.reshape(-1, 4 * blocks)[:, :size]).to(world.device)
 
 
 def check_seed(seed: SupportsIndex, *, masked: bool = False) -> int:

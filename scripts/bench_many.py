@@ -19,10 +19,11 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+from matplotlib.figure import Figure  # noqa: E402
+
 from mjstack.files import to_csv, write_atomic  # noqa: E402
 from mjstack.process import Child, stop_all  # noqa: E402
 from mjstack.report.formats import to_markdown  # noqa: E402
-from mjstack.report.picture import figure  # noqa: E402
 from mjstack.report.sections import Part, Section  # noqa: E402
 from mjstack.report.table import Console, Table  # noqa: E402
 
@@ -149,13 +150,15 @@ def write(folder: Path, runs: list[Run]) -> None:
 
     def draw(path: Path) -> None:
         names = [f"{r['what']} {r['worlds']:,}, {r['figure']}, {r['gpus']} GPUs" for r in rows]
-        with figure(path, title, figsize=(9, 1.2 + 0.3 * len(rows))) as (_, axes):
-            axes.barh(range(len(rows)), [row["ratio"] / row["gpus"] for row in rows])
-            axes.set_yticks(range(len(rows)), names)
-            axes.invert_yaxis()
-            axes.axvline(1.0, color="0.3", linewidth=1.0)
-            axes.set(xlabel="ratio over the number of GPUs (1: perfect)")
-            axes.grid(alpha=0.3, axis="x")
+        picture = Figure((9, 1.2 + 0.3 * len(rows)), layout="constrained")
+        axes = picture.subplots()
+        axes.barh(range(len(rows)), [row["ratio"] / row["gpus"] for row in rows])
+        axes.set_yticks(range(len(rows)), names)
+        axes.invert_yaxis()
+        axes.axvline(1.0, color="0.3", linewidth=1.0)
+        axes.set(xlabel="ratio over the number of GPUs (1: perfect)", title=title)
+        axes.grid(alpha=0.3, axis="x")
+        picture.savefig(path, dpi=100)
 
     picture = folder / "many.png"
     if rows:

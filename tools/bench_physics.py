@@ -37,7 +37,7 @@ def measure(args: argparse.Namespace, cfg: Config, advance: Advance) -> Iterator
     """Time each plan of the step, in the task and under random joint targets."""
     stage = Stage(cfg, progress=Progress(advance=advance))
     for random in (False, True):
-        times = _measure_plans(stage, args.steps, args.repetitions, random)
+        times = measure_plans(stage, args.steps, args.repetitions, random)
         targets = "random actions" if random else f"from {cfg.gate.throughput.from_phase}"
         yield Table(
             title=f"a captured step: {cfg.robot.title}, {cfg.nworld:,} worlds, {targets}",
@@ -49,10 +49,12 @@ def measure(args: argparse.Namespace, cfg: Config, advance: Advance) -> Iterator
         )
 
 
-def _measure_plans(
-    stage: Stage, steps: int, repetitions: int, random: bool
+def measure_plans(
+    stage: Stage, steps: int, repetitions: int, random: bool, *, only_planned: bool = False
 ) -> dict[str, list[float]]:
-    """Milliseconds per batched physics step, one number per repetition, by the step's name."""
+    """Milliseconds per batched physics step, one number per repetition, by the step's name;
+    ``only_planned`` leaves out all but the planned and the bare one.
+    """
     cfg = stage.cfg
     decimation = cfg.timing.decimation
     sizes = resolve_sizes(cfg, driven=False) if random else None
@@ -62,6 +64,8 @@ def _measure_plans(
     plans = {"stock": StepPlan(), sim.plan.name: sim.plan}
     if sim.plan.name == "fused":
         plans = {"stock": StepPlan(), "arranged": StepPlan("arranged"), "fused": sim.plan}
+    if only_planned:
+        plans = {sim.plan.name: sim.plan}
     state, targets = (_random_targets if random else _task_targets)(stage, sim, steps)
     columns = torch.as_tensor(stage.index.ctrl, device=sim.device)
     bare = bare_step(sim)

@@ -51,18 +51,8 @@ Numbers = dict[str, np.ndarray]
 
 def measure(args: argparse.Namespace, cfg: Config, advance: Advance) -> Iterator[Table]:
     """Record states, solve each with both solvers and with native MuJoCo, and report."""
-    stage = Stage(cfg, progress=Progress(advance=advance))
-    device = resolve_device(cfg.sim.device)
-    sim = stage.simulation(
-        cfg.nworld, Backend.mjwarp, device, sizes=resolve_sizes(cfg, driven=False)
-    )
-    assert isinstance(sim, MjwarpSimulation)
+    sim, samples, native = record(args, cfg, advance)
     pipeline = Pipeline(sim)
-    samples = record_states(stage, sim, args.states)
-    model = copy.copy(stage.model)
-    for name, value in _REFERENCE.items():
-        setattr(model.opt, name, value)
-    native = NativeSimulation(model, sim.nworld, fields=tuple(sim.fields))
     parts = []
     for number, sample in enumerate(samples):
         parts.append(compare(pipeline, native, sample))
@@ -72,6 +62,23 @@ def measure(args: argparse.Namespace, cfg: Config, advance: Advance) -> Iterator
     numbers = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     title = f"solvers: {cfg.task.name}, {cfg.robot.title}, {cfg.nworld:,} worlds"
     yield report(numbers, title)
+
+
+def record(
+    args: argparse.Namespace, cfg: Config, advance: Advance
+) -> tuple[MjwarpSimulation, list[Sample], NativeSimulation]:
+    """MJWarp's worlds, states that they recorded, and native worlds whose solver converges."""
+    stage = Stage(cfg, progress=Progress(advance=advance))
+    device = resolve_device(cfg.sim.device)
+    sim = stage.simulation(
+        cfg.nworld, Backend.mjwarp, device, sizes=resolve_sizes(cfg, driven=False)
+    )
+    assert isinstance(sim, MjwarpSimulation)
+    samples = record_states(stage, sim, args.states)
+    model = copy.copy(stage.model)
+    for name, value in _REFERENCE.items():
+        setattr(model.opt, name, value)
+    return sim, samples, NativeSimulation(model, sim.nworld, fields=tuple(sim.fields))
 
 
 def compare(pipeline: Pipeline, native: NativeSimulation, sample: Sample) -> Numbers:

@@ -19,5 +19,5 @@ if ! test -e "$venv/.installed"; then
 fi
 PATH="$PWD/$venv/bin:$PATH"
 export PATH HF_HUB_OFFLINE=1 HF_HOME="$PWD/build/lerobot/hf" MPLBACKEND=agg
-python -m pytest -q tests/test_lerobot.py
+python -m pytest -q tests/drivers/test_lerobot.py
 exec python tools/check_lerobot.py "$@"

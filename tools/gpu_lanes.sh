@@ -23,6 +23,7 @@ declare -A lanes=(
   [pixels_rebot]="$pixels $(sizes 96) robot=rebot"
   [pixels_looks]="$pixels $(sizes 96) looks=randomized job.rounds=15"
   [pixels_held]="$pixels $(sizes 96) looks=randomized $(held) job.rounds=15"
+  [real_arm]="$pixels $(sizes 96) experiment=[pixels,real_arm,real_arm_student] job.rounds=9 job.episodes=6144"
   [pixels_wrist]="$pixels cameras=wrist scene.cameras.wrist.size=[96,96]"
   [pixels_front]="$pixels cameras=front scene.cameras.front.size=[96,96]"
 )

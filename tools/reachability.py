@@ -9,19 +9,21 @@ half-widths, reached at every level with the margin all round, of objects of any
 """
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 import torch
 from common import make_parser, run
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
 from mjstack.config.schema import Config
 from mjstack.envs.buffers import Advance
 from mjstack.errors import ConfigError
 from mjstack.kinematics.batched_ik import BatchedIk, find_reach
-from mjstack.report.picture import figure, outline
 from mjstack.report.table import Table
 from mjstack.scene import build_model
 from mjstack.scene.phases import object_targets
@@ -99,22 +101,31 @@ def save_map(
         " squares: objects; solid: configured region; dotted: largest with margin"
     )
     size = ((3.6 * max(0.6, half[0] / half[1]) + 1.0) * len(tilts) + 1.2, 5.6)
-    with figure(path, title, len(tilts), figsize=size) as (drawing, panels):
-        top = np.nanmax(list(tilts.values()), initial=1.0)
-        for panel, (label, tilt) in zip(panels, tilts.items(), strict=True):
-            panel.set(title=label, xlabel="x [m]", ylabel="y [m]", aspect="equal", facecolor="0.92")
-            middle = (x[len(x) // 2], y[len(y) // 2])
-            panel.add_patch(outline(middle, half, hatch="////", ec="0.6", lw=0))
-            colors = tilt.reshape(len(y), len(x))
-            image = panel.pcolormesh(x, y, colors, vmin=0.0, vmax=top, shading="nearest")
-            panel.add_patch(outline(scene.table_center, scene.table_half, ec="k", lw=1.5))
-            for name, region in largest.items():
-                color = scene.objects[name].color
-                place = scene.objects[name].xy
-                panel.plot(*place, "s", color=color, markersize=7, markeredgecolor="w")
-                panel.add_patch(outline(place, scene.random_xy, ec=color, lw=1.8))
-                panel.add_patch(outline(place, region, ec=color, lw=1.2, ls=":"))
-        drawing.colorbar(image, ax=panels, label="smallest tilt of the gripper from vertical [deg]")
+    drawing = Figure(size, layout="constrained")
+    panels = drawing.subplots(1, len(tilts), squeeze=False)[0]
+    top = np.nanmax(list(tilts.values()), initial=1.0)
+    for panel, (label, tilt) in zip(panels, tilts.items(), strict=True):
+        panel.set(title=label, xlabel="x [m]", ylabel="y [m]", aspect="equal", facecolor="0.92")
+        middle = (x[len(x) // 2], y[len(y) // 2])
+        panel.add_patch(outline(middle, half, hatch="////", ec="0.6", lw=0))
+        colors = tilt.reshape(len(y), len(x))
+        image = panel.pcolormesh(x, y, colors, vmin=0.0, vmax=top, shading="nearest")
+        panel.add_patch(outline(scene.table_center, scene.table_half, ec="k", lw=1.5))
+        for name, region in largest.items():
+            color = scene.objects[name].color
+            place = scene.objects[name].xy
+            panel.plot(*place, "s", color=color, markersize=7, markeredgecolor="w")
+            panel.add_patch(outline(place, scene.random_xy, ec=color, lw=1.8))
+            panel.add_patch(outline(place, region, ec=color, lw=1.2, ls=":"))
+    drawing.colorbar(image, ax=panels, label="smallest tilt of the gripper from vertical [deg]")
+    drawing.suptitle(title, wrap=True)
+    drawing.savefig(path, dpi=100)
+
+
+def outline(center: Sequence[float], half: Sequence[float], **style: Any) -> Rectangle:
+    """A rectangle around a point, of which the border is drawn."""
+    corner = (center[0] - half[0], center[1] - half[1])
+    return Rectangle(corner, 2.0 * half[0], 2.0 * half[1], fill=False, **style)
 
 
 def draw_map(args: argparse.Namespace, cfg: Config, advance: Advance) -> Iterator[Table]:

@@ -35,7 +35,7 @@ class GpuLauncher(Launcher):
         folder = hydra_path(self._config, "sweep.dir")
         jobs = number_jobs(folder, job_overrides, initial_job_idx)
         finish = partial(update_summary, folder)
-        reports = run_jobs(folder, jobs, Queueing.of(self._queueing), finish)
+        reports = run_jobs(folder, jobs, Queueing.from_launcher(self._queueing), finish)
         return [
             JobReturn(overrides=job.overrides, status=JobStatus.COMPLETED, _return_value=report)
             for job, report in zip(jobs, reports, strict=True)

@@ -17,7 +17,6 @@ from mjstack.envs import Env, build_env
 from mjstack.errors import ArgumentError, ConfigError, MissingExtra, require_names
 from mjstack.files import CONFIG_FOLDER
 from mjstack.managers import offers
-from mjstack.report.picture import Window, opens_windows
 from mjstack.rng import check_seed
 from mjstack.scene import build_model
 from mjstack.sim import StateRenderer
@@ -35,7 +34,7 @@ except ImportError as error:
 __all__ = ["GymnasiumEnv", "GymnasiumVectorEnv", "make", "register_env"]
 Observation = ndarray | dict[str, ndarray]
 Info = dict[str, Any]
-_MODES = ("rgb_array", "human")  # of rendering
+_MODES = ["rgb_array"]  # of rendering
 _MAKER = "mjstack.adapters.gymnasium:make"
 
 
@@ -56,7 +55,7 @@ class GymnasiumVectorEnv(VectorEnv):
     ``gymnasium.wrappers.vector.ClipAction`` clips them.
 
     With ``render_mode="rgb_array"`` `render` returns a tuple with an image of each world by the
-    first camera; ``human`` shows the first world in MuJoCo's viewer.
+    first camera.
 
     Attributes:
         inner: The environment.
@@ -74,12 +73,12 @@ class GymnasiumVectorEnv(VectorEnv):
         cameras: Mapping[str, CameraCfg] | None = None,
     ) -> None:
         """Take over an environment, and close it when it is closed. The group and the render mode,
-        ``rgb_array``, ``human`` or None, are as of the class; ``cameras`` are those to render by,
-        if not those of its configuration.
+        ``rgb_array`` or None, are as of the class; ``cameras`` are those to render by, if not those
+        of its configuration.
 
         Raises:
-            MjstackError: This machine has no display, the scene no camera, the environment no such
-                group, or, with images, a camera does not draw the ends of episodes.
+            MjstackError: The scene has no camera, the environment no such group, or, with images,
+                a camera does not draw the ends of episodes.
         """
         self.inner = env
         self.group = group
@@ -87,19 +86,15 @@ class GymnasiumVectorEnv(VectorEnv):
         self.render_mode = render_mode
         self._film = [*(cameras or env.cfg.scene.cameras).items()][:1]
         self._renderer: StateRenderer | None = None
-        self._window: Window | None = None
         self.seen: tuple[torch.Tensor, Info] | None = None
         if render_mode == "rgb_array" and not self._film:
             fix = "Build the environment with cameras=front"
             raise ArgumentError("render_mode", repr(render_mode), "a scene with a camera", fix)
-        modes = _MODES[not self._film : 1 + opens_windows()]
-        if render_mode not in (None, *modes):
-            display = os.environ.get("DISPLAY", "not set")
-            expected = f"None, or one of {', '.join(modes)} on this display (DISPLAY={display})"
-            raise ArgumentError("render_mode", repr(render_mode), expected)
+        if render_mode not in (None, *_MODES):
+            raise ArgumentError("render_mode", repr(render_mode), "None or rgb_array")
         self.metadata = {
             "autoreset_mode": AutoresetMode.SAME_STEP,
-            "render_modes": modes,
+            "render_modes": _MODES if self._film else [],
             "render_fps": round(1.0 / env.cfg.timing.decision_dt),
         }
         boxes: dict[str, spaces.Space] = {
@@ -147,7 +142,6 @@ class GymnasiumVectorEnv(VectorEnv):
             seed = check_seed(seed, masked=mask is not None)
         obs, _ = self.inner.reset(seed=seed, mask=mask)
         super().reset(seed=seed)
-        self._show()
         return _numpy(obs, self.group), {}
 
     def step(self, actions: ndarray) -> tuple[Observation, ndarray, ndarray, ndarray, Info]:
@@ -174,21 +168,16 @@ class GymnasiumVectorEnv(VectorEnv):
                 info = {"success": bool(success[world])}
                 last = {"final_obs": _row(final, world), "final_info": info}
                 infos = self._add_info(infos, last, world)
-        rewards, ends, cuts = (part.cpu().numpy() for part in (reward, terminated, truncated))
-        self._show()
+        rewards, ends, cuts = (tensor.cpu().numpy() for tensor in (reward, terminated, truncated))
         return _numpy(obs, self.group), rewards, ends, cuts, infos
 
-    def render(self) -> tuple[ndarray, ...] | None:
-        """Images of all worlds, or None; see the class."""
+    def render(self) -> tuple[ndarray, ...]:
+        """Images of all worlds; see the class."""
         env = self.inner
         qpos, fields = self.seen or (env.sim.qpos, env.sim.fields)
         if self.render_mode is None:
             fix = "Give it to gymnasium.make"
-            raise ArgumentError("render_mode", None, f"one of {', '.join(_MODES)}", fix)
-        if self.render_mode == "human":
-            self._window = self._window or Window(env.sim.model, env.cfg.timing.decision_dt)
-            self._window.show(qpos[0].cpu().numpy())
-            return None
+            raise ArgumentError("render_mode", None, "rgb_array", fix)
         if self._renderer is None:
             cameras = with_outputs(dict(self._film), ["rgb"])
             cfg = replace(env.cfg, scene=replace(env.cfg.scene, cameras=cameras))
@@ -196,13 +185,9 @@ class GymnasiumVectorEnv(VectorEnv):
         (images,) = self._renderer.draw(qpos, fields).values()
         return tuple(images.to("cpu", copy=True).numpy())
 
-    def _show(self) -> None:
-        if self.render_mode == "human":
-            self.render()
-
     def close_extras(self, **kwargs: Any) -> None:
-        """Give the simulation's threads and buffers back, and close the viewer."""
-        for opened in (self._renderer, self._window, self.inner):
+        """Give the simulation's threads and buffers back."""
+        for opened in (self._renderer, self.inner):
             if opened is not None:
                 opened.close()
 
@@ -212,8 +197,8 @@ class GymnasiumEnv(gymnasium.Env):
 
     An episode ends when ``step`` says so; then call ``reset``. ``info`` has ``success``, bool.
 
-    `render` is that of `GymnasiumVectorEnv`, of one world: an image, or the viewer. After the step
-    that ends an episode it shows the state before that step.
+    `render` is that of `GymnasiumVectorEnv`, of one world. After the step that ends an episode it
+    shows the state before that step.
 
     Attributes:
         inner: The environment.
@@ -265,28 +250,27 @@ class GymnasiumEnv(gymnasium.Env):
             raise ArgumentError("env", value, "reset() first", "Call env.reset()")
         actions = _array(action, self.action_space)[None]
         sim = self.inner.sim
-        before = sim.qpos.clone(), {name: field.clone() for name, field in sim.fields.items()}
+        last_state = sim.qpos.clone(), {name: field.clone() for name, field in sim.fields.items()}
         self._worlds.seen = None
         obs, reward, terminated, truncated, infos = self._worlds.step(actions)
         seen = _row(obs, 0)
         if "final_obs" in infos:
             self._first = obs
             seen = infos["final_obs"][0]
-            self._worlds.seen = before
+            self._worlds.seen = last_state
         info = {"success": bool(infos["success"])}
         return seen, float(reward[0]), bool(terminated), bool(truncated), info
 
-    def render(self) -> ndarray | None:
-        """An image ``(height, width, 3)``, uint8, or None; see the class."""
-        images = self._worlds.render()
-        return images[0] if images else None
+    def render(self) -> ndarray:
+        """An image ``(height, width, 3)``, uint8."""
+        return self._worlds.render()[0]
 
     def close(self) -> None:
         """Give the simulation's threads and buffers back."""
         self._worlds.close()
 
 
-@offers(metadata={"render_modes": _MODES})
+@offers(metadata={"render_modes": _MODES})  # Gymnasium wraps it for human
 def make(
     num_envs: int | None = None,
     *,
@@ -308,15 +292,13 @@ def make(
     Raises:
         MjstackError: An override or an option cannot be used.
     """
-    words = [*choices, *overrides, f"nworld={1 if num_envs is None else num_envs}"]
-    cfg = filmed = load_config(words, config_dir=config_dir)
+    all_overrides = [*choices, *overrides, f"nworld={1 if num_envs is None else num_envs}"]
+    cfg = filmed = load_config(all_overrides, config_dir=config_dir)
     if options.get("render_mode") and not cfg.scene.cameras:
-        filmed = load_config([*words, "cameras=front"], config_dir=config_dir)
+        filmed = load_config([*all_overrides, "cameras=front"], config_dir=config_dir)
     env = build_env(cfg, model=build_model(filmed))  # with what pictures need
     kind = GymnasiumEnv if num_envs is None else GymnasiumVectorEnv
-    made = kind(env, cameras=filmed.scene.cameras, **options)
-    made.metadata["render_modes"] = _MODES[: 1 + opens_windows()]  # a camera is added for one
-    return made
+    return kind(env, cameras=filmed.scene.cameras, **options)
 
 
 def register_env(

@@ -15,7 +15,7 @@ from mjstack.files import MESHES
 
 _DEVICE = re.compile(r"auto|cpu|cuda:\d+")
 _DEVICES = re.compile(r"all|[1-9]\d*")
-_WORLD = re.compile(r"([A-Za-z_]\w*:)?((\d+:)?\d+|failing)")
+_WORLD = re.compile(r"([A-Za-z_]\w*:)?(\d+:)?\d+")
 
 Checks = Iterator[tuple[str, bool, str]]  # a key, whether its value is wrong, and what is expected
 
@@ -24,8 +24,8 @@ def validate(cfg: Config) -> None:
     """Raise a `ConfigError` or `UnknownName` for the first value that cannot be used."""
     check_fields("", cfg)
     for check in (_run, _robot, _scene, _cameras, _phases, _gates):
-        for key, wrong, expected in check(cfg):
-            if wrong:
+        for key, invalid, expected in check(cfg):
+            if invalid:
                 raise ConfigError(key, _value(cfg, key), expected)
 
 
@@ -91,20 +91,20 @@ def _run(cfg: Config) -> Checks:
             "Change both together, with timing.control_hz; a task that works at any rate sets none"
         )
         raise ConfigError(key, f"{cfg.timing.step_dt:g}", expected, fix)
-    wrong = cfg.world is not None and not _WORLD.fullmatch(cfg.world)
-    yield "world", wrong, "a world such as 17, a seed and a world such as 3:17, or failing"
+    invalid = cfg.world is not None and not _WORLD.fullmatch(cfg.world)
+    yield "world", invalid, "a world such as 17, or a seed and a world such as 3:17"
     for key in ("run", "world"):
-        wrong = getattr(cfg, key) is not None and cfg.job.name != "replay"
-        yield key, wrong, "null, because it is for job=replay alone. Add job=replay"
-    wrong = cfg.devices is not None and not _DEVICES.fullmatch(cfg.devices)
-    yield "devices", wrong, "all, or a number of GPUs of at least 1"
+        invalid = getattr(cfg, key) is not None and cfg.job.name != "replay"
+        yield key, invalid, "null, because it is for job=replay alone. Add job=replay"
+    invalid = cfg.devices is not None and not _DEVICES.fullmatch(cfg.devices)
+    yield "devices", invalid, "all, or a number of GPUs of at least 1"
     expected = "null, because no policy drives the worlds. Add controller=policy"
-    wrong = cfg.policy is not None and cfg.job.name != "export"
-    wrong = wrong and not offered(cfg.controller.func, "plays_policy")
-    yield "policy", wrong, expected
+    invalid = cfg.policy is not None and cfg.job.name != "export"
+    invalid = invalid and not offered(cfg.controller.func, "plays_policy")
+    yield "policy", invalid, expected
     resets = (cfg.reset, *(t.reset for t in cfg.gate.episodes().values()))
-    wrong = cfg.starts is not None and not any(map(reads_starts_file, resets))
-    yield "starts", wrong, "null, because no reset term reads it. Add reset=starts_file"
+    invalid = cfg.starts is not None and not any(map(reads_starts_file, resets))
+    yield "starts", invalid, "null, because no reset term reads it. Add reset=starts_file"
 
 
 def _robot(cfg: Config) -> Checks:
@@ -115,22 +115,22 @@ def _robot(cfg: Config) -> Checks:
     lengths = {"home": joints, "start": joints, "gripper_open": grip, "gripper_closed": grip}
     for key, size in lengths.items():
         values = getattr(robot, key)
-        wrong = values is not None and len(values) != size
-        yield f"robot.{key}", wrong, f"{size} numbers, one per joint"
-    wrong = abs(math.hypot(*robot.approach_axis) - 1.0) > 1e-3
-    yield "robot.approach_axis", wrong, "a vector of length 1, such as [0, 0, -1]"
+        invalid = values is not None and len(values) != size
+        yield f"robot.{key}", invalid, f"{size} numbers, one per joint"
+    invalid = abs(math.hypot(*robot.approach_axis) - 1.0) > 1e-3
+    yield "robot.approach_axis", invalid, "a vector of length 1, such as [0, 0, -1]"
     for key in ("name", "menagerie_name", "menagerie_file"):  # they become paths
         path = Path(getattr(robot, key))
-        wrong = path.is_absolute() or ".." in path.parts
-        yield f"robot.{key}", wrong, "a name that does not lead out of a folder"
+        invalid = path.is_absolute() or ".." in path.parts
+        yield f"robot.{key}", invalid, "a name that does not lead out of a folder"
     yield "robot.base.quat", not any(robot.base.quat), "a rotation (w, x, y, z)"
-    wrong = robot.file is not None and cfg.model.source == "menagerie"
-    yield "robot.file", wrong, "null, because model=menagerie has its own. Add model=builtin"
+    invalid = robot.file is not None and cfg.model.source == "menagerie"
+    yield "robot.file", invalid, "null, because model=menagerie has its own. Add model=builtin"
     names = (*robot.ik_joints, *robot.locked)
     require_names("robot.ik_joints, robot.locked: arm joint", names, robot.arm_joints)
     require_names("robot.roll_joint: arm joint", [robot.roll_joint], robot.arm_joints)
-    wrong = cfg.controller.yaw_alignment > 0.0 and robot.roll_joint is None
-    yield "controller.yaw_alignment", wrong, "0, because robot.roll_joint is null"
+    invalid = cfg.controller.yaw_alignment > 0.0 and robot.roll_joint is None
+    yield "controller.yaw_alignment", invalid, "0, because robot.roll_joint is null"
 
 
 def _scene(cfg: Config) -> Checks:
@@ -139,44 +139,46 @@ def _scene(cfg: Config) -> Checks:
     needs_free = cfg.task.check is not None or any(map(places_objects, cfg.reset.values()))
     expected = "at least one object that is not fixed, for the check and for random starts"
     yield "scene.objects", needs_free and not scene.free, expected
-    for name, thing in scene.objects.items():
+    for name, object_cfg in scene.objects.items():
         key = f"scene.objects.{name}"
-        made = bool(thing.parts or thing.file)
-        wrong = (thing.mass, thing.density) == (None, None) and not thing.fixed
-        wrong &= thing.file is None or thing.file.lower().endswith(MESHES)
-        yield f"{key}.mass", wrong, "a number [kg], or a density: it moves"
-        wrong = thing.density is not None and (thing.mass is not None or thing.fixed)
-        yield f"{key}.density", wrong, "null, because it has a mass or is fixed"
-        wrong = bool(thing.file) and thing.fixed and thing.mass is not None
-        yield f"{key}.mass", wrong, "null: masses of a fixture are its file's"
-        wrong = bool(thing.parts) and not thing.fixed
-        yield f"{key}.fixed", wrong, "true, because it has parts"
-        wrong = bool(thing.joints) and not (thing.file and thing.fixed)
-        yield f"{key}.joints", wrong, "{}, because it is no fixture from a file"
-        for joint, values in thing.joints.items():
+        made = bool(object_cfg.parts or object_cfg.file)
+        invalid = (object_cfg.mass, object_cfg.density) == (None, None) and not object_cfg.fixed
+        invalid &= object_cfg.file is None or object_cfg.file.lower().endswith(MESHES)
+        yield f"{key}.mass", invalid, "a number [kg], or a density: it moves"
+        invalid = object_cfg.density is not None and (
+            object_cfg.mass is not None or object_cfg.fixed
+        )
+        yield f"{key}.density", invalid, "null, because it has a mass or is fixed"
+        invalid = bool(object_cfg.file) and object_cfg.fixed and object_cfg.mass is not None
+        yield f"{key}.mass", invalid, "null: masses of a fixture are its file's"
+        invalid = bool(object_cfg.parts) and not object_cfg.fixed
+        yield f"{key}.fixed", invalid, "true, because it has parts"
+        invalid = bool(object_cfg.joints) and not (object_cfg.file and object_cfg.fixed)
+        yield f"{key}.joints", invalid, "{}, because it is no fixture from a file"
+        for joint, values in object_cfg.joints.items():
             if values.range is not None and not values.range[0] < values.range[1]:
                 expected = "two numbers, the smaller one first"
                 raise ConfigError(f"{key}.joints.{joint}.range", values.range, expected)
-        shapes = [(key, thing)] * (not made)
-        for where, shape in shapes + [(f"{key}.parts.{n}", p) for n, p in thing.parts.items()]:
-            count, words = SHAPES[shape.shape]
-            wrong = len(shape.size) != count
-            yield f"{where}.size", wrong, f"{count} number{'s' * (count > 1)}: {words}"
-            wrong = shape.quat is not None and (shape.yaw != 0.0 or not any(shape.quat))
-            yield f"{where}.quat", wrong, "a rotation (w, x, y, z), or null with a yaw"
-        if thing.pos is not None:
-            low = scene.table_top + thing.half_height
+        shapes = [(key, object_cfg)] * (not made)
+        for where, shape in shapes + [(f"{key}.parts.{n}", p) for n, p in object_cfg.parts.items()]:
+            count, meaning = SHAPES[shape.shape]
+            invalid = len(shape.size) != count
+            yield f"{where}.size", invalid, f"{count} number{'s' * (count > 1)}: {meaning}"
+            invalid = shape.quat is not None and (shape.yaw != 0.0 or not any(shape.quat))
+            yield f"{where}.quat", invalid, "a rotation (w, x, y, z), or null with a yaw"
+        if object_cfg.pos is not None:
+            low = scene.table_top + object_cfg.half_height
             expected = f"a height of at least {low:.4f} m in the world, or xy alone"
-            yield f"{key}.pos", not thing.fixed and thing.pos[2] < low - 1e-6, expected
-        edge = 0.0 if thing.fixed and made else thing.footprint
-        if thing.shape == "box" and thing.upright:
-            edge = min(edge, *thing.size[:2])
-        if thing.fixed and thing.pos is not None:
+            yield f"{key}.pos", not object_cfg.fixed and object_cfg.pos[2] < low - 1e-6, expected
+        edge = 0.0 if object_cfg.fixed and made else object_cfg.footprint
+        if object_cfg.shape == "box" and object_cfg.upright:
+            edge = min(edge, *object_cfg.size[:2])
+        if object_cfg.fixed and object_cfg.pos is not None:
             continue
-        yield from _on_table(scene, f"{key}.xy", thing.xy, (edge, edge))
-    for name, place in scene.places.items():
+        yield from _on_table(scene, f"{key}.xy", object_cfg.xy, (edge, edge))
+    for name, place_cfg in scene.places.items():
         yield "scene.places", name in scene.objects, "names that no object has"
-        yield from _on_table(scene, f"scene.places.{name}.xy", place.xy, place.random_xy)
+        yield from _on_table(scene, f"scene.places.{name}.xy", place_cfg.xy, place_cfg.random_xy)
 
 
 def _on_table(scene: SceneCfg, key: str, xy: list[float], edge: Sequence[float]) -> Checks:
@@ -184,15 +186,15 @@ def _on_table(scene: SceneCfg, key: str, xy: list[float], edge: Sequence[float])
         center = scene.table_center[axis]
         reach = scene.table_half[axis] - edge[axis]
         span = f"[{center - reach:.3f}, {center + reach:.3f}] m"
-        wrong = abs(xy[axis] - center) > reach + 1e-9
-        yield key, wrong, f"{name} within {span}, so that it is on the table"
+        invalid = abs(xy[axis] - center) > reach + 1e-9
+        yield key, invalid, f"{name} within {span}, so that it is on the table"
 
 
 def _cameras(cfg: Config) -> Checks:
     """Poses, rates and names of the cameras."""
     for name, camera in cfg.scene.cameras.items():
-        wrong = not re.fullmatch(r"[a-z][a-z0-9_]*", name)
-        yield "scene.cameras", wrong, "names of small letters, digits and _"
+        invalid = not re.fullmatch(r"[a-z][a-z0-9_]*", name)
+        yield "scene.cameras", invalid, "names of small letters, digits and _"
         key = f"scene.cameras.{name}"
         pose = camera.pose
         expected = f"a pose, because robot.wrist_camera of {cfg.robot.name} is null"
@@ -203,22 +205,26 @@ def _cameras(cfg: Config) -> Checks:
         yield f"{key}.pose.target", length < 1e-6, "a point away from pos"
         a, b, c = pose.up
         side = math.hypot(y * c - z * b, z * a - x * c, x * b - y * a)
-        wrong = side < 1e-3 * length * math.hypot(a, b, c) or not any(pose.up)
-        yield f"{key}.pose.up", wrong, "a direction across that from pos to target"
-        wrong = len(set(camera.outputs)) != len(camera.outputs) or not camera.outputs
-        yield f"{key}.outputs", wrong, f"some of {', '.join(OUTPUTS)}, each once"
+        invalid = side < 1e-3 * length * math.hypot(a, b, c) or not any(pose.up)
+        yield f"{key}.pose.up", invalid, "a direction across that from pos to target"
+        invalid = len(set(camera.outputs)) != len(camera.outputs) or not camera.outputs
+        yield f"{key}.outputs", invalid, f"some of {', '.join(OUTPUTS)}, each once"
         steps = cfg.task.control_hz / (camera.rate or cfg.task.control_hz)
-        wrong = steps < 1.0 - 1e-9 or not math.isclose(steps, round(steps), rel_tol=1e-9)
+        invalid = steps < 1.0 - 1e-9 or not math.isclose(steps, round(steps), rel_tol=1e-9)
         expected = f"{cfg.task.control_hz:g} Hz over an integer, as that is the control rate"
-        yield f"{key}.rate", wrong, expected
+        yield f"{key}.rate", invalid, expected
 
 
 def _phases(cfg: Config) -> Checks:
     """The scripted phases, and how their targets are followed."""
     controller = cfg.controller
     gain = max(controller.posture_gain, controller.approach_gain)
-    wrong = gain > 0 and controller.step_iterations < 4
-    yield "controller.step_iterations", wrong, "at least 4 with a posture_gain or an approach_gain"
+    invalid = gain > 0 and controller.step_iterations < 4
+    yield (
+        "controller.step_iterations",
+        invalid,
+        "at least 4 with a posture_gain or an approach_gain",
+    )
     phases = controller.phases
     exact = cfg.robot.closed_width is None and cfg.robot.gripper_closed is not None
     names = list(phases)
@@ -227,8 +233,8 @@ def _phases(cfg: Config) -> Checks:
     grasped = False
     for number, (name, phase) in enumerate(phases.items()):
         key = f"controller.phases.{name}"
-        wrong = number == 0 and phase.anchor is None
-        yield f"{key}.anchor", wrong, "an object or a place, as the phase is the first"
+        invalid = number == 0 and phase.anchor is None
+        yield f"{key}.anchor", invalid, "an object or a place, as the phase is the first"
         expected = (
             "null, because robot.gripper_closed is for any object. Set robot.closed_width too"
         )
@@ -237,18 +243,18 @@ def _phases(cfg: Config) -> Checks:
         require_names(f"{key}.retry: phase", [phase.retry], phases)
         for role, source in (("anchor", phase.anchor), ("toward", phase.toward)):
             require_names(f"{key}.{role}: object or place", [source], known)
-            wrong = not phase.observe and source not in observed
+            invalid = not phase.observe and source not in observed
             # Looks at the driver, which loads torch, only where it may be wrong.
             feedback = any(cfg.gate[gate].reset for gate in cfg.episode_gates)
-            wrong = wrong and (feedback or offered(controller.func, "measures"))
+            invalid = invalid and (feedback or offered(controller.func, "measures"))
             expected = f"true here or before, as closed_loop does not know yet where {source} is"
-            yield f"{key}.observe", wrong, expected
+            yield f"{key}.observe", invalid, expected
             observed.add(source)
-        wrong = phase.level == "on_top" and not grasped
-        yield f"{key}.level", wrong, "center or table, as no phase before grasps"
+        invalid = phase.level == "on_top" and not grasped
+        yield f"{key}.level", invalid, "center or table, as no phase before grasps"
         grasped = grasped or phase.grasps is not None
-        wrong = phase.align and (not grasped or phase.grasps is not None or phase.anchor is None)
-        yield f"{key}.align", wrong, "false: no object is in the hand, or the phase has no anchor"
+        invalid = phase.align and (not grasped or phase.grasps is not None or phase.anchor is None)
+        yield f"{key}.align", invalid, "false: no object is in the hand, or the phase has no anchor"
         if phase.retry is not None:
             expected = f"null, or {key}.grasps=OBJECT, whose empty grasp is tried again"
             yield f"{key}.retry", phase.grasps is None, expected
@@ -266,16 +272,10 @@ def _gates(cfg: Config) -> Checks:
     require_names("gate.parity.states: phase", gate.parity.states.values(), phases)
     if phases:
         require_names("gate.throughput.from_phase: phase", [gate.throughput.from_phase], phases)
-    wrong = gate.parity.images is not None and not cfg.scene.cameras
+    invalid = gate.parity.images is not None and not cfg.scene.cameras
     expected = "null, because there are no cameras. Set cameras to those of that run"
-    yield "gate.parity.images", wrong, expected
+    yield "gate.parity.images", invalid, expected
     for name, t in gate.episodes().items():
         from_file = bool(t.reset) and reads_starts_file(gate_reset(cfg, name))
         expected = "1, because with reset=starts_file worlds start alike under every seed"
         yield f"gate.{name}.seeds", from_file and t.seeds > 1, expected
-        # Looks at functions, which load torch, only where there is a region.
-        wrong = t.region is not None and (
-            from_file or not any(map(places_objects, t.reset.values()))
-        )
-        expected = f"null, because no reset term of the {name} gate has a region"
-        yield f"gate.{name}.region", wrong, expected

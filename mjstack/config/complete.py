@@ -108,34 +108,36 @@ def _complete_scene(scene: schema.SceneCfg) -> None:
     def in_world(at: list[float]) -> list[float]:
         return [a + b for a, b in zip(at, origin, strict=False)]
 
-    if any(thing.file for thing in scene.objects.values()):
+    if any(object_cfg.file for object_cfg in scene.objects.values()):
         from mjstack.config.mjcf import measure  # loads mujoco
 
         measure.cache_clear()  # files may have changed
-    for name, thing in scene.objects.items():
+    for name, object_cfg in scene.objects.items():
         key = f"scene.objects.{name}"
-        thing.file = _find_file(f"{key}.file", thing.file)
-        if thing.parts or thing.file:
+        object_cfg.file = _find_file(f"{key}.file", object_cfg.file)
+        if object_cfg.parts or object_cfg.file:
             size = [1e-4] * 3  # of no account: its parts are what others meet
-            if thing.file and not thing.fixed:
-                size = measure(thing.file, fixed=False).half
-            if thing.size not in ([], size) and (thing.file or thing.fixed):
-                raise ConfigError(f"{key}.size", thing.size, "[], because it has parts or a file")
-            thing.shape = "box"
-            thing.size = size
-        if thing.file is None:
-            thing.friction = thing.friction or [1.0, 0.005, 0.0005]
-            thing.color = thing.color or [0.6, 0.6, 0.6, 1.0]
-        if thing.pos is not None:
-            thing.pos = in_world(thing.pos)
-            thing.xy = thing.pos[:2]
-        elif len(thing.xy) == 2:
-            thing.xy = in_world(thing.xy)
+            if object_cfg.file and not object_cfg.fixed:
+                size = measure(object_cfg.file, fixed=False).half
+            if object_cfg.size not in ([], size) and (object_cfg.file or object_cfg.fixed):
+                raise ConfigError(
+                    f"{key}.size", object_cfg.size, "[], because it has parts or a file"
+                )
+            object_cfg.shape = "box"
+            object_cfg.size = size
+        if object_cfg.file is None:
+            object_cfg.friction = object_cfg.friction or [1.0, 0.005, 0.0005]
+            object_cfg.color = object_cfg.color or [0.6, 0.6, 0.6, 1.0]
+        if object_cfg.pos is not None:
+            object_cfg.pos = in_world(object_cfg.pos)
+            object_cfg.xy = object_cfg.pos[:2]
+        elif len(object_cfg.xy) == 2:
+            object_cfg.xy = in_world(object_cfg.xy)
         else:
             expected = f"a list of 2 numbers [m], or {key}.pos with 3"
-            raise ConfigError(f"{key}.xy", thing.xy, expected)
-    for place in scene.places.values():
-        place.xy = in_world(place.xy)
+            raise ConfigError(f"{key}.xy", object_cfg.xy, expected)
+    for place_cfg in scene.places.values():
+        place_cfg.xy = in_world(place_cfg.xy)
 
 
 def _find_file(key: str, file: str | None) -> str | None:

@@ -22,11 +22,11 @@ from omegaconf.errors import ConfigKeyError
 
 from mjstack.config import session
 from mjstack.config.fields import accepted, find_field
-from mjstack.config.schema import JOB_SCHEMAS, Config, GateCfg
+from mjstack.config.schema import Config, GateCfg
 from mjstack.errors import MjstackError, UnknownName, first_line, shorten, suggest
 
 COMMANDS = ("doctor", "list", "new")  # first words of a command line
-LISTS = ("cameras", "experiment")  # groups of which several may be chosen
+LISTS = ("cameras", "experiment", "randomization")  # groups of which several may be chosen
 TERM_GROUPS = ("action", "observation", "reset", "termination", "reward")
 
 
@@ -76,7 +76,7 @@ def parse(override: str) -> Override:
             f"override {shorten(override, 60)!r} cannot be read: expected key=value without spaces"
             " around the sign. A value with a bracket, a quote, a letter beyond ASCII or"
             " one of = , : ; # & ! < > ^ ~ ` needs double quotes inside of single ones:"
-            " 'policy=\"run (1)\"', or in a list 'job.against=[\"policy=DIR\"]'."
+            " 'policy=\"run (1)\"'."
         ) from error
 
 
@@ -149,8 +149,8 @@ def _explain(error: Exception, overrides: Sequence[str]) -> MjstackError:
     key = getattr(cause, "full_key", None) or ""
     if deleted := re.match(r"Could not delete from config\. '([^']+)'", text):
         key = deleted[1]
-        beside = _beside(key, _keys(o for o in overrides if not o.startswith("~")))
-        return MjstackError(f"~{key}: there is none to leave out. {suggest(key, beside)}")
+        siblings = _siblings(key, _keys(o for o in overrides if not o.startswith("~")))
+        return MjstackError(f"~{key}: there is none to leave out. {suggest(key, siblings)}")
     if key and isinstance(cause, ConfigKeyError | AttributeError):
         return _unknown_key(key, _field_names(getattr(cause, "object_type", None)), overrides)
     value = re.match("Value '(.*)' of type", text)
@@ -158,51 +158,32 @@ def _explain(error: Exception, overrides: Sequence[str]) -> MjstackError:
     settings += [o for o in overrides if o.lstrip("+~").partition("=")[0] == key]
     field = find_field(Config, re.sub(r"\[\d+\]$", "", key))
     if settings and field and (error.__cause__ or value):
-        expected = accepted(*field)
-        value_text = settings[-1].partition("=")[2]
-        one_name = settings[-1] in overrides and re.match(r"(?!null$)[^\[{]", value_text)
-        names = expected.startswith("a list of names")
-        group = key.rpartition(".")[2]
-        if value_text in session.list_choices().get(group, ()):
-            return MjstackError(
-                f"{settings[-1]}: expected {expected}", f"Write {group}@{settings[-1]}"
-            )
-        cure = f" Write {shlex.quote(f'{key}=[{value_text}]')}." if one_name and names else ""
-        return MjstackError(f"{settings[-1]}: expected {expected}.{cure}")
+        names = session.list_choices().get(key.rpartition(".")[2], ())
+        fix = f"Write {key.rpartition('.')[2]}@{settings[-1]}"
+        chosen = settings[-1].partition("=")[2] in names
+        expected = f"{settings[-1]}: expected {accepted(*field)}"
+        return MjstackError(expected, fix if chosen else "")
     return MjstackError(f"{key or ' '.join(overrides) or 'the values'}: {text}.")
 
 
 def _unknown_key(key: str, known: Iterable[str], overrides: Sequence[str]) -> MjstackError:
-    """A key that does not exist, with one that may have been meant, beside it (*known*) or not."""
-    parent, _, leaf = key.rpartition(".")
-    job = ["job=gates", *(o for o in overrides if o.startswith("job="))][-1]
-    owners = [f"job={name}" for name, schema in JOB_SCHEMAS.items() if leaf in _field_names(schema)]
-    trainer = [o for o in overrides if o.startswith("trainer=")][-1:]
-    if parent == "job" and trainer and "job=train" in owners:  # of some trainers, and not of this
-        owners = ["trainer=dagger", "trainer=clone"]
-        job = trainer[0]
-    if parent == "job" and owners and job not in owners:
-        return MjstackError(
-            f"{key} is a key of {' and '.join(owners)}, and this is {job}. Set {owners[0]}."
-        )
+    """A key that does not exist, with the nearest one, beside it (*known*) or not."""
+    parent = key.rpartition(".")[0]
     groups = session.list_choices()
     keys = [*_keys(o for o in overrides if o.partition("=")[0] in groups), *groups]
     keys += [f"{parent}.{name}".lstrip(".") for name in known]
-    keys = [name for name in keys if not f"{key}.".startswith(f"{name}.")]
-    # A key of nearly the same name, or one that is alike as a whole
-    namesakes = [n for n in keys if get_close_matches(leaf, [n.rpartition(".")[2]], 1, 0.7)]
-    near = get_close_matches(key, namesakes, 1, 0.3) or get_close_matches(key, keys, 1)
     if parent == "robot.servos":  # others are no joints
-        near = [name for name in near if name.startswith(f"{parent}.")]
+        keys = [name for name in keys if name.startswith(f"{parent}.")]
+    near = get_close_matches(key, [n for n in keys if not f"{key}.".startswith(f"{n}.")], 1)
     hint = f" Did you mean '{near[0]}'?" if near else ""
     if key.partition(".")[0] in TERM_GROUPS or parent == "robot.servos":
         problem = f"'{key}' is not in the configuration.{hint} To add it, write +{key}=..."
         return MjstackError(problem)
-    hint = hint or f" {suggest(key, _beside(key, keys))}"
+    hint = hint or f" {suggest(key, _siblings(key, keys))}"
     return MjstackError(f"configuration key '{key}' does not exist.{hint}")
 
 
-def _beside(key: str, keys: Iterable[str]) -> set[str]:
+def _siblings(key: str, keys: Iterable[str]) -> set[str]:
     return {name for name in keys if name.rpartition(".")[0] == key.rpartition(".")[0]}
 
 

@@ -134,8 +134,8 @@ def find_field(owner: type, key: str) -> tuple[type, Field] | None:
     kind, holders = _kind(_hints(owner)[name])
     if not (isinstance(kind, type) and is_dataclass(kind)):
         return owner, item
-    below = rest.partition(".")[2] if holders else rest  # several are by name
-    return find_field(kind, below) if below else (owner, item)
+    nested_key = rest.partition(".")[2] if holders else rest  # several are by name
+    return find_field(kind, nested_key) if nested_key else (owner, item)
 
 
 def select(
@@ -154,9 +154,11 @@ def select(
         depends = field_range(item).changes or inherited
         kind, holders = _kind(_hints(owner)[item.name])
         if isinstance(value, dict) and isinstance(kind, type) and is_dataclass(kind):
-            parts = value if holders else {"": value}
-            nested = {name: select(part, changes, kind, depends) for name, part in parts.items()}
-            if nested := {name: part for name, part in nested.items() if part}:
+            children = value if holders else {"": value}
+            nested = {
+                name: select(member, changes, kind, depends) for name, member in children.items()
+            }
+            if nested := {name: member for name, member in nested.items() if member}:
                 selected[item.name] = nested if holders else nested[""]
         elif item.name in config and {*changes} & {*depends}:
             selected[item.name] = value
@@ -192,12 +194,12 @@ def _check(path: str, value: object, owner: type, item: Field, *, inside: bool =
     if is_dataclass(value):
         check_fields(path, value)
     elif isinstance(value, Mapping):
-        for name, part in value.items():
+        for name, member in value.items():
             if limits.vectors:
-                if not isinstance(part, list) or {*map(type, part)} - {int, float}:
-                    raise ConfigError(f"{path}.{name}", part, accepted(owner, item, inside=True))
-                part[:] = map(float, part)
-            _check(f"{path}.{name}", part, owner, item, inside=True)
+                if not isinstance(member, list) or {*map(type, member)} - {int, float}:
+                    raise ConfigError(f"{path}.{name}", member, accepted(owner, item, inside=True))
+                member[:] = map(float, member)
+            _check(f"{path}.{name}", member, owner, item, inside=True)
     elif isinstance(value, list | tuple):
         if limits.length not in (None, len(value)) or not all(map(limits.holds, value)):
             raise ConfigError(path, value, accepted(owner, item, inside=inside))
@@ -215,17 +217,19 @@ def accepted(owner: type, item: Field, *, inside: bool = False) -> str:
     holders = holders[inside:]
     if limits.choices or isinstance(kind, EnumMeta):
         choices = limits.choices or kind.__members__
-        words = f"{'some' if holders else 'one'} of {', '.join(map(str, choices))}"
+        description = f"{'some' if holders else 'one'} of {', '.join(map(str, choices))}"
     elif holders or is_dataclass(kind):
         mapping = holders[:1] == [dict] or is_dataclass(kind)
         count = "" if limits.length is None else f"{limits.length} "
-        words = f"{'keys and' if mapping else 'a list of'} {count}{_PLURALS.get(kind, 'values')}"
+        description = (
+            f"{'keys and' if mapping else 'a list of'} {count}{_PLURALS.get(kind, 'values')}"
+        )
     elif (kind is float or inside) and limits == Range(unit=limits.unit, changes=limits.changes):
-        words = "a finite number"
+        description = "a finite number"
     else:
-        words = _NOUNS.get(kind, "a value")
+        description = _NOUNS.get(kind, "a value")
     null = " or null" if NoneType in get_args(hint) and not inside else ""
-    return limits.describe(words) + null
+    return limits.describe(description) + null
 
 
 @cache
@@ -234,9 +238,9 @@ def field_docs(owner: type) -> dict[str, str]:
     docs: dict[str, str] = {}
     for cls in filter(is_dataclass, reversed(owner.__mro__)):
         tree: Any = ast.parse(textwrap.dedent(inspect.getsource(cls)))
-        for node, after in pairwise(tree.body[0].body):
-            if isinstance(node, ast.AnnAssign) and isinstance(after, ast.Expr):
-                docs[ast.unparse(node.target)] = " ".join(ast.literal_eval(after.value).split())
+        for node, successor in pairwise(tree.body[0].body):
+            if isinstance(node, ast.AnnAssign) and isinstance(successor, ast.Expr):
+                docs[ast.unparse(node.target)] = " ".join(ast.literal_eval(successor.value).split())
     return docs
 
 

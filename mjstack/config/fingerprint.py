@@ -70,14 +70,14 @@ def differences(earlier: Mapping[str, Any], current: Mapping[str, Any]) -> str:
     """The first keys in which two configurations differ, such as ``seed=1, expected 2``, and how
     many more do; empty if they are equal.
     """
-    before, now = (
+    old_values, new_values = (
         {k: value for k, value in list_items(config) if value == {} or not isinstance(value, dict)}
         for config in (earlier, current)
     )
     different = [
-        f"{key}={before.get(key, 'missing')}, expected {now.get(key, 'none')}"
-        for key in before | now
-        if before.get(key) != now.get(key)
+        f"{key}={old_values.get(key, 'missing')}, expected {new_values.get(key, 'none')}"
+        for key in old_values | new_values
+        if old_values.get(key) != new_values.get(key)
     ]
     more = f", and {len(different) - 3} more keys" if len(different) > 3 else ""
     return "; ".join(different[:3]) + more

@@ -52,7 +52,7 @@ Examples:
   mjstack controller=policy policy=outputs/mine/last 'gates=[success]'
     the policy in the expert's place, in any gate
   mjstack job=play controller=policy policy=outputs/mine/last
-    four worlds of the policy as a video; view=true: in MuJoCo's viewer
+    four worlds of the policy as a video; view=web: in a browser
 
 Groups, to be set as group=choice, and their choices, the default first:
 {groups}
@@ -85,7 +85,7 @@ class Key(NamedTuple):
     name: str
     value: str
     accepts: str
-    words: str
+    meaning: str
     effect: str = ""
 
 
@@ -96,10 +96,10 @@ def list_groups() -> dict[str, tuple[list[str], str]]:
     choices = list_choices()
     text = (CONFIG_FOLDER / "config.yaml").read_text(encoding="utf-8")
     groups = dict.fromkeys(choices, ("", "added by the search path"))
-    known = {name: (default, words) for name, default, words in _GROUP.findall(text)}
+    known = {name: (default, meaning) for name, default, meaning in _GROUP.findall(text)}
     return {
-        name: (sorted(choices[name], key=default.__ne__), words)
-        for name, (default, words) in (known | groups | known).items()
+        name: (sorted(choices[name], key=default.__ne__), meaning)
+        for name, (default, meaning) in (known | groups | known).items()
     }
 
 
@@ -113,17 +113,17 @@ def list_keys(
     """
     docs = field_docs(value.__class__)
     for item in fields(value) if is_dataclass(value) else ():
-        part = getattr(value, item.name)
+        child = getattr(value, item.name)
         key = f"{name}.{item.name}".lstrip(".")
         changes = field_range(item).changes or inherited
-        if is_dataclass(part):
-            yield from list_keys(part, key, named=named, inherited=changes)
-        elif isinstance(part, dict) and any(map(is_dataclass, part.values())):
-            for entry in part if named else list(part)[:1]:
+        if is_dataclass(child):
+            yield from list_keys(child, key, named=named, inherited=changes)
+        elif isinstance(child, dict) and any(map(is_dataclass, child.values())):
+            for entry in child if named else list(child)[:1]:
                 path = f"{key}.{entry if named else 'NAME'}"
-                yield from list_keys(part[entry], path, named=named, inherited=changes)
+                yield from list_keys(child[entry], path, named=named, inherited=changes)
         else:
-            text = "" if ".NAME" in key else _yaml(part)
+            text = "" if ".NAME" in key else _yaml(child)
             effect = " ".join(filter(None, map(CHANGES.get, changes)))
             yield Key(key, text, accepted(type(value), item), docs.get(item.name, ""), effect)
 
@@ -146,13 +146,13 @@ def key_help(cfg: Config, prefix: str, width: int) -> str:
     if not matching:
         parent = prefix.rpartition(".")[0]
         depth = prefix.count(".") + 1
-        beside = [key.name.split(".") for key in keys if f".{key.name}".startswith(f".{parent}")]
-        raise UnknownName("key", prefix, {".".join(names[:depth]) for names in beside})
+        siblings = [key.name.split(".") for key in keys if f".{key.name}".startswith(f".{parent}")]
+        raise UnknownName("key", prefix, {".".join(names[:depth]) for names in siblings})
     lines = []
     for key in matching:
-        text = f"{key.words} Accepts {key.accepts}. {key.effect}"
-        words = textwrap.wrap(text.strip(), width - 2)
-        lines += [f"{key.name}={key.value}", *(f"  {line}" for line in words)]
+        text = f"{key.meaning} Accepts {key.accepts}. {key.effect}"
+        meaning = textwrap.wrap(text.strip(), width - 2)
+        lines += [f"{key.name}={key.value}", *(f"  {line}" for line in meaning)]
     return "\n".join(lines)
 
 
@@ -171,9 +171,11 @@ def _declared_keys(key: str, node: dict[str, Any], attribute: str) -> Iterator[K
 def help_text(cfg: Config, width: int) -> str:
     """The whole text with a configuration's values, in lines of at most ``width``."""
     groups = {
-        name: f"{words}: {', '.join(names)}" for name, (names, words) in list_groups().items()
+        name: f"{meaning}: {', '.join(names)}" for name, (names, meaning) in list_groups().items()
     }
-    keys = {key.name: f"{key.words} ({key.value})" for key in list_keys(cfg) if "." not in key.name}
+    keys = {
+        key.name: f"{key.meaning} ({key.value})" for key in list_keys(cfg) if "." not in key.name
+    }
     for name in (*groups, "unused_terms"):  # which mjstack fills in
         keys.pop(name, None)
     text = _TEXT.format(groups=_table(groups), keys=_table(keys))
@@ -195,7 +197,7 @@ def _yaml(value: object) -> str:
 def _table(rows: Mapping[str, str]) -> str:
     """Two columns, a line for each row."""
     indent = max(map(len, rows)) + 4
-    return "\n".join(f"  {name}".ljust(indent) + words for name, words in rows.items())
+    return "\n".join(f"  {name}".ljust(indent) + meaning for name, meaning in rows.items())
 
 
 def list_text(kinds: Sequence[str]) -> str:
@@ -209,7 +211,7 @@ def list_text(kinds: Sequence[str]) -> str:
         if kind != "policies":
             one_kind = len(kinds) == 1
             named = _functions(kind, one_kind) if kind in _FUNCTIONS else _files(kind[:-1])
-        lines += [f"{kind}:", *(f"  {name:<12} {words}".rstrip() for name, words in named)]
+        lines += [f"{kind}:", *(f"  {name:<12} {meaning}".rstrip() for name, meaning in named)]
     return "\n".join(lines)
 
 

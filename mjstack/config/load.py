@@ -52,6 +52,13 @@ def _by_device(cuda: Any, cpu: Any, *, _root_: DictConfig) -> Any:
     return cuda if device.startswith("cuda") else cpu
 
 
+def _ranged(values: Any, middle: float = 0.0, *, _root_: DictConfig) -> Any:
+    """The ends of a range, or its half-width, as far from the middle as ``range_scale`` says."""
+    if isinstance(values, Sequence):
+        return [_ranged(value, middle, _root_=_root_) for value in values]
+    return middle + _root_.range_scale * (values - middle)
+
+
 # The functions that a replay calls: where a run's configuration names them, and of which kind.
 _REPLAYED = {
     r"controller\.func": "driver",
@@ -65,6 +72,7 @@ _RESOLVERS: dict[str, Callable] = {
     "steps": _control_steps,
     "by_device": _by_device,
     "if_native": lambda a, b, *, _root_: a if _root_.sim.backend == Backend.native else b,
+    "ranged": _ranged,
     "at_most": lambda value, limit, small, large: small if value <= limit else large,
 }
 for _name, _function in _RESOLVERS.items():
@@ -130,9 +138,9 @@ def _policy_choices(overrides: Sequence[str]) -> list[str]:
     if not isinstance(folder, str):
         return []
     try:
-        facts = read_json(policy_folder(folder) / POLICY_FILE)
-        trained = {group: [facts["config"][group]["name"]] for group in ("robot", "task")}
-        trained["cameras"] = list(facts["observation"].get("images", {}))
+        policy_json = read_json(policy_folder(folder) / POLICY_FILE)
+        trained = {group: [policy_json["config"][group]["name"]] for group in ("robot", "task")}
+        trained["cameras"] = list(policy_json["observation"].get("images", {}))
     except Exception:  # it may hold anything
         return []
     choices = session.list_choices()
@@ -224,8 +232,8 @@ def load_saved(path: Path) -> Config:
         if missing := sorted(OmegaConf.missing_keys(merged)):
             raise MjstackError(f"{missing[0]} is missing, expected every key of this version.")
         for key, name in session.list_items(merged):
-            for place, kind in _REPLAYED.items():
-                if re.match(place, key) and key.endswith(".func"):
+            for pattern, kind in _REPLAYED.items():
+                if re.match(pattern, key) and key.endswith(".func"):
                     session.check_term(key.removesuffix(".func"), str(name), kind, path)
         _locate_saved(merged, path)
         try:
@@ -252,11 +260,11 @@ def _locate_saved(cfg: DictConfig, path: Path) -> None:
     pairs += [(old.parent, new.parent) for old, new in moved]
     for key, owner in _with_file(cfg):
         file = Path(os.path.abspath(owner.file))
-        places = [new / file.relative_to(old) for old, new in pairs if file.is_relative_to(old)]
-        if not places:
+        candidates = [new / file.relative_to(old) for old, new in pairs if file.is_relative_to(old)]
+        if not candidates:
             problem = f"{key}.file={file}: expected a file beside a folder of the search path"
             raise MjstackError(f"{problem}. {session.add_folder(path, file.parent)}")
-        owner.file = str(places[0])
+        owner.file = str(candidates[0])
 
 
 def to_config(cfg: DictConfig) -> Config:

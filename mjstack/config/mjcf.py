@@ -130,8 +130,8 @@ def free_body(
     body.add_freejoint(name=name)
     attach_guest(scene, spec, body.add_frame(pos=origin), f"{name}_")
     scene.fuse_static()
-    if apart := [low.name.removeprefix(f"{name}_") for low in body.bodies]:
-        problem = f"{file}: expected one rigid body; body {', '.join(apart)} cannot be fused"
+    if separate := [low.name.removeprefix(f"{name}_") for low in body.bodies]:
+        problem = f"{file}: expected one rigid body; body {', '.join(separate)} cannot be fused"
         raise MjstackError(problem, "Correct it, or set fixed=true for a fixture")
     return scene
 
@@ -147,12 +147,12 @@ def fix_masses(spec: mujoco.MjSpec) -> None:
     """Give bodies the masses and inertias that they have when the file is compiled alone, with its
     total mass.
     """
-    alone = spec.copy()
-    alone.compiler.fusestatic = False  # the same bodies
-    alone.compiler.settotalmass = -1.0
-    model = alone.compile()
+    standalone = spec.copy()
+    standalone.compiler.fusestatic = False  # the same bodies
+    standalone.compiler.settotalmass = -1.0
+    model = standalone.compile()
     mujoco.mj_setTotalmass(model, spec.compiler.settotalmass)
-    for body, twin in zip(spec.bodies[1:], alone.bodies[1:], strict=True):
+    for body, twin in zip(spec.bodies[1:], standalone.bodies[1:], strict=True):
         body.explicitinertial = True
         body.mass = model.body_mass[twin.id]
         for name in ("inertia", "ipos", "iquat"):
@@ -179,25 +179,30 @@ def measure(file: str, *, fixed: bool) -> Solid:
     if not collides.any() and (not fixed or model.ngeom == 1):
         raise MjstackError(f"{file}: expected a geom that collides, there is none.")
     geoms = np.flatnonzero(collides if collides.any() else np.arange(model.ngeom) != probe.id)
-    z = np.linspace(-1.0, 1.0, _DIRECTIONS)  # of a spiral from pole to pole
-    turn = np.pi * (1.0 + 5.0**0.5) * np.arange(_DIRECTIONS)
-    spiral = np.stack((np.cos(turn), np.sin(turn), z), axis=1)
-    spiral[:, :2] *= np.sqrt(1.0 - z**2)[:, None]
     # The point of an object that lies farthest in a direction is nearest to one far away there
-    around = np.concatenate((np.eye(3), -np.eye(3), spiral))
+    directions = unit_vectors(_DIRECTIONS)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    ends = np.empty((len(around), len(geoms), 6))
-    for row, direction in zip(ends, around, strict=True):
+    ends = np.empty((len(directions), len(geoms), 6))
+    for row, direction in zip(ends, directions, strict=True):
         data.geom_xpos[probe.id] = _FAR * direction
         for end, geom in zip(row, geoms, strict=True):
             mujoco.mj_geomDistance(model, data, geom, probe.id, 2.0 * _FAR, end)
     points = ends[..., :3]
     low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
     center = 0.5 * (low + high)
-    farthest = np.argmax(np.einsum("nki,ni->nk", points, around), axis=1)
-    hull = np.unique(points[np.arange(len(around)), farthest].round(9), axis=0)
+    farthest = np.argmax(np.einsum("nki,ni->nk", points, directions), axis=1)
+    hull = np.unique(points[np.arange(len(directions)), farthest].round(9), axis=0)
     return Solid(center, (high - center).tolist(), (hull - center * (not fixed)).tolist())
+
+
+def unit_vectors(count: int) -> np.ndarray:
+    """Unit vectors to all sides, shape ``(6 + count, 3)``: the axes', and a spiral's."""
+    z = np.linspace(-1.0, 1.0, count)
+    turn = np.pi * (1.0 + 5.0**0.5) * np.arange(count)
+    spiral = np.stack((np.cos(turn), np.sin(turn), z), axis=1)
+    spiral[:, :2] *= np.sqrt(1.0 - z**2)[:, None]
+    return np.concatenate((np.eye(3), -np.eye(3), spiral))
 
 
 def attach_guest(

@@ -104,8 +104,10 @@ def read_yaml(path: Path) -> Any:
 def config_folders() -> list[Path]:
     """Folders of the search path beside mjstack's: those of registered packages, and added ones."""
     specs = [spec for name in _registered() if (spec := find_spec(name)) is not None]
-    places = [Path(place) for spec in specs for place in spec.submodule_search_locations or ()]
-    return list(dict.fromkeys((*places, *_added.get())))
+    locations = [
+        Path(location) for spec in specs for location in spec.submodule_search_locations or ()
+    ]
+    return list(dict.fromkeys((*locations, *_added.get())))
 
 
 @functools.cache
@@ -145,18 +147,18 @@ def in_search_path(dotted: str, saved: Path) -> bool:
         return False
     # A package may have several places, and a module of them may come from any. The origin of a
     # module of Python's own is a word, such as frozen.
-    places = [*(module.submodule_search_locations or (module.origin or "",))] if module else []
-    beside = [folder.parent for folder in _added.get()]
+    locations = [*(module.submodule_search_locations or (module.origin or "",))] if module else []
+    parents = [folder.parent for folder in _added.get()]
     files = {saved.resolve(), Path(os.path.abspath(saved))}  # it may be a link
-    return bool(places) and all(
-        Path(place).is_absolute()
-        and Path(place).resolve().parent in beside
+    return bool(locations) and all(
+        Path(location).is_absolute()
+        and Path(location).resolve().parent in parents
         and not any(
             file.is_relative_to(folder)
             for file in files
-            for folder in (Path(place), Path(place).resolve())
+            for folder in (Path(location), Path(location).resolve())
         )
-        for place in places
+        for location in locations
     )
 
 
@@ -237,14 +239,14 @@ def _add_entries(overrides: Sequence[str]) -> list[str]:
     overrides come back, and set such an entry's values over its defaults.
     """
     entries = DictConfig({})
-    out = []
+    rewritten = []
     for text in overrides:
         entry = _ENTRY.match(text)
         if entry:
             OmegaConf.update(entries, entry[1], {}, force_add=True)
-        out.append(f"++{text.lstrip('+')}" if entry else text)
+        rewritten.append(f"++{text.lstrip('+')}" if entry else text)
     ConfigStore.instance().store("added_entries", entries, package="_global_", provider="mjstack")
-    return out
+    return rewritten
 
 
 def without_hydra(cfg: DictConfig) -> DictConfig:

@@ -77,12 +77,11 @@ def _choices(cfg: DictConfig, overrides: Sequence[str], played: Sequence[str]) -
     """A line for a choice of starts or looks on the command line that a gate with starts of its own
     has not.
     """
-    compared = ["success"] * (cfg.job.name == "compare")
     choices = [override.partition("=") for override in overrides if cfg.job.name != "train"]
     missed = [
         c for c in choices if c[0] in ("reset", "looks") and c[2] not in ("starts_file", "null")
     ]
-    for gate in [name for name in played if name in (*cfg.gates, *compared)]:
+    for gate in [name for name in played if name in cfg.gates]:
         for group, _, name in missed:
             key = f"{group}@gate.{gate}.reset"
             if not any(o.lstrip("+").startswith(f"{key}=") for o in overrides):
@@ -100,26 +99,28 @@ def _complete_copy(cfg: DictConfig, gate: str) -> Iterator[str]:
     copy = _terms(cfg, key)
     explicit = {*_written(cfg, key), *(name for name, term in copy.items() if term is None)}
     for name, term in _written(cfg, "reset").items():
+        if copy.get(name) == f"${{reset.{name}}}":  # acts there already
+            continue
         func = _func(term)
-        there = _func(copy.get(name))
-        added = func != _func(shipped.get(name)) and not (there and func.startswith("mjstack."))
-        if name not in explicit and (term is None or func == there or added):
+        copied = _func(copy.get(name))
+        added = func != _func(shipped.get(name)) and not (copied and func.startswith("mjstack."))
+        if name not in explicit and (term is None or func == copied or added):
             OmegaConf.select(cfg, key)[name] = None if term is None else f"${{reset.{name}}}"
         elif judged:
-            place = f"{key}.{name} takes its place" if there else f"{key} has no {name}"
-            yield f"reset.{name} does not act in gate {gate}: {place}"
+            cause = f"{key}.{name} takes its place" if copied else f"{key} has no {name}"
+            yield f"reset.{name} does not act in gate {gate}: {cause}"
 
 
 def _left_out(cfg: DictConfig) -> Iterator[str]:
     """A line for each group of which a job leaves out written terms."""
     job = cfg.job.name
     taught = OmegaConf.get_type(cfg.job) is CloneJobCfg
-    driven = taught or job in ("gates", "collect", "play", "compare")
+    driven = taught or job in ("gates", "collect", "play")
     where = " but gate throughput" if job == "gates" else ""
-    for group, place in _LEFT_OUT.items():
+    for group, cause in _LEFT_OUT.items():
         names = [f"{group}.{name}" for name, term in _written(cfg, group).items() if term]
         if names and (taught or (driven and group != "reward")):
-            yield f"job={job}{where} leaves out {', '.join(names)}: {place}"
+            yield f"job={job}{where} leaves out {', '.join(names)}: {cause}"
 
 
 def _unseen(cfg: DictConfig) -> Iterator[str]:

@@ -21,7 +21,7 @@ from mjstack.datasets.video import VideoEncoder
 
 
 @dataclass(kw_only=True, slots=True)
-class Part:
+class ShardFiles:
     """Complete hidden files, and a row for each of their episodes.
 
     Attributes:
@@ -42,7 +42,7 @@ class PartWriter:
     images until they are encoded.
 
     Attributes:
-        part: What is written so far.
+        files: What is written so far.
     """
 
     def __init__(self, folder: Path, spec: DatasetSpec, name: str, images_gib: float) -> None:
@@ -53,9 +53,9 @@ class PartWriter:
         self._spec = spec
         path = lerobot.shard_path(folder, lerobot.DATA, 0)
         # Readers list names that end in .parquet and .mp4, hidden ones too.
-        self.part = Part(path=path.with_name(f".file-{name}.parquet.part"))
-        self.part.path.parent.mkdir(parents=True, exist_ok=True)
-        self._file = open(self.part.path, "xb")  # noqa: SIM115
+        self.files = ShardFiles(path=path.with_name(f".file-{name}.parquet.part"))
+        self.files.path.parent.mkdir(parents=True, exist_ok=True)
+        self._file = open(self.files.path, "xb")  # noqa: SIM115
         # Few floats occur twice: a dictionary of them takes three times the time, and more room.
         self._writer = lerobot.require_pyarrow()[1].ParquetWriter(
             self._file,
@@ -65,15 +65,15 @@ class PartWriter:
         )
         for video in spec.videos:
             path = lerobot.shard_path(folder, lerobot.VIDEO, 0, video)
-            self.part.videos[video] = path.with_name(f".file-{name}.mp4.part")
-        self._videos = VideoEncoder(spec.videos, spec.fps, self.part.videos, images_gib * 2**30)
+            self.files.videos[video] = path.with_name(f".file-{name}.mp4.part")
+        self._videos = VideoEncoder(spec.videos, spec.fps, self.files.videos, images_gib * 2**30)
 
     def is_full(self) -> bool:
         """Whether one more episode like these would make the data file larger than
         `lerobot.DATA_MB`, or a video larger than `lerobot.VIDEO_MB`, or its footer too long.
         """
         data = self._file.tell() / (lerobot.DATA_MB * 2**20)
-        rows = len(self.part.rows)
+        rows = len(self.files.rows)
         share = max(data, self._videos.megabytes() / lerobot.VIDEO_MB, rows / lerobot.MOST_ROWS)
         return share * (1.0 + 1.0 / rows) > 1.0
 
@@ -110,17 +110,17 @@ class PartWriter:
             row[f"{lerobot.PIXELS}/{name}"] = pixels.ravel()
         for name, kinds in statistics.items():
             row |= {f"stats/{name}/{kind}": values for kind, values in kinds.items()}
-        self.part.rows.append(row)
+        self.files.rows.append(row)
 
-    def complete(self) -> Part:
+    def complete(self) -> ShardFiles:
         """Close the files; they are on the disk then."""
         self._writer.close()
         self._file.flush()
         os.fsync(self._file.fileno())
         self._file.close()
         self._videos.complete()
-        self.part.waited = self._videos.waited
-        return self.part
+        self.files.waited = self._videos.waited
+        return self.files
 
     def abandon(self) -> None:
         """Close the files as they are."""

@@ -46,7 +46,7 @@ def join(paths: Sequence[Path], path: Path) -> None:
         OSError: The file cannot be written.
     """
     listed = path.with_name(f"{path.name}.txt")
-    listed.write_text("".join(f"file '{os.path.relpath(part, path.parent)}'\n" for part in paths))
+    listed.write_text("".join(f"file '{os.path.relpath(clip, path.parent)}'\n" for clip in paths))
     source = ["-f", "concat", "-safe", "0", "-i", str(listed)]
     _ffmpeg([*source, "-c", "copy", "-f", "mp4", str(path)])
     listed.unlink()
@@ -115,7 +115,7 @@ class VideoEncoder:
         self._paths = paths
         self._most = most
         self._pool = ThreadPoolExecutor(os.cpu_count() or 1, "encoder")
-        self._parts: dict[str, list[Path]] = {name: [] for name in videos}
+        self._clips: dict[str, list[Path]] = {name: [] for name in videos}
         self._running: deque[tuple[Future[None], int]] = deque()  # with bytes of images
 
     def add(self, images: Mapping[str, np.ndarray]) -> None:
@@ -125,11 +125,11 @@ class VideoEncoder:
             OSError: An encoder has failed.
         """
         for name, video in self._videos.items():
-            parts = self._parts[name]
+            clips = self._clips[name]
             whole = self._paths[name]
             whole.parent.mkdir(parents=True, exist_ok=True)
-            parts.append(whole.with_name(f"{whole.name}.{len(parts):06d}"))
-            work = self._pool.submit(encode, images[name], self._fps, video.codec, parts[-1])
+            clips.append(whole.with_name(f"{whole.name}.{len(clips):06d}"))
+            work = self._pool.submit(encode, images[name], self._fps, video.codec, clips[-1])
             self._running.append((work, images[name].nbytes))
         while self._running and (
             sum(size for _, size in self._running) > self._most or self._running[0][0].done()
@@ -139,8 +139,8 @@ class VideoEncoder:
     def megabytes(self) -> float:
         """Size of the largest video so far, as far as it is encoded [MiB]."""
         sizes = [
-            sum(path.stat().st_size for path in parts if path.exists())
-            for parts in self._parts.values()
+            sum(path.stat().st_size for path in clips if path.exists())
+            for clips in self._clips.values()
         ]
         return max(sizes, default=0) / 2**20
 
@@ -152,9 +152,9 @@ class VideoEncoder:
         """
         while self._running:
             self._finish_one()
-        for name, parts in self._parts.items():
+        for name, clips in self._clips.items():
             path = self._paths[name]
-            join(parts, path)
+            join(clips, path)
             with open(path, "rb") as file:
                 os.fsync(file.fileno())
         self.abandon()
@@ -162,8 +162,8 @@ class VideoEncoder:
     def abandon(self) -> None:
         """Wait for what is being encoded, and remove the episodes' files."""
         self._pool.shutdown(cancel_futures=True)
-        for parts in self._parts.values():
-            for path in parts:
+        for clips in self._clips.values():
+            for path in clips:
                 path.unlink(missing_ok=True)
 
     def _finish_one(self) -> None:

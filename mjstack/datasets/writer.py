@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from mjstack.datasets import lerobot, reader
-from mjstack.datasets.part import Part
+from mjstack.datasets.part import ShardFiles
 from mjstack.datasets.reader import StoredDataset
 from mjstack.datasets.spec import DatasetSpec
 from mjstack.datasets.statistics import by_name, frame_statistics, image_statistics, sampled_frames
@@ -100,9 +100,9 @@ class DatasetWriter:
             for row in stored.episodes:
                 self._count(row)
             with reader.readable(self.folder / lerobot.INFO):
-                for facts in stored.info["mjstack"]["provenance"]:
-                    if facts["from_episode"] < len(self.committed):
-                        self._provenance.append(facts)
+                for entry in stored.info["mjstack"]["provenance"]:
+                    if entry["from_episode"] < len(self.committed):
+                        self._provenance.append(entry)
             columns = [f"{lerobot.PIXELS}/{name}" for name in self._pixels]
             for path in reader.data_files(self.folder, stored.info, lerobot.EPISODES):
                 with reader.readable(path):
@@ -111,14 +111,14 @@ class DatasetWriter:
             path.unlink()
         # Where the last writer and this one differ, such as in a version, both are on record.
         count = len(self.committed)
-        now = json.loads(json.dumps(dict(self.spec.provenance)))
+        provenance = json.loads(json.dumps(dict(self.spec.provenance)))
         *_, last = [{"from_episode": 0}, *self._provenance]
-        if last != {"from_episode": last["from_episode"], **now}:
-            self._provenance.append({"from_episode": count, **now})
+        if last != {"from_episode": last["from_episode"], **provenance}:
+            self._provenance.append({"from_episode": count, **provenance})
         (self.folder / "meta").mkdir(exist_ok=True)
         write_atomic(self.folder / lerobot.INFO, lerobot.to_json(self._make_info()))
 
-    def commit(self, parts: Sequence[Part]) -> None:
+    def commit(self, complete: Sequence[ShardFiles]) -> None:
         """Put complete files, whose episodes follow one another, to their places, then what says
         what is in them, and info.json last.
 
@@ -126,29 +126,29 @@ class DatasetWriter:
             FolderError: It cannot be written; the writer is closed, and what was committed
                 before is kept.
         """
-        if not parts:
+        if not complete:
             return
         with self.guarded():
             self._write_table(lerobot.tasks_table(self.spec.task), self.folder / lerobot.TASKS)
-            for shard, part in enumerate(parts, self._shards):
-                moves = {lerobot.shard_path(self.folder, lerobot.DATA, shard): part.path}
-                for name, hidden in part.videos.items():
+            for shard, files in enumerate(complete, self._shards):
+                moves = {lerobot.shard_path(self.folder, lerobot.DATA, shard): files.path}
+                for name, hidden in files.videos.items():
                     moves[lerobot.shard_path(self.folder, lerobot.VIDEO, shard, name)] = hidden
                 for path, hidden in moves.items():
                     path.parent.mkdir(parents=True, exist_ok=True)
                     os.replace(hidden, path)
-                self.waited += part.waited
+                self.waited += files.waited
                 first = self.frames
-                for number, row in enumerate(part.rows, len(self.committed)):
+                for number, row in enumerate(files.rows, len(self.committed)):
                     end = self.frames + row["length"]
                     row |= lerobot.episode_columns(
                         self.spec, shard, number, first, self.frames, end
                     )
                     self._count(row)
                     self._count_pixels(row)
-                rows = self._pa.Table.from_pylist(part.rows)
+                rows = self._pa.Table.from_pylist(files.rows)
                 self._write_table(rows, lerobot.shard_path(self.folder, lerobot.EPISODES, shard))
-            self._shards += len(parts)
+            self._shards += len(complete)
             if self.frames > 2 * self._described:  # all frames are read: not in every commit
                 self._write_statistics()
             write_atomic(self.folder / lerobot.INFO, lerobot.to_json(self._make_info()))

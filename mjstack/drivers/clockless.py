@@ -11,8 +11,8 @@ from typing_extensions import override
 
 from mjstack.drivers.feedback import State, servo_lag
 from mjstack.drivers.moves import find_moves
-from mjstack.drivers.sag import Sag
-from mjstack.drivers.turning import Due, TurningDriver
+from mjstack.drivers.servos import ServoInverse
+from mjstack.drivers.turning import Due, TurningDriver, directions
 from mjstack.managers.view import EnvView
 from mjstack.math import norm, quat_to_matrix
 from mjstack.mdp.geometry import pose_w, robot
@@ -22,6 +22,7 @@ _SPEED = 0.5  # m/s, of the grasp point
 _CARRY_SPEED = 0.25  # m/s, with an object in the jaws
 _PUSH_SPEED = 0.1  # m/s, with one before them
 _HASTE = 1.5  # times the mean speed of its phase, along a way that has to be exact
+_AHEAD = 0.4  # of a step's way that is led more, for each step by which commands are late
 _SLOWING = 0.5  # largest share of the distance that is left, in one step,
 _PUSH_SLOWING = 0.4  # and with an object before the jaws
 _JOINT = 0.25  # rad, m: largest lead of a joint
@@ -54,24 +55,18 @@ _OFF_CENTER = (0.015, 0.015, 0.010)  # m: so far from the grasp point, an object
 
 
 class ClocklessDriver(TurningDriver):
-    """Joint targets that are a function of the simulation's state: no clock, no memory.
-
-    The objects that the phases move go to their goals one after the other, as far as
+    """Joint targets that are a function of the simulation's state. The objects that the phases move go to their goals one after the other, as far as
     `EpisodeCheck.placed` and the measured positions do not find them there. The phases give the
     ways: to the object, and on with it. The state says which is due in each world: of the phases on
     whose way the grasp point is, the last one. It stays as far from the end of that way as it is
     off it, the jaws are turned or the gripper is not open, and moves straight up where it is too
-    low. A held object that is off the grasp point is made up for.
-
-    Where a phase aligns, the ways are exact: an object goes on only where it is off the way by less
+    low. A held object that is off the grasp point is made up for. Where a phase aligns, the ways are exact: an object goes on only where it is off the way by less
     than the task's check tolerates, turned to a face of the anchor, and as fast as the phases say.
     An object that no phase lets go of, as in a lift, is kept where the phases bring it last.
 
-    Closed jaws push an object in the same order: over the place beside it, down, to the object
-    and with it to its goal, open, up. Where nothing is moved, as in reach, the grasp point goes to
-    the only target of the phases.
-
-    A check judges it as it judges a policy: it has no phases. ``error`` and ``retries`` stay 0.
+    Closed jaws push an object in the same order. Where nothing is moved, as in reach, the grasp
+    point goes to the only target of the phases. A check judges it as it judges a policy: it has no
+    phases. ``error`` and ``retries`` stay 0.
 
     Attributes:
         due: Number of the configured phase to whose target the last command led, shape
@@ -144,12 +139,18 @@ class ClocklessDriver(TurningDriver):
         # A servo that lags has to be led by more than it is to move in a step.
         lag = servo_lag(env.sim.model, actuators)
         self._lead = 1.0 / (1.0 - math.exp(-cfg.timing.step_dt / lag))
-        self._sag = Sag(env)
+        self._servos = ServoInverse(env)
+        # Measured servos differ, stick and have backlash: each is led by its own figures.
+        differ = "dof_frictionloss" in env.sim.fields
+        self._measured = bool(cfg.robot.servos) or cfg.robot.backlash > 0.0 or differ
+        self._lead = 1.0 if self._measured else self._lead
+        self._pace = torch.ones_like(self.error)
         self._always = torch.ones_like(self._seen[:, : len(things), 0], dtype=torch.bool)
 
     @override
     def command(self) -> Tensor:
         self._observe(self._always)
+        self._pace = 1.0 + _AHEAD * self._env.command_delay.steps
         state = self._measure()
         points = self._points(state)
         due = self._decide(state, points)
@@ -162,7 +163,8 @@ class ClocklessDriver(TurningDriver):
         for column, value in self._locked:
             start[:, column] = value
         if self._aligns:
-            start[:, self._roll_column] += turn.clamp(-_ROLL, _ROLL)
+            most = _ROLL * self._pace
+            start[:, self._roll_column] += turn.clamp(-most, most)
         approach = None if self._tilt is None else self._tilted(state, due, phase)
         if approach is not None:
             # From a gripper that points elsewhere, the shortest way may end at a joint's limit.
@@ -171,15 +173,19 @@ class ClocklessDriver(TurningDriver):
             start = torch.where(flipped, self._nominal[phase], start)
             start[:, self._roll_column] = roll
         change = self._solve(start, target, phase, approach)[0] - q
+        if self._measured:
+            change = self._servos.lead(change, state, holds=due.closes)
         largest = change.abs().amax(1, keepdim=True)
         command = q + change * (_JOINT / largest.clamp(min=1e-6)).clamp(max=1.0)
-        command[:, : self._n_arm] += self._sag.bend()
+        if not self._measured:
+            command[:, : self._n_arm] += self._servos.sag(state)[:, : self._n_arm]
 
         # The gripper
         now = q[:, self._n_arm :]
-        grip = (self._grip[phase] - now).clamp(-self._grip_lead, self._grip_lead)
+        most = self._pace[:, None] * self._grip_lead
+        grip = (self._grip[phase] - now).clamp(-most, most)
         command[:, self._n_arm :] = now + grip
-        return self._keep_finite(command)
+        return self._as_read(self._keep_finite(command))
 
     def _decide(self, state: State, points: Tensor) -> Due:
         """The next thing to do in every world."""
@@ -239,7 +245,7 @@ class ClocklessDriver(TurningDriver):
         placed = torch.cat((unknown, placed), dim=1).index_select(1, self._judged)
         ends = points[:, self._place]
         left = ends - pos - offsets
-        way, _ = _directions(points[:, self._ways[1, :, -2]], ends)
+        way, _ = directions(points[:, self._ways[1, :, -2]], ends)
         along = (left * way).sum(-1)
         across = norm(left - along[..., None] * way)
         there = (across <= self._slack[self._place]) & (along <= _ABOVE)
@@ -272,7 +278,7 @@ class ClocklessDriver(TurningDriver):
         first = ends[:, 0].clone()
         first[:, 2].clamp_(min=torch.where(due.grasped, self._top[due.move], clear))
         begins = torch.cat((first[:, None], ends[:, :-1]), dim=1)
-        way, length = _directions(begins, ends)
+        way, length = directions(begins, ends)
 
         # How far the jaws, or the object in them, have to turn
         aligns = self._align[ways] & due.grasped[:, None]
@@ -312,7 +318,7 @@ class ClocklessDriver(TurningDriver):
         move[:, :2] *= 1.0 - (move[:, 2:] / _UP_FIRST - 0.33).clamp(0.0, 1.0)
         distance = norm(move)
         speed = torch.where(due.pushes, _PUSH_SPEED, _CARRY_SPEED)
-        speed = torch.where(due.grasped, speed, _SPEED) * dt
+        speed = torch.where(due.grasped, speed, _SPEED) * dt * self._pace
         slowing = torch.where(pushing, _PUSH_SLOWING, _SLOWING)
         lead = self._lead * torch.minimum(speed, slowing * distance)
         # Fingers that touch the table are not pressed onto it.
@@ -343,7 +349,7 @@ class ClocklessDriver(TurningDriver):
         quat = torch.stack([pose_w(self._env, name)[:, 3:] for name in names], dim=1)
         axes = quat_to_matrix(quat.float()[self._worlds, due.object])
         up = axes[self._worlds, :, axes[:, 2].abs().argmax(1)]
-        out = (state.point - self._env.sim.xpos[:, self._sag.base].float())[:, :2]
+        out = (state.point - self._env.sim.xpos[:, self._base[0]].float())[:, :2]
         x, y = (out / norm(out).clamp(min=1e-6)[:, None]).unbind(1)
         sin = -(up[:, 0] * x + up[:, 1] * y) * torch.sign(up[:, 2])
         cos = (1.0 - sin.square()).clamp(min=0.0).sqrt()
@@ -372,10 +378,3 @@ class ClocklessDriver(TurningDriver):
             offsets[:, k, :2] -= self._seen[:, self._aimed[place][1].source, :2]
             offsets[:, k, 2] -= pos[:, k, 2]
         return offsets
-
-
-def _directions(begins: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit vectors of ways, zero where they have no length, and their lengths."""
-    way = ends - begins
-    length = norm(way)
-    return way / length.clamp(min=1e-6)[..., None], length

@@ -94,9 +94,9 @@ class ClosedLoopDriver(FeedbackDriver):
             there = self._aim(self._tilt.place[self.phase])
             approach = self._tilt.desired_approach(start, self.phase, there, fresh)
         command, distance = self._solve(start, target, self.phase, approach)
-        self._keep_finite(command)
+        command = self._as_read(self._keep_finite(command))
         _put(self.error, self._time >= length - _DONE, torch.maximum(self.error, distance))
-        return self._command
+        return command
 
     def _advance(self, fresh: Tensor) -> None:
         """A step later: worlds whose phase is over enter the next one, or retry their grasp."""
@@ -136,7 +136,7 @@ class ClosedLoopDriver(FeedbackDriver):
         env = self._env
         force = [jaw_forces(env.index, env.sim, name).amin(1) for name in self._cfg.scene.objects]
         pressing = torch.stack(force, dim=1)[self._worlds, self._handled[self.phase]]
-        point = self._ik.forward(robot(env).qpos.read(env.sim.qpos).float())[0]
+        point = self._measure().point
         left = norm(point - self._to[:, :3])
         pressed = pressing >= self._until_force[self.phase]
         return (left <= self._until_within[self.phase]) | pressed

@@ -19,7 +19,7 @@ from mjstack.errors import ArgumentError
 from mjstack.kinematics.batched_ik import BatchedIk
 from mjstack.managers.view import EnvView
 from mjstack.math import atan2
-from mjstack.mdp.geometry import gripper_opening, objects_in_hand, place_xy, pose_w, robot
+from mjstack.mdp.geometry import objects_in_hand, place_xy, pose_w, robot, zeros
 from mjstack.scene.index import gripper_targets, turn_sign
 from mjstack.scene.phases import Phase, Target, build_phases, source_names
 
@@ -198,7 +198,10 @@ class FeedbackDriver(Driver):
         grips = gripper_targets(env.sim.model, cfg.robot, [phase.width for phase in self._plan])
         self._grip = self._tensor(grips.tolist())
 
-        # Inverse kinematics
+        # Inverse kinematics, and where the arm stands
+        model = env.sim.model
+        body = int(model.body_rootid[model.jnt_bodyid[model.joint(cfg.robot.arm_joints[0]).id]])
+        self._base = body, self._tensor(model.body_pos[body].tolist())
         self._ik = _solver(env, c.posture_gain)
         # Where nothing is carried, the gripper points down as far as it can.
         grasped = {phase.grasps for phase in c.phases.values()} - {None}
@@ -257,13 +260,20 @@ class FeedbackDriver(Driver):
     def _measure(self) -> State:
         """The state now."""
         env = self._env
-        q = robot(env).qpos.read(env.sim.qpos).float()
+        tensors = robot(env)
+        q = tensors.qpos.read(env.sim.qpos).float()
+        if (off := zeros(env)) is not None:  # the joints' truth, whatever their servos believe
+            q = q + off.float()
+        point, closing, approach = self._ik.forward(q)
+        grip = (q[:, self._n_arm :] - tensors.gripper_closed) / tensors.gripper_travel
         pos = [pose_w(env, name)[:, :3].float() for name in self._cfg.scene.objects]
         return State(
             q,
-            robot(env).qvel.read(env.sim.qvel)[:, : self._n_arm].float().abs().amax(1),
-            *self._ik.forward(q),
-            opening=gripper_opening(env).float().amin(1),
+            tensors.qvel.read(env.sim.qvel)[:, : self._n_arm].float().abs().amax(1),
+            point - self._sunk(),
+            closing,
+            approach,
+            opening=grip.float().amin(1),
             pos=torch.stack(pos, dim=1),
             in_hand=objects_in_hand(env.index, env.sim),
         )
@@ -282,7 +292,19 @@ class FeedbackDriver(Driver):
     ) -> tuple[Tensor, Tensor]:
         """Inverse kinematics near the posture of each world's phase; as of `BatchedIk.solve`."""
         posture = self._nominal[phase] if self._cfg.controller.posture_gain > 0.0 else None
-        return self._ik.solve(start, target, posture, approach)
+        return self._ik.solve(start, target + self._sunk(), posture, approach)
+
+    def _sunk(self) -> Tensor | float:
+        """How much lower each world's arm stands than in the model, over x, y, z [m]."""
+        if "body_pos" not in self._env.sim.fields:
+            return 0.0
+        body, nominal = self._base
+        return nominal - self._env.sim.fields["body_pos"][:, body].float()
+
+    def _as_read(self, command: Tensor) -> Tensor:
+        """A command of the joints' true positions, as their servos count it."""
+        off = zeros(self._env)
+        return command if off is None else command - off.float()
 
     def _keep_finite(self, command: Tensor) -> Tensor:
         """Keep the command for the next step. A world whose state is not finite keeps its last one,

@@ -7,6 +7,7 @@ from mjstack.config.schema import Config
 from mjstack.errors import ConfigError
 from mjstack.scene.phases import Phase, source_names
 
+_LATE = 0.1001  # s: by so much commands may be late
 _FIX = "Set controller.clock=true, or trainer=clone to train a policy"
 
 
@@ -33,6 +34,9 @@ class Move(NamedTuple):
     open: int
     retreat: int
     lifts: list[int]
+
+
+_LATE = 0.1001  # s: by so much commands may be late
 
 
 def find_moves(cfg: Config, phases: Sequence[Phase]) -> list[Move]:

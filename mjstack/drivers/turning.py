@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mjstack.drivers.feedback import STAY, FeedbackDriver, State
 from mjstack.managers.view import EnvView
-from mjstack.math import atan2
+from mjstack.math import atan2, norm
 
 _UPRIGHT = 1e-3  # horizontal part of an approach axis that points straight down
 
@@ -92,3 +92,10 @@ class TurningDriver(FeedbackDriver):
         cost[1::2].masked_fill_(oblong, math.inf)
         goal = rolls.gather(0, cost.argmin(0, keepdim=True))[0]
         return torch.where(oblong, 1.0, share) * goal - roll
+
+
+def directions(begins: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
+    """Unit vectors of ways, zero where they have no length, and their lengths."""
+    way = ends - begins
+    length = norm(way)
+    return way / length.clamp(min=1e-6)[..., None], length

@@ -4,7 +4,6 @@ recorded, and what they keep of each batch.
 
 from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -55,12 +54,12 @@ class Batch:
 
     def finite(self) -> Tensor:
         """Whether all that was recorded of each world is finite, shape ``(nworld,)``, bool."""
-        parts = [
+        finite_rows = [
             rows.isfinite().reshape(*rows.shape[:2], -1).all(2).all(0)
             for rows in self.rows.values()
             if rows.is_floating_point()
         ]
-        return torch.stack(parts).all(0)
+        return torch.stack(finite_rows).all(0)
 
     def select(self, name: str, worlds: Tensor) -> Tensor:
         """A channel's rows in some worlds, shape ``(worlds, rows, ...)``; ``worlds`` are numbers or
@@ -88,7 +87,7 @@ def play_batches(
         plans: The batches.
         channels: What is recorded.
         cfg: Configuration of the environment, if not that of a driven episode.
-        alone: Backend and device on which the worlds play without the rest of their batch.
+        alone: Backend and device on which single worlds play without the rest of their batch.
         driver: Makes the driver of worlds that have started, if not the configured one.
         observers: More observers of a batch.
         label: Name of the steps in the progress, before the seed.
@@ -100,20 +99,18 @@ def play_batches(
             if sim is None or sim.nworld != len(plan.worlds):
                 if sim is not None:
                     sim.close()
-                make = (
-                    stage.batch_simulation
-                    if alone is None
-                    else partial(stage.simulate_alone, *alone)
+                sim = (
+                    stage.simulate_alone(*alone)
+                    if alone is not None
+                    else stage.batch_simulation(len(plan.worlds))
                 )
-                sim = make(len(plan.worlds))
             env = Env(sim, stage.index, cfg, check_faults=False)  # the check names lost worlds
             reset_worlds(env, plan.seed, plan.worlds)
             recorder = Recorder(*channels)
             episode = play_episode(
                 env,
                 driver(plan, env) if driver else stage.driver(env),
-                # Once each: the live view may be both
-                [*dict.fromkeys((recorder, *observers(plan), *stage.observers))],
+                [recorder, *observers(plan), *stage.observers],
                 advance=stage.progress.advance,
                 label=f"{label}, seed {plan.seed}",
             )

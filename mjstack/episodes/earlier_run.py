@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from mjstack.config.check import gate_reset, reads_starts_file
 from mjstack.config.load import load_saved
 from mjstack.config.schema import Config
@@ -82,23 +80,6 @@ class EarlierRun:
                 f" {self.cfg.nworld} worlds. Run that gate again."
             )
         return record
-
-    def failing(self, gate: str) -> tuple[dict[int, dict[int, int]], int]:
-        """The bits of the rules that each failing world of a gate broke, by seed and world, and the
-        number of episodes of the seeds that it has finished.
-
-        Raises:
-            FolderError: A record cannot be read.
-        """
-        bits = {}
-        episodes = 0
-        for seed in range(self.cfg.seed, self.cfg.seed + self.cfg.gate[gate].seeds):
-            record = EpisodeRecord.read(self.folder, seed, gate)
-            if record is not None:
-                episodes += len(record.failed)
-                if worlds := np.flatnonzero(record.failed).tolist():
-                    bits[seed] = {world: int(record.failed[world]) for world in worlds}
-        return bits, episodes
 
 
 def archive_starts(cfg: Config, folder: Path) -> Config:

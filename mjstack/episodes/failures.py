@@ -73,19 +73,24 @@ class FailureMonitor(Observer):
         self._check = env.check
         # Numbers of objects are the check's. Without phases there is one, which moves nothing.
         names = list(env.cfg.scene.objects)
-        column = {names.index(name): place for place, name in enumerate(self._check.objects)}
+        column = {
+            names.index(name): column_number
+            for column_number, name in enumerate(self._check.objects)
+        }
         grasped = [column.get(phase.grasped, -1) for phase in driver.phases] or [-1]
         carried = [column.get(phase.carried, -1) for phase in driver.phases] or [-1]
         # The phase that lets go of each object last; one that never comes for what is not carried
-        last = {place: number for number, place in enumerate(carried)}
-        released = [last.get(place, len(carried) - 1) + 1 for place in column.values()]
+        last = {column_number: number for number, column_number in enumerate(carried)}
+        released = [
+            last.get(column_number, len(carried) - 1) + 1 for column_number in column.values()
+        ]
         self._grasped = torch.tensor(grasped, device=device)
         self._carried = torch.tensor(carried, device=device)
         self._release = torch.tensor(released, device=device)
         self.sign = torch.zeros(env.nworld, dtype=torch.int64, device=device)
         self.phase = torch.full_like(self.sign, -1)
         self.step = torch.full_like(self.sign, -1)
-        self._now = torch.zeros_like(self.sign[:1])
+        self._count = torch.zeros_like(self.sign[:1])
         self._at = torch.zeros_like(self.sign)
         self._gone = torch.zeros_like(self.sign)
         self._loaded = self.sign.new_zeros((env.nworld, len(released)), dtype=torch.bool)
@@ -101,9 +106,9 @@ class FailureMonitor(Observer):
         lost = not_finite(sim.qpos, sim.qvel) | ((sim.overflow & LOST_PHYSICS) != 0)
         entered = phase > self._at
         grasped = self._grasped.index_select(0, self._at)
-        empty = entered & (grasped >= 0) & ~_of(self._loaded, grasped)
+        empty = entered & (grasped >= 0) & ~_column_of(self._loaded, grasped)
         carried = self._carried.index_select(0, phase)
-        self._gone.add_(1).mul_((carried >= 0) & ~_of(loaded, carried))
+        self._gone.add_(1).mul_((carried >= 0) & ~_column_of(loaded, carried))
         dropped = self._gone >= GONE_STEPS
         missed = entered & ((self._at[:, None] == self._release) & ~self._placed).any(1)
         left = ((phase[:, None] > self._release) & self._placed & ~placed).any(1)
@@ -119,14 +124,14 @@ class FailureMonitor(Observer):
         self.sign.copy_(torch.where(first, seen, self.sign))
         if self.driver.phases:
             self.phase.copy_(torch.where(first, torch.where(ended, self._at, phase), self.phase))
-        self.step.copy_(torch.where(first, self._now, self.step))
+        self.step.copy_(torch.where(first, self._count, self.step))
         self._at.copy_(phase)
         self._loaded.copy_(loaded)
         self._placed.copy_(placed)
-        self._now += 1
+        self._count += 1
 
 
-def _of(table: Tensor, column: Tensor) -> Tensor:
+def _column_of(table: Tensor, column: Tensor) -> Tensor:
     """Each world's column, shape ``(nworld,)``; the first one where there is none (-1)."""
     if not table.shape[1]:  # the task is about no object
         return torch.zeros_like(column, dtype=torch.bool)

@@ -1,10 +1,8 @@
 """Worlds in motion, for the run's 3-D page: recorded on the device, failing ones first."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import closing
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from mjstack.drivers.driver import Driver
@@ -14,7 +12,6 @@ from mjstack.episodes.stage import Stage
 from mjstack.mdp.geometry import place_xy
 from mjstack.report.geometry import Fields, is_visible, match_geoms
 from mjstack.report.page import World, frame_stride
-from mjstack.sim import Simulation
 
 _BYTES = 64 * 2**20  # of one recording
 
@@ -42,8 +39,10 @@ def world_fields(stage: Stage, env: Env, worlds: Sequence[int]) -> list[Fields]:
     with visuals.
     """
     sim = env.sim
-    places = env.cfg.scene.places.items()
-    centers = {name: place_xy(env, name) for name, place in places if any(place.random_xy)}
+    place_cfgs = env.cfg.scene.places.items()
+    centers = {
+        name: place_xy(env, name) for name, place_cfg in place_cfgs if any(place_cfg.random_xy)
+    }
     fields = {name: values for name, values in sim.fields.items() if is_visible(name)}
     if not centers and not fields:
         return [{}] * len(worlds)
@@ -65,52 +64,17 @@ def world_fields(stage: Stage, env: Env, worlds: Sequence[int]) -> list[Fields]:
     return [{name: values[row] for name, values in rows.items()} for row in range(len(worlds))]
 
 
-def draw_seen(
-    stage: Stage, qpos: np.ndarray, sim: Simulation, world: int = 0, stride: int = 1
-) -> dict[str, np.ndarray]:
-    """Draw what a policy that sees images saw in a world.
-
-    Args:
-        stage: On which it was played.
-        qpos: Its positions every ``stride`` control steps, shape ``(frames, nq)``; NaN where it was
-            not played.
-        sim: The worlds, whose looks are still those of the episode.
-        world: Its place among them.
-        stride: Control steps between two positions.
-
-    Returns:
-        Images by camera, each ``(frames, height, width, 3)``, uint8, which change where the policy
-        was queried. None of a driver that sees no images, or of LeRobot's.
-    """
-    policy = stage.policy
-    if policy is None or not policy.network.vision.sizes:
-        return {}
-    looks = {name: values[world : world + 1] for name, values in sim.fields.items()}
-    queried = np.arange(len(qpos)) * stride // policy.execute * policy.execute // stride
-    frames, rows = np.unique(queried, return_inverse=True)
-    cameras = list(policy.network.vision.sizes)
-    images: dict[str, list[np.ndarray]] = {name: [] for name in cameras}
-    with closing(stage.color_renderer(1, list(looks), cameras)) as renderer:
-        for state in torch.from_numpy(np.nan_to_num(qpos[frames])):
-            buffers = renderer.draw(state[None], looks)
-            for name in cameras:
-                images[name].append(buffers[f"images.{name}"][0].cpu().numpy().copy())
-    return {name: np.stack(part)[rows] for name, part in images.items()}
-
-
 def moving_worlds(
     stage: Stage,
     env: Env,
     qpos: Tensor,
     failed: np.ndarray,
     labels: Mapping[int, str],
-    seen: int = 0,
 ) -> list[World]:
     """Worlds of a batch in motion, as an episode on the stage has left them: positions that
     `motion_recorder` has recorded, bits of the task's rules, shape ``(nworld,)``, and the labels of
-    the worlds that are shown, by their rows. So many as ``seen`` show what their driver saw.
+    the worlds that are shown, by their rows.
     """
-    stride = frame_stride(stage.cfg.timing.step_dt)
     motions = qpos[:, [*labels]].float().swapaxes(0, 1).cpu().numpy()
     fields = world_fields(stage, env, [*labels])
     return [
@@ -118,10 +82,7 @@ def moving_worlds(
             label=label,
             qpos=motion,
             rules=stage.check.rules.broken(failed[row]),
-            images=draw_seen(stage, motion, env.sim, row, stride) if number < seen else {},
             fields=values,
         )
-        for number, ((row, label), motion, values) in enumerate(
-            zip(labels.items(), motions, fields, strict=True)
-        )
+        for (row, label), motion, values in zip(labels.items(), motions, fields, strict=True)
     ]

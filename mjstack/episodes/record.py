@@ -1,7 +1,6 @@
 """The record of all episodes of one seed, as arrays."""
 
 import re
-import socket
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -10,12 +9,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from mjstack.distributed import Ranks
 from mjstack.episodes.batches import Batch
 from mjstack.episodes.failures import FailureMonitor, Sign
 from mjstack.files import read_npz, reading
 
-_FACTS = ("seed", "backend", "device", "seconds", "steps")
+_SCALARS = ("seed", "backend", "device", "seconds", "steps")
 _NAMES = ("object_names", "phase_names")
 
 
@@ -40,7 +38,6 @@ class EpisodeRecord:
         phase_names: Names of the phases, where circumstances are recorded.
         seconds: Wall time of the steps, in the slowest rank [s].
         steps: Physics steps of all worlds.
-        ranks: The first world of each rank that has played some, and its host and device.
     """
 
     seed: int
@@ -51,7 +48,6 @@ class EpisodeRecord:
     phase_names: list[str] = field(default_factory=list)
     seconds: float = 0.0
     steps: int = 0
-    ranks: dict[int, str] = field(default_factory=dict)
 
     @property
     def failed(self) -> np.ndarray:
@@ -75,9 +71,7 @@ class EpisodeRecord:
         return {name.removeprefix("value."): self.worlds[name] for name in names}
 
     @classmethod
-    def from_batch(
-        cls, ranks: Ranks, batch: Batch, monitor: FailureMonitor | None = None
-    ) -> "EpisodeRecord":
+    def from_batch(cls, batch: Batch, monitor: FailureMonitor | None = None) -> "EpisodeRecord":
         """The record of a batch that a rank has played, perhaps watched by a monitor."""
         sim = batch.env.sim
         episode = batch.episode
@@ -98,7 +92,6 @@ class EpisodeRecord:
             worlds["unreachable"] = ~(episode.ik_error <= batch.env.cfg.controller.ik_tolerance)
             signs = torch.stack((monitor.sign, monitor.phase, monitor.step)).cpu().numpy()
             worlds |= zip(("sign", "sign_phase", "sign_step"), signs, strict=True)
-        where = f"rank {ranks.rank}: {socket.gethostname()}, {sim.device}"
         return cls(
             seed=batch.plan.seed,
             backend=sim.backend,
@@ -108,23 +101,22 @@ class EpisodeRecord:
             phase_names=[phase.name for phase in monitor.driver.phases] if monitor else [],
             seconds=episode.timing.seconds,
             steps=int(sim.step_count.sum()),
-            ranks={batch.plan.worlds[0]: where} if ranks.size > 1 else {},
         )
 
     @classmethod
-    def join(cls, parts: Sequence["EpisodeRecord"]) -> "EpisodeRecord":
+    def join(cls, records: Sequence["EpisodeRecord"]) -> "EpisodeRecord":
         """The record of all worlds, from those of ranks, in the order of their worlds."""
-        first = parts[0]
-        if len(parts) == 1:
+        first = records[0]
+        if len(records) == 1:
             return first
         return replace(
             first,
             worlds={
-                name: np.concatenate([part.worlds[name] for part in parts]) for name in first.worlds
+                name: np.concatenate([rank_record.worlds[name] for rank_record in records])
+                for name in first.worlds
             },
-            seconds=max(part.seconds for part in parts),
-            steps=sum(part.steps for part in parts),
-            ranks={world: where for part in parts for world, where in part.ranks.items()},
+            seconds=max(rank_record.seconds for rank_record in records),
+            steps=sum(rank_record.steps for rank_record in records),
         )
 
     @classmethod
@@ -139,13 +131,12 @@ class EpisodeRecord:
             return None
         with reading(path, "Run the gate again"):
             arrays = read_npz(path)
-            ranks = [arrays.pop(name) for name in ("rank_first_world", "rank_place")]
-            arrays.pop("sign_names", None)
+            for name in ("sign_names", "rank_first_world", "rank_place"):  # those of earlier runs
+                arrays.pop(name, None)
             record = cls(
-                **{n: arrays.pop(n).item() for n in _FACTS},
+                **{n: arrays.pop(n).item() for n in _SCALARS},
                 **{n: _items(arrays.pop(n)) for n in _NAMES if n in arrays},
                 worlds=arrays,
-                ranks=dict(zip(*map(_items, ranks), strict=True)),
             )
             record._check()
         return record
@@ -166,13 +157,12 @@ class EpisodeRecord:
 
     def arrays(self) -> dict[str, Any]:
         """The content of its file, `record_name`."""
-        arrays: dict[str, Any] = self.worlds | {name: getattr(self, name) for name in _FACTS}
+        arrays: dict[str, Any] = self.worlds | {name: getattr(self, name) for name in _SCALARS}
         arrays["object_names"] = self.object_names
         if "sign" in arrays:
             arrays["phase_names"] = self.phase_names
             arrays["sign_names"] = [sign.name for sign in Sign]
-        ranks = {"rank_first_world": list(self.ranks), "rank_place": list(self.ranks.values())}
-        return arrays | ranks
+        return arrays
 
 
 def _items(array: np.ndarray) -> Any:

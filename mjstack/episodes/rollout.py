@@ -117,7 +117,7 @@ def rollout(
         """Warm-up and capture so far [s]."""
         return (0.0, 0.0) if graph is None else (graph.warm_up_seconds, graph.capture_seconds)
 
-    before = graph_seconds()
+    graph_start = graph_seconds()
 
     # The episode
     sim.synchronize()
@@ -137,7 +137,8 @@ def rollout(
 
     # Its time
     warm_up, capture = (
-        end if end != start else 0.0 for end, start in zip(graph_seconds(), before, strict=True)
+        end if end != start else 0.0
+        for end, start in zip(graph_seconds(), graph_start, strict=True)
     )
     captured = play.captured
     play.drop()  # its memory, which only the collector would find otherwise
@@ -235,16 +236,16 @@ def start_places(env: Env) -> dict[str, np.ndarray]:
         for body in np.flatnonzero(model.body_weldid[model.body_parentid] == 0)[1:].tolist():
             pose = torch.cat((sim.xpos[:, body], sim.xquat[:, body]), dim=1)
             poses.setdefault(model.body(body).name or f"body {body}", pose)
-    out = {}
+    poses_by_name = {}
     for name, pose in poses.items():
         # Objects stand flat at a start, so that all of a rotation is about z.
         x, y, _, w, _, _, z = pose.double().cpu().numpy().T
-        out[name] = np.column_stack((x, y, 2.0 * np.arctan2(z, w)))
-    for name, place in env.cfg.scene.places.items():
-        if any(place.random_xy):
+        poses_by_name[name] = np.column_stack((x, y, 2.0 * np.arctan2(z, w)))
+    for name, place_cfg in env.cfg.scene.places.items():
+        if any(place_cfg.random_xy):
             xy = place_xy(env, name).double().cpu().numpy()
-            out[name] = np.column_stack((xy, np.full(len(xy), np.nan)))
-    return out
+            poses_by_name[name] = np.column_stack((xy, np.full(len(xy), np.nan)))
+    return poses_by_name
 
 
 def play_episode(

@@ -1,6 +1,6 @@
 """A run: the stage on which it plays, its folder, its records, and the products of its gates."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -9,10 +9,10 @@ import numpy as np
 
 from mjstack.config.schema import Backend, Config
 from mjstack.envs import Env
-from mjstack.episodes.motion import draw_seen, world_fields
+from mjstack.episodes.motion import world_fields
 from mjstack.episodes.record import EpisodeRecord
 from mjstack.episodes.recorder import Snapshots, WorldRecorder
-from mjstack.episodes.rollout import Episode, Hook, Observer, State
+from mjstack.episodes.rollout import Episode, Hook, State
 from mjstack.episodes.stage import Stage, TextHook
 from mjstack.managers.episode import required_fields
 from mjstack.managers.view import offers
@@ -80,7 +80,6 @@ class Run:
         gate: Name of the gate that is running.
         begin: Gets the name of each part of the run as it begins.
         record: Gets each result as soon as there is one.
-        viewers: Look on at the one-world episode that is shown.
         artifacts: Products of gates.
         records: The episodes of *batch* and *success*, by gate, a record for each seed.
         page: What the run shows besides its results.
@@ -91,7 +90,6 @@ class Run:
     gate: str = ""
     begin: TextHook = lambda name: None
     record: Callable[[GateResult], None] = lambda result: None
-    viewers: Sequence[Observer] = ()
     artifacts: Artifacts = field(default_factory=Artifacts)
     records: dict[str, list[EpisodeRecord]] = field(default_factory=dict)
     page: Page = field(default_factory=Page)
@@ -105,7 +103,7 @@ class Run:
         """Print a line, which has no markup."""
         self.stage.progress.print_line(line)
 
-    def on(self, stage: Stage) -> "Run":
+    def with_stage(self, stage: Stage) -> "Run":
         """The run on another stage, with artifacts of its own."""
         return replace(self, stage=stage, artifacts=Artifacts())
 
@@ -127,10 +125,10 @@ class Run:
             ctrl.append(sim.ctrl.numpy().copy())
 
         sent = Hook(keep)
-        viewers = () if "parity" in self.cfg.gates else self.viewers
+        viewers = () if "parity" in self.cfg.gates else stage.observers
         episode = stage.play(sim, reset, [*viewers, world, snapshots, sent])
-        late = int(sent.env.command_delay.steps[0])  # physics has seen these commands
-        seen = {step: max(0, step - late) for step in snapshots.states}
+        delay = int(sent.env.command_delay.steps[0])  # physics has seen these commands
+        seen = {step: max(0, step - delay) for step in snapshots.states}
         states = {k: state._replace(ctrl=ctrl[seen[k]]) for k, state in snapshots.states.items()}
         modes = [(t.params.get("joints"), t.params.get("mode")) for t in stage.action.values()]
         absolute = modes == [("arm", "absolute"), ("gripper", "absolute")]
@@ -171,22 +169,22 @@ class Run:
         values in a few words.
         """
         check = self.stage.check
-        broken, beyond = check.why(episode.failed, episode.values)
-        words = ", ".join(f"{check.rules.texts[rule]}{why}" for rule, why in broken.items())
+        broken, beyond_keys = check.why(episode.failed, episode.values)
+        failures = ", ".join(f"{check.rules.texts[rule]}{why}" for rule, why in broken.items())
         values = {key: float(values[0]) for key, values in episode.values.items()}
         measured = [replace(check.figures[key], value=value) for key, value in values.items()]
         result = GateResult(
             name=name,
             status=Status.failed if broken else Status.passed,
-            reason=f"failed: {words}" if words else "",
+            reason=f"failed: {failures}" if failures else "",
             figures=[*check.thresholds(), *measured],
-            beyond=beyond,
+            beyond=beyond_keys,
         )
         return result, check.headline(values)
 
     def show_world(
         self,
-        part: str,
+        section: str,
         label: str,
         qpos: np.ndarray,
         episode: Episode,
@@ -194,17 +192,15 @@ class Run:
         title: str = "",
     ) -> None:
         """Show a world that was played alone, under a label, on the run's page if that has worlds
-        in motion; with a title on the run's pictures too. ``part`` is the part of the run that has
-        played it, ``qpos`` its positions at every step end, shape ``(steps, nq)``.
+        in motion; with a title on the run's pictures too. ``section`` is the part of the run that
+        has played it, ``qpos`` its positions at every step end, shape ``(steps, nq)``.
         """
         (fields,) = world_fields(self.stage, env, [0])
         if self.page.motion:
-            stride = frame_stride(self.cfg.timing.step_dt)
-            frames = qpos[::stride]
-            seen = draw_seen(self.stage, frames, env.sim, stride=stride)
             bits = int(episode.failed[0])
             rules = self.stage.check.rules.broken(bits) if bits else []
-            world = World(label=label, qpos=frames, rules=rules, images=seen, fields=fields)
-            self.page.worlds3d[part] = [world]
+            frames = qpos[:: frame_stride(self.cfg.timing.step_dt)]
+            world = World(label=label, qpos=frames, rules=rules, fields=fields)
+            self.page.worlds3d[section] = [world]
         if title:
             self.artifacts.pictured = World(label=title, qpos=qpos, fields=fields)

@@ -161,11 +161,9 @@ class Stage:
 
     def driven(self, reset: Reset) -> Config:
         """The configuration of a driven episode. Of a driver that needs no phases it has success in
-        every step, and that of the live view rewards too.
+        every step.
         """
         cfg = driven_config(self.cfg, reset, self.action)
-        if self.cfg.view == "web":
-            cfg = replace(cfg, reward=self.cfg.reward, task=self.cfg.task)
         if not self.driver_class.needs_phases:
             graph = "off" if self.driver_class.on_host else cfg.graph
             cfg = replace(cfg, task=self.cfg.task, graph=graph)
@@ -232,14 +230,14 @@ class Stage:
             sizes=sizes,
         )
 
-    def simulate_alone(self, backend: Backend, device: str, nworld: int = 1) -> Simulation:
-        """Worlds of the batch without the others. In its batch a world could take more than its
-        share of the contact pool, so it gets some more.
+    def simulate_alone(self, backend: Backend, device: str) -> Simulation:
+        """A world of the batch without the others. In its batch it could take more than its share
+        of the contact pool, so it gets some more.
         """
         sizes = resolve_sizes(self.cfg)
         nconmax = min(_SHARES, self.cfg.nworld) * sizes.nconmax
         sizes = replace(sizes, nconmax=nconmax, nccdmax=None)
-        return self.simulation(nworld, backend, device, sizes=sizes)
+        return self.simulation(1, backend, device, sizes=sizes)
 
     @property
     def sizes(self) -> BatchSizes:

@@ -81,7 +81,7 @@ class EpisodeTally:
         return {name: self.array(f"value.{name}") for name in self.records[0].values}
 
     @property
-    def places(self) -> dict[str, np.ndarray]:
+    def start_poses(self) -> dict[str, np.ndarray]:
         """Where each object started, and all else that did not start the same in every episode, as
         of `start_places`, over the episodes of all seeds.
         """
@@ -89,9 +89,9 @@ class EpisodeTally:
         rows = self.array("start_places").swapaxes(0, 1) if names else ()
         movable = self.check.cfg.scene.free
         return {
-            name: places
-            for name, places in zip(names, rows, strict=True)
-            if name in movable or np.ptp(np.nan_to_num(places), 0).any()
+            name: poses
+            for name, poses in zip(names, rows, strict=True)
+            if name in movable or np.ptp(np.nan_to_num(poses), 0).any()
         }
 
     @property
@@ -112,8 +112,8 @@ class EpisodeTally:
     def names(self, episodes: Sequence[int] | np.ndarray) -> list[str]:
         """Names of episodes, counted over all seeds, as ``world=`` of job=replay takes them."""
         seeds = [f"{record.seed}:" if self.several else "" for record in self.records]
-        places = (divmod(episode, len(self.records[0].failed)) for episode in episodes)
-        return [f"{seeds[seed]}{world}" for seed, world in places]
+        pairs = (divmod(episode, len(self.records[0].failed)) for episode in episodes)
+        return [f"{seeds[seed]}{world}" for seed, world in pairs]
 
     def write_failing(self) -> None:
         """Write the table of failing episodes, if any: rules, signs, where objects were at the
@@ -121,7 +121,7 @@ class EpisodeTally:
         """
         rows = []
         failed = np.flatnonzero(self.array("failed")).tolist() if self.records else []
-        places = self.places if failed else {}
+        poses = self.start_poses if failed else {}
         for episode in failed:
             number, world = divmod(episode, len(self.records[0].failed))
             record = self.records[number]
@@ -133,7 +133,7 @@ class EpisodeTally:
                 row["phase"] = [*record.phase_names, ""][values["sign_phase"]]
                 row["step"] = values["sign_step"] if values["sign_step"] >= 0 else ""
                 row |= {"retries": values["retries"], "unreachable": int(values["unreachable"])}
-            for name, starts in places.items():
+            for name, starts in poses.items():
                 cells = zip(("x_m", "y_m", "yaw_rad"), starts[episode], strict=True)
                 row |= {f"{name}_{end}": f"{x:.6g}" for end, x in cells if not np.isnan(x)}
             row |= {name: f"{values[f'value.{name}']:.6g}" for name in record.values}
@@ -181,15 +181,14 @@ class EpisodeTally:
 
     def result(
         self,
-        parts: Sequence[str],
+        sentences: Sequence[str],
         *,
         passed: bool,
         figures: Sequence[Figure],
         rate: float = -math.inf,
-        tables: Sequence[Table] = (),
     ) -> GateResult:
-        """The episodes as the gate's result, in words (``parts``) before failures and problems;
-        with a problem it has failed. Figures and tables add to those of the tally and the check.
+        """The episodes as the gate's result, in words (``sentences``) before failures and problems;
+        with a problem it has failed. Figures add to those of the tally and the check.
         ``rate`` is the least success rate that is wanted.
         """
         bits = self.array("failed")
@@ -197,18 +196,20 @@ class EpisodeTally:
         texts = self.check.rules.texts
         which = self.check.rules.failing(bits)
         broken = {texts[rule]: episodes for rule, episodes in which.items()}
-        why, beyond = self.check.why(bits, self.values)
-        reason = [*parts]
+        why, beyond_keys = self.check.why(bits, self.values)
+        reason = [*sentences]
         if len(failed):
-            counts = "; ".join(f"{texts[n]} in {len(which[n])}{words}" for n, words in why.items())
+            counts = "; ".join(
+                f"{texts[n]} in {len(which[n])}{detail}" for n, detail in why.items()
+            )
             reason.append(f"{self._name(failed, 8)} failed: {counts}")
-        look = ""
+        hint = ""
         cfg = self.check.cfg
         if len(failed) and self.folder is not None and cfg.job.name == "gates":
             gate = "" if self.gate == cfg.episode_gates[0] else f"{self.gate}:"
             world = f"world={gate}{self.names(failed[:1])[0]}"
-            look = command("job=replay", assign("run", self.folder), world)
-            look = f". To look at one: {look}"
+            hint = command("job=replay", assign("run", self.folder), world)
+            hint = f". To look at one: {hint}"
         if "sign" in self.records[0].worlds and self.array("unreachable").any():
             unreachable = np.flatnonzero(self.array("unreachable"))
             broken = {"target out of reach": unreachable.tolist()} | broken
@@ -216,12 +217,12 @@ class EpisodeTally:
         return GateResult(
             name=self.gate,
             status=Status.passed if passed and not self.problems else Status.failed,
-            reason="; ".join([*reason, *self.problems]) + look,
+            reason="; ".join([*reason, *self.problems]) + hint,
             figures=[*self.check.thresholds(), *self.figures(rate), *figures],
-            beyond=beyond,
+            beyond=beyond_keys,
             notes=self.notes,
             details=named + self.details,
-            tables=[*self.tables(), *tables],
+            tables=self.tables(),
         )
 
     def _name(self, episodes: Sequence[int] | np.ndarray, limit: int) -> str:
@@ -249,21 +250,21 @@ class EpisodeTally:
         # What the check judges, and what else differs
         index = stage.index
         judged = self.check.objects
-        starts = self.places
-        marks = {name: place.xy for name, place in scene.places.items()}
+        starts = self.start_poses
+        marks = {name: place_cfg.xy for name, place_cfg in scene.places.items()}
         marks |= {name: at for name, at in index.fixed.items() if name in judged}
         marks = {name: at[:2] for name, at in marks.items() if name not in starts}
-        for name, places in starts.items():
+        for name, poses in starts.items():
             if name in index.objects and name not in judged:
                 worlds.unjudged.append(name)
                 continue
-            ways = []
+            paths = []
             if name in index.objects:
                 x, _ = index.objects[name]
-                ways = [(w.caption, bool(w.rules), w.qpos[:, x : x + 2]) for w in moving]
-            xy = places[plotted, :2]
+                paths = [(w.caption, bool(w.rules), w.qpos[:, x : x + 2]) for w in moving]
+            xy = poses[plotted, :2]
             worlds.maps.append(
-                Map(title=name, xy=xy, table=table, ways=ways, marks=marks, base=index.base)
+                Map(title=name, xy=xy, table=table, ways=paths, marks=marks, base=index.base)
             )
         return worlds
 

@@ -63,9 +63,9 @@ def run_baseline(run: Run) -> list[GateResult]:
     names = scene_names(cfg.scene)
     lines = left_behind(read_robot(cfg.robot, cfg.model), cfg.robot, run.stage.model, names)
     result.details += [f"robot's file: {line}" for line in lines]
-    for name, thing in cfg.scene.objects.items():
-        if thing.file is not None:
-            lines = object_left_behind(thing.file, run.stage.model, fixed=thing.fixed)
+    for name, object_cfg in cfg.scene.objects.items():
+        if object_cfg.file is not None:
+            lines = object_left_behind(object_cfg.file, run.stage.model, fixed=object_cfg.fixed)
             result.details += [f"file of {name}: {line}" for line in lines]
     result.details += [*loose, *causes]
     return [result]

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from mjstack.config.check import gate_reset, places_objects, reads_starts_file, with_region
+from mjstack.config.check import gate_reset, places_objects, reads_starts_file
 from mjstack.config.schema import Config
 from mjstack.distributed import Ranks
 from mjstack.drivers.clockless import ClocklessDriver
@@ -26,8 +26,7 @@ from mjstack.episodes.run import Run, needs_episode, spread
 from mjstack.episodes.stage import Stage
 from mjstack.episodes.tally import EpisodeTally
 from mjstack.errors import MjstackError, first_line
-from mjstack.files import to_csv, write_atomic, write_npz
-from mjstack.gates.regions import BOUNDS, find_regions, regions_table
+from mjstack.files import write_npz
 from mjstack.interrupt import check_interrupt
 from mjstack.math import wilson_interval
 from mjstack.mdp.starts.starts_file import start_arrays
@@ -38,21 +37,16 @@ from mjstack.report.table import Table
 from mjstack.report.text import format_percent
 
 log = logging.getLogger(__name__)
-_MOST_SEEN = 4  # worlds on the page with what their driver saw
 
 
 def gate_config(cfg: Config, gate: str) -> Config:
     """The configuration under which a gate of episodes plays. One with starts of its own has the
     closed-loop expert in the place of a plan, which is made for the configured starts.
     """
-    t = cfg.gate[gate]
-    if not t.reset:
+    if not cfg.gate[gate].reset:
         return cfg
-    reset = gate_reset(cfg, gate)
-    if t.region is not None:
-        reset = with_region(reset, lambda xy: list(t.region))
     cfg = with_controller(cfg, "closed_loop") if find_driver(cfg).planned else cfg
-    return replace(cfg, reset=reset)
+    return replace(cfg, reset=gate_reset(cfg, gate))
 
 
 @spread
@@ -63,7 +57,7 @@ def judge_episodes(run: Run) -> list[GateResult]:
     """
     cfg = gate_config(run.cfg, run.gate)
     if cfg is not run.cfg:
-        run = run.on(run.stage.with_config(cfg))
+        run = run.with_stage(run.stage.with_config(cfg))
     t = cfg.gate[run.gate]
     tally = EpisodeTally(gate=run.gate, check=run.stage.check, folder=run.folder)
     run.records[run.gate] = tally.records
@@ -82,8 +76,7 @@ def judge_episodes(run: Run) -> list[GateResult]:
         Figure("distinct_fraction", high=t.distinct_fraction),
         Figure("episode", tally.seconds, "s"),
     ]
-    words = [f"{tally.summary}, {format_percent(t.rate)} wanted"]
-    tables = []
+    sentences = [f"{tally.summary}, {format_percent(t.rate)} wanted"]
     if succeeded.all():  # worlds that fail have no speed
         steps = sum(record.steps for record in tally.records)
         measured.append(Figure("world_steps", steps / tally.seconds, "/s"))
@@ -92,8 +85,7 @@ def judge_episodes(run: Run) -> list[GateResult]:
         problem = f"only {states} distinct final states of {tally.episodes} episodes"
         tally.problems.append(f"{problem}: identical worlds prove nothing, use reset=jitter")
     if t.reset:
-        places = tally.places
-        rows = np.stack([*places.values()], axis=1)
+        rows = np.stack([*tally.start_poses.values()], axis=1)
         distinct = _count_distinct(np.nan_to_num(rows).reshape(len(rows), -1), 6)
         retries = tally.array("retries")
         retried = int((retries > 0).sum())
@@ -108,19 +100,11 @@ def judge_episodes(run: Run) -> list[GateResult]:
         )
         tally.notes["starts"] = _describe_start(cfg, run.gate)
         if retried:
-            words.append(f"{retried} retried, {retried_succeeded} of them succeeded")
+            sentences.append(f"{retried} retried, {retried_succeeded} of them succeeded")
         tally.details += find_doubts(distinct, tally.episodes, tally.successes, lost or 0, t.rate)
-        regions = find_regions(t.cell_episodes, rows, succeeded, list(places), run.stage.index.base)
-        if all(region["succeeded"] == region["episodes"] for region in regions):
-            more = f"(gate.{run.gate}.cell_episodes): more seeds have more"
-            there = "had a failure" if regions else more
-            tally.details.append(f"no region of at least {t.cell_episodes} episodes {there}")
-        tally.write(f"{run.gate}_regions.csv", write_atomic, to_csv(regions, ("object", *BOUNDS)))
-        tables = regions_table(t.cell_episodes, regions)
-        tables += ends.table(tally) if ends else []
-    return [
-        tally.result(words, passed=rate >= t.rate, figures=measured, rate=t.rate, tables=tables)
-    ]
+    result = tally.result(sentences, passed=rate >= t.rate, figures=measured, rate=t.rate)
+    result.tables += ends.table(tally) if ends else []
+    return [result]
 
 
 def _play(run: Run, tally: EpisodeTally, ends: "Ends | None") -> int | None:
@@ -150,8 +134,8 @@ def _play(run: Run, tally: EpisodeTally, ends: "Ends | None") -> int | None:
     try:
         with closing(play_batches(stage, plans, observers=observe)) as batches:
             for batch in batches:
-                part = EpisodeRecord.from_batch(ranks, batch, monitor)
-                record = EpisodeRecord.join(ranks.gather(part))
+                rank_record = EpisodeRecord.from_batch(batch, monitor)
+                record = EpisodeRecord.join(ranks.gather(rank_record))
                 # Before the next one can break or be stopped. A full disk takes no result back.
                 tally.write(record_name(run.gate, record.seed), write_npz, record.arrays())
                 if t.reset:
@@ -169,7 +153,7 @@ def _play(run: Run, tally: EpisodeTally, ends: "Ends | None") -> int | None:
                         chosen = np.argsort(record.succeeded[: qpos.shape[1]], kind="stable")
                         labels = {row: str(row) for row in chosen[:MOST_WORLDS].tolist()}
                         run.page.worlds3d[run.gate] = moving_worlds(
-                            stage, batch.env, qpos, record.failed, labels, _MOST_SEEN
+                            stage, batch.env, qpos, record.failed, labels
                         )
                 tally.add(record)
                 if t.seeds > 1:

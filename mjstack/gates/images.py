@@ -101,8 +101,8 @@ def _report(stage: Stage, result: GateResult, agreements: dict[str, _Agreement])
     for name, camera in agreements.items():
         group = f"images.{name}"
         figures = [
-            Figure(thing, iou, group=f"{group}.iou", low=limits.image_iou, limit="images.iou")
-            for thing, iou in camera.iou.items()
+            Figure(object_name, iou, group=f"{group}.iou", low=limits.image_iou, limit="images.iou")
+            for object_name, iou in camera.iou.items()
         ]
         same = Figure("same_thing", camera.same, low=limits.image_same)
         color = Figure("color_of_255", camera.color, high=limits.image_color)

@@ -58,7 +58,7 @@ def _compare(run: Run, mjwarp: Simulation) -> GateResult:
         problems += [] if equal else [line]
 
     world = WorldRecorder()
-    episode = run.stage.play(mjwarp, run.cfg.gate.baseline.reset, [*run.viewers, world])
+    episode = run.stage.play(mjwarp, run.cfg.gate.baseline.reset, [*run.stage.observers, world])
     judged, headline = run.judge_one("parity", episode)
     result.beyond = judged.beyond
     problems += [judged.reason] if judged.reason else []
@@ -69,8 +69,8 @@ def _compare(run: Run, mjwarp: Simulation) -> GateResult:
         peak_constraint_rows=int(mjwarp.peak_constraints[0]),
     )
     result.figures += [*judged.figures, *peaks, Figure("episode", episode.timing.seconds, "s")]
-    apart, ends = _compare_ends(run, world.qpos[-1], result, rounded=not problems)
-    problems += apart
+    deviations, ends = _compare_ends(run, world.qpos[-1], result, rounded=not problems)
+    problems += deviations
     if run.cfg.scene.cameras:
         problems += compare_images(run, result)
 
@@ -114,8 +114,8 @@ def compare_states(run: Run, mjwarp: Simulation, result: GateResult) -> list[str
     for name, state, kinds in compared_states(run):
         for steps in kinds:
             sims = (native, mjwarp, rounded[steps])
-            ends, apart, ranges = _measure(*sims, state, steps)
-            if _counts_differ(apart, ranges) and not model.opt.disableflags & _SEVERAL:
+            ends, deviations, ranges = _measure(*sims, state, steps)
+            if _counts_differ(deviations, ranges) and not model.opt.disableflags & _SEVERAL:
                 for sim in sims:
                     sim.switch(_SEVERAL, off=True)
                 single = _measure(*sims, state, steps)
@@ -123,19 +123,19 @@ def compare_states(run: Run, mjwarp: Simulation, result: GateResult) -> list[str
                     sim.switch(_SEVERAL, off=False)
                 if not _counts_differ(*single[1:]):
                     result.details.append(
-                        f"{name}, {steps} steps: {int(apart['contact_count'])} contacts more or"
-                        " fewer than native's, of shapes whose contacts are searched for; compared"
-                        " with one contact of two such shapes"
+                        f"{name}, {steps} steps: {int(deviations['contact_count'])} contacts more"
+                        " or fewer than native's, of shapes whose contacts are searched for;"
+                        " compared with one contact of two such shapes"
                     )
-                    ends, apart, ranges = single
+                    ends, deviations, ranges = single
             for field in COMPARED:
                 allowed = ranges[field]
                 if field != "contact_count":
                     largest = float(ends[field].abs().max())
                     rounding = UNIT * max(largest, _LEAST_SIZES.get(field, 2.0))
                     allowed = multiples[steps] * (allowed + rounding)
-                worst = int((apart[field] / allowed.clamp(min=1e-30)).argmax())
-                error, limit = float(apart[field][worst]), float(allowed[worst])
+                worst = int((deviations[field] / allowed.clamp(min=1e-30)).argmax())
+                error, limit = float(deviations[field][worst]), float(allowed[worst])
                 group = f"{name}.step{steps}"
                 result.figures.append(Figure(field, error, group=group, high=limit))
                 if not error <= limit:
@@ -148,10 +148,10 @@ def compare_states(run: Run, mjwarp: Simulation, result: GateResult) -> list[str
     tolerance.copy_(configured)
     for sim in (native, *rounded.values()):
         sim.close()
-    if look := farthest[-1]:
-        moves = look in run.stage.index.objects
-        parts = "shape, mass, friction and contacts" if moves else "servo, damping and range"
-        problems.append(f"look first at {look}: its {parts}")
+    if suspect := farthest[-1]:
+        moves = suspect in run.stage.index.objects
+        properties = "shape, mass, friction and contacts" if moves else "servo, damping and range"
+        problems.append(f"look first at {suspect}: its {properties}")
     return problems
 
 
@@ -160,16 +160,16 @@ def _measure(
 ) -> tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Tensor]]:
     """Native's fields after steps, how far off MJWarp's are, and how far native's that round."""
     ends = end_state(native, state, steps)
-    apart = differences(ends, end_state(mjwarp, state, steps))
+    deviations = differences(ends, end_state(mjwarp, state, steps))
     ranges = differences(ends, end_state(rounded, state, steps))
-    if _counts_differ(apart, ranges):
-        apart["contact_count"] = _nearest_count(mjwarp, state, steps, ends)
-    return ends, apart, ranges
+    if _counts_differ(deviations, ranges):
+        deviations["contact_count"] = _nearest_count(mjwarp, state, steps, ends)
+    return ends, deviations, ranges
 
 
-def _counts_differ(apart: dict[str, Tensor], ranges: dict[str, Tensor]) -> bool:
+def _counts_differ(deviations: dict[str, Tensor], ranges: dict[str, Tensor]) -> bool:
     """Whether the number of contacts is off by more than its range."""
-    return bool((apart["contact_count"] > ranges["contact_count"]).any())
+    return bool((deviations["contact_count"] > ranges["contact_count"]).any())
 
 
 def _nearest_count(sim: Simulation, state: State, steps: int, ends: dict[str, Tensor]) -> Tensor:
@@ -244,14 +244,14 @@ def _compare_ends(
 
     native = run.nominal.world.qpos[-1]
     share = shares(native)
-    beyond = [name for name, value in share.items() if not value <= 1.0]
-    if beyond and rounded:
+    exceeding = [name for name, value in share.items() if not value <= 1.0]
+    if exceeding and rounded:
         with closing(RoundedSimulation(run.stage.model, _ROUNDED_EPISODES)) as sim:
             run.stage.play(sim, run.cfg.gate.baseline.reset, worlds=[0] * _ROUNDED_EPISODES)
             candidates = [share, *map(shares, sim.qpos.numpy())]
         share = min(candidates, key=lambda candidate: np.max([*candidate.values()]))
         text = f"one of {_ROUNDED_EPISODES} native worlds that round"
-        result.details += [f"{n} ends {share[n]:.2g} of the limit from {text}" for n in beyond]
+        result.details += [f"{n} ends {share[n]:.2g} of the limit from {text}" for n in exceeding]
     problems = []
     farthest: dict[bool, tuple[float, str]] = {}  # object, and other joint
     for name, gaps in _ends_apart(run, end, native).items():
@@ -271,25 +271,25 @@ def _ends_apart(run: Run, *ends: np.ndarray) -> dict[str, list[Figure]]:
     limits = run.cfg.gate.parity
     moved = np.empty(model.nv)
     mujoco.mj_differentiatePos(model, moved, 1.0, *ends)
-    out: dict[str, list[Figure]] = {}
+    by_name: dict[str, list[Figure]] = {}
     limit: dict[str, Any]
     for number, kind in enumerate(model.jnt_type):
         name = model.joint(number).name or f"joint {number}"
         if name in run.cfg.robot.joints:
             continue
         slid, turned = np.split(moved[model.dof_jntid == number], [_SLIDES.get(int(kind), 0)])
-        gaps = out.setdefault(name, [])
+        gaps = by_name.setdefault(name, [])
         if slid.size:
             limit = {"high": limits.object_position, "limit": "final.position_m"}
             gaps.append(Figure("position", float(np.linalg.norm(slid)), "m", **limit))
         if turned.size:
             angle = math.degrees(np.linalg.norm(turned))
-            if thing := run.cfg.scene.objects.get(name):
+            if object_cfg := run.cfg.scene.objects.get(name):
                 quats = [torch.from_numpy(q[model.jnt_qposadr[number] :][3:7]) for q in ends]
-                angle = math.degrees(turn_between(thing.shape, *quats))
+                angle = math.degrees(turn_between(object_cfg.shape, *quats))
             limit = {"high": limits.object_rotation_deg, "limit": "final.rotation_deg"}
             gaps.append(Figure("rotation", angle, "deg", **limit))
-    return out
+    return by_name
 
 
 def turn_between(shape: str, a: Tensor, b: Tensor) -> float:
@@ -316,13 +316,13 @@ def end_state(sim: Simulation, state: State, steps: int) -> dict[str, Tensor]:
 
 def differences(a: dict[str, Tensor], b: dict[str, Tensor]) -> dict[str, Tensor]:
     """Largest absolute difference over the worlds of every number of every field, each ``(n,)``."""
-    out = {}
+    by_name = {}
     for name in COMPARED:
         x, y = a[name], b[name]
         if name == "xquat":  # q and -q are one rotation
             y = torch.where((x * y).sum(-1, keepdim=True) < 0.0, -y, y)
-        out[name] = (x - y).abs().amax(0).flatten()
-    return out
+        by_name[name] = (x - y).abs().amax(0).flatten()
+    return by_name
 
 
 def compare_options(native: Simulation, mjwarp: Simulation) -> dict[str, tuple[str, str, bool]]:

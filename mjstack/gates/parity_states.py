@@ -42,8 +42,8 @@ def _moved(model: mujoco.MjModel, state: State, name: str) -> State:
     """
     data = _forward(model, state)
     qvel = np.full((1, model.nv), float(name != TWISTED))
-    beyond = state.qpos[0, model.jnt_qposadr] > model.jnt_range.mean(1)
-    qvel[0, model.jnt_dofadr[beyond & (model.jnt_limited == 1)]] *= -1.0
+    past_middle = state.qpos[0, model.jnt_qposadr] > model.jnt_range.mean(1)
+    qvel[0, model.jnt_dofadr[past_middle & (model.jnt_limited == 1)]] *= -1.0
     bodies = model.geom_bodyid[data.contact.geom]
     movable = (model.body_weldid[bodies] > 0).all(1)
     for joint in np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)):

@@ -69,7 +69,7 @@ def run_guarded(run: Run, name: str, gate: Gate, spread: str = "") -> None:
     began = time.perf_counter()
     ranks = run.stage.ranks
     spread = spread or getattr(gate, "spread", "")
-    over: BaseException | None = None
+    fatal: BaseException | None = None
     try:
         run.gate = name
         run.begin(name)  # which may load what the gate plays on
@@ -88,21 +88,19 @@ def run_guarded(run: Run, name: str, gate: Gate, spread: str = "") -> None:
             raise
         results = [GateResult(name=name, status=Status.failed, reason=log_error(cause))]
         gone = isinstance(cause, RankError) and cause.gone
-        over = cause if gone or (ranks.size > 1 and spread == "worlds") else None
+        fatal = cause if gone or (ranks.size > 1 and spread == "worlds") else None
     seconds = time.perf_counter() - began
     for result in results:
         if result.status is not Status.skipped and not result.seconds:
             result.seconds = seconds
         run.artifacts.results[result.name] = result
         run.record(result)
-    if over is not None:
-        raise over
+    if fatal is not None:
+        raise fatal
 
 
 def _in_each_rank(run: Run, gate: Gate) -> list[GateResult]:
-    """Run a gate in every rank on its own worlds: the results of rank 0, with the sums of all
-    ranks' rates. It has failed if it has failed in any.
-    """
+    """Run a gate in every rank on its own worlds. It has failed if it has failed in any."""
     stage = run.stage
     ranks = stage.ranks
     gate_cfg = run.cfg.gate
@@ -110,21 +108,32 @@ def _in_each_rank(run: Run, gate: Gate) -> list[GateResult]:
     throughput = replace(gate_cfg.throughput, precision=0.0)
     gates = replace(gate_cfg, throughput=throughput)
     share = replace(run.cfg, nworld=len(stage.worlds), gate=gates)
-    alone = replace(run, stage=stage.with_config(share, ranks=Ranks(), measured=stage.measured))
-    results_of = ranks.in_all(lambda: gate(alone))
-    note = f"each of {ranks.size} ranks its own worlds; figures are rank 0's"
+    single = replace(run, stage=stage.with_config(share, ranks=Ranks(), measured=stage.measured))
+    return join_ranks(ranks.in_all(lambda: gate(single)))
+
+
+def join_ranks(results_of: list[list[GateResult]]) -> list[GateResult]:
+    """The results of rank 0, with sums of all ranks' rates and the slowest of each."""
+    size = len(results_of)
+    note = f"each of {size} ranks its own worlds; figures are rank 0's"
     results = _with_note(results_of[0], note)
     for result, *later in zip(*results_of, strict=True):
-        for rank, part in enumerate(later, 1):
-            result.details.append(f"rank {rank}: {part.status}, {part.reason}")
-            if part.status is Status.failed and result.status is not Status.failed:
+        for rank, rank_result in enumerate(later, 1):
+            result.details.append(f"rank {rank}: {rank_result.status}, {rank_result.reason}")
+            if rank_result.status is Status.failed and result.status is not Status.failed:
                 result.status = Status.failed
-                result.reason = f"rank {rank}: {part.reason}"
+                result.reason = f"rank {rank}: {rank_result.reason}"
+        rates = {}
         for figure in [f for f in result.figures if f.unit == "/s" and f.column == "median"]:
-            if all(figure.key in part.metrics for part in later):
-                total = sum(part.metrics[figure.key] for part in (result, *later))
+            if all(figure.key in rank_result.metrics for rank_result in later):
+                values = [rank_result.metrics[figure.key] for rank_result in (result, *later)]
                 group = f"all_ranks.{figure.group}"
-                result.figures.append(replace(figure, value=total, group=group))
+                result.figures.append(replace(figure, value=sum(values), group=group))
+                unit = f"{figure.name.replace('_', '-')}/s"
+                slowest = f"rank {values.index(min(values))}, the slowest, {min(values):,.0f}"
+                rates[figure.group] = f"{figure.group} {sum(values):,.0f} {unit} ({slowest})"
+        if rates and result.status is not Status.failed:
+            result.reason = f"{size} ranks: {'; '.join(rates.values())}; rank 0: {result.reason}"
     return results
 
 
@@ -143,11 +152,11 @@ def log_error(error: BaseException) -> str:
         KeyboardInterrupt: The command was interrupted, which may have caused the error.
     """
     check_interrupt()
-    place = "run.log"
+    log_name = "run.log"
     if not isinstance(error, MjstackError):
         if current_ranks().writes:
             log.error("unexpected error", exc_info=error)
         else:
-            place = "stderr"
+            log_name = "stderr"
             traceback.print_exception(error)
-    return describe_error(error, f"{place} has the traceback")
+    return describe_error(error, f"{log_name} has the traceback")

@@ -15,7 +15,7 @@ from mjstack.scene.build import TABLE, add_scene
 
 _STEPS = 20  # of a fall
 _HEIGHT = 10.0  # m
-_ALONE = (
+_FALL_FLAGS = (
     mujoco.mjtDisableBit.mjDSBL_ACTUATION
     | mujoco.mjtDisableBit.mjDSBL_CONTACT
     | mujoco.mjtDisableBit.mjDSBL_SPRING
@@ -37,20 +37,20 @@ def scene_faults(cfg: Config, model: mujoco.MjModel) -> Iterator[str]:
     add_scene(spec, replace(cfg, robot=replace(cfg.robot, jaw_bodies=[]), scene=bare))
     expected = compile_scene(spec)
     shapes = {TABLE: (bare.table_half, bare.table_friction)}
-    for name, thing in bare.objects.items():
-        friction = thing.friction or []  # null of a file alone, which has no pieces
-        shapes |= {name + end: (p.size, friction) for end, p in thing.pieces.items()}
-        if not thing.fixed and thing.mass is not None:
-            expected.body(name).mass = thing.mass
+    for name, object_cfg in bare.objects.items():
+        friction = object_cfg.friction or []  # null of a file alone, which has no pieces
+        shapes |= {name + end: (p.size, friction) for end, p in object_cfg.pieces.items()}
+        if not object_cfg.fixed and object_cfg.mass is not None:
+            expected.body(name).mass = object_cfg.mass
     for name, (size, friction) in shapes.items():  # not as `add_scene` has understood them
         expected.geom(name).size[: len(size)] = size
         expected.geom(name).friction = friction
     expected.geom_friction[:] = expected.geom_friction.clip(min=mujoco.mjMINMU)  # as in contacts
     yield from _field_faults(cfg, model, expected)
-    alone = copy.copy(model)
-    alone.opt.disableflags |= _ALONE
+    falling = copy.copy(model)
+    falling.opt.disableflags |= _FALL_FLAGS
     for name in bare.free:
-        yield from _fall_faults(cfg, alone, expected, name)
+        yield from _fall_faults(cfg, falling, expected, name)
 
 
 def _field_faults(cfg: Config, model: mujoco.MjModel, expected: mujoco.MjModel) -> Iterator[str]:
@@ -95,17 +95,17 @@ def _elements(model: mujoco.MjModel, scene: mujoco.MjModel) -> dict[str, dict[st
     of the world's geom, and kind. Only geoms that collide: others may have been discarded.
     """
     collide = (model.geom_contype | model.geom_conaffinity) != 0
-    out = {}
+    result = {}
     for geom in (scene.geom(number).name for number in np.flatnonzero(scene.geom_bodyid == 0)):
         number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, geom)
-        out[geom] = {"geom": np.flatnonzero(collide & (np.arange(model.ngeom) == number))}
+        result[geom] = {"geom": np.flatnonzero(collide & (np.arange(model.ngeom) == number))}
     for name in filter(None, (scene.body(number).name for number in range(1, scene.nbody))):
         body = model.body(name).id
-        out[name] = {"body": np.array([body])}
-        out[name]["geom"] = np.flatnonzero(collide & (model.geom_bodyid == body))
+        result[name] = {"body": np.array([body])}
+        result[name]["geom"] = np.flatnonzero(collide & (model.geom_bodyid == body))
         for kind in ("jnt", "dof"):
-            out[name][kind] = np.flatnonzero(getattr(model, f"{kind}_bodyid") == body)
-    return out
+            result[name][kind] = np.flatnonzero(getattr(model, f"{kind}_bodyid") == body)
+    return result
 
 
 def _fall_faults(
@@ -125,9 +125,9 @@ def _fall_faults(
         data.xfrc_applied[body] = [force, 0.0, 0.0, *axes @ torque]
         mujoco.mj_step(model, data, _STEPS)
         mujoco.mj_forward(model, data)
-        out = np.empty(6)
-        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, out, 0)
-        return np.concatenate((out[3:], out[:3] @ axes))
+        result = np.empty(6)
+        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, result, 0)
+        return np.concatenate((result[3:], result[:3] @ axes))
 
     mass, inertia = float(expected.body(name).mass[0]), expected.body(name).inertia
     if not mass:

@@ -68,18 +68,18 @@ def _measure(run: Run, gate: str, backend: Backend, device: str) -> GateResult:
     # Whether they count
     episode = measured.get("episode", Measurement(name="episode"))
     if episode.failed:
-        for part in measured.values():
-            part.problem = part.problem or f"the episode failed, and {_UNVERIFIED}"
+        for measurement in measured.values():
+            measurement.problem = measurement.problem or f"the episode failed, and {_UNVERIFIED}"
     verified = batch is not None and batch.status is Status.passed
     verified |= bool(episode.samples) and not episode.problem
     result.reason = "; ".join(f"{key}: {_describe(m, on_cuda)}" for key, m in measured.items())
     if not verified and not lacks_episode(cfg):
         result.reason += " (the task was not verified in this run: add batch to gates)"
-    for part in measured.values():
-        result.figures += part.figures()
-        result.notes |= part.named_notes()
-    if not any(part.problem for part in measured.values()):
-        sampled = any(part.samples for part in measured.values())
+    for measurement in measured.values():
+        result.figures += measurement.figures()
+        result.notes |= measurement.named_notes()
+    if not any(measurement.problem for measurement in measured.values()):
+        sampled = any(measurement.samples for measurement in measured.values())
         result.status = Status.passed if sampled else Status.skipped
     if result.status is not Status.skipped:
         result.seconds = time.perf_counter() - began
@@ -126,9 +126,9 @@ def _on_driven_worlds(
             step_ms = physics.median("ms_per_batched_step")
             step_seconds = 1e-3 * step_ms * run.cfg.timing.decimation
     if "episode" in names:
-        before = run.artifacts.timed_episode
+        timed_episode = run.artifacts.timed_episode
         measure = partial(measure_episode, step_seconds=step_seconds)
-        measured["episode"] = _guarded("episode", measure, run.stage, sim, before)
+        measured["episode"] = _guarded("episode", measure, run.stage, sim, timed_episode)
     sim.close()
     return measured
 

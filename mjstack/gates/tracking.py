@@ -56,14 +56,14 @@ def find_cause(stage: Stage, state: State, target: np.ndarray) -> str:
 
     # The joint
     dofs = index.robot_qvel[: index.n_arm]
-    off = (target - data.qpos[index.robot_qpos])[: index.n_arm]
-    shares = grasp_jacobian(data, stage.cfg.robot.grasp_sites)[:, dofs] * off
+    offset = (target - data.qpos[index.robot_qpos])[: index.n_arm]
+    shares = grasp_jacobian(data, stage.cfg.robot.grasp_sites)[:, dofs] * offset
     worst = int(np.argmax(np.linalg.norm(shares, axis=0)))
     dof, servo, name = dofs[worst], index.ctrl[worst], stage.cfg.robot.arm_joints[worst]
     joint = model.dof_jntid[dof]
     turns = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
     unit, newton = ("rad", "N m") if turns else ("m", "N")
-    text = f"{name} is {abs(off[worst]):.3g} {unit} off"
+    text = f"{name} is {abs(offset[worst]):.3g} {unit} off"
     if not np.isclose(bounded := data.ctrl[servo], target[worst], atol=1e-5):
         return f"{text}; its range bounds its target {target[worst]:.3g} to {bounded:.3g}"
     most = np.inf
@@ -90,7 +90,7 @@ def find_cause(stage: Stage, state: State, target: np.ndarray) -> str:
         force_of_row = np.where(np.arange(data.nefc) == row, data.efc_force, 0.0)
         mujoco.mj_mulJacTVec(model, data, torque, force_of_row)
         loads[cause] = loads.get(cause, 0.0) + torque[dof]
-    cause, load = min(loads.items(), key=lambda item: item[1] * np.sign(off[worst]))
+    cause, load = min(loads.items(), key=lambda item: item[1] * np.sign(offset[worst]))
     return f"{text}; {cause} ({abs(load):.3g} {newton})"
 
 

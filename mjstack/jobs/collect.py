@@ -16,7 +16,7 @@ import numpy as np
 
 from mjstack.config.schema import CollectJobCfg, Config
 from mjstack.datasets import lerobot
-from mjstack.datasets.part import Part
+from mjstack.datasets.part import ShardFiles
 from mjstack.datasets.writer import DatasetWriter
 from mjstack.envs import demonstration_config
 from mjstack.episodes.batches import Batch, BatchPlan, play_batches
@@ -195,22 +195,22 @@ class Collection:
         """Add a batch's episodes to the dataset."""
         ranks = self._stage.ranks
         finite = batch.finite().cpu().numpy()
-        parts = ranks.gather((batch.episode.failed, finite, int(batch.episode.retries.sum())))
-        chosen, *place = ranks.from_first(partial(self._choose, batch.plan.seed, parts))
+        outcomes = ranks.gather((batch.episode.failed, finite, int(batch.episode.retries.sum())))
+        chosen, *counts = ranks.from_first(partial(self._choose, batch.plan.seed, outcomes))
         with self.writer.guarded() if ranks.writes else nullcontext():
-            files = ranks.gather(self._source.write(batch, chosen, *place))
+            files = ranks.gather(self._source.write(batch, chosen, *counts))
         ranks.from_first(partial(self._commit, [file for group in files for file in group]))
 
     def _choose(
-        self, seed: int, parts: Sequence[tuple[np.ndarray, np.ndarray, int]]
+        self, seed: int, outcomes: Sequence[tuple[np.ndarray, np.ndarray, int]]
     ) -> tuple[list[int], int, int]:
         """Record a batch, and choose the worlds whose episodes are kept.
 
         Returns:
             These worlds, and the numbers of the next episode and of the next frame of the dataset.
         """
-        failed = np.concatenate([bits for bits, _, _ in parts])
-        finite = np.concatenate([flags for _, flags, _ in parts])
+        failed = np.concatenate([bits for bits, _, _ in outcomes])
+        finite = np.concatenate([flags for _, flags, _ in outcomes])
         candidates = (failed == 0) | self._job.keep_failures
         missing = self._job.episodes - self.committed
         chosen = np.flatnonzero(candidates & finite)[:missing].tolist()
@@ -223,7 +223,7 @@ class Collection:
             worlds=len(failed),
             succeeded=int((failed == 0).sum()),
             episodes=len(chosen),
-            retries=sum(retries for _, _, retries in parts),
+            retries=sum(retries for _, _, retries in outcomes),
             broken=broken,
         )
         self.batches.append(record)
@@ -231,7 +231,7 @@ class Collection:
         write_atomic(self._record_path, json.dumps(records, indent=1) + "\n")
         return chosen, self.committed, self.writer.frames
 
-    def _commit(self, files: Sequence[Part]) -> None:
+    def _commit(self, files: Sequence[ShardFiles]) -> None:
         """Commit the files of all ranks, and print what the batch has brought."""
         self.writer.commit(files)
         batch = self.batches[-1]

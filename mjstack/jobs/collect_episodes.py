@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from mjstack.datasets.part import Part, PartWriter
+from mjstack.datasets.part import PartWriter, ShardFiles
 from mjstack.datasets.spec import DatasetSpec, EpisodeData
 from mjstack.drivers.driver import Driver
 from mjstack.envs import Env
@@ -85,7 +85,9 @@ class EpisodeSource:
         if self._renderer is not None:
             self._renderer.close()
 
-    def write(self, batch: Batch, chosen: Sequence[int], episode: int, frame: int) -> list[Part]:
+    def write(
+        self, batch: Batch, chosen: Sequence[int], episode: int, frame: int
+    ) -> list[ShardFiles]:
         """Write this rank's part of a batch into hidden files: of the worlds of all ranks those
         that are ``chosen``. ``episode`` and ``frame`` are numbers in the dataset: of the first of
         these episodes, and of its first frame. An OSError if a file cannot be written.
@@ -94,7 +96,7 @@ class EpisodeSource:
         order = {world: number for number, world in enumerate(chosen) if world in worlds}
         episodes = self.episodes(batch, [worlds.index(world) for world in order])
         images_gib = self._stage.cfg.job.buffer_gib
-        files: list[Part] = []
+        files: list[ShardFiles] = []
         writer: PartWriter | None = None
         try:
             for count, (number, data) in enumerate(zip(order.values(), episodes, strict=True), 1):
@@ -181,15 +183,15 @@ class EpisodeSource:
             for name, values in batch.env.sim.fields.items()
         }
         shapes = {name: (len(qpos), *camera.size, 3) for name, camera in self._cameras.items()}
-        out = {name: np.empty(shape, np.uint8) for name, shape in shapes.items()}
+        image_arrays = {name: np.empty(shape, np.uint8) for name, shape in shapes.items()}
         for first in range(0, len(qpos), self._most_rendered):
             rows = slice(first, first + self._most_rendered)
-            looks = {name: values[rows] for name, values in fields.items()}
-            images = self._renderer.draw(qpos[rows], looks)
-            for name, whole in out.items():
+            chunk_fields = {name: values[rows] for name, values in fields.items()}
+            images = self._renderer.draw(qpos[rows], chunk_fields)
+            for name, whole in image_arrays.items():
                 torch.from_numpy(whole[rows]).copy_(images[f"images.{name}"])
         self.drawing += time.perf_counter() - began
         return {
             name: whole.reshape(len(worlds), len(steps), *whole.shape[1:])
-            for name, whole in out.items()
+            for name, whole in image_arrays.items()
         }

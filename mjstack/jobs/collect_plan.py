@@ -51,7 +51,7 @@ class CollectPlan:
     most: int
 
     @classmethod
-    def of(cls, stage: Stage, home: Path, env: Env) -> "CollectPlan":
+    def from_stage(cls, stage: Stage, home: Path, env: Env) -> "CollectPlan":
         """Plan from an environment of the demonstrations, with any number of worlds.
 
         Raises:
@@ -93,7 +93,7 @@ def plan_collection(stage: Stage) -> CollectPlan:
     with stage.native_env(played, nworld=2) as env:
         if cfg.job.episodes > 1:
             _check_starts(env)
-        plan = CollectPlan.of(stage, collect_folder(cfg), env)
+        plan = CollectPlan.from_stage(stage, collect_folder(cfg), env)
     for name, camera in cfg.scene.cameras.items():
         if "rgb" not in camera.outputs:
             expected = "rgb among them, which a dataset keeps"
@@ -112,8 +112,8 @@ def _check_starts(env: Env) -> None:
     seed = env.cfg.seed
     for start_seed in (seed, seed - 1 if seed else 1):
         env.reset(seed=start_seed)
-        parts = (env.sim.qpos, env.sim.qvel, *env.sim.fields.values())
-        rows = torch.cat([part.double().flatten(1) for part in parts], dim=1)
+        arrays = (env.sim.qpos, env.sim.qvel, *env.sim.fields.values())
+        rows = torch.cat([array.double().flatten(1) for array in arrays], dim=1)
         starts += [row.numpy().tobytes() for row in rows]
     if len(set(starts)) < len(starts):
         expected = "starts that differ between worlds and seeds, so that no episode is there twice"

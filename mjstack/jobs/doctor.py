@@ -43,16 +43,18 @@ def findings(overrides: Sequence[str]) -> Iterator[tuple[str, str]]:
         MjstackError: The configuration is wrong.
     """
     cfg = load_config(overrides)
-    facts = collect_provenance()
-    versions = cast(dict[str, str], facts["versions"])
+    provenance = collect_provenance()
+    versions = cast(dict[str, str], provenance["versions"])
     folder = Path(__file__).parents[1]
-    yield "mjstack", f"{versions.pop('mjstack')}, commit {facts['git_commit']}, {folder}"
+    yield "mjstack", f"{versions.pop('mjstack')}, commit {provenance['git_commit']}, {folder}"
     yield "system", f"{platform.platform()}, Python {versions.pop('python')}"
     yield "packages", ", ".join(f"{name} {version}" for name, version in versions.items())
     yield "extras", ", ".join(f"{extra}: {_version(name)}" for extra, name in _EXTRAS.items())
     yield "torch", f"{torch.__version__}, built for CUDA {torch.version.cuda or 'not at all'}"
     sections: dict[str, Callable[[], Iterable[str]]] = {
-        "processor": lambda: [f"{facts['cpu']}, {facts['cpu_count']} cores, {_free_memory()}"],
+        "processor": lambda: [
+            f"{provenance['cpu']}, {provenance['cpu_count']} cores, {_free_memory()}"
+        ],
         "GPU": _gpus,
         "kernel cache": lambda: [_kernel_cache()],
         "OpenGL": lambda: [_pictures(cfg)],
@@ -61,7 +63,7 @@ def findings(overrides: Sequence[str]) -> Iterator[tuple[str, str]]:
     }
     for name, describe in sections.items():
         try:
-            yield from ((name, words) for words in describe())
+            yield from ((name, text) for text in describe())
         except Exception as error:
             yield name, f"none: {describe_error(error)}"
 

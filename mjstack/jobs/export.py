@@ -125,11 +125,12 @@ def export_facts(stage: Stage) -> dict[str, Any]:
         "task": _fields(cfg.task, "name", "instruction", "control_hz", "episode_steps", "params"),
         "timing": _fields(cfg.timing, "physics_dt", "decimation", "command_delay"),
         "objects": {
-            name: _fields(thing, "shape", "size", "fixed")
-            for name, thing in cfg.scene.objects.items()
+            name: _fields(object_cfg, "shape", "size", "fixed")
+            for name, object_cfg in cfg.scene.objects.items()
         },
         "places": {
-            name: _fields(place, "xy", "random_xy") for name, place in cfg.scene.places.items()
+            name: _fields(place_cfg, "xy", "random_xy")
+            for name, place_cfg in cfg.scene.places.items()
         },
     }
 

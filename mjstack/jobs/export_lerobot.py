@@ -43,8 +43,10 @@ def lerobot_files(stage: Stage) -> Mapping[str, str | bytes]:
         "device": "cpu",
         "joint_range": stage.index.servo_range.tolist(),
     }
-    beside = Path(__file__)
-    processors = {name: beside.with_name(name).read_text(encoding="utf-8") for name in _PROCESSORS}
+    module_file = Path(__file__)
+    processors = {
+        name: module_file.with_name(name).read_text(encoding="utf-8") for name in _PROCESSORS
+    }
     files = policy_files(policy)
     return files | processors | {"config.json": json.dumps(config, indent=2) + "\n"}
 

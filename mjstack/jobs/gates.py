@@ -36,7 +36,7 @@ def check_machine(cfg: Config) -> Stage:
     stage = Stage(cfg)
     check_task(stage)
     for key, value in (("view", cfg.view), ("video", str(cfg.video).lower())):
-        names = ["baseline", "parity", *(cfg.gate.episodes() if value == "web" else ())]
+        names = ["baseline", "parity", *(cfg.gate.episodes() if key == "view" else ())]
         if value != "false" and not {*names} & {*cfg.gates}:
             expected = f"a gate that shows worlds: {', '.join(names)}"
             raise ConfigError(key, value, expected, "Add one of them to gates")

@@ -1,4 +1,4 @@
-"""Job *play*: worlds with a policy or the expert, in MuJoCo's viewer or in a video."""
+"""Job *play*: worlds with a policy or the expert, in a video or in a browser."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import closing
@@ -11,7 +11,7 @@ import torch
 from mjstack.config.schema import Config, PlayJobCfg
 from mjstack.drivers.driver import find_driver
 from mjstack.episodes.batches import BatchPlan, play_batches
-from mjstack.episodes.motion import draw_seen, world_fields
+from mjstack.episodes.motion import world_fields
 from mjstack.episodes.recorder import WorldRecorder
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
@@ -65,18 +65,17 @@ def play_worlds(run: Run) -> list[GateResult]:
     """
     stage = run.stage
     cfg = stage.cfg
-    job: PlayJobCfg = cfg.job
     judged = cfg.task.check is not None
     recorder = WorldRecorder()
     worlds: list[World] = []
-    looks = []
+    model_fields = []
     result = GateResult(name=NAME, status=Status.passed)
     succeeded = 0
     for batch in play_batches(
         stage,
         [BatchPlan(cfg.seed, [world]) for world in range(cfg.nworld)],
         alone=stage.backend,
-        observers=lambda plan: [recorder, *run.viewers],
+        observers=lambda plan: [recorder],
     ):
         world = batch.plan.worlds[0]
         sim = batch.env.sim
@@ -86,10 +85,9 @@ def play_worlds(run: Run) -> list[GateResult]:
             succeeded += played.status is Status.passed
             outcome = played.reason or f"succeeded, {headline}"
         qpos = recorder.qpos
-        seen = draw_seen(stage, qpos, sim) if cfg.video and job.camera is None else {}
         (fields,) = world_fields(stage, batch.env, [0])
-        worlds.append(World(label=str(world), qpos=qpos, images=seen, fields=fields))
-        looks.append({name: value.clone() for name, value in sim.fields.items()})
+        worlds.append(World(label=str(world), qpos=qpos, fields=fields))
+        model_fields.append({name: value.clone() for name, value in sim.fields.items()})
         run.show_world(f"{NAME}_{world}", str(world), qpos, batch.episode, batch.env)
         result.details.append(f"world {world}: {outcome}")
         result.notes["backend"] = sim.description
@@ -97,7 +95,7 @@ def play_worlds(run: Run) -> list[GateResult]:
     result.reason = f"{succeeded} of {cfg.nworld} worlds succeeded" if judged else outcome
     result.figures = figures(worlds=cfg.nworld, **({"succeeded": succeeded} if judged else {}))
     if cfg.video:
-        _save(run, worlds, looks, result)
+        _save(run, worlds, model_fields, result)
     return [result]
 
 
@@ -123,10 +121,14 @@ def _save(
         if job.camera is None:
             save()
             return
-        looks = {field: torch.cat([world[field] for world in fields]) for field in fields[0]}
+        model_fields = {field: torch.cat([world[field] for world in fields]) for field in fields[0]}
         name = f"images.{job.camera}"
-        with closing(stage.color_renderer(len(worlds), list(looks), [job.camera])) as renderer:
-            save(draw=lambda q: renderer.draw(torch.from_numpy(q), looks)[name].cpu().numpy())
+        with closing(
+            stage.color_renderer(len(worlds), list(model_fields), [job.camera])
+        ) as renderer:
+            save(
+                draw=lambda q: renderer.draw(torch.from_numpy(q), model_fields)[name].cpu().numpy()
+            )
 
     if problem := safely_write(path, write):
         result.status = Status.failed

@@ -66,14 +66,14 @@ class ProgressBar:
             self._unit = unit
             self._show(f"{self._gate}: {unit}", total)
         self._progress.update(self._task.id, completed=done)
-        now = time.monotonic()
-        if self._progress.disable and now - self._spoke <= 15.0:
+        clock = time.monotonic()
+        if self._progress.disable and clock - self._spoke <= 15.0:
             return
         speed = self._task.speed or 0.0  # a sum over all reports
         rate = f"{speed:.1f}/s" if speed > 0.0 else ""
         self._progress.update(self._task.id, rate=rate)
         if self._progress.disable and speed > 0.0:
-            self._spoke = now
+            self._spoke = clock
             left = (total - done) / speed
             self.print_line(f"{self._gate}: {unit} {done}/{total}, {rate}, {left:.0f} s left")
 

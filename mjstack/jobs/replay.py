@@ -1,11 +1,10 @@
-"""Job *replay*: one world of an earlier run again, rule by rule, or all failing ones as a table."""
+"""Job *replay*: one world of an earlier run again, rule by rule."""
 
 import math
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from omegaconf import OmegaConf
@@ -20,9 +19,8 @@ from mjstack.episodes.replay import WorldTrace
 from mjstack.episodes.rollout import Episode, require_episode
 from mjstack.episodes.run import Run
 from mjstack.episodes.stage import Stage
-from mjstack.episodes.tally import rate_cells
 from mjstack.errors import ConfigError, DeviceError, FolderError, shorten
-from mjstack.files import to_csv, write_atomic, write_npz
+from mjstack.files import write_atomic, write_npz
 from mjstack.gates.episodes import gate_config
 from mjstack.gates.runner import run_guarded
 from mjstack.jobs.gates import check_task
@@ -30,12 +28,9 @@ from mjstack.jobs.runner import VIEWS, CheckedJob, Job, run_provenance
 from mjstack.jobs.showing import check_showing
 from mjstack.report.figure import figures
 from mjstack.report.record import GateResult, Status
-from mjstack.report.table import Table
 from mjstack.sim import resolve_backend, resolve_device
 
-TABLE = "replayed_worlds.csv"
-_TABLE_ROWS = 100  # worlds in report.md
-_FACTS = {  # besides versions, on which a result or its last bits depend
+_COMPARED = {  # besides versions, on which a result or its last bits depend
     "git_commit": "mjstack's commit",
     "cpu": "the processor",
     "policy": "the policy",
@@ -48,33 +43,23 @@ _NATIVE = (Backend.native, "cpu")
 
 @dataclass(frozen=True, kw_only=True)
 class _Plan:
-    """One world, or all failing ones, to be played again."""
+    """A world to be played again."""
 
     run: EarlierRun
-    gate: str  # whose worlds they are
-    failing: bool  # whether they are all failing ones
-    bits: dict[int, dict[int, int]]  # of the rules that each world broke, by seed and world
-    record: EpisodeRecord  # of the first seed
+    gate: str  # whose world it is
+    seed: int
+    world: int
+    record: EpisodeRecord  # of the seed
     # Backend and device, each played once; the first is the run's unless ``sim`` says otherwise.
     where: list[tuple[Backend, str]]
     stage: Stage  # with the configuration that the gate played under, on the first backend here
-
-    @property
-    def seed(self) -> int:
-        """The first one."""
-        return next(iter(self.bits))
-
-    @property
-    def world(self) -> int:
-        """The first one's first."""
-        return next(iter(self.bits[self.seed]))
 
 
 def _plan_replay(cfg: Config) -> _Plan:
     """Read what ``run`` and ``world`` name.
 
     Raises:
-        ConfigError: The run has no such worlds.
+        ConfigError: The run has no such world.
         FolderError: The run, or its record, cannot be read.
     """
     for key, expected in (("run", "the folder of an earlier run"), ("world", "one of its worlds")):
@@ -84,32 +69,25 @@ def _plan_replay(cfg: Config) -> _Plan:
     resolve_backend(cfg)  # what this command line asks for must be there
     run = EarlierRun.read(str(cfg.run))
 
-    # The worlds: [gate:][seed:]number or [gate:]failing
+    # The world: [gate:][seed:]number
     *heads, tail = str(cfg.world).split(":")
-    failing = tail == "failing"
     gates = run.cfg.episode_gates
     gate = heads.pop(0) if heads and not heads[0].isdigit() else gates[0] if gates else ""
     seeds = range(run.cfg.seed, run.cfg.seed + (run.cfg.gate[gate].seeds if gate in gates else 0))
     seed = int(heads[0]) if heads else run.cfg.seed
-    bits: dict[int, dict[int, int]] = {}
+    world = int(tail)
     expected = ""
     if gate not in gates:
-        noun = "failing worlds" if failing else "a world"
-        expected = f"{noun} of a gate that run had, {' or '.join(gates) or 'but it had none'}"
-    elif failing:
-        bits, episodes = run.failing(gate)
-        if not bits:
-            expected = f"a world such as 17, as none of gate {gate}'s {episodes} failed"
+        expected = f"a world of a gate that run had, {' or '.join(gates) or 'but it had none'}"
     elif seed not in seeds:
         expected = f"a seed from {seeds[0]} to {seeds[-1]}, as that run has (seed:world)"
-    elif int(tail) >= run.cfg.nworld:
+    elif world >= run.cfg.nworld:
         expected = f"a world from 0 to {run.cfg.nworld - 1}, as that run has"
     if expected:
         raise ConfigError("world", cfg.world, expected)
-    record = run.record(next(iter(bits), seed), gate)
-    bits = bits or {seed: {int(tail): int(record.failed[int(tail)])}}
+    record = run.record(seed, gate)
 
-    # How they are played here
+    # How it is played here
     played = gate_config(archived_starts(run.cfg, run.folder), gate)
     where = _choose(cfg.sim, record)
     backend, device = where[0]
@@ -119,8 +97,8 @@ def _plan_replay(cfg: Config) -> _Plan:
     return _Plan(
         run=run,
         gate=gate,
-        failing=failing,
-        bits=bits,
+        seed=seed,
+        world=world,
         record=record,
         where=where,
         stage=Stage(played),
@@ -141,7 +119,7 @@ def _choose(requested: SimCfg, record: EpisodeRecord) -> list[tuple[Backend, str
 
 
 def _check_start(plan: _Plan) -> None:
-    """Check that the first world would start where it did in that run.
+    """Check that the world would start where it did in that run.
 
     Raises:
         FolderError: It would start elsewhere.
@@ -154,12 +132,12 @@ def _check_start(plan: _Plan) -> None:
             stage.start(sim, stage.cfg.reset, seed=plan.seed, worlds=[plan.world])
             start = sim.qpos[0].cpu().numpy()
             same = start.shape == recorded.shape
-            off = float(np.abs(start - recorded).max()) if same else math.inf
-        if off <= _SAME_START:
+            distance = float(np.abs(start - recorded).max()) if same else math.inf
+        if distance <= _SAME_START:
             return
     raise FolderError(
-        f"run={plan.run.folder}: world {plan.world} of seed {plan.seed} would start up to {off:.3g}"
-        " (m, rad) from where it did, expected its own start",
+        f"run={plan.run.folder}: world {plan.world} of seed {plan.seed} would start up to"
+        f" {distance:.3g} (m, rad) from where it did, expected its own start",
         f"Use mjstack at {plan.run.provenance.get('git_commit')}",
     )
 
@@ -173,44 +151,30 @@ def check_replay(cfg: Config) -> CheckedJob:
     check_showing(stage.cfg)
     _check_start(plan)
     title = f"replay of world {plan.world} of seed {plan.seed} of {plan.run.folder}"
-    if plan.failing:
-        if cfg.view != "false" or cfg.video:
-            expected = "one world, such as 17, which view and video show"
-            raise ConfigError("world", cfg.world, expected)
-        count = sum(map(len, plan.bits.values()))
-        title = f"replay of {count} failing worlds of {plan.run.folder}"
-    return CheckedJob(
-        stage=stage, title=title, work=partial(_replay_all, plan), spreads=plan.failing
-    )
+    return CheckedJob(stage=stage, title=title, work=partial(_replay_all, plan))
 
 
 def _replay_all(plan: _Plan, run: Run, folder: Path) -> None:
     """Play on the run's backend and, where that was MJWarp, on native MuJoCo too."""
-    rows: dict[tuple[int, int], dict[str, Any]] = {}
-    changes: list[str] = []
-    if not plan.failing:
-        played = OmegaConf.structured(replace(run.cfg, seed=plan.seed))
-        write_atomic(folder / "replayed_config.yaml", OmegaConf.to_yaml(played))
-        changes = _changes(plan.run.provenance, run_provenance(run.stage))
+    played = OmegaConf.structured(replace(run.cfg, seed=plan.seed))
+    write_atomic(folder / "replayed_config.yaml", OmegaConf.to_yaml(played))
+    changes = _changes(plan.run.provenance, run_provenance(run.stage))
     for line in changes:
         run.print_line(line)
     for number, (backend, _) in enumerate(plan.where):
-        play = partial(_replay, plan, number, changes, folder)
-        if plan.failing:
-            play = partial(_play_failing, plan, number, rows, folder)
-        run_guarded(run, f"replay_{backend}", play, "worlds" * plan.failing)
+        run_guarded(run, f"replay_{backend}", partial(_replay, plan, number, changes, folder))
 
 
 def _changes(recorded: dict, current: dict) -> list[str]:
     """Facts that differ from the earlier run's and could change a result, or its last bits."""
-    before, now = (
-        facts["versions"] | {words: facts.get(key) for key, words in _FACTS.items()}
-        for facts in (recorded, current)
+    original, replayed = (
+        identity["versions"] | {meaning: identity.get(key) for key, meaning in _COMPARED.items()}
+        for identity in (recorded, current)
     )
     return [
-        f"{name} was {shorten(str(before[name]), 100)} in that run and is {value} now"
-        for name, value in now.items()
-        if name in before and before[name] != value
+        f"{name} was {shorten(str(original[name]), 100)} in that run and is {value} now"
+        for name, value in replayed.items()
+        if name in original and original[name] != value
     ]
 
 
@@ -224,8 +188,8 @@ def _replay(
     check = stage.check
     monitors = [FailureMonitor()] if stage.cfg.gate[plan.gate].reset else []
     trace = WorldTrace()
-    observers = [trace, *(run.viewers if first else []), *monitors]
-    facts = {"seed": plan.seed, "world": plan.world}
+    observers = [trace, *monitors]
+    identity = {"seed": plan.seed, "world": plan.world}
     plans = [BatchPlan(plan.seed, [plan.world])]
     batches = play_batches(stage, plans, alone=(backend, device), observers=lambda _: observers)
     with closing(batches):
@@ -242,11 +206,11 @@ def _replay(
         run.print_line(f"  {line}")
     name = "trajectory.npz" if first else f"trajectory_{backend}.npz"
     ends = {"backend": episode.description, "failed": int(episode.failed[0])}
-    write_npz(folder / name, facts | ends | trace.arrays)
-    recorded = check.rules.describe(plan.bits[plan.seed][plan.world]) or "succeeded"
+    write_npz(folder / name, identity | ends | trace.arrays)
+    recorded = check.rules.describe(int(plan.record.failed[plan.world])) or "succeeded"
     result.status = result.status if agrees else Status.failed
     result.reason = f"{result.reason or f'succeeded, {headline}'}; {comparison}"
-    result.figures = figures(**facts) + result.figures
+    result.figures = figures(**identity) + result.figures
     result.notes = {"backend": episode.description, "recorded": recorded, "trajectory": name}
     result.details = lines + changes
     return [result]
@@ -271,8 +235,8 @@ def _compare(
     record = plan.record
     rules = run.stage.check.rules
     bits = int(record.failed[plan.world])
-    now = int(episode.failed[0])
-    same = bits == now
+    replayed = int(episode.failed[0])
+    same = bits == replayed
     result = "the same result" if same else rules.describe(bits) or "succeeded"
     if record.backend != backend:
         prefix = "" if same else "another result: "
@@ -284,14 +248,14 @@ def _compare(
 
     possible_reasons = {  # why it need not end bit for bit where it did
         "runs on CUDA agree to rounding only": "cuda" in device + record.device,
-        "a world alone shares no contact pool": (bits | now) & rules["OVERFLOW"],
+        "a world alone shares no contact pool": (bits | replayed) & rules["OVERFLOW"],
         "not all is as it was in that run": changes,
     }
     reasons = [reason for reason, applies in possible_reasons.items() if applies]
     ends = "it ends bit for bit where it did"
     if not exact:
-        apart = end - recorded_end
-        most = max(float(np.linalg.norm(apart[a : a + 3])) for a in run.stage.index.object_qpos)
+        offset = end - recorded_end
+        most = max(float(np.linalg.norm(offset[a : a + 3])) for a in run.stage.index.object_qpos)
         ends = f"its objects end {1e3 * most:.3g} mm from where they did"
         if not reasons:
             ends += ", expected bit for bit there"
@@ -300,51 +264,5 @@ def _compare(
     return bool(reasons), f"{agrees} {ends}{why}"
 
 
-def _play_failing(
-    plan: _Plan, number: int, rows: dict[tuple[int, int], dict], folder: Path, run: Run
-) -> list[GateResult]:
-    """Play the failing worlds of each seed together, on one backend; ranks share the seeds."""
-    backend, device = plan.where[number]
-    stage = run.stage
-    ranks = stage.ranks
-    if ranks.size > 1 and backend is Backend.mjwarp and device.startswith("cuda"):
-        device = resolve_device("auto")
-    rules = stage.check.rules
-    share = list(plan.bits.items())[ranks.rank :: ranks.size]
-    batches = play_batches(
-        stage,
-        [BatchPlan(seed, list(worlds)) for seed, worlds in share],
-        alone=(backend, device),
-    )
-    played: list[tuple[int, int, int]] = []  # seed, world and bits
-    for done, batch in enumerate(batches, 1):
-        failed = zip(batch.plan.worlds, batch.episode.failed.tolist(), strict=True)
-        played += [(batch.plan.seed, world, bits) for world, bits in failed]
-        stage.progress.advance("seeds", done, len(share))
-    played = sorted(world for part in ranks.gather(played) for world in part)
-    again = sum(bits != 0 for _, _, bits in played)
-    same = sum(bits == plan.bits[seed][world] for seed, world, bits in played)
-    for seed, world, bits in played:
-        row = rows.setdefault((seed, world), {"seed": seed, "world": world})
-        row["recorded"] = " ".join(rules.broken(plan.bits[seed][world]))
-        row[str(backend)] = " ".join(rules.broken(bits)) or "succeeded"
-    if ranks.writes:
-        write_atomic(folder / TABLE, to_csv(list(rows.values())))
-    rate, interval = rate_cells(again, len(played))
-    table_rows = list(rows.values())[:_TABLE_ROWS]
-    columns = {name: name for name in table_rows[0]}
-    return [
-        GateResult(
-            name=f"replay_{backend}",
-            status=Status.failed if again else Status.passed,
-            reason=f"{again} of {len(played)} failing worlds fail again ({rate}, 95 % interval"
-            f" {interval}), {same} by the same rules",
-            figures=figures(worlds=len(played), fail_again=again, by_the_same_rules=same),
-            notes={"backend": f"{backend} on {device}", "table": TABLE},
-            tables=[Table.of(columns, table_rows, f"Failing worlds (all of them: {TABLE})")],
-        )
-    ]
-
-
-_KEYS = ("job", "run", "world", "sim", "view", "video", "web", "devices")
+_KEYS = ("job", "run", "world", "sim", "view", "video", "web")
 JOB = Job(check_replay, keys=_KEYS, views=VIEWS)

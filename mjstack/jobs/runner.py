@@ -13,7 +13,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from threading import Thread
 
 import mujoco
 import numpy as np
@@ -47,7 +46,7 @@ from mjstack.sim.build import cuda_driver, cuda_uuid
 
 log = logging.getLogger(__name__)
 
-VIEWS = ("false", "true", "web")  # of a job that shows worlds
+VIEWS = ("view", "video")  # keys of a job that shows worlds
 
 
 @dataclass(frozen=True)
@@ -58,14 +57,12 @@ class Job:
         check: Raises a `MjstackError` for what cannot be done here, before anything is written.
             Returns the job ready to run, with the scene and the plan that the check built.
         keys: Top-level keys and groups that its command line may set; None for all.
-        overrides: Whether its check takes the command line's overrides too.
-        views: Values of ``view`` that it can show worlds in; ``video`` goes with ``true``.
+        views: Keys with which it shows worlds, some of `VIEWS`.
     """
 
-    check: Callable[..., "CheckedJob"]
+    check: Callable[[Config], "CheckedJob"]
     keys: tuple[str, ...] | None = None
-    overrides: bool = False
-    views: tuple[str, ...] = ("false",)
+    views: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,11 +93,11 @@ class CheckedJob:
             Exception: The work has failed.
         """
         self.stage.progress = Progress(advance=lambda what, done, total: check_interrupt())
-        self.stage.ranks.gather(self._place())
+        self.stage.ranks.gather(self._host())
         self.work(Run(self.stage, begin=lambda name: check_interrupt()), folder)
         check_interrupt()
 
-    def _place(self) -> str:
+    def _host(self) -> str:
         """Where this rank plays."""
         return f"{socket.gethostname()}, {_device_name(*self.stage.backend)}"
 
@@ -149,8 +146,8 @@ class CheckedJob:
             log.warning("%s", line)
         report.provenance = run_provenance(self.stage)
         if self.stage.ranks.size > 1:
-            places = self.stage.ranks.gather(self._place())
-            report.provenance["ranks"] = [f"rank {r}: {p}" for r, p in enumerate(places)]
+            hosts = self.stage.ranks.gather(self._host())
+            report.provenance["ranks"] = [f"rank {r}: {p}" for r, p in enumerate(hosts)]
         write_formats(report, page)
 
         def record(result: GateResult) -> None:
@@ -162,8 +159,6 @@ class CheckedJob:
         def begin(name: str) -> None:
             bar.start(name)
             self._load(warp=name == "parity")
-            if name == "capacity":  # it times nothing, and waits for a GPU if there is one
-                Thread(target=showing.load_drawing, daemon=True).start()
             if live is not None:
                 live.begin(name)
 
@@ -175,13 +170,12 @@ class CheckedJob:
                 folder=folder,
                 begin=begin,
                 record=record,
-                viewers=[live] if live else showing.find_viewers(self.stage),
                 page=page,
             )
             self.work(run, folder)
         report.conclude()
         write_formats(report, page)
-        showing.draw_episode(self.stage, folder, run.artifacts.pictured, page, run.draw)
+        showing.draw_episode(self.stage, folder, run.artifacts.pictured, run.draw)
         showing.save_page(self.stage, folder, page)
 
     def _load(self, *, warp: bool) -> None:
@@ -223,12 +217,12 @@ def count_devices(cfg: Config) -> int:
         return 1
     backend, device = resolve_backend(cfg)
     on_cuda = device.startswith("cuda")
-    there = torch.cuda.device_count() if on_cuda else available_cores()
-    all_of_them = there if on_cuda else 1  # one process uses all cores
+    available = torch.cuda.device_count() if on_cuda else available_cores()
+    all_of_them = available if on_cuda else 1  # one process uses all cores
     count = all_of_them if cfg.devices == "all" else int(cfg.devices)
-    if count > there:
+    if count > available:
         kind = "CUDA devices" if on_cuda else "cores"
-        expected = f"at most {there}, the {kind} that this machine has for sim={backend}"
+        expected = f"at most {available}, the {kind} that this machine has for sim={backend}"
         raise ConfigError("devices", cfg.devices, expected)
     _check_share(cfg, count)
     return count
@@ -251,17 +245,19 @@ def check_ranks(stage: Stage) -> None:
     cfg = stage.cfg
     _, device = stage.backend
     host = socket.gethostname()
-    facts = collect_provenance()
-    equal = {key: facts[key] for key in ("versions", "git_commit")} | config_content(cfg)
+    provenance = collect_provenance()
+    equal = {key: provenance[key] for key in ("versions", "git_commit")} | config_content(cfg)
     gpu = cuda_uuid(device) if device.startswith("cuda") else ""
     gathered = ranks.gather((host, equal, gpu))
     holders: dict[tuple[str, str], int] = {}
-    for rank, (place, values, unit) in enumerate(gathered):
+    for rank, (host_name, values, unit) in enumerate(gathered):
         if changes := differences(values, gathered[0][1]):
-            problem = f"rank {rank} ({place}) has {changes} as in rank 0 ({gathered[0][0]})"
+            problem = f"rank {rank} ({host_name}) has {changes} as in rank 0 ({gathered[0][0]})"
             raise MjstackError(problem, "Install and start the same everywhere")
-        if unit and (holder := holders.setdefault((place, unit), rank)) != rank:
-            problem = f"ranks {holder} and {rank} ({place}) have one GPU, {unit}, expected one each"
+        if unit and (holder := holders.setdefault((host_name, unit), rank)) != rank:
+            problem = (
+                f"ranks {holder} and {rank} ({host_name}) have one GPU, {unit}, expected one each"
+            )
             fix = "Start as many ranks as there are GPUs, with sim.device=auto"
             raise MjstackError(problem, fix)
     _check_share(cfg, ranks.size)
@@ -279,12 +275,10 @@ def check_job(cfg: Config, overrides: Sequence[str] = ()) -> CheckedJob:
         if job.keys is not None and re.split(r"[.@/]", key)[0] not in job.keys:
             expected = f"only {', '.join(job.keys[1:])} beside job={cfg.job.name}"
             raise ConfigError(key, value, expected, "Leave it out")
-    if cfg.view not in job.views:
-        expected = f"{' or '.join(job.views)} with job={cfg.job.name}"
-        raise ConfigError("view", cfg.view, expected, "Leave it out")
-    if cfg.video and "true" not in job.views:
-        raise ConfigError("video", True, f"false with job={cfg.job.name}", "Leave it out")
-    return job.check(cfg, overrides) if job.overrides else job.check(cfg)
+    for key in VIEWS:
+        if (value := str(getattr(cfg, key)).lower()) != "false" and key not in job.views:
+            raise ConfigError(key, value, f"false with job={cfg.job.name}", "Leave it out")
+    return job.check(cfg)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -11,10 +11,10 @@ from mjstack.config.explain import parse
 from mjstack.errors import is_out_of_memory
 from mjstack.files import to_csv, write_atomic
 from mjstack.jobs.sweep import LOG, list_jobs
+from mjstack.report.curves import Plot, Row, save_curves
 from mjstack.report.formats import to_markdown
 from mjstack.report.record import Report, Status
 from mjstack.report.sections import Part, Section
-from mjstack.report.sweep_picture import Plot, Row, save_sweep
 from mjstack.report.table import Table
 from mjstack.report.write import safely_write
 
@@ -49,24 +49,24 @@ def write_summary(
     swept = _swept(rows)
     title = f"sweep of {len(rows)} job{'s' if len(rows) > 1 else ''}"
     table = Table.of(_columns(rows, swept), rows)
-    over = next(iter(swept), "")
+    numbers = [key for key in swept if all(type(row.get(key)) in (int, float) for row in rows)]
     plot = Plot(
         title=title,
-        over=over,
-        lines=swept[1:],
+        over=next(iter(numbers), ""),
+        lines=[key for key in swept if key not in numbers[:1]],
         panels={name: {"": name} for name in _headlines(rows)[:_PANELS]},
     )
     picture = folder / "summary.png"
     problem = ""
-    if draw and any(row["status"] != _NOT_RUN for row in rows) and plot.shows(rows):
-        problem = safely_write(picture, save_sweep, plot, rows, stops=False)
+    if draw and plot.over and plot.shows(rows):
+        problem = safely_write(picture, save_curves, plot, rows, stops=False)
     notes = []
     for key, name in (("backend", "hardware"), ("git_commit", "commit")):
         values = sorted({str(row[key]) for row in rows if row.get(key)})
         notes += [f"{name}: {value}" for value in values]
     write_atomic(folder / "summary.csv", to_csv(rows))
-    parts: list[Part] = [table, *([picture] if picture.exists() else []), notes]
-    write_atomic(folder / "summary.md", to_markdown([Section(title=title, parts=parts, level=1)]))
+    blocks: list[Part] = [table, *([picture] if picture.exists() else []), notes]
+    write_atomic(folder / "summary.md", to_markdown([Section(title=title, parts=blocks, level=1)]))
     rows_shown = [[_first_words(cell) for cell in row] for row in table.rows]
     return replace(table, title=title, rows=rows_shown), problem
 
@@ -124,8 +124,8 @@ def _swept(rows: Sequence[Row]) -> list[str]:
 
 def _columns(rows: Sequence[Row], swept: Sequence[str]) -> dict[str, str]:
     """The columns of the table by their titles: what differs, and the gates' results."""
-    words = [key for row in rows for key, value in row.items() if _is_result(value)]
-    return {name: name for name in ("job", *swept, *words, *_headlines(rows), "status")}
+    result_keys = [key for row in rows for key, value in row.items() if _is_result(value)]
+    return {name: name for name in ("job", *swept, *result_keys, *_headlines(rows), "status")}
 
 
 def _is_result(value: object) -> bool:

@@ -24,9 +24,9 @@ from mjstack.gates.runner import run_guarded
 from mjstack.jobs.gates import check_task
 from mjstack.jobs.runner import CheckedJob, Job
 from mjstack.jobs.showing import check_showing
+from mjstack.report.curves import Plot, save_curves
 from mjstack.report.figure import Figure
 from mjstack.report.record import GateResult, Status
-from mjstack.report.sweep_picture import Plot, save_sweep
 from mjstack.report.table import Table
 from mjstack.train.trainer import FAILED, LAST, Trainer, whole_starts
 
@@ -86,7 +86,7 @@ def _run(trainer: Trainer, run: Run, folder: Path) -> None:
         write_atomic(folder / CONFIG, json.dumps(training_fingerprint(run.cfg), indent=1) + "\n")
     run_guarded(run, NAME, partial(_train, trainer, folder), "worlds")
     if run.artifacts.results[NAME].status is Status.passed:
-        judged = run.on(judged_stage(run.stage, folder / LAST))
+        judged = run.with_stage(judged_stage(run.stage, folder / LAST))
         run_guarded(judged, "success", judge_episodes)
         trained = run.artifacts.results[NAME]
         judgement = Figure("judgement", judged.artifacts.results["success"].seconds, "s")
@@ -117,19 +117,19 @@ def _train(trainer: Trainer, folder: Path, run: Run) -> list[GateResult]:
     run.stage.ranks.gather(None)  # rank 0 has written the policy that all read next
     rows = trained.curve
     last = rows[-1]
-    words = {name: name.replace("_", " ") for name in last}
+    titles = {name: name.replace("_", " ") for name in last}
     if run.stage.ranks.writes:
         write_atomic(folder / f"{NAME}.csv", to_csv(rows))
         title = f"{run.cfg.robot.title}, task {run.cfg.task.name}: training"
-        curves = {words[name]: name for name in trained.lines}
+        curves = {titles[name]: name for name in trained.lines}
         plot = Plot(
             title=title, over=trained.abscissa, lines=[], panels={"": curves}, log=trained.log
         )
-        run.draw(f"{NAME}.png", save_sweep, plot, rows)
+        run.draw(f"{NAME}.png", save_curves, plot, rows)
     seconds = time.perf_counter() - began
-    reached = ", ".join(f"{words[name]} {last[name]:.4g}" for name in trained.lines)
+    reached = ", ".join(f"{titles[name]} {last[name]:.4g}" for name in trained.lines)
     rules = {name.removeprefix(FAILED): name for name in last if name.startswith(FAILED)}
-    columns = {words[name]: name for name in last if name not in rules.values()}
+    columns = {titles[name]: name for name in last if name not in rules.values()}
     tables = [Table.of(columns, rows, "Curve")]
     if rules:
         counted = {name: name for name in (trained.abscissa, "judged")}
@@ -148,4 +148,4 @@ def _train(trainer: Trainer, folder: Path, run: Run) -> list[GateResult]:
     ]
 
 
-JOB = Job(check_train, views=("false", "web"))
+JOB = Job(check_train, views=("view",))

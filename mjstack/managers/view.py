@@ -31,6 +31,7 @@ class EnvView(Protocol):
         action: The policy's last action, shape ``(nworld, action_dim)``.
         previous_action: The one before.
         success: Whether the task is achieved, shape ``(nworld,)``, bool.
+        command_delay: How late commands are: ``command_delay.steps``, shape ``(nworld,)``, int64.
         given_places: Positions [m] of places that a file of starts gives instead of the draw, by
             name, shape ``(rows, 2)``; world w has row w.
     """
@@ -48,6 +49,7 @@ class EnvView(Protocol):
     action: Tensor
     previous_action: Tensor
     success: Tensor
+    command_delay: Any
     given_places: dict[str, Tensor]
 
     @property

@@ -2,6 +2,7 @@
 
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -10,7 +11,7 @@ from mjstack.errors import ParameterError, UnknownName
 from mjstack.managers.action import ActionTerm
 from mjstack.managers.view import EnvView
 from mjstack.math import atan2, norm
-from mjstack.mdp.geometry import Pose, robot
+from mjstack.mdp.geometry import Pose, robot, zeros
 from mjstack.sim.simulation import Columns
 
 _TILT_STEP = 0.03  # rad: how far `EndEffectorDelta` tilts the gripper in a step at most
@@ -20,8 +21,10 @@ class _Commands(ActionTerm):
     """Commands of some of the robot's actuators, from actions of -1 to 1."""
 
     def _set_up(self, env: EnvView, chosen: list[int] | slice, dim: int) -> None:
+        self._env = env
         self._ctrl = env.sim.ctrl
         self._columns = Columns(env.index.ctrl[chosen], env.device)
+        self._chosen = Columns(np.arange(len(env.index.ctrl))[chosen], env.device)
         adjacent = isinstance(self._columns.at, slice)
         self._out = self._columns.read(self._ctrl) if adjacent else None
         self._low, self._high = robot(env).ctrl_range[chosen].unbind(1)
@@ -31,8 +34,11 @@ class _Commands(ActionTerm):
         self.low = -self.high
 
     def _write_bounded(self, command: Tensor) -> None:
-        """Write commands, kept within the actuators' ranges."""
-        self._write(torch.clamp(command, self._low, self._high, out=self._out))
+        """Write commands, kept within the actuators' ranges, which count from the joints' zeros."""
+        low, high = self._low, self._high
+        if (off := zeros(self._env)) is not None:
+            low, high = (end - self._chosen.read(off).to(end) for end in (low, high))
+        self._write(torch.clamp(command, low, high, out=self._out))
 
     def _write(self, command: Tensor) -> None:
         """Write commands, unless they are computed in their place."""

@@ -9,7 +9,7 @@ from mjstack.errors import require_names
 from mjstack.managers.state import shared
 from mjstack.managers.view import EnvView, offers
 from mjstack.math import constant, quat_to_matrix
-from mjstack.mdp.geometry import LOADED, jaw_forces, place_xy, pose_w, robot
+from mjstack.mdp.geometry import LOADED, jaw_forces, place_xy, pose_w, robot, zeros
 
 _in = partial(offers, "observation term", reads="state")
 _in_metres = _in(unit="m")
@@ -177,3 +177,12 @@ def jaw_force(env: EnvView, *, object: str) -> Tensor:
 def last_action(env: EnvView) -> Tensor:
     """The policy's last action, shape ``(nworld, action_dim)``."""
     return env.action
+
+
+@_by_joint
+def joint_zeros(env: EnvView) -> Tensor:
+    """How far each joint truly is from where its servo believes it to be [rad, m], which no real
+    arm knows, shape ``(nworld, n)``.
+    """
+    off = zeros(env)
+    return torch.zeros_like(joint_pos(env)) if off is None else off.to(env.sim.qpos.dtype)

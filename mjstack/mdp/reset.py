@@ -60,26 +60,44 @@ class JointNoise:
         write_robot(env, mask, command)
 
 
-@uses_fields("qpos0")
+@uses_fields("qpos0", "jnt_range", "actuator_ctrlrange")
 class JointZeros:
     """Moves the zero of every joint by a random amount that no sensor shows, as the calibrations of
     real arms differ. Positions and commands count from the zero that the servo believes in, and the
-    arm is elsewhere, with what follows it. Objects are placed clear of where it would be without.
+    arm is elsewhere, with what follows it. Its stops stay where they are. Objects are placed clear
+    of where it would be without.
     """
 
     label = "reset.zeros"
 
-    def __init__(self, env: EnvView, *, arm: NotNegative, gripper: NotNegative = 0.0) -> None:
-        """Take the half-widths: of the arm's joints and of the gripper's [rad or m]."""
+    def __init__(
+        self,
+        env: EnvView,
+        *,
+        arm: NotNegative | Sequence[NotNegative],
+        gripper: NotNegative = 0.0,
+    ) -> None:
+        """Take the half-widths: of the arm's joints, one for all or for each, and of the gripper's
+        [rad or m].
+        """
+        count = env.index.n_arm
+        if not isinstance(arm, int | float) and len(arm) != count:
+            raise ParameterError("arm", arm, f"a number, or {count}, one per joint of the arm")
         self._width = torch.full_like(robot(env).home, gripper, dtype=torch.float64)
-        self._width[: env.index.n_arm] = arm
+        self._width[:count] = self._width.new_tensor(arm)
         self._moving = self._width.cpu().numpy().nonzero()[0]
-        self._nominal = torch.from_numpy(env.sim.model.qpos0[env.index.robot_qpos]).to(env.device)
+        model = env.sim.model
+        joints = model.actuator_trnid[env.index.ctrl, 0].tolist()
+        self._zero = Elements(env, "qpos0", env.index.robot_qpos.tolist())
+        self._stops = Elements(env, "jnt_range", joints)
+        self._commands = Elements(env, "actuator_ctrlrange", env.index.ctrl.tolist())
 
     def __call__(self, env: EnvView, mask: Tensor) -> None:
-        """Write qpos0, from which MuJoCo counts, and qpos and ctrl of what follows."""
+        """Write qpos0, from which MuJoCo counts, both ranges, and qpos and ctrl of what follows."""
         moved = self._width * random_uniform(env, self.label, len(self._width))
-        robot(env).qpos.write_masked(env.sim.fields["qpos0"], mask, self._nominal - moved)
+        self._zero.write(mask, self._zero.nominal - moved)
+        for ends in (self._stops, self._commands):
+            ends.write(mask, ends.nominal - moved[..., None])
         if env.index.posture.leader.size:
             command = robot(env).ctrl.read(env.sim.ctrl)
             env.index.posture.project(command, self._moving, zeros(env))

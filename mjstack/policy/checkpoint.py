@@ -176,6 +176,7 @@ def policy_facts(policy: Policy) -> Facts:
         "network": {
             "hidden": policy.network.hidden,
             "activation": "elu",
+            **({"relative": relative} if (relative := policy.network.relative) else {}),
             **(layers if images else {}),
         },
         "training": policy.training,
@@ -253,10 +254,13 @@ def _from_facts(facts: Facts, path: Path) -> Policy:
     execute = action["execute"]
     if type(execute) is not int or not 1 <= execute <= _MOST_STEPS:
         raise ValueError(f"action.execute is {execute!r}, not a whole number of steps")
+    inputs = sum(widths.values())
+    relative = layers.get("relative", [])
+    if relative and (len(relative) != action["width"] or not {*relative} <= {*range(inputs)}):
+        raise ValueError("network.relative is no column of the observation for each joint")
+    sizes = (inputs, action["width"], action["chunk"], layers["hidden"])
     with torch.device("meta"):
-        network = PolicyNetwork(
-            sum(widths.values()), action["width"], action["chunk"], layers["hidden"], vision
-        )
+        network = PolicyNetwork(*sizes, vision, relative)
     policy = Policy(
         network=network,
         group=str(seen["group"]),

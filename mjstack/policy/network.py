@@ -63,8 +63,11 @@ class PolicyNetwork(nn.Module):
         width: Numbers of one action.
         hidden: Widths of the hidden layers.
         vision: Images that it sees; without cameras if there are none.
+        relative: Columns of an observation with the measured joints, to which actions are added;
+            none where actions are absolute.
     """
 
+    origin: Tensor
     observation_mean: Tensor
     observation_std: Tensor
     action_mean: Tensor
@@ -79,6 +82,7 @@ class PolicyNetwork(nn.Module):
         chunk: int,
         hidden: Sequence[int],
         vision: Vision | None = None,
+        relative: Sequence[int] = (),
     ) -> None:
         """Make the layers, with random weights of torch's generator. ``inputs`` is the width of an
         observation without its images; the rest are the attributes.
@@ -88,6 +92,9 @@ class PolicyNetwork(nn.Module):
         self.width = width
         self.hidden = list(hidden)
         self.vision = vision = vision or Vision()
+        self.relative = list(relative)
+        if self.relative:  # that the observed joints count from
+            self.register_buffer("origin", torch.zeros(width))
         self.encoders = nn.ModuleList(
             ImageEncoder(size, vision.channels, vision.features) for size in vision.sizes.values()
         )
@@ -126,11 +133,18 @@ class PolicyNetwork(nn.Module):
         scaled = torch.cat([scaled, *(part.to(scaled.dtype) for part in features)], dim=1)
         return self.layers(scaled).unflatten(1, (self.chunk, self.width))
 
+    def measured(self, observation: Tensor) -> Tensor | float:
+        """The joints that actions are added to, ``(n, 1, width)``; 0 where they are absolute."""
+        if not self.relative:
+            return 0.0
+        columns = [observation[:, column] for column in self.relative]
+        return (torch.stack(columns, dim=1) + self.origin)[:, None]
+
     def forward(self, observation: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
         """Actions, ``(n, chunk, width)``, in the units of the policy's action terms, from an
         observation, ``(n, inputs)``, and the images of each camera of ``vision``, ``(n, height,
         width, 3)``, 0 to 255, in the network's type.
         """
         normalized = self.normalized(observation, self.encode(images))
-        actions = self.action_mean + self.action_std * normalized
+        actions = self.action_mean + self.action_std * normalized + self.measured(observation)
         return torch.minimum(torch.maximum(actions, self.action_low), self.action_high)

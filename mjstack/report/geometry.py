@@ -158,9 +158,9 @@ class Shapes:
         data.qpos[:] = self.rest[world]
         mujoco.mj_kinematics(model, data)
         owner = model.body_weldid[model.geom_bodyid]
-        back = data.xmat[owner].reshape(-1, 3, 3).swapaxes(1, 2)
-        place = back @ (data.geom_xpos - data.xpos[owner])[..., None]
-        turn = back @ data.geom_xmat.reshape(-1, 3, 3)
+        inverse = data.xmat[owner].reshape(-1, 3, 3).swapaxes(1, 2)
+        place = inverse @ (data.geom_xpos - data.xpos[owner])[..., None]
+        turn = inverse @ data.geom_xmat.reshape(-1, 3, 3)
         count = model.ngeom
         return np.hstack(
             (place[..., 0], turn.reshape(count, 9), model.geom_size, geom_colors(model))

@@ -61,14 +61,12 @@ class World:
         label: Its text, short.
         qpos: Positions at frames, shape ``(frames, nq)``; NaN where it was not played.
         rules: Names of the rules that it broke; the first one colours its table.
-        images: What its driver saw, by camera, each ``(frames, height, width, 3)``, uint8.
         fields: Its model fields that pictures show, those of the model with visuals, by name.
     """
 
     label: str
     qpos: np.ndarray
     rules: Sequence[str] = ()
-    images: Mapping[str, np.ndarray] = field(default_factory=dict)
     fields: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     @property

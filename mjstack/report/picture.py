@@ -1,12 +1,9 @@
-"""Pictures of a run: the final scene, the objects' way there, and a video."""
+"""Pictures of a run: the final scene, and a video."""
 
 import copy
 import itertools
 import math
-import time
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,7 +11,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageDraw
 
 from mjstack.errors import MissingExtra
 from mjstack.interrupt import check_interrupt
@@ -22,42 +19,8 @@ from mjstack.report.geometry import Fields, write_fields
 from mjstack.report.gl import open_renderer
 from mjstack.report.page import World, frame_stride
 
-_FACES = [[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]]
-"""Corners of a box in the order of their signs, by its faces."""
 Draw = Callable[[np.ndarray], Iterable[np.ndarray]]
 Write = Callable[[Path, Iterator[Image.Image], int, float], None]
-
-
-@contextmanager
-def figure(
-    path: Path,
-    title: str,
-    columns: int = 1,
-    rows: int = 1,
-    *,
-    figsize: tuple[float, float],
-    **options: Any,
-) -> Iterator[tuple[Any, Any]]:
-    """Make a figure with panels by options of ``Figure.subplots``, and save it when the block ends.
-
-    Yields:
-        The figure, and its axes: an array unless there is one panel.
-    """
-    from matplotlib.figure import Figure  # takes a while to load
-
-    picture = Figure(figsize, layout="constrained")
-    yield picture, picture.subplots(rows, columns, **options)
-    if title:
-        picture.suptitle(title, wrap=True)
-    picture.savefig(path, dpi=100)
-
-
-def outline(centre: Sequence[float], half: Sequence[float], **style: Any) -> Any:
-    """A rectangle around a point, of which the border is drawn."""
-    from matplotlib.patches import Rectangle
-
-    corner = (centre[0] - half[0], centre[1] - half[1])
-    return Rectangle(corner, 2.0 * half[0], 2.0 * half[1], **({"fill": False} | style))
 
 
 def _render(
@@ -120,8 +83,7 @@ def save_video(
     Args:
         path: The file.
         model: The scene.
-        worlds: The worlds with positions, and perhaps images that stand in their corners, at the
-            ends of equally many steps.
+        worlds: The worlds with positions at the ends of equally many steps.
         step_dt: Time of a step [s].
         advance: Reports progress.
         fps: Frames per second [Hz], as near as whole steps allow.
@@ -145,13 +107,6 @@ def save_video(
         images = _render(model, states.reshape(-1, nq), wide, 3 * wide // 4, fields)
     else:
         images = (image for frame in states for image in draw(frame))
-    if any(world.images for world in worlds):
-        corners = (
-            [rows[number * skip] for rows in world.images.values()]
-            for number in range(count)
-            for world in worlds
-        )
-        images = map(_with_corner, images, corners)
 
     def frames() -> Iterator[Image.Image]:
         for done in range(1, count + 1):
@@ -160,18 +115,6 @@ def save_video(
             advance("pictures of the video", done, count)
 
     write(path, frames(), count, step_dt * skip)
-
-
-def _with_corner(image: np.ndarray, seen: Sequence[np.ndarray]) -> np.ndarray:
-    """An image with others in its upper left corner, each a quarter as high."""
-    frame = Image.fromarray(image)
-    tall = frame.height // 4
-    left = 0
-    for small in seen:
-        wide = tall * small.shape[1] // small.shape[0]
-        frame.paste(Image.fromarray(small).resize((wide, tall)), (left, 0))
-        left += wide
-    return np.asarray(frame)
 
 
 def _side_by_side(images: Sequence[np.ndarray], columns: int, wide: int) -> Image.Image:
@@ -235,99 +178,16 @@ def _write_loop(path: Path, frames: Iterator[Image.Image], count: int, dt: float
     )
 
 
-def opens_windows() -> bool:
-    """Whether MuJoCo's viewer can open one; where it cannot, it ends the process."""
-    with warnings.catch_warnings(action="ignore"), suppress(ImportError):
-        import glfw
-
-        return bool(glfw.init())
-    return False
-
-
-class Window:
-    """MuJoCo's viewer of states in real time; what shows them goes on when it is closed."""
-
-    def __init__(self, model: mujoco.MjModel, step_dt: float) -> None:
-        """Open it for states of a model that are ``step_dt`` [s] apart."""
-        import mujoco.viewer
-
-        self._model = model
-        self._data = mujoco.MjData(model)
-        self._step_dt = step_dt
-        self._handle = mujoco.viewer.launch_passive(model, self._data)
-
-    def show(self, qpos: np.ndarray) -> None:
-        """Show a state, shape ``(nq,)``, until the next one is due."""
-        if not self._handle.is_running():
-            return
-        began = time.perf_counter()
-        self._data.qpos[:] = qpos
-        mujoco.mj_forward(self._model, self._data)
-        self._handle.sync()
-        time.sleep(max(0.0, self._step_dt - (time.perf_counter() - began)))
-
-    def close(self) -> None:
-        """Close it."""
-        self._handle.close()
-
-
-def save_trajectories(
-    path: Path,
-    positions: np.ndarray,
-    objects: Mapping[str, tuple[Sequence[float], Sequence[float]]],
-    fixed: np.ndarray,
-    places: Mapping[str, Sequence[Sequence[float]]],
-    title: str,
-) -> None:
-    """Plot the objects' way among what does not move.
-
-    Args:
-        path: The file.
-        positions: Of the objects [m], shape ``(steps, objects, 3)``.
-        objects: Half sizes [m] and colour of each object by name.
-        fixed: Corners of the boxes that hold fixed things [m], shape ``(n, 8, 3)``, in the order of
-            their signs.
-        places: Position of each place by name, and middle and half-widths of its region [m].
-        title: The picture's.
-    """
-    with figure(path, title, 3, figsize=(13, 4)) as (_, (side, above, height)):
-        for axes, row in ((side, 2), (above, 0)):
-            for box in 1e3 * fixed:
-                for face in box[_FACES][..., [1, row]]:
-                    axes.fill(*face.T, color="0.75", zorder=0)
-        for name, place in places.items():
-            at, middle, half = 1e3 * np.fliplr(place)
-            above.plot(*at, "x", color="0.3")
-            above.annotate(name, at, color="0.3")
-            above.add_patch(outline(middle, half, linestyle=":"))
-        for number, (name, (half, color)) in enumerate(objects.items()):
-            mm = 1e3 * positions[:, number]
-            for axes, row in ((side, 2), (above, 0)):
-                axes.plot(mm[:, 1], mm[:, row], color=color, label=name)
-                size = (1e3 * half[1], 1e3 * half[row])
-                for at, style in ((mm[0], {}), (mm[-1], {"fill": True, "alpha": 0.5})):
-                    axes.add_patch(outline((at[1], at[row]), size, color=color, **style))
-            height.plot(mm[:, 2], color=color, label=name)
-        front = "from the front (outline: start, filled: end)"
-        side.set(xlabel="y [mm]", ylabel="z [mm]", title=front, aspect="equal")
-        above.set(xlabel="y [mm]", ylabel="x [mm]", title="from above", aspect="equal")
-        height.set(xlabel="control step", ylabel="z [mm]", title="height of the centre")
-        for axes in (side, above, height):
-            axes.grid(alpha=0.3)
-            axes.margins(0.1)
-        height.legend(frameon=False)
-
-
 def save_images(
     path: Path, rows: Mapping[str, Sequence[np.ndarray]], columns: Sequence[str]
 ) -> None:
     """Save images, each of shape ``(height, width, 3)``, uint8, in named rows and columns."""
-    size = (2.6 * len(columns), 2.6 * len(rows))
-    with figure(path, "", len(columns), len(rows), figsize=size, squeeze=False) as (_, axes):
-        for line, (name, images) in zip(axes, rows.items(), strict=True):
-            line[0].set_ylabel(name)
-            for axis, image in zip(line, images, strict=True):
-                axis.imshow(image)
-                axis.set(xticks=[], yticks=[])
-        for axis, name in zip(axes[0], columns, strict=True):
-            axis.set_title(name)
+    side = 256
+    picture = Image.new("RGB", (side * len(columns), side * len(rows)))
+    draw = ImageDraw.Draw(picture)
+    for i, (name, images) in enumerate(rows.items()):
+        for j, (column, image) in enumerate(zip(columns, images, strict=True)):
+            at = (side * j, side * i)
+            picture.paste(Image.fromarray(image.astype(np.uint8)).resize((side, side)), at)
+            draw.text(at, f" {name}, {column}", stroke_width=1, stroke_fill="black")
+    picture.save(path)

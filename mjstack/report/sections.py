@@ -127,11 +127,11 @@ def _figure_tables(figures: Sequence[Figure]) -> Iterator[Table]:
     for figure in figures:
         if figure.value is not None:
             groups.setdefault(figure.row, []).append(figure)
-    alike: dict[tuple[str, ...], list[str]] = {}
+    rows_by_columns: dict[tuple[str, ...], list[str]] = {}
     for row, members in groups.items():
-        alike.setdefault(tuple(figure.title for figure in members), []).append(row)
+        rows_by_columns.setdefault(tuple(figure.title for figure in members), []).append(row)
     rows = []
-    for columns, names in alike.items():
+    for columns, names in rows_by_columns.items():
         if len(names) > 1 or columns == _SPREAD:
             body = [[name, *map(_cell, groups[name])] for name in names]
             yield Table(title="Figures", header=["", *columns], rows=body)

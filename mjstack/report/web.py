@@ -55,8 +55,6 @@ addEventListener("DOMContentLoaded", () => {
   document.body.append(list);
 });
 }</script>"""
-_IMAGE = 0.16  # m, height of what a driver saw
-_UPRIGHT = (0.5, -0.5, -0.5, 0.5)  # it faces the viewer
 
 
 def lacks_viser() -> str:
@@ -78,9 +76,8 @@ class Stage:
     ) -> None:
         """Add the worlds to a ``viser.ViserServer``, in the state of their model with visuals.
 
-        Images stand behind the table. In worlds that failed, the table and what stands still in
-        all worlds alike have the colour of the first rule that they broke, by its number in
-        ``rules``.
+        In worlds that failed, the table and what stands still in all worlds alike have the colour
+        of the first rule that they broke, by its number in ``rules``.
         """
         self._shapes = shapes = Shapes(model, [world.fields for world in worlds])
         low, high = shapes.box()
@@ -111,8 +108,7 @@ class Stage:
             )
             self._handles.append((shape, handle))
 
-        # Texts, images, the floor, and where one looks from
-        self._images: list[tuple[np.ndarray, Any]] = []
+        # Texts, the floor, and where one looks from
         for number, world in enumerate(worlds):
             x, y = self._offsets[number]
             server.scene.add_label(
@@ -123,21 +119,6 @@ class Stage:
                 font_size_mode="scene",
                 font_scene_height=0.035,
             )
-            left = y + low[1]
-            for name, images in world.images.items():
-                wide = _IMAGE * images.shape[2] / images.shape[1]
-                handle = server.scene.add_image(
-                    f"/image/{number}/{name}",
-                    images[0],
-                    wide,
-                    _IMAGE,
-                    wxyz=_UPRIGHT,
-                    position=(x + low[0], left + 0.5 * wide, high[2] + 0.5 * _IMAGE),
-                    cast_shadow=False,
-                    receive_shadow=False,
-                )
-                left += wide + 0.02
-                self._images.append((images, handle))
         size = (high - low)[:2]
         span = np.ptp(self._offsets, 0) + size
         middle = 0.5 * (low + high)[:2]
@@ -164,14 +145,8 @@ class Stage:
         server.initial_camera.position = centre + reach * np.array([0.75, -0.45, 0.6])
         server.initial_camera.look_at = centre + reach * np.array([0.1, -0.06, 0.0])
 
-    def update(self, qpos: np.ndarray, frame: int = 0) -> None:
-        """Move the worlds to positions of shape ``(worlds, nq)``, and show the images of a frame;
-        what rests costs nothing.
-        """
-        for images, handle in self._images:
-            image = images[min(frame, len(images) - 1)]
-            if not np.array_equal(handle.image, image):
-                handle.image = image
+    def update(self, qpos: np.ndarray) -> None:
+        """Move the worlds to positions of shape ``(worlds, nq)``; what rests costs nothing."""
         places, turns = self._round(*self._shapes.poses(qpos))
         old_places, old_turns = self._last
         for shape, handle in self._handles:
@@ -191,11 +166,10 @@ class Stage:
 
 def choose_worlds(parts: Mapping[str, Sequence[World]]) -> list[World]:
     """At most 64 worlds of a run's parts: those alone, and equal shares of the rest."""
-    alone = [part[0] for part in parts.values() if len(part) == 1][:MOST_WORLDS]
+    single = [part[0] for part in parts.values() if len(part) == 1][:MOST_WORLDS]
     batches = [part for part in parts.values() if len(part) > 1]
-    share = (MOST_WORLDS - len(alone)) // max(1, len(batches))
-    # An even number, and the others at the end: worlds of a comparison stand in pairs.
-    return [*(world for part in batches for world in part[: share - share % 2]), *alone]
+    share = (MOST_WORLDS - len(single)) // max(1, len(batches))
+    return [*(world for part in batches for world in part[:share]), *single]
 
 
 def not_shown(model: mujoco.MjModel, worlds: Sequence[World]) -> list[str]:
@@ -243,10 +217,10 @@ def _record(
         stage.update(qpos[0])
         scene = server.get_scene_serializer()
         with server.atomic():  # no browser waits for the messages
-            for frame, row in enumerate(qpos[1:], 1):
+            for row in qpos[1:]:
                 check_interrupt()
                 scene.insert_sleep(frame_dt)
-                stage.update(row, frame)
+                stage.update(row)
         scene.insert_sleep(1.0)
         return scene
     finally:
@@ -361,10 +335,7 @@ def _fill(world: World, worlds: Sequence[World]) -> np.ndarray:
 
 
 def _grid(count: int, size: np.ndarray) -> np.ndarray:
-    """Places of worlds of a size in x and y [m], shape ``(count, 2)``; an even number of columns,
-    so that the worlds of a comparison stand in pairs.
-    """
-    columns = math.ceil(math.sqrt(count * size[0] / size[1]))
-    columns = min(count, columns + columns % 2)
+    """Positions of worlds of a size in x and y [m], shape ``(count, 2)``."""
+    columns = min(count, math.ceil(math.sqrt(count * size[0] / size[1])))
     number = np.arange(count)
     return np.column_stack((-size[0] * (number // columns), size[1] * (number % columns)))

@@ -20,6 +20,7 @@ from mjstack.config.mjcf import (
 )
 from mjstack.config.schema import RobotCfg
 from mjstack.errors import ConfigError, MjstackError, require_names
+from mjstack.robots.collision import change_collision
 from mjstack.robots.posture import REST
 
 WORLD = "world"  # MuJoCo's name of the body that never moves
@@ -162,6 +163,7 @@ def left_behind(
         reserved: As of `as_guest`.
     """
     strangers = _strangers(spec, robot)
+    yield from change_collision(spec.copy(), robot)
     yield from _options_left(spec, model)
     if robot.gravcomp != "auto" or not any(body.gravcomp for body in spec.bodies):
         state = "on" if model.body_gravcomp.any() else "off"

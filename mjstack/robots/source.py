@@ -10,6 +10,7 @@ import numpy as np
 from mjstack.config.mjcf import read_mjcf
 from mjstack.config.schema import ModelCfg, RobotCfg
 from mjstack.errors import ConfigError, MjstackError, require_names
+from mjstack.robots.collision import change_collision
 from mjstack.robots.guest import as_guest
 from mjstack.robots.hand import find_hands
 from mjstack.robots.servos import prepare_servos
@@ -46,6 +47,7 @@ def robot_spec(robot: RobotCfg, model: ModelCfg, reserved: Collection[str] = ())
     _require("robot.approach_body: body", [robot.approach_body or None], spec.bodies)
     _add_grasp_sites(spec, robot)
     _require("robot.arm_joints, robot.gripper_joints: joint", robot.joints, spec.joints)
+    change_collision(spec, robot)
     prepare_servos(spec, robot)
     return as_guest(spec, robot, reserved)
 

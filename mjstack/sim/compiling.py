@@ -1,9 +1,11 @@
 """Kernels of a physics step, compiled at the same time instead of one after the other."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from functools import partial
+from threading import Lock
 from typing import Any
 
 import mujoco
@@ -43,20 +45,52 @@ def compile_step(
     def play(stage: Stage) -> None:
         stage(m, mjw.put_data(model, data, **sizes.as_kwargs()))
 
+    def work(task: Callable[..., object], *args: Any) -> None:
+        with turn:
+            task(*args)
+
+    turn = Lock()
     source = constraints if plan.name == "fused" else mjw
     pairs = len(constraints.convex_pairs(m)) + 1
-    works = [partial(play, stage) for stage in _stages(m, plan)]
-    with wp.ScopedDevice(device), ThreadPoolExecutor(available_cores()) as pool:
-        futures = [pool.submit(work) for work in works[:pairs]]
+    stages = _stages(m, plan)
+    workers = ThreadPoolExecutor(available_cores())
+    with wp.ScopedDevice(device), _compilers_at_once(turn), workers as pool:
+        futures = [pool.submit(work, play, stage) for stage in stages[:pairs]]
         if plan.name != "fused":
             modules = [f"mujoco_warp._src.{name}" for name in SHARED]
-            wait([pool.submit(wp.load_module, name, device=device) for name in modules])
-        futures += [pool.submit(work) for work in works[pairs:]]
+            wait([pool.submit(work, wp.load_module, name, device) for name in modules])
+        futures += [pool.submit(work, play, stage) for stage in stages[pairs:]]
         if wait(futures, timeout=_SILENT).not_done:
             log.info("compiling MJWarp's kernels; later runs on this machine load them")
         wait(futures)
-        wait([pool.submit(play, source.collision)])  # if its flags ask for others
+        wait([pool.submit(work, play, source.collision)])  # if its flags ask for others
     wp.synchronize_device(device)
+
+
+@contextmanager
+def _compilers_at_once(turn: Lock) -> Iterator[None]:
+    """Threads that have their ``turn`` give it back while a compiler works for them, and no longer.
+
+    Warp's decorators hand out the newest function of a name: of two threads that declare kernels,
+    one gets a kernel that calls the other's function.
+    """
+    source = wp._src.build  # type: ignore[attr-defined]
+    compilers = {name: getattr(source, name) for name in ("build_cpu", "build_cuda")}
+
+    def compile_aside(compiler: Callable[..., object], *args: Any, **options: Any) -> object:
+        turn.release()
+        try:
+            return compiler(*args, **options)
+        finally:
+            turn.acquire()
+
+    for name, compiler in compilers.items():
+        setattr(source, name, partial(compile_aside, compiler))
+    try:
+        yield
+    finally:
+        for name, compiler in compilers.items():
+            setattr(source, name, compiler)
 
 
 def _stages(m: mjw.Model, plan: StepPlan) -> list[Stage]:

@@ -16,7 +16,9 @@ from typing_extensions import override
 from mjstack.config.schema import CameraCfg, Config
 from mjstack.errors import MjstackError, first_line
 from mjstack.sim.cameras import Cameras
+from mjstack.sim.clearance import PROVED_BY
 from mjstack.sim.compiling import compile_step
+from mjstack.sim.fused import constraints
 from mjstack.sim.fused.launch import arguments
 from mjstack.sim.fused.smooth import positions
 from mjstack.sim.fused.step import (
@@ -90,6 +92,7 @@ class MjwarpSimulation(Simulation):
             self._m.opt.disableflags |= int(mjw.DisableBit.NATIVECCD)
             self._m.opt.warn_overflow = 0
             self._d = mjw.make_data(model, nworld=nworld, **sizes.as_kwargs())
+            self._stepped = self._m  # what steps are made of, but for stock ones
             self.plan = StepPlan()  # how a physics step is done
             if cfg.sim.step != "stock":
                 self.plan = plan_step(model, self._m, self._d)
@@ -110,8 +113,16 @@ class MjwarpSimulation(Simulation):
                 body_mocapid=wp.full(model.nbody, -1, dtype=int),
             )
 
+            if self.plan.name != "stock" and PROVED_BY.isdisjoint(names):
+                self._stepped = constraints.without_far_pairs(model, self._m)
+
         if self.plan.reason:
             _log_once(f"sim.step: {self.plan}")
+        if omitted := len(self._m.nxn_geom_pair_filtered) - len(
+            self._stepped.nxn_geom_pair_filtered
+        ):
+            count = f"{omitted} of {len(self._m.nxn_geom_pair_filtered)} pairs of geoms"
+            _log_once(f"{count} are left out of collision: no range of joints lets them touch")
         hardware = self._device.name if self._device.is_cuda else "Warp's CPU device"
         self.description = (
             f"MuJoCo Warp {mjw.__version__}, Warp {wp.__version__}, {hardware}, {self.plan}"
@@ -140,7 +151,7 @@ class MjwarpSimulation(Simulation):
         self._selected = wp.from_torch(self._mask)
 
         # Compile and load every kernel, then leave the worlds as new
-        compile_step(model, self._m, sizes, self._device, self.plan)
+        compile_step(model, self._stepped, sizes, self._device, self.plan)
         with torch_stream_scope(self._device):
             self._decimation(1, kinematics=True)
         self.synchronize()
@@ -160,7 +171,7 @@ class MjwarpSimulation(Simulation):
                 prepare_stock(self._m, self._d)
                 mjw.forward(self._m, self._d)
             else:  # the same kernels as a step's, so that no others are compiled
-                rearranged_forward(self._m, self._d, self.device, self.plan, sensors=True)
+                rearranged_forward(self._stepped, self._d, self.device, self.plan, sensors=True)
         self.latch()
 
     def kinematics(self, mask: Tensor | None = None) -> None:
@@ -247,7 +258,7 @@ class MjwarpSimulation(Simulation):
             return
         # The use of a step is counted while the next one begins, which touches neither contacts nor
         # rows.
-        step = partial(rearranged_step, self._m, self._d, self.device, self.plan)
+        step = partial(rearranged_step, self._stepped, self._d, self.device, self.plan)
         for i in range(n):
             step(sensors=i == n - 1, beside_kinematics=(count,) if i else ())
         side_by_side(self.device, *((self._pose,) if kinematics else ()), count)

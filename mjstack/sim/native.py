@@ -80,6 +80,8 @@ class NativeSimulation(Simulation):
         for kind, offsets in _SAMEFRAME.items():
             if not offsets.isdisjoint(names):
                 getattr(stepped, kind)[:] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+        if "geom_size" in names:  # its boxes around bodies, too, are those that it compiled
+            stepped.bvh_aabb[:, 3:] *= 1.5
         try:
             self.batch = batch = Batch(stepped, nworld, nthread)
         except ValueError as error:

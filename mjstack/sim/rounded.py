@@ -24,13 +24,14 @@ _TERMS = 4  # of a moment of inertia about an axis elsewhere, each of which is r
 
 
 class RoundedSimulation(NativeSimulation):
-    """Native worlds whose model, state at every step, and forces of constraint rows are off by up
-    to float32's rounding, in each world otherwise. Shapes whose contacts MuJoCo has to search for,
-    such as cylinders, lie elsewhere by less than a search in float32 can tell.
+    """Native worlds whose model, state at every step, inertia times acceleration, and forces of
+    constraint rows are off by up to float32's rounding, in each world otherwise. Shapes whose
+    contacts MuJoCo has to search for, such as cylinders, lie elsewhere by less than a search in
+    float32 can tell.
 
-    If equalities connect bodies, bodies lie elsewhere by the rounding of their positions in the
-    world, which cancels along a chain but not around a loop. Their inertia is off by its rounding
-    about the centre of mass of their tree: the light links of a gripper lose most by it.
+    Inertia is off by its rounding about the centre of mass of its tree: light links far from it,
+    such as a wrist's, lose most by it. If equalities connect bodies, they lie elsewhere by the
+    rounding of their positions in the world, which cancels along a chain but not around a loop.
     """
 
     def __init__(
@@ -45,7 +46,7 @@ class RoundedSimulation(NativeSimulation):
             self.fields[name].copy_(values)
         self._round(*self.fields.values())
         linked = np.isin(model.eq_type, _LINKS).any()
-        names = ("body_pos", "body_quat", "body_inertia") if linked else ()
+        names = ("body_inertia", *("body_pos", "body_quat") * bool(linked))
         self._bodies = {name: self.fields[name].clone() for name in names}
         solid = (model.geom_contype | model.geom_conaffinity) > 0
         geoms = np.flatnonzero(np.isin(model.geom_type, _SEARCHED) & solid)
@@ -61,8 +62,8 @@ class RoundedSimulation(NativeSimulation):
 
     @override
     def forward(self) -> None:
-        """Compute everything, and the errors for the steps that follow: of bodies, and of the rows'
-        forces.
+        """Compute everything, and the errors for the steps that follow: of bodies, of the inertia
+        matrix and of the rows' forces.
         """
         self._round(self.qpos, self.qvel)
         super().forward()
@@ -79,9 +80,14 @@ class RoundedSimulation(NativeSimulation):
         for name, values in self._bodies.items():
             unit = UNIT * torch.from_numpy(sizes[name])[:, None]
             self.fields[name].copy_(values + unit * self._random(*values.shape))
-        errors = UNIT * self._random(self.nworld, data.nefc).numpy() * data.efc_force
-        for error, row in zip(errors, self.batch.bind("qfrc_applied"), strict=True):
+        inertia = np.empty((self.model.nv, self.model.nv))
+        mujoco.mj_fullM(self.model, data, inertia)
+        inertial = self._random(self.nworld, *inertia.shape).numpy() * inertia @ data.qacc
+        errors = self._random(self.nworld, data.nefc).numpy() * data.efc_force
+        applied = self.batch.bind("qfrc_applied")
+        for error, row in zip(errors, applied, strict=True):
             mujoco.mj_mulJacTVec(self.model, data, row, error)
+        applied[:] = UNIT * (applied + inertial)
 
     def _round(self, *views: Tensor) -> None:
         for view in views:

@@ -118,7 +118,7 @@ class BoxCheck(EpisodeCheck):
             distance=t.carry_distance,
             phases=self._during("carry"),
             after=lift,
-            inside=self.over,
+            inside=self.over_box,
             hold=self._during("hold"),
         )
         drop = _Drop(
@@ -171,7 +171,7 @@ class BoxCheck(EpisodeCheck):
             raise ConfigError("task.check.into", t.into, expected, "Set scene=box")
         center = [box.xy[i] + floor.pos[i] for i in (0, 1)]
         bottom, rim = (
-            scene.table_top + max(part.pos[2] + part.size[2] for part in parts)
+            scene.table_top + max(shape.pos[2] + shape.size[2] for shape in parts)
             for parts in ([floor], box.parts.values())
         )
         self._low = [*(center[i] - floor.size[i] for i in (0, 1)), bottom]
@@ -191,8 +191,8 @@ class BoxCheck(EpisodeCheck):
     @shared
     def airborne(self, step: Step) -> Tensor:
         """Whether each object is held in the air, shape ``(nworld, objects)``, bool."""
-        up = step.bounds[0][..., 2] - step.top >= self.t.lift_height
-        return step.in_hand & up & ~step.supported
+        lifted = step.bounds[0][..., 2] - step.top >= self.t.lift_height
+        return step.in_hand & lifted & ~step.supported
 
     @shared
     def outside(self, step: Step) -> Tensor:
@@ -205,10 +205,10 @@ class BoxCheck(EpisodeCheck):
 
     def high(self, step: Step) -> Tensor:
         """Whether each object is too high to be let go of, ``(nworld, objects)``, bool."""
-        heights = [self._low[2] + thing.half_height for thing in step.things]
+        heights = [self._low[2] + object_cfg.half_height for object_cfg in step.object_cfgs]
         return step.pos[..., 2] - step.constant(*heights) > self.t.drop_height
 
-    def over(self, step: Step) -> Tensor:
+    def over_box(self, step: Step) -> Tensor:
         """Whether each object is over the box or in it."""
         return (self.outside(step)[..., :2] <= 0.0).all(-1)
 
@@ -236,9 +236,9 @@ class BoxCheck(EpisodeCheck):
 
     def headline(self, values: Mapping[str, float]) -> str:
         """How well the objects are placed."""
-        off = [f"{name} {1e3 * values[f'slot_err_{name}_m']:.1f} mm" for name in self.objects]
+        offsets = [f"{name} {1e3 * values[f'slot_err_{name}_m']:.1f} mm" for name in self.objects]
         clearance = 1e3 * values["jaw_clearance_m"]
-        return f"{', '.join(off)} off their places, jaws {clearance:.0f} mm above the rim"
+        return f"{', '.join(offsets)} off their places, jaws {clearance:.0f} mm above the rim"
 
 
 @dataclass(eq=False, kw_only=True)
@@ -254,16 +254,17 @@ class _CarriedOver(parts.Carried):
     def start(self, step: Step) -> None:
         super().start(step)
         self._hold = step.during(self.hold)
-        self.over = step.counter(len(self.objects))  # in the last step of the hold, or of any load
+        # In the last step of the hold, or of any load
+        self.over_box = step.counter(len(self.objects))
 
     def update(self, step: Step) -> None:
         super().update(step)
         hold = step.judged(self._hold) if step.phased else step.in_hand
-        self.over.copy_(torch.where(hold, self.inside(step), self.over))
+        self.over_box.copy_(torch.where(hold, self.inside(step), self.over_box))
 
     def judge(self, end: Step) -> Judgement:
-        holds = self.holds() & (self.over > 0.0)
-        return holds, self.by_object(self.best, self._longest, self.over)
+        holds = self.holds() & (self.over_box > 0.0)
+        return holds, self.by_object(self.best, self._longest, self.over_box)
 
 
 @dataclass(eq=False, kw_only=True)
@@ -291,7 +292,7 @@ class _Drop(parts.AtLeast):
         else:
             # High over the box, and let go of now, or in free fall
             falls = self.high(step) & ((self._loaded > 0.0) | ~step.supported)
-            lost = self.lift.holds() & ((self.carry.over == 0.0) | falls)
+            lost = self.lift.holds() & ((self.carry.over_box == 0.0) | falls)
         self._loaded.copy_(self.condition(step))
         self.best.add_(lost & ~self.condition(step))
 
@@ -334,14 +335,14 @@ class _Order(Rule):
         self._release = release
 
     def start(self, step: Step) -> None:
-        self._early = step.zeros()
+        self._premature = step.zeros()
 
     def update(self, step: Step) -> None:
-        early = step.in_hand[:, 1:] & ~self._release.holds()[:, :-1]
-        self._early.masked_fill_(early.any(1), 1.0)
+        premature = step.in_hand[:, 1:] & ~self._release.holds()[:, :-1]
+        self._premature.masked_fill_(premature.any(1), 1.0)
 
     def judge(self, end: Step) -> Judgement:
-        return self._early == 0.0, [self._early]
+        return self._premature == 0.0, [self._premature]
 
 
 class _JawClear(Rule):

@@ -284,24 +284,24 @@ class EpisodeCheck(ABC):
         the rules' bits, ``values`` what was measured, each of shape ``(nworld,)``.
         """
         broken = dict.fromkeys(self.rules.failing(failed), "")
-        beyond = []
+        beyond_keys = []
         for name, figures in chain(*(zip(r.texts, r.figures, strict=True) for r in self._rules)):
             limited = [figure for figure in figures if figure.limits]
-            words = []
+            reasons = []
             for figure in limited if name in broken else ():
                 measured = values[figure.key]
-                wrong = (failed & self.rules[name] != 0) & ~figure.holds(measured)
-                if wrong.any():
+                violating = (failed & self.rules[name] != 0) & ~figure.holds(measured)
+                if violating.any():
                     limit = figure.high if measured[0] > figure.high else figure.low
                     number = f"{measured[0]:.4g} of {limit:g}"
-                    words.append(
+                    reasons.append(
                         f"{figure.column or figure.key}"
-                        f" {number if len(failed) == 1 else f'in {wrong.sum()}'}"
+                        f" {number if len(failed) == 1 else f'in {violating.sum()}'}"
                     )
-                    beyond.append(figure.key)
-            if words and len(limited) > 1:
-                broken[name] = f" ({', '.join(words)})"
-        return broken, beyond
+                    beyond_keys.append(figure.key)
+            if reasons and len(limited) > 1:
+                broken[name] = f" ({', '.join(reasons)})"
+        return broken, beyond_keys
 
     @abstractmethod
     def placed(self, step: Step) -> Tensor:

@@ -31,8 +31,8 @@ def airborne(*objects: str, height: float) -> Condition:
 
     def condition(step: Step) -> Tensor:
         columns = step.columns(objects)
-        up = columns.read(step.height) > height
-        return up if step.phased else up & columns.read(step.in_hand)
+        above_height = columns.read(step.height) > height
+        return above_height if step.phased else above_height & columns.read(step.in_hand)
 
     return condition
 
@@ -48,11 +48,11 @@ def released(*objects: str, open_fraction: float) -> AllOf:
     """
     least = open_fraction or -math.inf
 
-    def parts(step: Step) -> tuple[Tensor, ...]:
+    def conditions(step: Step) -> tuple[Tensor, ...]:
         wide = step.narrowest >= least
         return step.columns(objects).read(step.untouched) if objects else wide, wide
 
-    return AllOf(("untouched", "open_fraction"), parts)
+    return AllOf(("untouched", "open_fraction"), conditions)
 
 
 def on_top(object: str, onto: str, *, xy_err: float, dz_min: float, dz_max: float) -> AllOf:
@@ -60,19 +60,19 @@ def on_top(object: str, onto: str, *, xy_err: float, dz_min: float, dz_max: floa
     heights [m].
     """
 
-    def parts(step: Step) -> tuple[Tensor, ...]:
-        apart, dz = offset(step, object, onto)
-        return apart <= xy_err, dz.clamp(dz_min, dz_max) == dz
+    def conditions(step: Step) -> tuple[Tensor, ...]:
+        separation, dz = offset(step, object, onto)
+        return separation <= xy_err, dz.clamp(dz_min, dz_max) == dz
 
-    return AllOf(("xy_err", "dz"), parts)
+    return AllOf(("xy_err", "dz"), conditions)
 
 
 def offset(step: Step, object: str, onto: str) -> tuple[Tensor, Tensor]:
     """Horizontal distance of the centres [m], and height of the first above the second [m], each
     ``(nworld,)``.
     """
-    apart = step.center(object) - step.center(onto)
-    return norm(apart[:, :2]), apart[:, 2]
+    separation = step.center(object) - step.center(onto)
+    return norm(separation[:, :2]), separation[:, 2]
 
 
 def on_top_of(step: Step, onto: str, object: str) -> Tensor:
@@ -89,8 +89,8 @@ def at_place(object: str, place: str, *, distance: float) -> AllOf:
 
 def away(step: Step, object: str, place: str) -> Tensor:
     """Horizontal distance of an object's centre from a place [m], shape ``(nworld,)``."""
-    apart = step.center(object)[:, :2] - place_xy(step.env, place).float()
-    return norm(apart)
+    separation = step.center(object)[:, :2] - place_xy(step.env, place).float()
+    return norm(separation)
 
 
 def on_table(object: str, *, gap: float) -> AllOf:
@@ -98,7 +98,7 @@ def on_table(object: str, *, gap: float) -> AllOf:
     the top [m], its centre at least half its size from the edges.
     """
 
-    def parts(step: Step) -> Tensor:
+    def conditions(step: Step) -> Tensor:
         scene = step.env.cfg.scene
         half = scene.objects[object].half
         room = step.constant(*(scene.table_half[i] - half[i] for i in (0, 1)), gap)
@@ -107,7 +107,7 @@ def on_table(object: str, *, gap: float) -> AllOf:
         at = torch.cat((step.center(object)[:, :2], height), dim=1)
         return (at - center).abs() <= room
 
-    return AllOf(("x", "y", "gap"), parts)
+    return AllOf(("x", "y", "gap"), conditions)
 
 
 def upright(object: str, *, tilt_deg: float, axis: str = "z", either_end: bool = True) -> AllOf:
@@ -115,10 +115,10 @@ def upright(object: str, *, tilt_deg: float, axis: str = "z", either_end: bool =
     ``either_end`` is false.
     """
 
-    def parts(step: Step) -> tuple[Tensor, ...]:
+    def conditions(step: Step) -> tuple[Tensor, ...]:
         return (step.tilt(object, axis, either_end=either_end) <= tilt_deg,)
 
-    return AllOf(("tilt_deg",), parts)
+    return AllOf(("tilt_deg",), conditions)
 
 
 def flat(object: str, *, tilt_deg: float) -> AllOf:
@@ -131,14 +131,14 @@ def in_zone(object: str, frame: str, *, low: Sequence[float], high: Sequence[flo
     least and largest x, y and perhaps z [m].
     """
 
-    def parts(step: Step) -> Tensor:
+    def conditions(step: Step) -> Tensor:
         pose = pose_w(step.env, frame).float()
-        apart = step.center(object) - pose[:, :3]
-        at = (quat_to_matrix(pose[:, 3:]) * apart[..., None]).sum(-2)[:, : len(low)]
+        separation = step.center(object) - pose[:, :3]
+        at = (quat_to_matrix(pose[:, 3:]) * separation[..., None]).sum(-2)[:, : len(low)]
         constant = step.constant
         return at.clamp(constant(*low), constant(*high)) == at
 
-    return AllOf(("along_x", "along_y", "along_z")[: len(low)], parts)
+    return AllOf(("along_x", "along_y", "along_z")[: len(low)], conditions)
 
 
 # Rules
@@ -307,13 +307,13 @@ class InWindow(Rule):
 
     @override
     def update(self, step: Step) -> None:
-        self.length.add_(1.0).mul_(self._rule.apart(step))
+        self.length.add_(1.0).mul_(self._rule.by_part(step))
 
     @override
     def judge(self, end: Step) -> Judgement:
         total = self.length.amin(1)
-        parts = self.length.unbind(1) if self.length.shape[1] > 1 else ()
-        return total >= self.window, [total, *parts, *self.measure(end).values()]
+        conditions = self.length.unbind(1) if self.length.shape[1] > 1 else ()
+        return total >= self.window, [total, *conditions, *self.measure(end).values()]
 
 
 @dataclass(eq=False)
@@ -371,8 +371,8 @@ class AtRest(Rule):
             a = self._poses[:, : self.window - lag]
             b = self._poses[:, lag:]
             # amax hands NaN on, so that an unfilled or diverged window fails its rule.
-            apart = norm(a[..., :3] - b[..., :3])
-            distance = torch.maximum(distance, apart.amax((1, 2)))
+            separation = norm(a[..., :3] - b[..., :3])
+            distance = torch.maximum(distance, separation.amax((1, 2)))
             angle = torch.maximum(angle, quat_angle(a[..., 3:], b[..., 3:]).amax((1, 2)))
         turn = math.radians(self.rotation_deg)
         holds = (rms <= self.speed, distance <= self.position, angle <= turn)

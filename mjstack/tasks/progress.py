@@ -14,7 +14,7 @@ from mjstack.math import norm
 from mjstack.mdp.observation import grasp_point_pos
 
 STAGES = ("reach", "lift", "carry", "place", "release")
-BELOW = 0.005  # m below its goal that an object over it may be: contacts are soft
+SUPPORT_GAP = 0.005  # m below its goal that an object over it may be: contacts are soft
 
 
 @offers(reads="state")
@@ -76,12 +76,12 @@ class Progress:
         self._ranges = constant(scale, scale, scale, height, max(open_fraction, 1e-6))
         self._nearest = constant(1.0)
         self._number = constant(0.0, 2.0, 3.0, 1.0, 4.0)
-        self._least = constant(-inf, -inf, -BELOW, height, -inf)
+        self._least = constant(-inf, -inf, -SUPPORT_GAP, height, -inf)
         self._most = constant(within, near, inf, inf, inf)
         # Conditions of each of these stages. Any opening will do, so the first has none.
-        away, across, above, low, opening, in_hand, placed = range(7)
-        conditions = [[opening] * 3, [in_hand, away, low], [across, above, above]]
-        conditions += [[in_hand, away, away], [placed] * 3]
+        distance, offset_xy, offset_z, low, opening, in_hand, placed = range(7)
+        conditions = [[opening] * 3, [in_hand, distance, low], [offset_xy, offset_z, offset_z]]
+        conditions += [[in_hand, distance, distance], [placed] * 3]
         self._conditions = torch.tensor(conditions, device=env.device).flatten()
 
     def __call__(self, env: EnvView) -> Tensor:
@@ -92,8 +92,8 @@ class Progress:
 
         # Which stages each object has got to
         within = measured.clamp(self._least, self._most) == measured
-        facts = torch.cat((within, in_hand[..., None], placed[..., None]), dim=-1)
-        reached = facts.index_select(-1, self._conditions).unflatten(-1, (5, 3)).all(-1)
+        predicates = torch.cat((within, in_hand[..., None], placed[..., None]), dim=-1)
+        reached = predicates.index_select(-1, self._conditions).unflatten(-1, (5, 3)).all(-1)
 
         # How far it has got in each: the last one that it has got to is worth most
         worth = measured / self._ranges
@@ -119,8 +119,8 @@ class Progress:
         pos = self._columns.read(step.pos)
         goals = list(self._check.goals(step).values())
         offset = pos - (torch.stack(goals, dim=1) if len(goals) > 1 else goals[0][:, None])
-        away = norm(pos - grasp_point_pos(step.env).float()[:, None])
+        distance = norm(pos - grasp_point_pos(step.env).float()[:, None])
         low = self._columns.read(step.height)
         opening = step.narrowest.expand_as(low)
-        parts = (away, norm(offset[..., :2]), offset[..., 2], low, opening)
-        return torch.stack(parts, dim=-1), self._columns.read(step.in_hand)
+        measures = (distance, norm(offset[..., :2]), offset[..., 2], low, opening)
+        return torch.stack(measures, dim=-1), self._columns.read(step.in_hand)

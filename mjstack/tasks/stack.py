@@ -82,17 +82,22 @@ class StackCheck(EpisodeCheck):
     def build(self) -> list[Rule]:
         t = self.t
         self.objects = [t.object, t.onto]
-        up = parts.airborne(t.object, height=t.airborne_height)
+        airborne = parts.airborne(t.object, height=t.airborne_height)
         self.stacked = parts.on_top(
             t.object, t.onto, xy_err=t.xy_err, dz_min=t.dz_min, dz_max=t.dz_max
         )
         self.supported = parts.on_table(t.onto, gap=t.support_gap)
         self.released = parts.released(t.object, open_fraction=t.open_fraction)
         lift = parts.Streak(
-            "LIFT", "{object} not lifted", [t.object], up, t.lift_steps, phases=[t.lift_phases]
+            "LIFT",
+            "{object} not lifted",
+            [t.object],
+            airborne,
+            t.lift_steps,
+            phases=[t.lift_phases],
         )
         carry = parts.Carried(
-            *("CARRY", "{object} not carried", [t.object], up, t.carry_steps),
+            *("CARRY", "{object} not carried", [t.object], airborne, t.carry_steps),
             distance=t.carry_distance,
             phases=[[t.carry_phase]],
             after=lift,
@@ -156,7 +161,7 @@ class StackSuccess(HeldSuccess):
         self._pose = state.zeros(*ring, 7)
         self._energy = state.zeros(*ring)  # squared speed
         # Squared distance to later steps, and 1 - |cosine of half the angle| to them
-        self._apart = state.zeros(*ring, 2)
+        self._spans = state.zeros(*ring, 2)
         t = check.t
         rotation = 1.0 - math.cos(0.5 * math.radians(t.rest_rotation_deg))
         speeds = [t.rest_speed**2] * len(state.objects)
@@ -164,13 +169,13 @@ class StackSuccess(HeldSuccess):
 
     def __call__(self, env: EnvView) -> Tensor:
         """Process a step; shape ``(nworld,)``, bool."""
-        achieved, _ = branches(env.device, partial(super().__call__, env), self._look)
+        achieved, _ = branches(env.device, partial(super().__call__, env), self._record_step)
         if achieved.is_cuda or bool(achieved.any()):
-            largest = torch.cat((self._energy.mean(1), self._apart.amax((1, 2))), dim=1)
+            largest = torch.cat((self._energy.mean(1), self._spans.amax((1, 2))), dim=1)
             achieved &= (largest <= self._limits).all(1)
         return achieved
 
-    def _look(self) -> None:
+    def _record_step(self) -> None:
         """Take a step in place of the oldest one. `reset` may leave the ring alone: every slot is
         written anew before the streak can reach the window.
         """
@@ -182,9 +187,9 @@ class StackSuccess(HeldSuccess):
         step = self._state
         self._pose.index_copy_(1, self._slot, step.pose[:, None])
         self._energy.index_copy_(1, self._slot, step.speed.square()[:, None])
-        self._apart.index_fill_(1, self._slot, 0.0)
+        self._spans.index_fill_(1, self._slot, 0.0)
         # The newest step against the others
         distance = (self._pose[..., :3] - step.pos[:, None]).square().sum(-1)
         cosine = (self._pose[..., 3:] * step.quat[:, None]).sum(-1).abs()
-        apart = torch.stack((distance, 1.0 - cosine), dim=-1)
-        torch.maximum(self._apart, apart, out=self._apart)
+        spans = torch.stack((distance, 1.0 - cosine), dim=-1)
+        torch.maximum(self._spans, spans, out=self._spans)

@@ -77,10 +77,14 @@ class Step:
 
         index = env.index
         scene = env.cfg.scene
-        self.things = [scene.objects[name] for name in objects]
+        self.object_cfgs = [scene.objects[name] for name in objects]
         self.top = scene.table_top
-        self.half = torch.tensor([thing.half for thing in self.things], device=env.device)
-        self.radius = torch.tensor([thing.radius for thing in self.things], device=env.device)
+        self.half = torch.tensor(
+            [object_cfg.half for object_cfg in self.object_cfgs], device=env.device
+        )
+        self.radius = torch.tensor(
+            [object_cfg.radius for object_cfg in self.object_cfgs], device=env.device
+        )
 
         def columns(forces: Mapping[str, Sequence[int]]) -> Columns:
             addresses = itertools.chain(*(forces.get(name, ()) for name in objects))
@@ -163,7 +167,7 @@ class Step:
     @_value
     def height(self) -> Tensor:
         """Height of the lowest point above the table [m], shape ``(nworld, objects)``."""
-        forms = [thing.form for thing in self.things]
+        forms = [object_cfg.form for object_cfg in self.object_cfgs]
         if forms[1:] == forms[:-1]:  # all alike
             return lowest_point(self.pos, self.quat, *forms[0]) - self.top
         poses = zip(self.pos.unbind(1), self.quat.unbind(1), forms, strict=True)
@@ -299,7 +303,7 @@ class AllOf:
         holds = self.parts(step)  # in as few calls of torch as there are
         return holds.all(-1) if isinstance(holds, Tensor) else reduce(and_, holds)
 
-    def apart(self, step: Step) -> Tensor:
+    def by_part(self, step: Step) -> Tensor:
         """Whether each part holds for all objects, shape ``(nworld, parts)``, bool."""
         holds = self.parts(step)
         if not isinstance(holds, Tensor):
@@ -310,6 +314,6 @@ class AllOf:
         """A condition of the parts of both, each for all its objects, shape ``(nworld,)``, bool."""
 
         def parts(step: Step) -> Tensor:
-            return torch.cat((self.apart(step), condition.apart(step)), dim=-1)
+            return torch.cat((self.by_part(step), condition.by_part(step)), dim=-1)
 
         return AllOf((*self.names, *condition.names), parts)

@@ -218,7 +218,8 @@ class CloneLearner(Learner):
         """
         ahead = torch.arange(network.chunk, device=steps.device)
         later = torch.minimum(steps[:, None] + ahead, self._last[steps][:, None])
-        target = (self._labels[later] - network.action_mean) / network.action_std
+        target = self._labels[later] - network.measured(self._seen[steps])
+        target = (target - network.action_mean) / network.action_std
         # Convolutions on CUDA in bfloat16. A graph cannot hold the cache of converted weights.
         fast = steps.is_cuda and len(images) > 0
         error = _LOSSES[self._job.loss]

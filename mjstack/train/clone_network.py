@@ -9,11 +9,13 @@ from torch import Tensor, nn
 
 from mjstack.config.schema import CloneJobCfg, Config, ObservationTermCfg
 from mjstack.distributed import Ranks
+from mjstack.errors import ConfigError
 from mjstack.managers.observation import column_noise, slide_joints
 from mjstack.policy import PolicyNetwork, Vision
 from mjstack.tasks.check import make_check
 from mjstack.train.demonstrations import Demonstrations
 
+_JOINTS = "mjstack.mdp.observation.joint_pos"
 _LEAST = 0.1  # scale of a column, of the largest one of its term
 _NOISE = 0.02  # of the standard deviation of a column, where its term has no noise
 _ROUGH = 0.005  # m
@@ -30,7 +32,12 @@ def make_network(cfg: Config, demonstrations: Demonstrations, ranks: Ranks) -> P
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(cfg.seed)
         sizes = (seen.shape[1], labels.shape[1], job.chunk, job.hidden)
-        network = PolicyNetwork(*sizes, vision_of(cfg, job))
+        relative, origin = _measured(cfg, demonstrations.widths) if job.relative else ([], [])
+        network = PolicyNetwork(*sizes, vision_of(cfg, job), relative)
+    if relative:
+        network.origin.copy_(torch.tensor(origin))
+        labels = labels - network.to(labels.device).measured(seen)[:, 0]
+        network.cpu()
     mean, std = _moments(labels, ranks)
     network.set_scale("action", mean.cpu(), std.cpu())
     # A column that hardly moves would count as much as others: its noise would be followed.
@@ -91,6 +98,21 @@ def input_noise(
         else:
             widest += (scale * _NOISE * spread).tolist()
     return torch.tensor(widest)
+
+
+def _measured(cfg: Config, widths: Mapping[str, int]) -> tuple[list[int], list[float]]:
+    """Columns of the observation with the latest measured joints, and what these count from."""
+    job: CloneJobCfg = cfg.job
+    home = cfg.robot.home
+    start = 0
+    for name, width in widths.items():
+        start += width
+        term = cfg.observation[job.group].terms[name]
+        relative = term.func == f"{_JOINTS}_relative"
+        if (relative or term.func == _JOINTS) and term.scale == 1.0 and term.clip is None:
+            return [*range(start - len(home), start)], home if relative else [0.0] * len(home)
+    expected = f"false, because the policy sees no {_JOINTS}, as it is"
+    raise ConfigError("job.relative", True, expected)
 
 
 def vision_of(cfg: Config, job: CloneJobCfg) -> Vision:

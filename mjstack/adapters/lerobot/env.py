@@ -93,9 +93,9 @@ class MjstackEnv(EnvConfig):
         keys = {STATE: "agent_pos", SEEN: "environment_state"}
         self.features = {"action": PolicyFeature(FeatureType.ACTION, (len(cfg.robot.joints),))}
         self.features_map = {"action": "action"}
-        for name, part in worlds.words.observe().items():
+        for name, array in worlds.words.observe().items():
             key = keys.get(name, name)
-            self.features[key] = PolicyFeature(kinds.get(name, FeatureType.VISUAL), part.shape[1:])
+            self.features[key] = PolicyFeature(kinds.get(name, FeatureType.VISUAL), array.shape[1:])
             self.features_map[key] = name
         return {self.type: {0: worlds}}
 

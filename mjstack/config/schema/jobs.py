@@ -61,14 +61,6 @@ class ExportJobCfg(JobCfg):
 
 
 @dataclass(slots=True)
-class CompareJobCfg(JobCfg):
-    """Two policies, drivers or settings, compared on equal starts."""
-
-    against: list[str] = spec([])
-    """Overrides that make the second side of the command's configuration, which is the first."""
-
-
-@dataclass(slots=True)
 class TrainJobCfg(JobCfg):
     """A policy is trained, and judged from starts that training has not used."""
 
@@ -143,6 +135,9 @@ class CloneJobCfg(TrainJobCfg):
     """Joint targets of a chunk, which is one action."""
     execute: int = spec(unit="steps", ge=1, le=1000)
     """Control steps between two queries."""
+    relative: bool = False
+    """Whether joint targets count from the joints as the policy observes them at its query. Then
+    they depend on no joint's zero."""
     warm_up: float = spec(0.0, ge=0.0, le=1.0)
     """Share of a round's batches in which the learning rate rises to ``learning_rate``, before a
     cosine brings it to 0."""
@@ -204,7 +199,6 @@ TRAINER_SCHEMAS = {"ppo": PpoJobCfg}
 JOB_SCHEMAS = {
     "collect": CollectJobCfg,
     "play": PlayJobCfg,
-    "compare": CompareJobCfg,
     "export": ExportJobCfg,
     "train": CloneJobCfg,
 }

@@ -100,6 +100,9 @@ class RobotCfg:
     exclude: list[Any] = spec([])
     """Pairs of the robot's bodies that do not collide, such as ``[world, link1]``. world:
     what its file has in the worldbody."""
+    collision: Any = spec("hull 64", changes=("episodes",))
+    """How its meshes collide: ``file``, as they are; ``hull N``, as convex hulls of N vertices at
+    most, nearest to them; ``primitives``, as boxes and capsules around them."""
     menagerie_name: str = ""
     """The robot's folder in MuJoCo Menagerie, for ``model=menagerie``."""
     menagerie_file: str = ""
@@ -138,6 +141,9 @@ class RobotCfg:
     servos: dict[str, ServoCfg] = spec({})
     """Servos by joint, which the group ``actuator`` chooses; other joints have the file's own. One
     with stiffness, damping and effort is made where the file has a motor, or none."""
+    backlash: float = spec(0.0, unit="rad, m", ge=0.0)
+    """Play of the gears of each arm joint, to either side: so far from a command that comes from
+    one side its servo stays."""
     ranges: dict[str, Any] = spec({}, vectors=True, unit="rad, m", length=2)
     """Ranges of joints, in place of the file's own."""
 

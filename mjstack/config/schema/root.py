@@ -69,13 +69,15 @@ class Config:
     graph: str = spec(choices=("auto", "require", "off"), changes=("report",))
     """Capture the step as a CUDA graph: auto, require or off. Ignored on native MuJoCo; on Warp's
     CPU device, of physics alone."""
-    view: str = spec(choices=("false", "true", "web"), changes=("report",))
-    """true: MuJoCo's viewer on the parity world, or without that gate the baseline world; job=play:
-    every world. web: the same, worlds of batch and success, and training, in a browser."""
+    view: str = spec(choices=("false", "web"), changes=("report",))
+    """web: worlds of the gates, of replay and play, and training, in a browser."""
     video: bool = spec(changes=("report",))
-    """Write a video of the same; job=play without view does so."""
+    """Write a video of the parity world, or without that gate of the baseline world; job=play
+    without view does so of every world."""
     web: WebCfg = spec(WebCfg, changes=("nothing",))
     """Worlds in a browser."""
+    range_scale: float = spec(1.0, ge=0.0, le=10.0)
+    """How wide the ranges of ``randomization`` are, of their own; 1.5: wider by half."""
     starts: str | None = spec(None)
     """reset=starts_file: an npz file with one row per world, from which all of them start."""
     policy: str | None = spec(None)
@@ -86,7 +88,7 @@ class Config:
     """GPUs that share the job's worlds, a process for each: all, or how many. null: as torchrun
     has it, or one."""
     world: str | None = spec(None, changes=("report",))
-    """job=replay: 17; of seed 3, 3:17; success:3:17 where batch ran too; failing: all those."""
+    """job=replay: 17; of seed 3, 3:17; success:3:17 where batch ran too."""
     unused_terms: list[str] = spec([], changes=("nothing",))
     """Terms of the task that this job does not use, a line each; mjstack fills it in."""
 
@@ -99,5 +101,8 @@ class Config:
     def files(self) -> dict[str, str]:
         """Paths of its MJCF files, by key."""
         named = {"robot.file": self.robot.file}
-        named |= {f"scene.objects.{n}.file": thing.file for n, thing in self.scene.objects.items()}
+        named |= {
+            f"scene.objects.{n}.file": object_cfg.file
+            for n, object_cfg in self.scene.objects.items()
+        }
         return {key: path for key, path in named.items() if path is not None}

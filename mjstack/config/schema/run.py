@@ -213,14 +213,10 @@ class EpisodesGateCfg(GateFuncCfg):
     """Share of the episodes that must succeed."""
     distinct_fraction: float = spec(0.0, ge=0.0, le=1.0)
     """Smallest share of distinct starts, or of distinct final states."""
-    region: list[float] | None = spec(None, unit="m", length=2, ge=0.0, changes=("gates",))
-    """Half-widths of the objects' region in x and y; null: as ``reset`` has them."""
-    cell_episodes: int = spec(20, unit="episodes", ge=1, le=MOST_COUNT)
-    """Episodes below which a cell of start positions has no rate."""
     reset: dict[str, Any] = spec({}, changes=("gates",))
     """Reset terms of its own: what they add to the task's own terms of ``reset``, or replace by
     name. ``reset=starts_file`` takes the place of those that read no file. With some, closed_loop
-    plays in place of a plan, and starts, signs of failure and regions are recorded. Empty: those of
+    plays in place of a plan, and starts and signs of failure are recorded. Empty: those of
     ``reset``."""
 
 

@@ -38,7 +38,7 @@ class ShapeCfg:
         if self.quat is None:
             return [math.cos(0.5 * self.yaw), 0.0, 0.0, math.sin(0.5 * self.yaw)]
         length = math.hypot(*self.quat)
-        return [part / length for part in self.quat]
+        return [component / length for component in self.quat]
 
     @property
     def upright(self) -> bool:
@@ -58,7 +58,7 @@ class ShapeCfg:
     @property
     def half_height(self) -> float:
         """Height of the centre above what it stands on [m]."""
-        up = [abs(part) for part in self.axes[2]]
+        up = [abs(component) for component in self.axes[2]]
         if self.shape == "box":
             return sum(map(mul, up, self.size))
         radius = self.size[0]
@@ -141,7 +141,7 @@ class ObjectCfg(ShapeCfg):
     def pieces(self) -> dict[str, PartCfg]:
         """Its shapes in its own frame, by the names of their geoms but for the object's."""
         if self.parts or self.file:
-            return {f"_{name}": part for name, part in self.parts.items()}
+            return {f"_{name}": component for name, component in self.parts.items()}
         return {"": PartCfg(shape=self.shape, size=self.size)}
 
     @property
@@ -279,7 +279,9 @@ class SceneCfg:
     @property
     def free(self) -> dict[str, ObjectCfg]:
         """The objects that move."""
-        return {name: thing for name, thing in self.objects.items() if not thing.fixed}
+        return {
+            name: object_cfg for name, object_cfg in self.objects.items() if not object_cfg.fixed
+        }
 
     @property
     def table_top(self) -> float:

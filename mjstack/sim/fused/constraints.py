@@ -7,7 +7,9 @@ from functools import partial
 from typing import Any
 
 import mujoco
+import numpy as np
 
+from mjstack.sim.clearance import find_separate
 from mjstack.sim.fused.launch import SHARED_BYTES, arguments, launch, padded_rows
 from mjstack.sim.graph import side_by_side
 from mjstack.sim.mujoco_warp import mjw, wp
@@ -43,6 +45,25 @@ def shared_bytes(nv: int, row: int, njmax: int) -> int:
     team, chunk = (_TEAM, 64) if nv <= _TEAM_NV else (1, 32)
     floats = (nv + 1) * (nv | 1) + max((chunk + 2) * row, 512) + 4 * nv + 5 * njmax + 11 * team
     return 4 * floats + 8 * njmax
+
+
+def without_far_pairs(model: mujoco.MjModel, m: mjw.Model) -> mjw.Model:
+    """The model without the pairs of geoms that are proved to be apart in every posture."""
+    pairs, numbers = m.nxn_geom_pair_filtered.numpy(), m.nxn_pairid_filtered.numpy()
+    if m.opt.broadphase != mjw.BroadphaseType.NXN or m.opt.disableflags & mjw.DisableBit.LIMIT:
+        return m
+    listed = (numbers != -1).any(axis=1)  # a pair of the file, or of a sensor
+    listed[~listed] = ~find_separate(model, pairs[~listed])
+    kinds = np.sort(model.geom_type[pairs[listed]], axis=1)
+    count = np.zeros(len(m.geom_pair_type_count), dtype=int)
+    index = [mjw._src.math.upper_trid_index(len(mjw.GeomType), *kind) for kind in kinds.tolist()]
+    np.add.at(count, index, 1)
+    return dataclasses.replace(
+        m,
+        nxn_geom_pair_filtered=wp.array(pairs[listed], dtype=wp.vec2i),
+        nxn_pairid_filtered=wp.array(numbers[listed], dtype=wp.vec2i),
+        geom_pair_type_count=tuple(count.tolist()),
+    )
 
 
 def convex_pairs(m: mjw.Model) -> list[tuple[mjw.GeomType, mjw.GeomType]]:

@@ -1,0 +1,116 @@
+"""Pairs of geoms that no posture lets touch: a proof by the ranges of joints."""
+
+import hashlib
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy import ndarray
+
+from mjstack.sim.model_fields import PLACING_FIELDS
+
+PROVED_BY = PLACING_FIELDS | {
+    *("geom_size", "geom_aabb", "geom_rbound", "geom_margin", "geom_gap"),
+    *("jnt_pos", "jnt_axis", "jnt_range", "qpos0"),
+}
+"""Fields that a proof reads: it holds for no world that differs in one."""
+
+_SHAPES = range(mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_MESH + 1)
+_HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+_BEYOND = {_HINGE: 0.1, _SLIDE: 0.005}  # rad, m: a range is a soft limit
+_CLEAR = 5e-4  # m between surfaces, at least
+_DEEP = 3  # joints between two geoms; of more there are too many postures
+_POSTURES = 2500  # of a pair, at most
+_known: dict[bytes, ndarray] = {}
+
+
+def find_separate(model: mujoco.MjModel, pairs: ndarray) -> ndarray:
+    """Whether two geoms are apart in every posture that the ranges of joints allow, and somewhat
+    beyond; shape ``(n,)``, bool, for pairs of shape ``(n, 2)``.
+
+    A proof, not a sample. A hinge that turns by an angle moves no point of a geom farther than that
+    angle times the largest distance of the geom from the hinge. So a distance in one posture is
+    enough for all postures nearby, and ranges are halved until all are covered. Once in a process.
+    """
+    content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, content)
+    key = hashlib.sha256(content.tobytes()).digest() + pairs.tobytes()
+    if key not in _known:
+        data = mujoco.MjData(model)
+        _known[key] = np.array([_proved(model, data, int(a), int(b)) for a, b in pairs], dtype=bool)
+    return _known[key]
+
+
+def _proved(model: mujoco.MjModel, data: mujoco.MjData, *geoms: int) -> bool:
+    bodies = [int(model.geom_bodyid[geom]) for geom in geoms]
+    if any(model.geom_type[geom] not in _SHAPES for geom in geoms) or any(
+        model.body_mocapid[model.body_rootid[body]] >= 0 for body in bodies
+    ):
+        return False
+    data.qpos = model.qpos0
+    mujoco.mj_kinematics(model, data)
+    chains = [_chain(model, body) for body in bodies]
+    speeds: dict[int, float] = {}  # of a geom's farthest point, in m/rad, or m/m
+    for geom, chain in zip(geoms, chains, strict=True):
+        reach, point, hinges = float(model.geom_rbound[geom]), data.geom_xpos[geom], 0
+        for joint in [j for j in chain if (j in chains[0]) != (j in chains[1])]:
+            kind = int(model.jnt_type[joint])
+            if kind == _HINGE:
+                arm = point - data.xanchor[joint]
+                if not hinges:  # along the axis of its own hinge a geom stays where it is
+                    arm = arm - (arm @ data.xaxis[joint]) * data.xaxis[joint]
+                reach += float(np.linalg.norm(arm))
+                speeds[joint], point, hinges = reach, data.xanchor[joint].copy(), hinges + 1
+            elif kind == _SLIDE and model.jnt_limited[joint]:
+                travel = model.jnt_range[joint] - model.qpos0[model.jnt_qposadr[joint]]
+                reach += float(np.abs(travel).max()) + _BEYOND[_SLIDE]
+                speeds[joint] = 1.0
+            else:
+                return False
+    joints = [*speeds]
+    ranges = model.jnt_range[joints].copy()
+    ranges[model.jnt_limited[joints] == 0] = -np.pi, np.pi  # a whole turn
+    half = 0.5 * np.diff(ranges)[:, 0] + [_BEYOND[int(model.jnt_type[j])] for j in joints]
+    clear = _CLEAR + float((model.geom_margin + model.geom_gap)[[*geoms]].sum())
+    addresses = model.jnt_qposadr[joints]
+    search = _Search(model, data, geoms, addresses, np.array([*speeds.values()]), clear)
+    return search.covers(ranges.mean(axis=1), half)
+
+
+def _chain(model: mujoco.MjModel, body: int) -> list[int]:
+    """Joints between a body and the world, from the body on."""
+    chain: list[int] = []
+    while body:
+        first = int(model.body_jntadr[body])
+        chain += reversed(range(first, first + int(model.body_jntnum[body])))
+        body = int(model.body_parentid[body])
+    return chain
+
+
+@dataclass(slots=True)
+class _Search:
+    """A search for a posture in which two geoms may touch."""
+
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    geoms: tuple[int, ...]
+    addresses: ndarray
+    speeds: ndarray
+    clear: float
+    budget: int = _POSTURES
+
+    def covers(self, middle: ndarray, half: ndarray) -> bool:
+        """Whether they are apart wherever each joint is at most ``half`` from ``middle``."""
+        self.budget -= 1
+        self.data.qpos[self.addresses] = middle
+        mujoco.mj_kinematics(self.model, self.data)
+        moved = half * self.speeds
+        horizon = self.clear + float(moved.sum())  # it searches no farther
+        distance = mujoco.mj_geomDistance(self.model, self.data, *self.geoms, horizon, None)
+        if distance >= horizon:
+            return True
+        if distance <= self.clear or self.budget <= 0 or len(half) > _DEEP:
+            return False
+        widest = np.arange(len(half)) == moved.argmax()
+        half = np.where(widest, 0.5 * half, half)
+        return all(self.covers(middle + side * widest * half, half) for side in (-1.0, 1.0))

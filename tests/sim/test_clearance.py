@@ -1,0 +1,116 @@
+"""Pairs of geoms are left out of collision only where no posture lets them touch."""
+
+import itertools
+
+import mujoco
+import numpy as np
+import pytest
+from environments import configure
+
+from mjstack.config.schema import Backend
+from mjstack.scene import build_model
+from mjstack.sim import make_simulation
+from mjstack.sim.clearance import find_separate
+from mjstack.sim.mjwarp import MjwarpSimulation
+from mjstack.sim.sizes import resolve_sizes
+
+# A bar that turns about z passes a pin, which a hinge with a range of its own may bring nearer
+BAR = """<mujoco><compiler angle="radian"/><worldbody>
+  <body><joint axis="0 0 1" {bar}/><geom type="capsule" size=".01" fromto="0 0 0 .2 0 0"/></body>
+  <body pos="0 {far} 0"><joint {pin}/><geom type="sphere" size=".01" pos="0 0 {up}"/></body>
+</worldbody></mujoco>"""
+
+
+def far_apart(up: str = "0", **words: str) -> bool:
+    model = mujoco.MjModel.from_xml_string(BAR.format(up=up, **words))
+    return bool(find_separate(model, np.array([[0, 1]]))[0])
+
+
+@pytest.mark.parametrize("bar", ["", 'range="-1 1.9"'])
+def test_a_bar_that_passes_by_millimetres_is_apart(bar: str) -> None:
+    """It reaches 210 mm, the pin's near side is at 212 or 209.8 mm."""
+    pin = 'axis="0 0 1"'
+    assert far_apart(bar=bar, pin=pin, far="0.222")
+    assert not far_apart(bar=bar, pin=pin, far="0.2198")
+
+
+def test_a_touch_in_few_postures_is_found() -> None:
+    """The pin is in the bar's way for one degree of each hinge; the middles of the ranges are
+    clear, and so are nearly all postures.
+    """
+    pin = 'axis="1 0 0" range="1.5 3"'
+    assert not far_apart(bar='range="-2.5 1.56"', pin=pin, far="0.2398", up=".02")
+    assert far_apart(bar='range="-2.5 1.56"', pin=pin, far="0.2445", up=".02")
+
+
+@pytest.mark.parametrize(
+    ("bar", "pin"),
+    [
+        ('range="0 .1"', 'axis="0 1 0" type="slide"'),
+        ('range="0 .1"', 'type="ball"'),
+        ('range="0 .1"', 'type="free"'),
+        ('limited="false" range="0 .1"', 'axis="0 0 1"'),
+    ],
+)
+def test_without_a_bound_nothing_is_apart(bar: str, pin: str) -> None:
+    assert far_apart(bar=bar, pin='axis="0 0 1" range="0 .1"', far="0.15") == ("false" not in bar)
+    assert not far_apart(bar=bar, pin=pin, far="0.15")
+
+
+def test_a_slide_moves_what_hangs_on_it() -> None:
+    """It brings the pin 50 mm nearer, whatever the position of the model's zero."""
+    for ref in ("0", "0.05"):
+        pin = f'axis="0 1 0" type="slide" range="-.05 0" ref="{ref}"'
+        zero = 0.24 + float(ref)
+        assert not far_apart(bar="", pin=pin, far=str(zero))
+        assert far_apart(bar="", pin=pin, far=str(zero + 0.05))
+
+
+def test_no_posture_of_a_robot_touches_what_is_left_out(robot: str) -> None:
+    """In 300 postures, at the ends of the ranges and beyond them among others."""
+    model = build_model(configure(robot=robot))
+    pairs = np.array([*itertools.combinations(range(model.ngeom), 2)])
+    out = {tuple(pair) for pair in pairs[find_separate(model, pairs)].tolist()}
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(0)
+    single = model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE)
+    low, high = model.jnt_range[single].T
+    for _ in range(300):
+        share = rng.choice([0.0, 1.0, rng.uniform()], len(low))
+        data.qpos[model.jnt_qposadr[single]] = low + share * (high - low)
+        mujoco.mj_fwdPosition(model, data)
+        touching = {tuple(sorted(pair)) for pair in data.contact.geom.tolist()}
+        assert not touching & out
+    assert robot != "so101" or out
+
+
+def test_the_worlds_list_what_is_left() -> None:
+    """By type too; all pairs where worlds may differ in what the proof reads."""
+    cfg = configure(robot="so101")
+    model = build_model(cfg)
+    left = []
+    for fields in ((), ("body_mass",), ("geom_size",)):
+        sim = make_simulation(
+            model,
+            cfg,
+            1,
+            backend=Backend.mjwarp,
+            device="cpu",
+            fields=fields,
+            sizes=resolve_sizes(cfg),
+        )
+        assert isinstance(sim, MjwarpSimulation)
+        pairs = sim._stepped.nxn_geom_pair_filtered.numpy()
+        assert (
+            len(sim._stepped.nxn_pairid_filtered)
+            == len(pairs)
+            == sum(sim._stepped.geom_pair_type_count)
+        )
+        left.append(len(pairs))
+        every = sim._m.nxn_geom_pair_filtered.numpy()
+        assert (
+            len(pairs) == (~find_separate(model, every)).sum()
+            if fields != ("geom_size",)
+            else len(every)
+        )
+    assert left[0] == left[1] < left[2]
