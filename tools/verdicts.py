@@ -30,6 +30,7 @@ _STEMS = ("batch", "success")
 _BOTH = "gates=[batch,success]"
 _BATCH = "gates=[batch]"
 _WARP = "sim=mjwarp sim.device=cpu"
+_STATE = "controller=closed_loop controller.clock=false"
 _SEEDS = "gate.batch.seeds=2"
 RUNS = {
     # Native MuJoCo. Gate success plays closed_loop in place of open_loop
@@ -37,8 +38,8 @@ RUNS = {
     "rebot_stack": f"robot=rebot {_BOTH} nworld=16 seed=3",
     "so101_stack_closed": f"{_BATCH} controller=closed_loop nworld=16 reset=randomized seed=5",
     "rebot_stack_closed": f"robot=rebot {_BATCH} controller=closed_loop nworld=16",
-    "so101_stack_state": f"{_BOTH} controller=state_based nworld=16",
-    "rebot_stack_state": f"robot=rebot {_BATCH} controller=state_based nworld=16 seed=7",
+    "so101_stack_state": f"{_BOTH} {_STATE} nworld=16",
+    "rebot_stack_state": f"robot=rebot {_BATCH} {_STATE} nworld=16 seed=7",
     "so101_stack_fine": f"{_BATCH} timing=fine nworld=8",
     "so101_box": f"task=box {_BOTH} nworld=4",
     "rebot_box": f"robot=rebot task=box {_BOTH} nworld=4 seed=11",
@@ -53,7 +54,7 @@ RUNS = {
     # MJWarp
     "warp_so101_stack": f"{_WARP} {_BATCH} nworld=8",
     "warp_rebot_stack": f"{_WARP} robot=rebot {_BATCH} controller=closed_loop nworld=4",
-    "warp_so101_state": f"{_WARP} {_BATCH} controller=state_based nworld=4 reset=randomized",
+    "warp_so101_state": f"{_WARP} {_BATCH} {_STATE} nworld=4 reset=randomized",
     "warp_so101_reach": f"{_WARP} task=reach {_BOTH} nworld=16",
     "warp_rebot_reach": f"{_WARP} robot=rebot task=reach {_BATCH} nworld=4 controller=closed_loop",
     "warp_scara": f"{_WARP} --config-dir=examples/scara/conf robot=scara {_BATCH} nworld=4",

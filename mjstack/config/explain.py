@@ -30,6 +30,9 @@ LISTS = ("cameras", "experiment", "randomization")  # groups of which several ma
 TERM_GROUPS = ("action", "observation", "reset", "termination", "reward")
 
 
+_GONE = {"controller=state_based": "controller=closed_loop controller.clock=false"}
+
+
 def check_overrides(overrides: Sequence[str]) -> None:
     """Raise a `MjstackError` for the first override that cannot be used alone."""
     for override in overrides:
@@ -123,7 +126,9 @@ def explain(error: Exception, overrides: Sequence[str] = ()) -> MjstackError:
         # Of a list of choices Hydra names none.
         choices = error.options or session.list_choices().get(group, [])
         problem: MjstackError = UnknownName(f"{group}={name}:", name, choices)
-        if not session.config_folders() and not group.startswith("hydra/"):
+        if cure := _GONE.get(f"{group}={name}"):
+            problem = MjstackError(f"{problem}", f"Write {cure}")
+        elif not session.config_folders() and not group.startswith("hydra/"):
             advice = "A choice of your own needs --config-dir DIR (Python: config_dir)."
             problem = MjstackError(f"{problem} {advice}")
     else:

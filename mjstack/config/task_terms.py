@@ -52,15 +52,21 @@ def complete_terms(cfg: DictConfig, overrides: Sequence[str]) -> None:
 
 
 def _observe_task(cfg: DictConfig, overrides: Sequence[str]) -> None:
-    """Let a new policy see the task's own observation, in place: where that is chosen, or nothing
-    is and the task writes all of its terms. Overrides of the policy's terms come on top.
+    """Let a new policy see the task's own observation, in place, where that is chosen; by default
+    the state, and what the task writes beside it. Overrides of the policy's terms come on top.
     """
-    choices = cfg.hydra.runtime.choices
-    chosen = any(o.startswith(f"{_OBSERVED}=") for o in overrides)
-    all_written = choices.get("observation") is None and bool(cfg.observation) and not chosen
-    if choices.get(_OBSERVED) != "task" and not (all_written and choices.get(_OBSERVED) == "state"):
+    choice = cfg.hydra.runtime.choices.get(_OBSERVED)
+    if choice == "task":
+        cfg.job.observation = OmegaConf.to_container(cfg.observation)
+    elif choice == "state" and not any(o.startswith(f"{_OBSERVED}=") for o in overrides):
+        group = cfg.job.group
+        terms = _terms(cfg, "job.observation", group)
+        known = [_content(term) for term in terms.values() if term]
+        written = _written(cfg, "observation", group).items()
+        terms |= {name: t for name, t in written if t and _content(t) not in known}
+        cfg.job.observation[group].terms = terms
+    else:
         return
-    cfg.job.observation = OmegaConf.to_container(cfg.observation)
     for override in map(parse, own_overrides(overrides)):
         if override.key_or_group.startswith("job.observation."):
             value = None if override.is_delete() else override.value()

@@ -7,7 +7,11 @@ import math
 import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import override
 
+from mjstack.config.schema import Config
+from mjstack.drivers.clockless import ClocklessDriver
+from mjstack.drivers.driver import Driver
 from mjstack.drivers.feedback import STAY, FeedbackDriver
 from mjstack.drivers.open_loop import OpenLoopPlanner, smoothstep
 from mjstack.envs import Env
@@ -42,6 +46,11 @@ class ClosedLoopDriver(FeedbackDriver):
 
     phased = True
     measures = True  # objects, in phases that say so
+
+    @classmethod
+    @override
+    def chosen(cls, cfg: Config) -> type[Driver]:
+        return cls if cfg.controller.clock else ClocklessDriver
 
     def __init__(self, env: EnvView, nominal: np.ndarray) -> None:
         """Allocate for the environment's worlds; see `FeedbackDriver`."""

@@ -123,6 +123,11 @@ class Driver(ABC):
         return cls.with_params(cfg, env)
 
     @classmethod
+    def chosen(cls, cfg: Config) -> type["Driver"]:
+        """The class that drives a configuration: this one, or one that stands behind it."""
+        return cls
+
+    @classmethod
     def trained_policy(cls, assets: Assets) -> Policy | None:
         """The policy whose observation and action terms its environment has; None without one."""
         return None
@@ -155,7 +160,7 @@ def find_driver(cfg: Config) -> type[Driver]:
     if lacking := sorted(driver.__abstractmethods__):
         problem = f"func={cfg.controller.func}: expected a class with {', '.join(lacking)}()"
         raise TermError("controller", problem)
-    return driver
+    return driver.chosen(cfg)
 
 
 def check_driver(env: Env, cfg: Config, assets: Assets) -> None:

@@ -18,15 +18,15 @@ from mjstack.envs import Env
 from mjstack.errors import ArgumentError
 from mjstack.kinematics.batched_ik import BatchedIk
 from mjstack.managers.view import EnvView
-from mjstack.math import atan2, quat_to_matrix
+from mjstack.math import atan2
 from mjstack.mdp.geometry import objects_in_hand, place_xy, pose_w, robot, zeros
-from mjstack.robots.bodies import ancestors
 from mjstack.scene.index import gripper_targets, turn_sign
 from mjstack.scene.phases import Phase, Target, build_phases, source_names
-from mjstack.sim.simulation import Columns
 
 _BEYOND = 10.0  # what a roll beyond the joint's range costs, per rad
 _BACK = 3.0  # rad: what a roll counts that leads back over the nominal one
+_SETTLING = 20  # solutions after which spare joints are where they stay
+_FARTHER = 6  # more iterations for an arm that somebody else has moved
 STAY = 0.3  # how much a roll made so far weighs against the face that is nearer
 
 
@@ -76,6 +76,14 @@ class CarryTilt:
         self._there = nominal.new_zeros((ik.nworld, nominal.shape[1]))
         self._last_axis = nominal.new_zeros((ik.nworld, 3))
         self._last_turn = nominal.new_zeros(ik.nworld)
+        # Of the nominal plan, with the gripper as upright as it can be
+        self._settled = nominal.clone()
+        for row in self._settled:
+            arm = row.expand(ik.nworld, -1)
+            point = self._there_ik.forward(arm)[0].clone()
+            for _ in range(_SETTLING):
+                arm = self._there_ik.solve(arm, point)[0]
+            row.copy_(arm[0])
 
     def desired_approach(
         self, command: Tensor, phase: Tensor, there: Tensor, fresh: Tensor
@@ -107,17 +115,17 @@ class CarryTilt:
         """Approach axis of the release pose, turned about the vertical to where the arm looks; from
         these arguments alone, which are those of `desired_approach`. Fixed shapes, no host read.
         """
-        arm = self._there_ik.solve(self._nominal[self.place[phase]], there)[0]
+        arm = self._there_ik.solve(self._settled[self.place[phase]], there)[0]
         axis = self._there_ik.forward(arm)[2]
         return _turn_about_z(axis, self._sign * (command[:, 0] - arm[:, 0]))
 
 
 def _turn_about_z(vectors: Tensor, angle: Tensor) -> Tensor:
-    """Vectors, shape ``(n, 2)`` or ``(n, 3)``, turned about the vertical [rad], shape ``(n,)``."""
-    x, y, *z = vectors.unbind(1)
+    """Vectors, shape ``(..., 2)`` or ``(..., 3)``, turned about the vertical [rad], ``(...)``."""
+    x, y, *z = vectors.unbind(-1)
     cos = torch.cos(angle)
     sin = torch.sin(angle)
-    return torch.stack((cos * x - sin * y, sin * x + cos * y, *z), dim=1)
+    return torch.stack((cos * x - sin * y, sin * x + cos * y, *z), dim=-1)
 
 
 def _keeps(phases: Sequence[Phase]) -> list[bool]:
@@ -231,18 +239,23 @@ class FeedbackDriver(Driver):
         return torch.stack([measure_planar(self._env, name) for name in objects], dim=1)
 
     def _aim(self, phase: Tensor) -> Tensor:
-        """Target of each world's phase, from its anchor as last seen [m], ``(nworld, 3)``."""
+        """Target of each world's phase, from its anchor as last seen [m], ``(nworld, 3)``; of
+        several, ``(nworld, n, 3)``.
+        """
         table = self._target[phase]
-        seen = self._last_seen(self._source, phase)[:, :2]
-        offset = table[:, :2]
+        seen = self._last_seen(self._source, phase)[..., :2]
+        offset = table[..., :2]
         if any(spec.toward is not None for spec in self._cfg.controller.phases.values()):
-            away = self._last_seen(self._toward, phase)[:, :2] - seen
-            offset = _turn_about_z(offset, atan2(away[:, 1], away[:, 0]))
-        return torch.cat((offset + seen, table[:, 2:]), dim=1)
+            away = self._last_seen(self._toward, phase)[..., :2] - seen
+            offset = _turn_about_z(offset, atan2(away[..., 1], away[..., 0]))
+        return torch.cat((offset + seen, table[..., 2:]), dim=-1)
 
     def _last_seen(self, sources: Tensor, phase: Tensor) -> Tensor:
-        """x, y [m] and yaw [rad] of each world's source of a phase, shape ``(nworld, 3)``."""
-        return self._seen[self._worlds, sources[phase]]
+        """x, y [m] and yaw [rad] of each world's source of a phase, shape ``(nworld, 3)``; of
+        several phases, ``(nworld, n, 3)``.
+        """
+        worlds = self._worlds if phase.dim() == 1 else self._worlds[:, None]
+        return self._seen[worlds, sources[phase]]
 
     def _measure(self) -> State:
         """The state now."""
@@ -321,84 +334,10 @@ def _solver(env: EnvView, posture_gain: float = 0.0) -> BatchedIk:
         env.cfg.robot,
         env.nworld,
         env.device,
-        iterations=c.step_iterations,
+        iterations=c.step_iterations + (0 if c.clock else _FARTHER),
         posture_gain=posture_gain,
         approach_gain=c.approach_gain,
     )
-
-
-class ServoInverse:
-    """By how much servos that differ between worlds, or have backlash, are to be led."""
-
-    def __init__(self, env: EnvView) -> None:
-        """Find the figures of the robot's servos, and the weights that they hold."""
-        cfg = env.cfg
-        self._sim = env.sim
-
-        def live(name: str) -> Tensor:
-            if name in env.sim.fields:
-                return env.sim.fields[name]
-            return torch.from_numpy(getattr(env.sim.model, name)[None].copy()).to(env.device)
-
-        self._gain, self._bias, self._damping, self._friction = map(
-            live, ("actuator_gainprm", "actuator_biasprm", "dof_damping", "dof_frictionloss")
-        )
-        self._servos, self._dofs = (
-            Columns(at, env.device) for at in (env.index.ctrl, env.index.robot_qvel)
-        )
-        self._backlash = cfg.robot.backlash
-        self._dt = cfg.timing.step_dt
-        moves = [name in cfg.robot.ik_joints for name in cfg.robot.joints]
-        self._moves = torch.tensor(moves, device=env.device)
-
-        # Weights that each hinge holds: of the bodies that it moves, and of objects in the hand
-        model = env.sim.model
-        joints = [model.joint(name).id for name in cfg.robot.joints]
-        self._carriers = Columns(model.jnt_bodyid[joints], env.device)
-        objects = [env.index.bodies[name] for name in cfg.scene.objects]
-        above = [{*ancestors(model, body)} for body in range(model.nbody)]
-        moved = [[carrier in bodies for bodies in above] for carrier in self._carriers.indices]
-        force = -model.opt.gravity[2] * model.body_mass * (1.0 - model.body_gravcomp)
-        hinges = model.jnt_type[joints, None] == mujoco.mjtJoint.mjJNT_HINGE
-        self._weights, self._loads, self._centers, self._anchors, self._axes = (
-            torch.from_numpy(values).to(env.device, torch.float32)
-            for values in (
-                moved * force * hinges,
-                force[objects] * hinges,
-                model.body_ipos,
-                model.jnt_pos[joints],
-                model.jnt_axis[joints],
-            )
-        )
-
-    def lead(self, change: Tensor, state: State, holds: Tensor) -> Tensor:
-        """The change of the joint targets that moves joints by a change in a control step [rad, m],
-        each ``(nworld, nu)``: beyond their lag, except in worlds that hold, ``(nworld,)`` bool;
-        beyond dry friction and backlash; and beyond what gravity pulls.
-        """
-        stiffness = self._servos.read(self._gain)[..., 0]
-        damping = self._dofs.read(self._damping) - self._servos.read(self._bias)[..., 2]
-        lag = (damping / stiffness).clamp(min=1e-6)
-        share = torch.where(self._moves & ~holds[:, None], 1.0 - torch.exp(-self._dt / lag), 1.0)
-        stick = self._dofs.read(self._friction) / stiffness + self._backlash
-        stick = stick * change / (change.abs() + stick).clamp(min=1e-6)
-        return (change / share + stick + self._hold(state) / stiffness).to(change)
-
-    def _hold(self, state: State) -> Tensor:
-        """Torques that hold the arm up, with what is in the hand [N m], ``(nworld, nu)``."""
-        sim = self._sim
-        turns = quat_to_matrix(sim.xquat.float())
-        centers = sim.xpos.float() + (turns * self._centers[:, None]).sum(-1)
-        turns = self._carriers.read(turns)
-        at = self._carriers.read(sim.xpos).float() + (turns * self._anchors[:, None]).sum(-1)
-        x, y, _ = (turns * self._axes[:, None]).sum(-1).unbind(-1)
-
-        def torque(points: Tensor, weights: Tensor) -> Tensor:
-            off = points[:, None] - at[:, :, None]
-            return ((x[..., None] * off[..., 1] - y[..., None] * off[..., 0]) * weights).sum(-1)
-
-        loads = self._loads * state.in_hand[:, None]
-        return torque(centers, self._weights) + torque(state.pos, loads)
 
 
 def measure_planar(env: EnvView, name: str) -> Tensor:

@@ -3,7 +3,7 @@ fail.
 """
 
 import logging
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +13,7 @@ from typing_extensions import override
 from mjstack.config.check import gate_reset, places_objects, reads_starts_file
 from mjstack.config.schema import Config
 from mjstack.distributed import Ranks
+from mjstack.drivers.clockless import ClocklessDriver
 from mjstack.drivers.driver import Driver, find_driver, with_controller
 from mjstack.envs import Env
 from mjstack.episodes.batches import BatchPlan, play_batches
@@ -22,8 +23,9 @@ from mjstack.episodes.record import EpisodeRecord, record_name
 from mjstack.episodes.recorder import Snapshots
 from mjstack.episodes.rollout import Observer
 from mjstack.episodes.run import Run, needs_episode, spread
+from mjstack.episodes.stage import Stage
 from mjstack.episodes.tally import EpisodeTally
-from mjstack.errors import first_line
+from mjstack.errors import MjstackError, first_line
 from mjstack.files import write_npz
 from mjstack.interrupt import check_interrupt
 from mjstack.math import wilson_interval
@@ -31,6 +33,7 @@ from mjstack.mdp.starts.starts_file import start_arrays
 from mjstack.report.figure import Figure, figures
 from mjstack.report.page import MOST_WORLDS
 from mjstack.report.record import GateResult
+from mjstack.report.table import Table
 from mjstack.report.text import format_percent
 
 log = logging.getLogger(__name__)
@@ -58,16 +61,18 @@ def judge_episodes(run: Run) -> list[GateResult]:
     t = cfg.gate[run.gate]
     tally = EpisodeTally(gate=run.gate, check=run.stage.check, folder=run.folder)
     run.records[run.gate] = tally.records
-    lost = _play(run, tally)
+    phased = run.stage.phases or not cfg.controller.phases  # else its failures' signs have them
+    ends = Ends(run.stage) if t.reset and not phased else None
+    lost = _play(run, tally, ends)
     if cfg.nworld > 1:
         run.page.worlds[run.gate] = tally.plot(run.stage, run.page.worlds3d.get(run.gate, []))
 
     succeeded = tally.array("failed") == 0
     rate = float(succeeded.mean())
-    ends = len(np.unique(tally.array("end")))
+    states = len(np.unique(tally.array("end")))
     starts = _count_distinct(tally.array("start_qpos"), 4)
     measured = [
-        Figure("distinct_final_states", ends),
+        Figure("distinct_final_states", states),
         Figure("distinct_fraction", high=t.distinct_fraction),
         Figure("episode", tally.seconds, "s"),
     ]
@@ -76,8 +81,8 @@ def judge_episodes(run: Run) -> list[GateResult]:
         steps = sum(record.steps for record in tally.records)
         measured.append(Figure("world_steps", steps / tally.seconds, "/s"))
     # Worlds that start apart may end alike, as a peg in its hole does.
-    if tally.episodes > 1 and max(ends, starts) < t.distinct_fraction * tally.episodes:
-        problem = f"only {ends} distinct final states of {tally.episodes} episodes"
+    if tally.episodes > 1 and max(states, starts) < t.distinct_fraction * tally.episodes:
+        problem = f"only {states} distinct final states of {tally.episodes} episodes"
         tally.problems.append(f"{problem}: identical worlds prove nothing, use reset=jitter")
     if t.reset:
         rows = np.stack([*tally.start_poses.values()], axis=1)
@@ -97,10 +102,12 @@ def judge_episodes(run: Run) -> list[GateResult]:
         if retried:
             sentences.append(f"{retried} retried, {retried_succeeded} of them succeeded")
         tally.details += find_doubts(distinct, tally.episodes, tally.successes, lost or 0, t.rate)
-    return [tally.result(sentences, passed=rate >= t.rate, figures=measured, rate=t.rate)]
+    result = tally.result(sentences, passed=rate >= t.rate, figures=measured, rate=t.rate)
+    result.tables += ends.table(tally) if ends else []
+    return [result]
 
 
-def _play(run: Run, tally: EpisodeTally) -> int | None:
+def _play(run: Run, tally: EpisodeTally, ends: "Ends | None") -> int | None:
     """Play, record and count the gate's seeds. A seed that breaks ends it, and those before it
     still count; the first one's error is raised. Return how many episodes reached the goal and lost
     it again, None where nothing computes that.
@@ -119,7 +126,7 @@ def _play(run: Run, tally: EpisodeTally) -> int | None:
     goal = Goal(ranks) if t.reset and not stage.driver_class.needs_phases else None
 
     def observe(plan: BatchPlan) -> list[Observer]:
-        watching = [starts, monitor, goal] if t.reset else []
+        watching = [starts, monitor, goal, ends] if t.reset else []
         first = [snapshots, motion if run.page.motion else None] if plan.seed == seeds[0] else []
         return [observer for observer in (*watching, *first) if observer is not None]
 
@@ -212,6 +219,48 @@ class Goal(Observer):
     @override
     def finish(self) -> None:
         self.lost += sum(self._ranks.gather(int((self._reached & ~self.env.success).sum())))
+
+
+class Ends(Observer):
+    """Keeps in which phase each episode ends, as an expert without a clock finds it in the state.
+
+    Attributes:
+        phases: Numbers of the phases, an array of all ranks for each seed; none where such an
+            expert cannot be asked.
+    """
+
+    def __init__(self, stage: Stage) -> None:
+        self.phases: list[np.ndarray] = []
+        self._stage = stage
+
+    @override
+    def start(self, env: Env, driver: Driver) -> None:
+        super().start(env, driver)
+        self._expert: ClocklessDriver | None = None
+        with suppress(MjstackError):  # no phases that a state tells, or other actions
+            self._expert = ClocklessDriver(env, self._stage.planner.nominal)
+
+    @override
+    def finish(self) -> None:
+        if self._expert is not None:
+            self._expert.command()
+            shares = self._stage.ranks.gather(self._expert.due.cpu().numpy())
+            self.phases.append(np.concatenate(shares))
+
+    def table(self, tally: EpisodeTally) -> list[Table]:
+        """How many failed episodes ended in each phase, by rule; no table if none failed."""
+        failed = tally.array("failed")
+        names = list(self._stage.cfg.controller.phases)
+        if len(self.phases) != len(tally.records) or not failed.any():
+            return []
+        phases = np.concatenate(self.phases)
+        rows = []
+        for rule, worlds in tally.check.rules.failing(failed).items():
+            counts = np.bincount(phases[worlds], minlength=len(names)).tolist()
+            rows.append({"rule": rule, **dict(zip(names, counts, strict=True))})
+        met = [name for name in names if any(row[name] for row in rows)]
+        columns = {name: name for name in ("rule", *met)}
+        return [Table.of(columns, rows, "Phases in which failed episodes ended")]
 
 
 class Starts(Observer):

@@ -8,8 +8,8 @@ from torch import Tensor
 from mjstack.errors import require_names
 from mjstack.managers.state import shared
 from mjstack.managers.view import EnvView, offers
-from mjstack.math import constant
-from mjstack.mdp.geometry import jaw_forces, place_xy, pose_w, robot, zeros
+from mjstack.math import constant, quat_to_matrix
+from mjstack.mdp.geometry import LOADED, jaw_forces, place_xy, pose_w, robot, zeros
 
 _in = partial(offers, "observation term", reads="state")
 _in_metres = _in(unit="m")
@@ -122,6 +122,27 @@ def headings(env: EnvView) -> Tensor:
     for _ in range(2):
         cos, sin = cos * cos - sin * sin, 2.0 * cos * sin
     return torch.stack((cos, sin), dim=2).flatten(1)
+
+
+@_in(unit="1")
+def tilts(env: EnvView) -> Tensor:
+    """How the objects that can move lean: x and y of the most upright axis of each, upwards, shape
+    ``(nworld, 2 * objects)``.
+    """
+    names = list(env.cfg.scene.free)
+    if not names:
+        return env.sim.qpos[:, :0]
+    axes = quat_to_matrix(torch.stack([pose_w(env, name)[:, 3:] for name in names], dim=1))
+    number = axes[..., 2, :].abs().argmax(-1)
+    up = axes.gather(-1, number[..., None, None].expand(*number.shape, 3, 1))[..., 0]
+    return (up[..., :2] * torch.sign(up[..., 2:])).flatten(1)
+
+
+@_in(unit="1")
+def held(env: EnvView) -> Tensor:
+    """Whether all jaws press on each object that can move, 0 or 1, shape ``(nworld, objects)``."""
+    parts = [(jaw_forces(env.index, env.sim, n) > LOADED).all(1) for n in env.cfg.scene.free]
+    return torch.stack(parts, dim=1).to(env.sim.qpos) if parts else env.sim.qpos[:, :0]
 
 
 @_in(unit=("m/s",) * 3 + ("rad/s",) * 3)

@@ -91,9 +91,9 @@ def change_collision(spec: mujoco.MjSpec, robot: RobotCfg) -> list[str]:
 
 def _compile(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, list[int]]:
     """The robot alone, with all of its bodies and geoms, and the geoms' numbers."""
-    alone = spec.copy()
-    alone.compiler.fusestatic = alone.compiler.discardvisual = False
-    return compile_scene(alone), [geom.id for geom in alone.geoms]
+    copied = spec.copy()
+    copied.compiler.fusestatic = copied.compiler.discardvisual = False
+    return compile_scene(copied), [geom.id for geom in copied.geoms]
 
 
 def _hull_points(model: mujoco.MjModel, mesh: int) -> ndarray:

@@ -1,5 +1,6 @@
 """Episode checks: how a task judges an episode. `mjstack new task NAME` writes one."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -211,6 +212,12 @@ class EpisodeCheck(ABC):
     def force(self) -> float:
         """A jaw or a support that presses with more than this touches an object [N]."""
         return getattr(self.t, "force", LOADED)
+
+    @property
+    def tolerance(self) -> float:
+        """Its smallest threshold that is a length [m]: so exactly has an object to arrive."""
+        lengths = [figure.high for figure in self.thresholds() if figure.unit == "m"]
+        return min((length for length in lengths if length > 0.0), default=math.inf)
 
     @property
     def settle_steps(self) -> int:

@@ -5,6 +5,7 @@ does, in the expert's episodes and, with rounds, in states to which the policy i
 import math
 from collections import Counter
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -47,11 +48,10 @@ def check_clone(stage: Stage) -> range:
 
 def _check_rounds(stage: Stage, job: CloneJobCfg) -> None:
     """Refuse what cannot be learned in rounds."""
-    name = stage.cfg.controller.name
     if not stage.driver_class.stateless:
-        expected = "state_based, because trainer=dagger asks the expert in the policy's states"
-        fix = "Set trainer=clone, which learns from any expert, or controller=state_based"
-        raise ConfigError("controller", name, expected, fix)
+        expected = "closed_loop, without a clock: trainer=dagger asks it in the policy's states"
+        fix = "Set trainer=clone, which learns from any expert, or controller.clock=false too"
+        raise ConfigError("controller", stage.cfg.controller.name, expected, fix)
     if job.dataset is not None:
         expected = "null, because trainer=dagger asks the expert itself"
         raise ConfigError("job.dataset", job.dataset, expected, "Set trainer=clone")
@@ -92,7 +92,11 @@ def train_clone(stage: Stage, folder: Path) -> Trained:
         pool = ImagePool(sizes, earlier[1]["pool"] if earlier else rows, stage.backend[1])
     if job.dataset is None:
         first = make_round(stage, folder, None, 0, pool)
-        _judge(stage, "round 0: the expert" if job.rounds else "the expert", first)
+        figures = _judge(stage, "round 0: the expert" if job.rounds else "the expert", first)
+        rules = {k.removeprefix(FAILED): n for k, n in figures.items() if k.startswith(FAILED)}
+        broken = "".join(f", {rule} broken in {count}" for rule, count in rules.items())
+        source = f"{first.source}: success {figures['success']:.4g}{broken}"
+        first = replace(first, source=source)
     else:
         source = find_instance("job.source", job.source, Source)
         first = source.read(stage, observed_widths(stage))

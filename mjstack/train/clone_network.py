@@ -12,11 +12,13 @@ from mjstack.distributed import Ranks
 from mjstack.errors import ConfigError
 from mjstack.managers.observation import column_noise, slide_joints
 from mjstack.policy import PolicyNetwork, Vision
+from mjstack.tasks.check import make_check
 from mjstack.train.demonstrations import Demonstrations
 
 _JOINTS = "mjstack.mdp.observation.joint_pos"
 _LEAST = 0.1  # scale of a column, of the largest one of its term
 _NOISE = 0.02  # of the standard deviation of a column, where its term has no noise
+_ROUGH = 0.005  # m
 _CONSTANT = 1e-3  # a column of what is estimated that varies less has no scale
 
 
@@ -77,22 +79,24 @@ class Estimator(nn.Module):
 def input_noise(
     cfg: Config, model: mujoco.MjModel, widths: Mapping[str, int], std: Tensor
 ) -> Tensor:
-    """Half-width of the noise on each column of the observation in a training, shape ``(n,)``.
+    """Half-width of the noise on each column of the observation in a training, shape ``(n,)``. It
+    is smaller for a task whose check tolerates less than `_ROUGH` [m]: noise hides what is finer.
 
     ``widths`` are the numbers of each term. The noise of terms without some follows from ``std``,
     the standard deviation of each column in the demonstrations, shape ``(n,)``: a policy that
     learned without any leaves the expert's path and does not come back.
     """
     job: CloneJobCfg = cfg.job
+    scale = job.input_noise * min(1.0, make_check(cfg).tolerance / _ROUGH)
     slides = slide_joints(model, cfg.robot.joints)
     widest: list[float] = []
     for (name, width), spread in zip(widths.items(), std.split([*widths.values()]), strict=True):
         term = cast(ObservationTermCfg, cfg.observation[job.group].terms[name])
         if term.noise:
             columns = column_noise(term, width // term.history, slides)
-            widest += [job.input_noise * term.scale * column for column in term.history * columns]
+            widest += [scale * term.scale * column for column in term.history * columns]
         else:
-            widest += (job.input_noise * _NOISE * spread).tolist()
+            widest += (scale * _NOISE * spread).tolist()
     return torch.tensor(widest)
 
 

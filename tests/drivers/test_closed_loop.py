@@ -10,9 +10,9 @@ from check_cases import limits
 from compositions import load_config, make_env
 from environments import GetStage, at_double_speed, on_cuda
 
+from mjstack.drivers.clockless import ClocklessDriver
 from mjstack.drivers.closed_loop import ClosedLoopDriver, make_expert
 from mjstack.drivers.feedback import FeedbackDriver, _keeps, _places, measure_planar
-from mjstack.drivers.state_based import StateBasedDriver
 from mjstack.envs import Env, driven_config
 from mjstack.episodes.stage import Stage
 from mjstack.errors import ArgumentError
@@ -282,7 +282,7 @@ def test_captured_commands_are_the_eager_ones() -> None:
 
 
 @pytest.mark.parametrize("shape", ["box", "cylinder"])
-@pytest.mark.parametrize("expert", [ClosedLoopDriver, StateBasedDriver])
+@pytest.mark.parametrize("expert", [ClosedLoopDriver, ClocklessDriver])
 def test_jaws_turn_to_an_object_that_has_faces(
     expert: type[FeedbackDriver], shape: str, drive: Drive, get_stage: GetStage
 ) -> None:
@@ -400,9 +400,9 @@ LYING = ["shape=cylinder", "size=[0.014,0.035]", "quat=[0.7071068,0.7071068,0,0]
     ("expert", "shape"),
     [
         (ClosedLoopDriver, LYING),
-        (StateBasedDriver, TURNED),
+        (ClocklessDriver, TURNED),
         *(pytest.param(ClosedLoopDriver, s, marks=pytest.mark.full) for s in (BRICK, TURNED)),
-        *(pytest.param(StateBasedDriver, s, marks=pytest.mark.full) for s in (BRICK, LYING)),
+        *(pytest.param(ClocklessDriver, s, marks=pytest.mark.full) for s in (BRICK, LYING)),
     ],
 )
 def test_jaws_close_across_what_is_oblong(

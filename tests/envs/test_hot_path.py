@@ -102,16 +102,20 @@ PATHS: dict[str, dict[str, str] | None] = {
     "drivers/feedback.py": {
         "CarryTilt": "desired_approach release_approach",
         "FeedbackDriver": "_observe _aim _last_seen _measure _solve _sunk _as_read _keep_finite",
-        "ServoInverse": "lead _hold",
     },
-    "drivers/state_based.py": {
-        "StateBasedDriver": (
-            "command _decide _find_delivered _lead_point _tilted _turn_left _point _grasp_offsets"
-        )
+    "drivers/servos.py": {"ServoInverse": "lead sag _hold"},
+    "drivers/turning.py": {
+        "TurningDriver": "_turn_left _jaw_turn _held_turn _nearest_turn",
+        "": "directions",
+    },
+    "drivers/clockless.py": {
+        "ClocklessDriver": (
+            "command _decide _find_delivered _lead_point _tilted _points _grasp_offsets"
+        ),
     },
     "train/rounds.py": {"MixedDriver": "command"},
     "policy/network.py": {"PolicyNetwork": "normalized measured forward"},
-    "episodes/failures.py": {"FailureMonitor": "update", "": "_of"},
+    "episodes/failures.py": {"FailureMonitor": "update", "": "_column_of"},
     "kinematics/batched_ik.py": {"BatchedIk": "solve forward _launch _copy_in"},
     "sim/mjwarp.py": {"MjwarpSimulation": "step reset kinematics _decimation _pose _place"},
     "sim/usage.py": {"Usage": "count clear"},

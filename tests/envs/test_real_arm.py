@@ -15,7 +15,7 @@ from policies import make_policy
 from mjstack.config.schema import Backend, Config
 from mjstack.drivers import feedback
 from mjstack.drivers.driver import Assets, find_driver
-from mjstack.drivers.feedback import ServoInverse
+from mjstack.drivers.servos import ServoInverse
 from mjstack.envs import Env, build_env
 from mjstack.episodes.batches import BatchPlan, play_batches
 from mjstack.episodes.stage import Stage

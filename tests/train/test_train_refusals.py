@@ -56,7 +56,7 @@ BAD: dict[tuple[str, ...], list[tuple[list[str], str]]] = {
         ),
     ],
     DAGGER: [
-        (["controller=closed_loop"], "Set trainer=clone, which learns from any expert"),
+        (["controller.clock=true"], "Set trainer=clone, which learns from any expert"),
         (["task=stack", "job.wider=1"], "Or set job.wider=0, in place of 1."),
         (["reset.cubes.params.xy=0.03"], "reset.cubes.params.xy=0.03: expected"),
         (["job.episodes=1"], "job.episodes=1: expected at least 2"),

@@ -130,7 +130,7 @@ class ControllerCfg:
     """Drives the worlds. Its actions go through the action terms of ``action``."""
 
     name: str = spec()
-    """open_loop, closed_loop, state_based, policy, lerobot, custom, or one of your own."""
+    """open_loop, closed_loop, policy, lerobot, custom, or one of your own."""
     func: str = spec()
     """Its driver: a subclass of ``mjstack.drivers.driver.Driver``."""
     params: dict[str, Any] = spec({})
@@ -143,8 +143,11 @@ class ControllerCfg:
     """Inverse-kinematics solutions per phase of a plan."""
     ik_tolerance: float = spec(unit="m", gt=0.0)
     """Largest distance of the grasp point from a target."""
+    clock: bool = True
+    """Whether closed_loop goes through the phases by a clock. Without one it decides from the state
+    alone, in every step, so that trainer=dagger can ask it in any state."""
     step_iterations: int = spec(ge=1, le=1000)
-    """Iterations of batched inverse kinematics per step of closed_loop and state_based."""
+    """Iterations of batched inverse kinematics per step of closed_loop."""
     posture_gain: float = spec(ge=0.0, le=1.0)
     """How strongly redundant joints follow the nominal plan per iteration."""
     approach_gain: float = spec(ge=0.0, le=1.0)
