@@ -115,7 +115,7 @@ PATHS: dict[str, dict[str, str] | None] = {
     },
     "train/rounds.py": {"MixedDriver": "command"},
     "policy/network.py": {"PolicyNetwork": "normalized measured forward"},
-    "episodes/failures.py": {"FailureMonitor": "update", "": "_of"},
+    "episodes/failures.py": {"FailureMonitor": "update", "": "_column_of"},
     "kinematics/batched_ik.py": {"BatchedIk": "solve forward _launch _copy_in"},
     "sim/mjwarp.py": {"MjwarpSimulation": "step reset kinematics _decimation _pose _place"},
     "sim/usage.py": {"Usage": "count clear"},
