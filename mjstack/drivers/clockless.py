@@ -55,13 +55,14 @@ _OFF_CENTER = (0.015, 0.015, 0.010)  # m: so far from the grasp point, an object
 
 
 class ClocklessDriver(TurningDriver):
-    """Joint targets that are a function of the simulation's state. The objects that the phases move go to their goals one after the other, as far as
-    `EpisodeCheck.placed` and the measured positions do not find them there. The phases give the
-    ways: to the object, and on with it. The state says which is due in each world: of the phases on
-    whose way the grasp point is, the last one. It stays as far from the end of that way as it is
-    off it, the jaws are turned or the gripper is not open, and moves straight up where it is too
-    low. A held object that is off the grasp point is made up for. Where a phase aligns, the ways are exact: an object goes on only where it is off the way by less
-    than the task's check tolerates, turned to a face of the anchor, and as fast as the phases say.
+    """Joint targets that are a function of the simulation's state. Objects that the phases move go
+    to their goals one after the other, where `EpisodeCheck.placed` and the measured positions do
+    not find them there. The phases give the ways: to the object, and on with it. Of those on whose
+    way the grasp point is, the last one is due. It stays as far from the end of that way as it is
+    off it, the jaws are turned or the gripper is not open, and moves up where it is too low. A held
+    object that is off the grasp point is made up for. Where a phase aligns, an object goes on only
+    where it is off the way by less than the check tolerates, turned to a face of the anchor, and as
+    fast as the phases say.
     An object that no phase lets go of, as in a lift, is kept where the phases bring it last.
 
     Closed jaws push an object in the same order. Where nothing is moved, as in reach, the grasp
@@ -126,7 +127,7 @@ class ClocklessDriver(TurningDriver):
             for phase, target in self._aimed
         )
         self._off_center = tensor(_OFF_CENTER)
-        self._every = torch.arange(len(plan), device=env.device).expand(env.nworld, -1)
+        self._phase_numbers = torch.arange(len(plan), device=env.device).expand(env.nworld, -1)
         self._order = torch.arange(1, longest + 1, device=env.device)
 
         # The robot
@@ -141,8 +142,8 @@ class ClocklessDriver(TurningDriver):
         self._lead = 1.0 / (1.0 - math.exp(-cfg.timing.step_dt / lag))
         self._servos = ServoInverse(env)
         # Measured servos differ, stick and have backlash: each is led by its own figures.
-        differ = "dof_frictionloss" in env.sim.fields
-        self._measured = bool(cfg.robot.servos) or cfg.robot.backlash > 0.0 or differ
+        differ = cfg.robot.backlash > 0.0 or "dof_frictionloss" in env.sim.fields
+        self._measured = bool(cfg.robot.servos) or differ
         self._lead = 1.0 if self._measured else self._lead
         self._pace = torch.ones_like(self.error)
         self._always = torch.ones_like(self._seen[:, : len(things), 0], dtype=torch.bool)
@@ -360,7 +361,7 @@ class ClocklessDriver(TurningDriver):
 
     def _points(self, state: State) -> Tensor:
         """Target of every phase, from where its anchor is [m], shape ``(nworld, phases, 3)``."""
-        points = self._aim(self._every)
+        points = self._aim(self._phase_numbers)
         source = self._source.clamp(max=state.pos.shape[1] - 1)
         height = state.pos[:, source, 2] + self._above
         points[..., 2] = torch.where(self._follows, height, points[..., 2])

@@ -1,4 +1,4 @@
-"""What the configured phases do with objects, for an expert without a clock."""
+"""Objects that the configured phases move, for an expert without a clock."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

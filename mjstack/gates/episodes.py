@@ -13,7 +13,6 @@ from typing_extensions import override
 from mjstack.config.check import gate_reset, places_objects, reads_starts_file
 from mjstack.config.schema import Config
 from mjstack.distributed import Ranks
-from mjstack.drivers.clockless import ClocklessDriver
 from mjstack.drivers.driver import Driver, find_driver, with_controller
 from mjstack.envs import Env
 from mjstack.episodes.batches import BatchPlan, play_batches
@@ -236,6 +235,8 @@ class Ends(Observer):
     @override
     def start(self, env: Env, driver: Driver) -> None:
         super().start(env, driver)
+        from mjstack.drivers.clockless import ClocklessDriver  # it loads Warp
+
         self._expert: ClocklessDriver | None = None
         with suppress(MjstackError):  # no phases that a state tells, or other actions
             self._expert = ClocklessDriver(env, self._stage.planner.nominal)

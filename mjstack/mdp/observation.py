@@ -139,7 +139,7 @@ def tilts(env: EnvView) -> Tensor:
 
 
 @_in(unit="1")
-def held(env: EnvView) -> Tensor:
+def grasped(env: EnvView) -> Tensor:
     """Whether all jaws press on each object that can move, 0 or 1, shape ``(nworld, objects)``."""
     parts = [(jaw_forces(env.index, env.sim, n) > LOADED).all(1) for n in env.cfg.scene.free]
     return torch.stack(parts, dim=1).to(env.sim.qpos) if parts else env.sim.qpos[:, :0]

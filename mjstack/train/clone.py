@@ -95,8 +95,8 @@ def train_clone(stage: Stage, folder: Path) -> Trained:
         figures = _judge(stage, "round 0: the expert" if job.rounds else "the expert", first)
         rules = {k.removeprefix(FAILED): n for k, n in figures.items() if k.startswith(FAILED)}
         broken = "".join(f", {rule} broken in {count}" for rule, count in rules.items())
-        source = f"{first.source}: success {figures['success']:.4g}{broken}"
-        first = replace(first, source=source)
+        words = f"{first.source}: success {figures['success']:.4g}{broken}"
+        first = replace(first, source=words)
     else:
         source = find_instance("job.source", job.source, Source)
         first = source.read(stage, observed_widths(stage))
