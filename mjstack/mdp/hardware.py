@@ -87,13 +87,13 @@ class Servos:
         low, high = self._scale
         factors = low + (high - low) * draws[:, 1:].unflatten(1, (3, self._joints))
         for name, values in self._values.items():
-            drawn = values[number]
+            servos = values[number]
             if name in self._scaled:
                 columns, kind = self._scaled[name]
-                factor = factors[:, kind].view(len(factors), -1, *[1] * (drawn.dim() - 2))
-                columns.write(drawn, columns.read(drawn) * factor.to(drawn))
+                factor = factors[:, kind].view(len(factors), -1, *[1] * (servos.dim() - 2))
+                columns.write(servos, columns.read(servos) * factor.to(servos))
             field = self._fields[name]
-            torch.where(mask.view(-1, *[1] * (field.dim() - 1)), drawn, field, out=field)
+            torch.where(mask.view(-1, *[1] * (field.dim() - 1)), servos, field, out=field)
 
 
 @uses_fields("actuator_forcerange")
