@@ -86,7 +86,6 @@ class ClocklessDriver(TurningDriver):
         tensor = self._tensor
         self.due = torch.zeros_like(self.phase)
         self._check = env.check
-
         # The moves: objects, their columns of `EpisodeCheck.placed`, and phases
         self._moves = moves = find_moves(cfg, plan)
         things = list(cfg.scene.objects)

@@ -176,7 +176,7 @@ class AtLeast(Rule):
         super().__init__(self.name, self.text, self.objects, self.counts())
 
     def counts(self) -> list[Figure]:
-        """What tells about each object."""
+        """Figures of each object."""
         return [Figure(self.value or f"{self.name.lower()}_steps{{}}", low=self.least)]
 
     @override
