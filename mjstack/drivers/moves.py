@@ -1,5 +1,6 @@
 """Objects that the configured phases move, for an expert without a clock."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -36,17 +37,15 @@ class Move(NamedTuple):
     lifts: list[int]
 
 
-_LATE = 0.1001  # s: by so much commands may be late
-
-
 def find_moves(cfg: Config, phases: Sequence[Phase]) -> list[Move]:
     """The moves of a configuration's phases, in their order; a ConfigError if they do nothing that
-    a state tells, or commands are late: a state does not have those that are still to come.
+    a state tells, or commands are too late: a state does not have those still to come.
     """
-    for key in ("command_delay", "random_delay"):
-        if delay := getattr(cfg.timing, key):
-            expected = "0 with controller.clock=false, which does not command ahead"
-            raise ConfigError(f"timing.{key}", delay, expected, _FIX)
+    most = math.floor(_LATE / cfg.timing.step_dt)
+    if cfg.timing.command_delay + cfg.timing.random_delay > most:
+        late = "command_delay" if cfg.timing.command_delay else "random_delay"
+        expected = f"at most {most}, both delays together, with controller.clock=false"
+        raise ConfigError(f"timing.{late}", getattr(cfg.timing, late), expected, _FIX)
     names = source_names(cfg.scene)
     leads = [k for k, phase in enumerate(phases) if phase.target is not None]
     moves: dict[str, Move] = {}
