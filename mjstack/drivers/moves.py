@@ -39,7 +39,7 @@ class Move(NamedTuple):
 
 def find_moves(cfg: Config, phases: Sequence[Phase]) -> list[Move]:
     """The moves of a configuration's phases, in their order; a ConfigError if they do nothing that
-    a state tells, or commands are too late: a state does not have those that are still to come.
+    a state tells, or commands are too late: a state does not have those still to come.
     """
     most = math.floor(_LATE / cfg.timing.step_dt)
     if cfg.timing.command_delay + cfg.timing.random_delay > most:
