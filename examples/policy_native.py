@@ -43,12 +43,24 @@ def play(folder: str, steps: int) -> list[np.ndarray]:
         yaws = np.array([4 * np.arctan2(turn[3], turn[0]) for turn in turns])
         return np.stack([np.cos(yaws), np.sin(yaws)], axis=1)
 
+    def tilts() -> np.ndarray:
+        turns = [data.body(name).xmat.reshape(3, 3) for name in objects]
+        ups = [turn[:, np.abs(turn[2]).argmax()] for turn in turns]
+        return np.array([up[:2] * np.sign(up[2]) for up in ups])
+
+    def grasped() -> list[float]:
+        jaws = [facts["objects"][name]["jaw_force"] for name in objects]
+        forces = [[np.linalg.norm(data.sensordata[a : a + 3]) for a in pair] for pair in jaws]
+        return [float(min(pair) > 1e-5) for pair in forces]  # N
+
     terms = {
         "joint_pos_relative": lambda: data.qpos[robot["qpos"]] - robot["home"],
         "joint_vel": lambda: data.qvel[robot["qvel"]],
         "offsets": offsets,
         "positions": positions,
         "headings": headings,
+        "tilts": tilts,
+        "grasped": grasped,
         "goals": lambda: [place["xy"] for place in facts["places"].values()],
     }
     for step in range(steps):

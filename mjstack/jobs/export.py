@@ -125,7 +125,10 @@ def export_facts(stage: Stage) -> dict[str, Any]:
         "task": _fields(cfg.task, "name", "instruction", "control_hz", "episode_steps", "params"),
         "timing": _fields(cfg.timing, "physics_dt", "decimation", "command_delay"),
         "objects": {
-            name: _fields(object_cfg, "shape", "size", "fixed")
+            name: {
+                **_fields(object_cfg, "shape", "size", "fixed"),
+                "jaw_force": list(map(int, index.jaw_force.get(name, []))),
+            }
             for name, object_cfg in cfg.scene.objects.items()
         },
         "places": {

@@ -164,7 +164,7 @@ def test_a_push_goes_on_from_wherever_the_arm_is(folder: Callable[[str], Path]) 
     for step in range(160):
         command = driver.command().clone()
         if 45 <= step < 55:
-            command[:, 1] -= 0.05
+            command[:, 1] -= 0.02
         env.step(command)
     puck = env.state
     assert stage.check.placed(puck).all()

@@ -46,6 +46,8 @@ OBSERVATIONS = {
     "positions": ({}, 6),
     "offsets": ({}, 6),
     "headings": ({}, 4),
+    "tilts": ({}, 4),
+    "grasped": ({}, 2),
     "goals": ({}, 0),
     "object_velocity": (OBJECT, 6),
     "jaw_force": (OBJECT, 2),

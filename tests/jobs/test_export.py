@@ -97,6 +97,8 @@ def test_the_metadata_is_what_a_program_needs(exported: Path) -> None:
         "offsets": 6,
         "positions": 6,
         "headings": 4,
+        "tilts": 4,
+        "grasped": 2,
         "goals": 0,
     }
     assert list(facts["observation"]["terms"]) == list(facts["observation"]["widths"])
