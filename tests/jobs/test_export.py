@@ -117,7 +117,7 @@ def test_the_example_imports_no_mjstack() -> None:
     names = {a.name for node in ast.walk(tree) if isinstance(node, ast.Import) for a in node.names}
     assert names <= {"json", "sys", "mujoco", "numpy", "onnxruntime"}
     assert not any(isinstance(node, ast.ImportFrom) for node in ast.walk(tree))
-    assert len(EXAMPLE.read_text().splitlines()) <= 72
+    assert len(EXAMPLE.read_text().splitlines()) <= 84
 
 
 def drivers_targets(policy: Path, cfg: Config, steps: int) -> np.ndarray:
