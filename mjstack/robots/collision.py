@@ -58,7 +58,8 @@ def change_collision(spec: mujoco.MjSpec, robot: RobotCfg) -> list[str]:
         elif len(hull) > limit:
             nearest, losses[mesh] = _nearest(hull, limit)
             name = f"{model.mesh(mesh).name}_{value}"
-            spec.add_mesh(name=name, uservert=nearest.ravel())
+            # The file's default would scale the points once more
+            spec.add_mesh(name=name, uservert=nearest.ravel(), scale=[1.0, 1.0, 1.0])
             shapes[mesh] = {"type": _MESH, "meshname": name}
     for n, geom in geoms:
         pos, quat = model.geom_pos[ids[n]].copy(), model.geom_quat[ids[n]].copy()

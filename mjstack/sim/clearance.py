@@ -1,4 +1,4 @@
-"""Pairs of geoms that no posture lets touch: a proof by the ranges of joints."""
+"""Pairs of geoms that no posture lets touch: a proof by the lengths of links."""
 
 import hashlib
 from dataclasses import dataclass
@@ -11,13 +11,12 @@ from mjstack.sim.model_fields import PLACING_FIELDS
 
 PROVED_BY = PLACING_FIELDS | {
     *("geom_size", "geom_aabb", "geom_rbound", "geom_margin", "geom_gap"),
-    *("jnt_pos", "jnt_axis", "jnt_range", "qpos0"),
+    *("jnt_pos", "jnt_axis", "qpos0"),
 }
 """Fields that a proof reads: it holds for no world that differs in one."""
 
 _SHAPES = range(mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_MESH + 1)
-_HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
-_BEYOND = {_HINGE: 0.1, _SLIDE: 0.005}  # rad, m: a range is a soft limit
+_HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 _CLEAR = 5e-4  # m between surfaces, at least
 _DEEP = 3  # joints between two geoms; of more there are too many postures
 _POSTURES = 2500  # of a pair, at most
@@ -25,12 +24,12 @@ _known: dict[bytes, ndarray] = {}
 
 
 def find_separate(model: mujoco.MjModel, pairs: ndarray) -> ndarray:
-    """Whether two geoms are apart in every posture that the ranges of joints allow, and somewhat
-    beyond; shape ``(n,)``, bool, for pairs of shape ``(n, 2)``.
+    """Whether two geoms are apart in every posture, shape ``(n,)``, bool, for pairs of shape ``(n,
+    2)``. Hinges may turn as they like: a range is a soft limit, and joints overshoot it.
 
     A proof, not a sample. A hinge that turns by an angle moves no point of a geom farther than that
     angle times the largest distance of the geom from the hinge. So a distance in one posture is
-    enough for all postures nearby, and ranges are halved until all are covered. Once in a process.
+    enough for all postures nearby, and a turn is halved until all are covered. Once in a process.
     """
     content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, content)
@@ -50,31 +49,23 @@ def _proved(model: mujoco.MjModel, data: mujoco.MjData, *geoms: int) -> bool:
     data.qpos = model.qpos0
     mujoco.mj_kinematics(model, data)
     chains = [_chain(model, body) for body in bodies]
-    speeds: dict[int, float] = {}  # of a geom's farthest point, in m/rad, or m/m
+    speeds: dict[int, float] = {}  # of a geom's farthest point, in m/rad
     for geom, chain in zip(geoms, chains, strict=True):
-        reach, point, hinges = float(model.geom_rbound[geom]), data.geom_xpos[geom], 0
-        for joint in [j for j in chain if (j in chains[0]) != (j in chains[1])]:
-            kind = int(model.jnt_type[joint])
-            if kind == _HINGE:
-                arm = point - data.xanchor[joint]
-                if not hinges:  # along the axis of its own hinge a geom stays where it is
-                    arm = arm - (arm @ data.xaxis[joint]) * data.xaxis[joint]
-                reach += float(np.linalg.norm(arm))
-                speeds[joint], point, hinges = reach, data.xanchor[joint].copy(), hinges + 1
-            elif kind == _SLIDE and model.jnt_limited[joint]:
-                travel = model.jnt_range[joint] - model.qpos0[model.jnt_qposadr[joint]]
-                reach += float(np.abs(travel).max()) + _BEYOND[_SLIDE]
-                speeds[joint] = 1.0
-            else:
+        reach, point = float(model.geom_rbound[geom]), data.geom_xpos[geom]
+        moving = [joint for joint in chain if (joint in chains[0]) != (joint in chains[1])]
+        for joint in moving:
+            if model.jnt_type[joint] != _HINGE:
                 return False
-    joints = [*speeds]
-    ranges = model.jnt_range[joints].copy()
-    ranges[model.jnt_limited[joints] == 0] = -np.pi, np.pi  # a whole turn
-    half = 0.5 * np.diff(ranges)[:, 0] + [_BEYOND[int(model.jnt_type[j])] for j in joints]
+            arm = point - data.xanchor[joint]
+            away = float(np.linalg.norm(arm))
+            if joint == moving[0]:  # along the axis of its own hinge a geom stays where it is
+                arm = arm - (arm @ data.xaxis[joint]) * data.xaxis[joint]
+            speeds[joint] = reach + float(np.linalg.norm(arm))
+            reach, point = reach + away, data.xanchor[joint].copy()
     clear = _CLEAR + float((model.geom_margin + model.geom_gap)[[*geoms]].sum())
-    addresses = model.jnt_qposadr[joints]
+    addresses = model.jnt_qposadr[[*speeds]]
     search = _Search(model, data, geoms, addresses, np.array([*speeds.values()]), clear)
-    return search.covers(ranges.mean(axis=1), half)
+    return search.covers(np.zeros(len(speeds)), np.full(len(speeds), np.pi))
 
 
 def _chain(model: mujoco.MjModel, body: int) -> list[int]:

@@ -122,7 +122,7 @@ class MjwarpSimulation(Simulation):
             self._stepped.nxn_geom_pair_filtered
         ):
             count = f"{omitted} of {len(self._m.nxn_geom_pair_filtered)} pairs of geoms"
-            _log_once(f"{count} are left out of collision: no range of joints lets them touch")
+            _log_once(f"{count} are left out of collision: no posture lets them touch")
         hardware = self._device.name if self._device.is_cuda else "Warp's CPU device"
         self.description = (
             f"MuJoCo Warp {mjw.__version__}, Warp {wp.__version__}, {hardware}, {self.plan}"

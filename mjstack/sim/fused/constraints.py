@@ -50,7 +50,7 @@ def shared_bytes(nv: int, row: int, njmax: int) -> int:
 def without_far_pairs(model: mujoco.MjModel, m: mjw.Model) -> mjw.Model:
     """The model without the pairs of geoms that are proved to be apart in every posture."""
     pairs, numbers = m.nxn_geom_pair_filtered.numpy(), m.nxn_pairid_filtered.numpy()
-    if m.opt.broadphase != mjw.BroadphaseType.NXN or m.opt.disableflags & mjw.DisableBit.LIMIT:
+    if m.opt.broadphase != mjw.BroadphaseType.NXN:
         return m
     listed = (numbers != -1).any(axis=1)  # a pair of the file, or of a sensor
     listed[~listed] = ~find_separate(model, pairs[~listed])
