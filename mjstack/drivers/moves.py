@@ -76,6 +76,8 @@ def find_moves(cfg: Config, phases: Sequence[Phase]) -> list[Move]:
             k for k in carry if k == carry[-1] or phases[k].target != phases[k + 1].target
         ]
         reach = [*range(over, down + 1)]
+        if name in moves:
+            raise _refusal(cfg, f"move {name} twice, which no state tells apart")
         moves[name] = Move(name, way, reach, close, carry, last, retreat, lifts)
     if not moves:
         anchor = str(phases[leads[0]].spec.anchor) if leads else ""

@@ -53,6 +53,12 @@ class Servos:
         if not models:
             raise ParameterError("models", models, "at least one model of the servos")
         robot = env.cfg.robot
+        for term in env.cfg.reset.values():
+            if term.func.endswith(".Servos"):
+                break
+            if term.func.endswith(".GripForce"):
+                problem = "reset: GripForce stands before Servos, which writes the forces anew"
+                raise MjstackError(problem, "Name it later, such as randomization=[servos,grip]")
         compiled = []
         for name, content in models.items():
             servos = dict(content.get("servos", content))
@@ -71,6 +77,14 @@ class Servos:
             )
             for name in _SERVO_FIELDS
         }
+        # Objects keep the inverse weights that the terms before have given them.
+        nominal = env.sim.model
+        self._own = {
+            name: (values != torch.from_numpy(getattr(nominal, name)).to(values)).any(0)
+            for name, values in self._values.items()
+            if name.endswith("invweight0")
+        }
+        self._every = torch.ones((), dtype=torch.bool, device=env.device)
         self._joints = len(robot.joints)
         servos_at, dofs = (Columns(at, env.device) for at in (env.index.ctrl, env.index.robot_qvel))
         self._scaled = {
@@ -93,7 +107,8 @@ class Servos:
                 factor = factors[:, kind].view(len(factors), -1, *[1] * (servos.dim() - 2))
                 columns.write(servos, columns.read(servos) * factor.to(servos))
             field = self._fields[name]
-            torch.where(mask.view(-1, *[1] * (field.dim() - 1)), servos, field, out=field)
+            written = mask.view(-1, *[1] * (field.dim() - 1)) & self._own.get(name, self._every)
+            torch.where(written, servos, field, out=field)
 
 
 @uses_fields("actuator_forcerange")
@@ -129,12 +144,14 @@ class ObjectSize:
     label = "reset.size"
 
     def __init__(self, env: EnvView, *, edge: NotNegative) -> None:
-        """Take the half-width of the change of an edge's length [m]."""
+        """Take the half-width of the change of an edge's length [m], less than any edge."""
         boxes = [
             n for n, thing in env.cfg.scene.free.items() if thing.shape == "box" and not thing.file
         ]
         if not boxes:
             raise ParameterError("edge", edge, "0, or a scene with a box that moves")
+        if edge >= (least := 2.0 * min(min(env.cfg.scene.free[name].half) for name in boxes)):
+            raise ParameterError("edge", edge, f"less than {least:g} m, the shortest edge")
         geoms = [env.index.geoms[name][0] for name in boxes]
         self._half = 0.5 * edge
         self._size, self._box, self._bound = (Elements(env, n, geoms) for n in _SIZE_FIELDS)

@@ -9,7 +9,7 @@ from mjstack.config.fields import Count, NotNegative
 from mjstack.managers.state import lost_state
 from mjstack.managers.view import EnvView, offers
 from mjstack.math import constant
-from mjstack.mdp.geometry import robot
+from mjstack.mdp.geometry import robot, zeros
 from mjstack.mdp.observation import joint_pos
 from mjstack.sim import LOST_PHYSICS
 from mjstack.sim.simulation import Columns
@@ -73,7 +73,8 @@ class JointLimit:
 
     def __call__(self, env: EnvView) -> Tensor:
         """True for worlds with a joint outside, shape ``(nworld,)``."""
-        return _outside(joint_pos(env), self._low, self._high)
+        read, off = joint_pos(env), zeros(env)
+        return _outside(read if off is None else read + off.to(read), self._low, self._high)
 
 
 @offers(ends_on="non_finite", reads="state")

@@ -256,7 +256,8 @@ def _from_facts(facts: Facts, path: Path) -> Policy:
         raise ValueError(f"action.execute is {execute!r}, not a whole number of steps")
     inputs = sum(widths.values())
     relative = layers.get("relative", [])
-    if relative and (len(relative) != action["width"] or not {*relative} <= {*range(inputs)}):
+    columns = all(type(number) is int and 0 <= number < inputs for number in relative)
+    if relative and not (columns and len(relative) == action["width"]):
         raise ValueError("network.relative is no column of the observation for each joint")
     shape = (inputs, action["width"], action["chunk"], layers["hidden"])
     with torch.device("meta"):

@@ -19,11 +19,19 @@ from mjstack.policy.checkpoint import Facts
 from mjstack.report.figure import Figure, figures
 from mjstack.sim.memory import give_back_memory
 from mjstack.train.clone_learner import CloneLearner
-from mjstack.train.clone_network import vision_of
+from mjstack.train.clone_network import measured_columns, vision_of
 from mjstack.train.demonstrations import Demonstrations, Source
 from mjstack.train.images import ImagePool, pool_rows
 from mjstack.train.rounds import make_round, round_file
-from mjstack.train.trainer import FAILED, LAST, Trained, Trainer, earlier_state, observed_widths
+from mjstack.train.trainer import (
+    FAILED,
+    LAST,
+    Trained,
+    Trainer,
+    earlier_state,
+    observed_widths,
+    with_observation,
+)
 
 
 def check_clone(stage: Stage) -> range:
@@ -36,6 +44,8 @@ def check_clone(stage: Stage) -> range:
         _check_vision(stage, job)
     source = find_instance("job.source", job.source, Source)
     widths = observed_widths(stage)
+    if job.relative:
+        measured_columns(with_observation(cfg), widths)
     if job.dataset is not None:
         return source.check(stage, widths)
     least = 2 * stage.ranks.size

@@ -32,7 +32,9 @@ def make_network(cfg: Config, demonstrations: Demonstrations, ranks: Ranks) -> P
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(cfg.seed)
         sizes = (seen.shape[1], labels.shape[1], job.chunk, job.hidden)
-        relative, origin = _measured(cfg, demonstrations.widths) if job.relative else ([], [])
+        relative, origin = (
+            measured_columns(cfg, demonstrations.widths) if job.relative else ([], [])
+        )
         network = PolicyNetwork(*sizes, vision_of(cfg, job), relative)
     if relative:
         network.origin.copy_(torch.tensor(origin))
@@ -100,7 +102,7 @@ def input_noise(
     return torch.tensor(widest)
 
 
-def _measured(cfg: Config, widths: Mapping[str, int]) -> tuple[list[int], list[float]]:
+def measured_columns(cfg: Config, widths: Mapping[str, int]) -> tuple[list[int], list[float]]:
     """Columns of the observation with the latest measured joints, and what these count from."""
     job: CloneJobCfg = cfg.job
     home = cfg.robot.home

@@ -2,6 +2,7 @@
 expert knows of it, and policies can do without a joint's zero.
 """
 
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,15 +20,16 @@ from mjstack.drivers.servos import ServoInverse
 from mjstack.envs import Env, build_env
 from mjstack.episodes.batches import BatchPlan, play_batches
 from mjstack.episodes.stage import Stage
-from mjstack.errors import FolderError
+from mjstack.errors import FolderError, MjstackError
 from mjstack.gates.episodes import gate_config
 from mjstack.math import norm
+from mjstack.mdp import termination
 from mjstack.mdp.geometry import robot, zeros
 from mjstack.mdp.starts.starts_file import start_arrays
 from mjstack.policy import load_policy, save_policy
 from mjstack.policy.network import PolicyNetwork
 from mjstack.scene.build import build_model
-from mjstack.train.clone_network import _measured
+from mjstack.train.clone_network import measured_columns
 
 BACKENDS = ("native", "mjwarp")
 ABSOLUTE = "action=joint_absolute"
@@ -235,7 +237,43 @@ def test_relative_targets_need_joints_that_are_seen() -> None:
     cfg = load_config(["job=train", "sim=native", "observation@job.observation=real"])
     cfg = replace(cfg, observation=cfg.job.observation)
     widths = dict.fromkeys(cfg.observation["policy"].terms, 6)
-    assert _measured(cfg, widths) == ([0, 1, 2, 3, 4, 5], cfg.robot.home)
+    assert measured_columns(cfg, widths) == ([0, 1, 2, 3, 4, 5], cfg.robot.home)
     cfg.observation["policy"].terms["joint_pos"].scale = 2.0
-    message = refusal(lambda: _measured(cfg, widths))
+    message = refusal(lambda: measured_columns(cfg, widths))
     assert message.startswith("job.relative=true: expected false, because the policy sees no")
+
+
+def test_servos_leave_the_weights_of_objects_to_other_terms() -> None:
+    """A heavier cube has a smaller inverse weight, whichever term comes first."""
+    for names in (("servos", "objects"), ("objects", "servos")):
+        with closing(build_env(real(*names), nworld=4, backend=Backend.native)) as env:
+            env.reset()
+            fields, model = env.sim.fields, env.sim.model
+            body = env.index.bodies["red"]
+            mass = fields["body_mass"][:, body] / model.body_mass[body]
+            weight = fields["body_invweight0"][:, body, 0] / model.body_invweight0[body, 0]
+            assert not torch.allclose(mass, torch.ones_like(mass))
+            torch.testing.assert_close(mass * weight, torch.ones_like(mass))
+
+
+def test_a_joint_at_its_true_stop_is_within_its_limits() -> None:
+    with closing(build_env(real("zeros"), nworld=16, backend=Backend.native)) as env:
+        env.reset()
+        off = zeros(env)
+        assert off is not None
+        at_stop = robot(env).range[:, 1] - off
+        env.sim.qpos[:, env.index.robot_qpos] = at_stop.to(env.sim.qpos)
+        limit = termination.JointLimit(env, margin=0.02)
+        assert not limit(env).any()
+        env.sim.qpos[:, env.index.robot_qpos] += 0.5
+        assert limit(env).all()
+
+
+def test_what_would_not_act_is_refused() -> None:
+    for chosen, extra, words in (
+        (("grip", "servos"), (), "GripForce stands before Servos"),
+        (("objects",), ("reset.size.params.edge=0.06",), "less than 0.044 m"),
+    ):
+        cfg = real(*chosen, extra=extra)
+        with pytest.raises(MjstackError, match=words):
+            build_env(cfg, nworld=1, backend=Backend.native)
