@@ -79,12 +79,12 @@ class Servos:
         }
         # Objects keep the inverse weights that the terms before have given them.
         nominal = env.sim.model
-        self._own = {
+        self._weights = {
             name: (values != torch.from_numpy(getattr(nominal, name)).to(values)).any(0)
             for name, values in self._values.items()
             if name.endswith("invweight0")
         }
-        self._every = torch.ones((), dtype=torch.bool, device=env.device)
+        self._rows = torch.ones((), dtype=torch.bool, device=env.device)
         self._joints = len(robot.joints)
         servos_at, dofs = (Columns(at, env.device) for at in (env.index.ctrl, env.index.robot_qvel))
         self._scaled = {
@@ -107,7 +107,7 @@ class Servos:
                 factor = factors[:, kind].view(len(factors), -1, *[1] * (servos.dim() - 2))
                 columns.write(servos, columns.read(servos) * factor.to(servos))
             field = self._fields[name]
-            written = mask.view(-1, *[1] * (field.dim() - 1)) & self._own.get(name, self._every)
+            written = mask.view(-1, *[1] * (field.dim() - 1)) & self._weights.get(name, self._rows)
             torch.where(written, servos, field, out=field)
 
 
