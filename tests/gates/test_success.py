@@ -326,7 +326,7 @@ def test_signs_in_real_episodes(new_run: NewRun) -> None:
     undisturbed.
     """
     base = new_run("sim=native", "nworld=6")
-    run = base.on(base.stage.with_config(gate_config(base.cfg, "success")))
+    run = base.with_stage(base.stage.with_config(gate_config(base.cfg, "success")))
     red, _ = run.stage.index.object_qpos
     at = {name: run.stage.phase(name).start for name in PHASES}
     done = at["done"] + 5
@@ -390,7 +390,7 @@ def test_each_cube_of_the_box_has_its_own_release(monkeypatch: Patch) -> None:
 def test_steps_with_the_tracker_are_one_graph(robot: str, new_run: NewRun, tmp_path: Path) -> None:
     device = ("sim=mjwarp", "sim.device=cuda:0", "nworld=64")
     base = new_run(*device, "graph=require", robot=robot)
-    run = base.on(base.stage.with_config(gate_config(base.cfg, "success")))
+    run = base.with_stage(base.stage.with_config(gate_config(base.cfg, "success")))
     sim = run.stage.batch_simulation(64)
     watch = FailureMonitor()
     episode = run.stage.play(sim, run.cfg.reset, [watch])
