@@ -52,7 +52,7 @@ def test_episodes_are_accepted(get_stage: GetStage, robot: str, task: str, steps
         ("so101", "peg", 240),
         pytest.param("rebot", "peg", 300, marks=pytest.mark.full),
         ("so101", "slot", 260),
-        pytest.param("rebot", "slot", 300, marks=pytest.mark.full),
+        pytest.param("rebot", "slot", 420, marks=pytest.mark.full),
         ("so101", "push", 180),
         pytest.param("rebot", "push", 260, marks=pytest.mark.full),
         ("so101", "lift", 170),
