@@ -445,7 +445,7 @@ def test_the_reference_has_every_group_and_job() -> None:
         (["sim=native"], 64, ["joint_vel?"]),
         (["sim=mjwarp", "sim.device=cpu"], 64, ["joint_vel?"]),
         (["sim=mjwarp", "sim.device=cuda:0"], 2048, ["joint_vel?"]),
-        (["sim=mjwarp", "sim.device=cuda:0", "trainer=clone"], 16384, []),
+        (["sim=mjwarp", "sim.device=cuda:0", "trainer=clone"], 16384, ["tilts?", "grasped?"]),
         (["sim=native", "job.episodes=5"], 5, ["joint_vel?"]),
     ],
 )
