@@ -58,7 +58,7 @@ def _proved(model: mujoco.MjModel, data: mujoco.MjData, *geoms: int) -> bool:
                 return False
             arm = point - data.xanchor[joint]
             away = float(np.linalg.norm(arm))
-            if joint == moving[0]:  # along the axis of its own hinge a geom stays where it is
+            if joint == moving[0]:  # its own hinge does not move it along the axis
                 arm = arm - (arm @ data.xaxis[joint]) * data.xaxis[joint]
             speeds[joint] = reach + float(np.linalg.norm(arm))
             reach, point = reach + away, data.xanchor[joint].copy()

@@ -254,8 +254,7 @@ class _CarriedOver(parts.Carried):
     def start(self, step: Step) -> None:
         super().start(step)
         self._hold = step.during(self.hold)
-        # In the last step of the hold, or of any load
-        self.over_box = step.counter(len(self.objects))
+        self.over_box = step.counter(len(self.objects))  # in the hold's or any load's last step
 
     def update(self, step: Step) -> None:
         super().update(step)

@@ -176,6 +176,15 @@ def find(cfg: Config) -> list[Move]:
     return find_moves(cfg, build_phases(cfg))
 
 
+def test_an_object_that_is_moved_twice_is_refused() -> None:
+    """Of two moves a state shows only where the object is."""
+    for task in ("stack", "box"):
+        cfg = load_config([f"task={task}"])
+        phases = build_phases(cfg)
+        with pytest.raises(ConfigError, match="twice, which no state tells apart"):
+            find_moves(cfg, [*phases[:-1], *phases])
+
+
 def test_late_commands_are_refused_before_anything_runs(tmp_path: Path) -> None:
     late = ["timing.command_delay=6", "sim=native", "nworld=2", f"hydra.run.dir={tmp_path}/out"]
     for overrides in ([*EXPERT, "gates=[success]"], ["job=train", f"job.folder={tmp_path}/out"]):

@@ -207,7 +207,7 @@ MOST = {
     "vague names": 490,
     "comments that begin with a pronoun": 17,
     "docstrings that begin with What": 1,
-    "lines": 35_003,
+    "lines": 35_002,
 }
 
 

@@ -85,6 +85,20 @@ def test_a_hull_has_its_vertices_and_lies_where_the_mesh_does() -> None:
     assert (after.geom_contype != 0).sum() == 3
 
 
+@pytest.mark.parametrize("scale", ["1e-3 1e-3 1e-3", "1 1 -1", "2 1 .5"])
+def test_a_default_scale_of_the_file_acts_once(scale: str) -> None:
+    """Of meshes whose vertices are in millimetres, mirrored or stretched."""
+    vertices = " ".join(map(str, (_BALL / [float(k) for k in scale.split()]).ravel()))
+    spec = mujoco.MjSpec.from_string(f"""<mujoco><default><mesh scale="{scale}"/></default>
+      <asset><mesh name="ball" vertex="{vertices}"/></asset><worldbody><body name="link">
+      <joint name="joint" axis="0 1 0"/><geom name="geom" type="mesh" mesh="ball"/></body>
+      </worldbody></mujoco>""")
+    robot = RobotCfg(name="arm", arm_joints=["joint"], gripper_joints=[], home=[0.0])
+    robot.collision = "hull 64"
+    change_collision(spec, robot)
+    assert spec.compile().geom("geom").rbound[0] == pytest.approx(0.03 * 3**0.5, rel=0.05)
+
+
 def test_primitives_are_around_their_meshes() -> None:
     before, after, (line,) = changed("primitives")
     assert_same_dynamics(before, after)
